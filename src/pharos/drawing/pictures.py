@@ -8,7 +8,7 @@ below all things. The look of "asphalt" and "walls" follows the Atari 2600 games
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -349,7 +349,7 @@ class Window:
         except ImportError as error:
             raise MissingExtra("render_mode='human'", "pygame-ce", "play") from error
         self._pygame, self._caption, self._fps = pygame, caption, fps
-        self._surface: Any = None
+        self._surface: pygame.Surface | None = None
         self._clock = pygame.time.Clock()
 
     def show(self, picture: np.ndarray) -> None:

@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pharos.environments import Color, Layer, Shape
 from pharos.errors import UnknownName
+
+T = TypeVar("T")
 
 
 @cache
@@ -50,7 +53,7 @@ def sprite_of(sprite: Any, value: int) -> Sequence[str]:
     return sprite if isinstance(sprite[0], str) else _of_value(sprite, value)
 
 
-def _of_value(several: Sequence[Any], value: int) -> Any:
+def _of_value(several: Sequence[T], value: int) -> T:
     return several[min(value, len(several)) - 1]
 
 
@@ -162,7 +165,7 @@ def _car(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
         x = 1 - x
     canvas = np.zeros((*x.shape, 4))
 
-    def box(x0: float, x1: float, half: float, round_off: float, paint: Any) -> None:
+    def box(x0: float, x1: float, half: float, round_off: float, paint: ArrayLike) -> None:
         dx = np.maximum(np.maximum(x0 + round_off - x, x - x1 + round_off), 0)
         dy = np.maximum(abs(y - 0.5) - half + round_off, 0)
         canvas[np.hypot(dx, dy) <= round_off] = (*np.broadcast_to(paint, 3), 1.0)

@@ -12,6 +12,7 @@ A page composes the drawing itself, so a state costs some numbers, not a picture
 
 import base64
 import io
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -125,7 +126,7 @@ class Exploration:
         learnt: Learnt | None = None,
         title: str = "",
         chance: str = "",
-        progress: Any = lambda text: None,
+        progress: Callable[[str], object] = lambda text: None,
     ):
         self.mdp = mdp = mdp.with_horizon(None)
         self.env, self.space, self.learnt, self.chance = env, space, learnt, chance
@@ -285,7 +286,7 @@ class Exploration:
     def _variables_of(self, state: int) -> tuple[int, ...]:
         return tuple(self.states.values(np.array([state]))[0].tolist())
 
-    def _checked(self, state: Any, previous: Any) -> tuple[int, int | None]:
+    def _checked(self, state: int, previous: int | None) -> tuple[int, int | None]:
         if not 0 <= state < self.mdp.num_states:
             raise ParameterError(f"there is no state {state}; expected 0 to {self.mdp.num_states - 1:,}")
         if previous is not None and not 0 <= previous < self.mdp.num_actions:
@@ -431,7 +432,7 @@ class Exploration:
         }
 
 
-def number(value: Any) -> float | None:
+def number(value: float | np.floating) -> float | None:
     """A float; None where it is not a number."""
     return float(value) if np.isfinite(value) else None
 

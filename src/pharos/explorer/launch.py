@@ -11,6 +11,7 @@ import hmac
 import json
 import os
 import secrets
+import socket
 import sys
 import threading
 import webbrowser
@@ -18,7 +19,7 @@ from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 from urllib.parse import parse_qs, urlsplit
 
 from pharos.environments import Environment, class_called, make
@@ -29,7 +30,7 @@ from pharos.explorer.states import Learnt
 from pharos.mdp import TabularMDP
 from pharos.policies import PolicyLike
 from pharos.state_space import StateSpace, build, load
-from pharos.training import ChanceSetting, load_agent, read_record
+from pharos.training import ChanceSetting, Task, load_agent, read_record
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")  # that a Host header may have
@@ -104,7 +105,7 @@ def _said(status: HTTPStatus, text: str) -> tuple[HTTPStatus, str, bytes]:
 # Questions ------------------------------------------------------------------------------------------------------------
 
 
-def _whole(words: Mapping[str, str], name: str, otherwise: int | None = None) -> Any:
+def _whole(words: Mapping[str, str], name: str, otherwise: int | None = None) -> int:
     """A whole number of a query; `otherwise` where it is not there."""
     text = words.get(name, "")
     if text == "":
@@ -140,22 +141,26 @@ QUESTIONS: dict[str, Callable[[Exploration, Mapping[str, str]], dict[str, Any]]]
 # HTTP -----------------------------------------------------------------------------------------------------------------
 
 
+Request: TypeAlias = socket.socket | tuple[bytes, socket.socket]
+Address: TypeAlias = tuple[str, int] | str
+
+
 class _Http(ThreadingHTTPServer):
     daemon_threads = True
     owner: Server
 
-    def __init__(self, *address: Any):
+    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]):
         self.places = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        super().__init__(*address)
+        super().__init__(address, handler)
 
-    def process_request(self, request: Any, client_address: Any) -> None:
+    def process_request(self, request: Request, client_address: Address) -> None:
         """Give the connection a thread; one too many is closed at once."""
         if self.places.acquire(blocking=False):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
+    def process_request_thread(self, request: Request, client_address: Address) -> None:
         try:
             super().process_request_thread(request, client_address)
         finally:
@@ -393,7 +398,7 @@ def _of_run(
     return Exploration(mdp, env=task.env, space=space, learnt=learnt, title=title, chance=setting, progress=progress)
 
 
-def _facts(record: Any, task: Any) -> dict[str, str]:
+def _facts(record: Mapping[str, Any], task: Task) -> dict[str, str]:
     """Facts that the run recorded, in its own setting."""
     result, config = record.get("result", {}), record["config"]
     limit = "discounted, no horizon" if task.horizon_steps is None else f"episodes of {task.horizon_steps} steps"

@@ -281,7 +281,7 @@ class Learnt:
 
     policy: PolicyLike
     name: str = "learnt"
-    observation: Any = "vector"
+    observation: object = "vector"
     observation_options: Mapping[str, Any] = field(default_factory=dict)
     previous_action: bool = False
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -299,9 +299,14 @@ class Learnt:
             raise ParameterError("a policy of observations needs an environment that is known; give it as a table")
         sight = Sight(space, space.environment, self.observation, dict(self.observation_options), self.previous_action)
         width = mdp.policy_width
-        options = {"observation": self.observation, "observation_options": self.observation_options}
         if sight.frames > 1 or mdp.num_states * width > ASKED_EVERYWHERE or (self.previous_action and width == 1):
-            return evaluate_policy(mdp, policy, **options, previous_action=self.previous_action)
+            return evaluate_policy(
+                mdp,
+                policy,
+                observation=self.observation,
+                observation_options=self.observation_options,
+                previous_action=self.previous_action,
+            )
         answers = PolicyAnswers(policy, mdp, sight)
         table = answers.of(np.arange(mdp.num_states * width))
         return evaluate_policy(mdp, table.reshape(mdp.num_states, width, -1) if width > 1 else table)

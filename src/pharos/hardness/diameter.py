@@ -21,7 +21,7 @@ import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
 import xxhash
@@ -35,6 +35,9 @@ from pharos.mdp import ExpandedMDP, TabularMDP, require_mdp
 from pharos.system import storage
 from pharos.system.memory import available_memory, kept_array, large_zeros, ranges_from_the_end
 from pharos.system.wording import many
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 
 @require_mdp
@@ -230,7 +233,7 @@ class _Episodes:
     each step of which takes the best policy for the last x. It starts with the policy that is least likely to miss.
     """
 
-    def __init__(self, matrix: Any, num_actions: int, goal: np.ndarray, rho: np.ndarray, horizon: int):
+    def __init__(self, matrix: "csr_matrix", num_actions: int, goal: np.ndarray, rho: np.ndarray, horizon: int):
         self.matrix, self.num_actions, self.goal, self.rho, self.horizon = matrix, num_actions, goal, rho, horizon
 
     def _pass(self, x: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
@@ -330,6 +333,7 @@ def digest_of(graph: Graph) -> str:
 
 
 Result = TypeVar("Result")
+Integers: TypeAlias = type[np.int16] | type[np.int32]
 
 
 def needs_more_than_memory(graph: Graph) -> bool:
@@ -349,7 +353,7 @@ def lean_diameter(
     """
     store = None if folder is None else KeptBounds(Path(folder), graph)
 
-    def interval(dtype: Any) -> Interval:
+    def interval(dtype: Integers) -> Interval:
         return LeanSweep(LeanGraph(graph, dtype), spending, conventions, store).interval()
 
     result = interval(np.int32) if store and store.dtype == np.int32 else _in_two_bytes_or_four(interval)
@@ -378,7 +382,7 @@ def lean_eccentricity(graph: Graph, source: int, spending: BudgetClock, conventi
     )
 
 
-def _in_two_bytes_or_four(result: Callable[[Any], Result]) -> Result:
+def _in_two_bytes_or_four(result: Callable[[Integers], Result]) -> Result:
     """result(dtype) with distances of two bytes; of four where one does not fit into two."""
     try:
         return result(np.int16)
@@ -394,7 +398,7 @@ class LeanGraph:
         far: the largest number of that type, for nodes that were not found.
     """
 
-    def __init__(self, graph: Graph, dtype: Any):
+    def __init__(self, graph: Graph, dtype: Integers):
         self.next_states, self.ends, self.start, self.pivot = graph.next_states, graph.ends, graph.start, graph.pivot
         self.num_nodes, self.has_end = graph.num_nodes, graph.has_end
         self.dtype, self.far = dtype, int(np.iinfo(dtype).max)
@@ -410,7 +414,9 @@ class LeanGraph:
         """distance[v] = d(v, source); returns and raises as `search_forward`."""
         return self._swept(kernels.lower_backward, source, distance, True)
 
-    def _swept(self, kernel: Any, source: int, distance: np.ndarray, backward: bool) -> tuple[int, int, int]:
+    def _swept(
+        self, kernel: Callable[..., int], source: int, distance: np.ndarray, backward: bool
+    ) -> tuple[int, int, int]:
         distance[:] = self.far
         distance[source] = 0
         size, lowered = len(self.next_states), 1

@@ -16,7 +16,7 @@ pharos's own variant of Laidlaw, Russell and Dragan's (2023) measure; `effective
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
@@ -351,7 +351,7 @@ class LargeHorizon:
     def is_greedy_optimal(self) -> bool:
         return all(needed is not None for needed, _, _ in self._walk(0.0, near=False))
 
-    def _walk(self, log: float, near: bool) -> Any:
+    def _walk(self, log: float, near: bool) -> Iterator[tuple[float | None, float, float]]:
         n, most = self._begin(), np.zeros(3)
         now, following = self.nodes
         for t in range(self.steps):
@@ -362,7 +362,7 @@ class LargeHorizon:
             if n < 0:
                 yield None, 0.0, 0.0
                 return
-            yield tuple(most.tolist())
+            yield float(most[0]), float(most[1]), float(most[2])
             now, following = following, now
             if not n:
                 return
@@ -631,7 +631,8 @@ def _states_and_the_end(mdp: TabularMDP) -> tuple[ExpandedMDP, np.ndarray]:
 
     What has ended stays where it is.
     """
-    next_states: Any = mdp.dynamics.deterministic_table()
+    next_states = mdp.dynamics.deterministic_table()
+    assert next_states is not None
     size = mdp.num_states
     table = np.full((size + 1, mdp.num_actions), size, next_states.dtype)
     table[:size] = next_states
@@ -643,7 +644,7 @@ def _states_and_the_end(mdp: TabularMDP) -> tuple[ExpandedMDP, np.ndarray]:
     return ExpandedMDP(None, np.arange(size + 1), np.full(size + 1, -1), starts, mdp.num_actions, size + 1, none), table
 
 
-def _on_nodes(solution: Solution, choices: Any, mdp: TabularMDP) -> np.ndarray:
+def _on_nodes(solution: Solution, choices: ExpandedMDP, mdp: TabularMDP) -> np.ndarray:
     """(N,): V of the nodes; 0 at the end. Of starts without a previous action any number, as nothing leads there."""
     inside = choices.underlying < mdp.num_states
     v = solution.v

@@ -38,7 +38,7 @@ The linear equations of the hitting times of one policy, with nodes that are ali
 import math
 from copy import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy  # whose `sparse` is loaded where it is used
@@ -46,6 +46,10 @@ import scipy  # whose `sparse` is loaded where it is used
 from pharos.hardness.interval import BudgetClock
 from pharos.kernels import hitting
 from pharos.mdp import ExpandedMDP
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.linalg import SuperLU
 
 # Relative rounding of a product of a bound and a factor.
 PRODUCT = 1 + 2.0**-50
@@ -358,7 +362,9 @@ class HittingTimes:
                 break
         return best
 
-    def _moved(self, high: np.ndarray, low: np.ndarray, count: int, factored: Any) -> tuple[Bounds, np.ndarray]:
+    def _moved(
+        self, high: np.ndarray, low: np.ndarray, count: int, factored: tuple[np.ndarray, "Factors"]
+    ) -> tuple[Bounds, np.ndarray]:
         """(bounds of J* relative to J + W, J + W rounded up); a policy that is greedy in J - W in place of that in J
         where ties need it."""
         inner, factors = factored
@@ -406,7 +412,7 @@ class Factors:
     first: (unknowns,) the first node of each. unknown: (inner nodes,) which one a node is.
     """
 
-    factors: Any
+    factors: "SuperLU"
     first: np.ndarray
     unknown: np.ndarray
 
@@ -447,7 +453,7 @@ def _numbered_once(alike: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(opens), group
 
 
-def without_common(matrix: Any, num_actions: int) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
     """What the actions of a node have in common is added up once: under random and sticky actions most of a row.
 
     Returns:

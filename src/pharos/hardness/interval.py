@@ -137,7 +137,7 @@ class Certificate:
         return {"kind": self.kind, **ends, "note": self.note, **self.details}
 
 
-def certificate_of(outcome: Any) -> Certificate:
+def certificate_of(outcome: object) -> Certificate:
     """What a measure's result says of itself: by `exact`, `lower`, `upper` and `note`, where it has them."""
     if not hasattr(outcome, "exact"):
         return Certificate("float64", note=getattr(outcome, "note", ""))

@@ -1,18 +1,18 @@
 """The measures of a report: name, function, definition and source; how users add one; and those of pharos, in order."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
 from pharos.hardness.diameter import diameter, start_eccentricity_interval
 from pharos.hardness.effective_horizon import effective_horizon, stationary_effective_horizon
 from pharos.hardness.gaps import Gaps, resolved_gaps, solved
 from pharos.hardness.gorp import gorp_bound
-from pharos.hardness.interval import Budget, Certified, Progress
+from pharos.hardness.interval import Budget, Certified, Interval, Progress
 from pharos.hardness.kernel_regret import (
     aliasing_floor,
     kernel_learning_time,
@@ -190,7 +190,7 @@ def measures() -> dict[str, Measure]:
     return dict(_MEASURES)
 
 
-def chosen(names: Any, is_seen: bool = False) -> list[Measure]:
+def chosen(names: str | Iterable[str] | None, is_seen: bool = False) -> list[Measure]:
     """The measures of these names; None: all but those on request; "all": these as well.
 
     Args:
@@ -216,10 +216,13 @@ def chosen(names: Any, is_seen: bool = False) -> list[Measure]:
     return result
 
 
+Outcome = TypeVar("Outcome")
+
+
 # Measures of pharos ---------------------------------------------------------------------------------------------------
 
 
-def _diameter(problem: Problem) -> Any:
+def _diameter(problem: Problem) -> Interval:
     reporter = problem.interval_reporter("diameter")
     options: dict[str, Any] = {"restart": problem.restart, "budget": problem.budget, "bounds": problem.folder}
     return diameter(problem.mdp, progress=reporter, **options)
@@ -379,17 +382,17 @@ register(
 )
 
 
-def _of_representation(function: Any) -> Any:
+def _of_representation(function: Callable[..., Outcome]) -> Callable[[Problem], Outcome]:
     """A measure of what the agent sees, as a report takes it."""
 
-    def measure(problem: Problem) -> Any:
+    def measure(problem: Problem) -> Outcome:
         representation = problem.seen(function.__name__)
         return function(problem.mdp, representation, schedule=problem.schedule, horizon=problem.horizon)
 
     return measure
 
 
-def _of_learner(function: Any, problem: Problem, **options: Any) -> Any:
+def _of_learner(function: Callable[..., Outcome], problem: Problem, **options: object) -> Outcome:
     """A measure of an idealised learner."""
     options |= {"schedule": problem.schedule, "solution": problem.solution, "horizon": problem.horizon}
     return function(problem.mdp, problem.seen(function.__name__), **options)

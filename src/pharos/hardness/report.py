@@ -204,7 +204,7 @@ def _error_bound(problem: Problem) -> float | None:
     return problem.solution.error_bound if "solution" in vars(problem) else None
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     if isinstance(value, Certified):
         return value.value
     if hasattr(value, "to_dict"):
@@ -214,19 +214,19 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if isinstance(value, float | np.floating):
         return f"{value:.10g}"
     return str(value)
 
 
-def _infinite(value: Any) -> bool:
+def _infinite(value: object) -> bool:
     if isinstance(value, Mapping):
         return bool(value.get("infinite", False))
     return isinstance(value, float) and math.isinf(value)
 
 
-def _finite(value: Any) -> Any:
+def _finite(value: object) -> object:
     if isinstance(value, Mapping):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -328,7 +328,7 @@ class ResultsFile:
     def put(
         self,
         measure: Measure,
-        value: Any,
+        value: object,
         text: str,
         certificate: Certificate,
         seconds: float,
@@ -400,7 +400,7 @@ class ResultsFile:
             warnings.warn(f"{self.path}: {what}; it is measured anew", stacklevel=2)
 
 
-def _check(value: Any) -> None:
+def _check(value: object) -> None:
     """ValueError where a value cannot be one: an interval whose ends are the wrong way round, or NaN."""
     if isinstance(value, Mapping):
         lower, upper = value.get("lower"), value.get("upper")

@@ -12,6 +12,7 @@ from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.visitation import Walk
@@ -48,7 +49,7 @@ class Representation:
             raise ParameterError("landmarks is 1; expected at least 2, as half of them tell the error, or 0 for none")
 
     @staticmethod
-    def of_matrix(kernel: Any, classes: Any = None, **options: Any) -> "Representation":
+    def of_matrix(kernel: ArrayLike, classes: ArrayLike | None = None, **options: Any) -> "Representation":
         """From a kernel (S, S), and numbers of observations (S,); None: every state looks different.
 
         Raises:
@@ -280,7 +281,7 @@ def _sum_of_powers(steps: int) -> np.ndarray:
     """Chebyshev coefficients in u = 1 - 2 x of the sum of (1 - x)^t, t < steps, on [0, 1]."""
     degree = min(steps - 1, math.ceil(3.5 * math.sqrt(steps)))
 
-    def total(u: Any) -> Any:
+    def total(u: np.ndarray) -> np.ndarray:
         x = (1 - u) / 2
         return np.where(x > 1e-9, -np.expm1(steps * np.log1p(-np.minimum(x, 1 - 1e-16))) / np.maximum(x, 1e-9), steps)
 

@@ -8,13 +8,17 @@ executed action) and the starts without one. Source: Laidlaw, Russell and Dragan
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy  # whose `sparse` is loaded where it is used
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.mdp import ExpandedMDP, PolicyTable, TabularMDP, require_mdp
+from pharos.solvers import TablePolicy
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 # In units of return: an action is optimal if its value is within this of the best (theirs).
 TIE = 1e-4
@@ -142,14 +146,14 @@ def mean_of_actions(values: np.ndarray) -> np.ndarray:
     return total / values.shape[1]
 
 
-def single_outcomes(matrix: Any, nodes: int, num_actions: int) -> np.ndarray | None:
+def single_outcomes(matrix: "csr_matrix", nodes: int, num_actions: int) -> np.ndarray | None:
     """(N, A) next nodes where every choice has one outcome; else None."""
     if matrix.nnz == nodes * num_actions and (np.diff(matrix.indptr) == 1).all() and (matrix.data == 1.0).all():
         return matrix.indices.reshape(nodes, num_actions).astype(np.int64)
     return None
 
 
-def expected_rewards(mdp: TabularMDP, choices: Any) -> np.ndarray:
+def expected_rewards(mdp: TabularMDP, choices: ExpandedMDP) -> np.ndarray:
     """(N, A): the expected reward of choosing an action in a node."""
     num_actions = mdp.num_actions
     paid = np.vstack([mdp.rewards, np.zeros((1, num_actions))])
@@ -207,7 +211,9 @@ class ReturnDistribution:
 
 
 @require_mdp
-def return_distribution(mdp: TabularMDP, policy: Any = None, *, horizon: int | None = None) -> ReturnDistribution:
+def return_distribution(
+    mdp: TabularMDP, policy: TablePolicy | None = None, *, horizon: int | None = None
+) -> ReturnDistribution:
     """Return the distribution of r_1 + ... + r_T under a policy, from the start, under every kind of chance.
 
     Args:
@@ -233,7 +239,9 @@ def return_distribution(mdp: TabularMDP, policy: Any = None, *, horizon: int | N
     return ReturnDistribution(returns[is_possible], mass[is_possible], conventions)
 
 
-def _backward(mdp: TabularMDP, policy: Any, steps: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
+def _backward(
+    mdp: TabularMDP, policy: TablePolicy | None, steps: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
     """For t = T - 1, ..., 0: the possible returns (K,), and their probabilities.
 
     These are (S + 1, W, K), from t on, W being A previous actions or 1.

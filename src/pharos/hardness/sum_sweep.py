@@ -23,6 +23,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from pharos.hardness.interval import Budget, BudgetClock, Interval
 from pharos.kernels import graph as kernels
@@ -118,7 +119,7 @@ class Layers(NamedTuple):
     position: np.ndarray
 
     @staticmethod
-    def of(layer: np.ndarray, widths: np.ndarray, dtype: Any) -> "Layers":
+    def of(layer: np.ndarray, widths: np.ndarray, dtype: DTypeLike) -> "Layers":
         """
         Args:
             layer: (N,) that of each node. widths: (P,) how many nodes each has. dtype: of nodes.

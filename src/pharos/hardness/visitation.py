@@ -14,7 +14,7 @@ rarer an exploring policy is where the optimal policy goes.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy  # whose `sparse` is loaded where it is used
@@ -24,8 +24,11 @@ from pharos.hardness.gaps import optimal_solution
 from pharos.hardness.interval import Interval
 from pharos.kernels import occupancy as kernels
 from pharos.mdp import Chance, ExpandedMDP, PolicyStep, PolicyTable, TabularMDP, chosen_mass, require_mdp
-from pharos.solvers import Solution, value_iteration
+from pharos.solvers import Solution, TablePolicy, value_iteration
 from pharos.system.compiling import Stopwatch
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 _MEMORY = 8 << 30  # bytes that all steps together may take
 _LEAST = 1e-280  # mass that is not worth a step: smaller numbers lose their digits, and take a hundred times longer
@@ -75,7 +78,7 @@ class Occupancy:
 @require_mdp
 def occupancy(
     mdp: TabularMDP,
-    policy: Any = None,
+    policy: TablePolicy | None = None,
     *,
     horizon: int | None = None,
     executed: bool = False,
@@ -137,7 +140,9 @@ def occupancy(
     return Occupancy(total, largest, steps, left, np.stack(by_step) if keep_all else None, conventions)
 
 
-def discounted_visits(mdp: TabularMDP, policy: Any = None, *, tolerance: float = 1e-9) -> tuple[np.ndarray, float]:
+def discounted_visits(
+    mdp: TabularMDP, policy: TablePolicy | None = None, *, tolerance: float = 1e-9
+) -> tuple[np.ndarray, float]:
     """Return the visits of states without a horizon, from below, and what they may lack together.
 
         d(s) = sum over t of gamma^t P(s_t = s),   t = 0, 1, ...
@@ -160,7 +165,9 @@ def discounted_visits(mdp: TabularMDP, policy: Any = None, *, tolerance: float =
     return started + visits.sum(axis=1), left
 
 
-def discounted_arrivals(mdp: TabularMDP, policy: Any = None, *, tolerance: float = 1e-9) -> tuple[np.ndarray, float]:
+def discounted_arrivals(
+    mdp: TabularMDP, policy: TablePolicy | None = None, *, tolerance: float = 1e-9
+) -> tuple[np.ndarray, float]:
     """Return the visits of states without a horizon, in terminal states and the end by arrival; and what they may lack
     together.
 
@@ -185,7 +192,7 @@ def discounted_arrivals(mdp: TabularMDP, policy: Any = None, *, tolerance: float
     return result, left
 
 
-def support(mdp: TabularMDP, policy: Any = None) -> np.ndarray:
+def support(mdp: TabularMDP, policy: TablePolicy | None = None) -> np.ndarray:
     """Return the states that a policy may be in at some step, however rarely: (S,) bool, without terminal ones.
 
     Args:
@@ -197,7 +204,7 @@ def support(mdp: TabularMDP, policy: Any = None) -> np.ndarray:
     return support_with_ends(mdp, policy)[:-1] & ~np.asarray(mdp.terminal)
 
 
-def support_with_ends(mdp: TabularMDP, policy: Any = None) -> np.ndarray:
+def support_with_ends(mdp: TabularMDP, policy: TablePolicy | None = None) -> np.ndarray:
     """As `support`, with terminal states, and the end as one more: (S + 1,) bool."""
     walk = Walk(mdp, policy, 1)
     started, is_visited = walk.after_the_start()
@@ -219,7 +226,7 @@ class Walk:
     Pairs (state, previous action) under sticky actions.
     """
 
-    def __init__(self, mdp: TabularMDP, policy: Any, horizon: int | None):
+    def __init__(self, mdp: TabularMDP, policy: TablePolicy | None, horizon: int | None):
         steps = mdp.horizon if horizon is None else horizon
         if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1):
             raise ParameterError(f"horizon is {steps!r}; expected a whole number of steps, at least 1")
@@ -551,7 +558,12 @@ class MixingTime:
 
 @require_mdp
 def mixing_time(
-    mdp: TabularMDP, policy: Any = None, *, epsilon: float = 0.25, restart: bool = True, lazy: bool = False
+    mdp: TabularMDP,
+    policy: TablePolicy | None = None,
+    *,
+    epsilon: float = 0.25,
+    restart: bool = True,
+    lazy: bool = False,
 ) -> MixingTime:
     """Return the mixing time of the Markov chain of a policy.
 
@@ -606,7 +618,7 @@ def mixing_time(
     return MixingTime(float(steps), 1, distance, conventions)
 
 
-def _merged(chain: Any, underlying: np.ndarray, ended: np.ndarray) -> Any:
+def _merged(chain: "csr_matrix", underlying: np.ndarray, ended: np.ndarray) -> "csr_matrix":
     """The chain in which an episode that has ended does not remember the previous action."""
     label = np.where(ended[underlying], underlying, len(ended) + np.arange(len(underlying)))
     _, first, place = np.unique(label, return_index=True, return_inverse=True)
@@ -621,7 +633,7 @@ def _too_many(nodes: int) -> str:
     )
 
 
-def _period(chain: Any) -> int:
+def _period(chain: "csr_matrix") -> int:
     """The period of the recurrent class; 0 where there are several."""
     count, labels = scipy.sparse.csgraph.connected_components(chain, directed=True, connection="strong")
     rows, columns = chain.nonzero()
@@ -670,7 +682,7 @@ def _time(chain: np.ndarray, epsilon: float) -> tuple[int, float]:
 
 @require_mdp
 def distribution_mismatch(
-    mdp: TabularMDP, policy: Any = None, solution: Solution | None = None, *, tolerance: float = 1e-9
+    mdp: TabularMDP, policy: TablePolicy | None = None, solution: Solution | None = None, *, tolerance: float = 1e-9
 ) -> Interval:
     """Return the distribution mismatch coefficient of a policy.
 

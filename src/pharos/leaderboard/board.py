@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from pharos.observations import title as observation_title
 from pharos.system import storage
 from pharos.system.wording import in_words, templates
 from pharos.training import TaskValues
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 LONGEST_REASON = 400
 
@@ -171,7 +174,7 @@ def write_page(
     storage.replace_file(file, text.encode(errors="replace"))  # names of files may be no text
 
 
-def _template() -> Any:
+def _template() -> "Template":
     return templates("pharos.leaderboard", "the page of a leaderboard").get_template("board.html.j2")
 
 
@@ -273,7 +276,7 @@ def _name_of(environment: str, parameters: object) -> str:
     return " ".join((environment, *words))
 
 
-def _plain_parameters(env: Environment) -> Any:
+def _plain_parameters(env: Environment) -> dict[str, object]:
     return storage.plain(env.parameters)
 
 

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Mapping, MutableMapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from pharos.system import storage
 from pharos.system.memory import available_memory
 from pharos.system.sources import is_reference
 from pharos.training import ReferenceValues, RunConfig, Task, TaskValues, evaluate_agent, regret
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
 
 LIBRARIES = ("stable_baselines3", "sb3_contrib")
 LARGEST_OBSERVATION = 1 << 21
@@ -148,7 +151,7 @@ def _check_sizes(entry: Entry, task: Task, hyperparameters: dict[str, Any]) -> N
         raise FileFormatError(f"its observations have {size:,} entries; expected at most {LARGEST_OBSERVATION:,}")
 
 
-def _check_arrays(entry: Entry, env: Any, hyperparameters: dict[str, Any]) -> None:
+def _check_arrays(entry: Entry, env: "VecEnv", hyperparameters: dict[str, Any]) -> None:
     """Refuse a network that is not the one in the file before it takes memory: each layer is found among the arrays.
 
     The extractor of features is made without numbers (on PyTorch's device "meta"), which tells its shapes.
@@ -442,7 +445,7 @@ def task_key(config: RunConfig) -> str:
     return storage.digest_of_json(_as_floats(storage.plain(task)))
 
 
-def _as_floats(value: object) -> Any:
+def _as_floats(value: object) -> object:
     if isinstance(value, dict):
         return {name: _as_floats(item) for name, item in value.items()}
     if isinstance(value, list):

@@ -12,7 +12,7 @@ import os
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -21,14 +21,16 @@ from pharos.errors import ParameterError, UnknownName
 from pharos.interaction import GymEnv
 from pharos.observations import render as render_state
 from pharos.plots.style import COLORS, INK, plain_log, single, styled
-from pharos.policies import PolicyAnswers
+from pharos.policies import PolicyAnswers, PolicyLike, TabularAgent
 from pharos.system.wording import many
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from pharos.environments import State
     from pharos.hardness import Report
+    from pharos.mdp import TabularMDP
     from pharos.solvers import Solution
     from pharos.state_space import StateSpace
     from pharos.training import Task
@@ -50,7 +52,7 @@ def value_map(
     fix: Mapping[str, int] | None = None,
     rest: Literal["start"] | None = None,
     title: str = "",
-    axes: Any = None,
+    axes: "Axes | None" = None,
 ) -> "Figure":
     """Draw V over the cells of a grid, or over two other variables, with the actions that the policy may take.
 
@@ -124,7 +126,7 @@ def value_map(
 
 
 def _draw_arrows(
-    axis: Any, cell: tuple[int, int], actions: Sequence[str], lengths: np.ndarray, color: str, letters: Sequence[str]
+    axis: "Axes", cell: tuple[int, int], actions: Sequence[str], lengths: np.ndarray, color: str, letters: Sequence[str]
 ) -> None:
     """Arrows as long as the actions are probable: one alone in the middle of its cell, several from there; a letter for
     each action that leads nowhere."""
@@ -136,7 +138,7 @@ def _draw_arrows(
         if actions[action] not in ARROWS:
             continue
         x, y = ARROWS[actions[action]]
-        head: Any = {"arrowstyle": "->", "color": color, "lw": 1.3, "shrinkA": 0, "shrinkB": 0}
+        head: dict[str, object] = {"arrowstyle": "->", "color": color, "lw": 1.3, "shrinkA": 0, "shrinkB": 0}
         length = 0.1 + 0.26 * lengths[action]
         back = length if len(indices) == 1 else 0.0
         end = (column + length * x, row + length * y)
@@ -225,7 +227,7 @@ def _lengths(solution: "Solution") -> np.ndarray:
     return (q >= q.max(axis=1, keepdims=True) - tolerance).astype(np.float64)
 
 
-def _reward_on_entering(mdp: Any, terminal: int) -> str:
+def _reward_on_entering(mdp: "TabularMDP", terminal: int) -> str:
     """The reward of the transitions that lead into a terminal state; empty where they differ or there are none."""
     into = mdp.dynamics.leads_to(terminal) & ~np.asarray(mdp.terminal)[:, None]
     rewards = np.unique(mdp.rewards[into])
@@ -244,7 +246,7 @@ def hardness_plane(
     *,
     visitation: str = "diameter",
     estimation: str = "sum_of_reciprocal_gaps",
-    axes: Any = None,
+    axes: "Axes | None" = None,
 ) -> "Figure":
     """Draw instances by two measures on logarithmic axes; a diameter that is an interval is drawn as a bar.
 
@@ -355,7 +357,7 @@ def states_by_depth(space: "StateSpace") -> np.ndarray:
 
 
 @styled
-def growth(spaces: Mapping[str, "StateSpace"], *, axes: Any = None) -> "Figure":
+def growth(spaces: Mapping[str, "StateSpace"], *, axes: "Axes | None" = None) -> "Figure":
     """Draw how many states are within so many steps from the start, a line for each space, on logarithmic axes.
 
     Args:
@@ -382,6 +384,7 @@ def growth(spaces: Mapping[str, "StateSpace"], *, axes: Any = None) -> "Figure":
 # Policies at play -----------------------------------------------------------------------------------------------------
 
 
+Observed: TypeAlias = np.ndarray | dict[str, np.ndarray]
 GAP = 12  # pixels between two pictures
 
 
@@ -441,7 +444,7 @@ def _beside(parts: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([piece for part in parts for piece in (gap, part)][1:], axis=1)
 
 
-def _episode(task: "Task", agent: Any, steps: int, seed: int) -> list[tuple["State", float]]:
+def _episode(task: "Task", agent: PolicyLike, steps: int, seed: int) -> list[tuple["State", float]]:
     """[(state, return so far)] from the start to the end of one episode, as `GymEnv` plays it."""
     env = GymEnv(task.env, **task.interaction)
     choose = _chooser(task, agent, np.random.default_rng(seed))
@@ -456,35 +459,34 @@ def _episode(task: "Task", agent: Any, steps: int, seed: int) -> list[tuple["Sta
     return episode
 
 
-def _chooser(task: "Task", agent: Any, rng: np.random.Generator) -> Callable[[Any, "State"], int]:
+def _chooser(task: "Task", agent: PolicyLike, rng: np.random.Generator) -> Callable[[Observed, "State"], int]:
     """A function (observation, state) -> action."""
-    if hasattr(agent, "policy_table"):
+    if isinstance(agent, TabularAgent):
         agent = agent.policy_table()
-    if isinstance(agent, np.ndarray):
-        if agent.shape[1:] not in ((), (task.env.num_actions,)) or len(agent) != task.space.num_states:
-            raise ParameterError(
-                f"the policy has shape {agent.shape}; expected ({task.space.num_states},) actions or "
-                f"({task.space.num_states}, {task.env.num_actions}) probabilities"
-            )
-        answers = None
-    else:
-        answers = PolicyAnswers(agent, task.mdp, task.sight)
+    table = agent if isinstance(agent, np.ndarray) else None
+    shapes = (task.space.num_states,), (task.space.num_states, task.env.num_actions)
+    if table is not None and table.shape not in shapes:
+        raise ParameterError(
+            f"the policy has shape {table.shape}; expected ({task.space.num_states},) actions or "
+            f"({task.space.num_states}, {task.env.num_actions}) probabilities"
+        )
+    answers = None if table is not None else PolicyAnswers(agent, task.mdp, task.sight)
 
-    def choose(observation: Any, state: "State") -> int:
-        if answers is None:
-            row = agent[task.space.index(state)]
+    def choose(observation: Observed, state: "State") -> int:
+        if answers is not None:
+            row = answers.answer(_batch(observation))[0]
+        elif table is not None:
+            row = table[task.space.index(state)]
             if np.ndim(row) == 0:
                 return int(row)
-        else:
-            row = answers.answer(_batch(observation))[0]
         return int(rng.choice(task.env.num_actions, p=row / row.sum()))
 
     return choose
 
 
-def _batch(observation: Any) -> Any:
+def _batch(observation: Observed) -> Observed:
     return (
-        {name: _batch(value) for name, value in observation.items()}
+        {name: np.asarray(value)[None] for name, value in observation.items()}
         if isinstance(observation, dict)
         else np.asarray(observation)[None]
     )

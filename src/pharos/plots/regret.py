@@ -37,6 +37,7 @@ from pharos.training import CELL, bootstrap_interval, read_curve, read_record
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from pharos.validation import Prediction
@@ -193,7 +194,7 @@ def _aligned(runs: list[tuple[dict[str, Any], Any]], column: str) -> tuple[np.nd
 
 
 def _line(
-    axis: Any, steps: np.ndarray, values: np.ndarray, color: str, label: str, confidence: float, resamples: int
+    axis: "Axes", steps: np.ndarray, values: np.ndarray, color: str, label: str, confidence: float, resamples: int
 ) -> None:
     axis.plot(steps, values.mean(axis=0), color=color, label=label)
     if len(values) > 1:
@@ -216,7 +217,7 @@ LONGEST_TITLE = 34
 
 
 @styled
-def predictions(prediction: "Prediction", *, axes: Any = None) -> "Figure":
+def predictions(prediction: "Prediction", *, axes: "Axes | None" = None) -> "Figure":
     """Draw a bar for each observation and network, from 0 (optimal) towards 1 (uniform play), with its interval.
 
     Args:

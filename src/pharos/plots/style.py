@@ -14,6 +14,8 @@ from pharos.errors import MissingExtra, ParameterError
 from pharos.system.storage import replace_file
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 P = ParamSpec("P")
@@ -70,7 +72,7 @@ def panels(count: int, width: float, height: float) -> tuple["Figure", list[Any]
     return figure, axes[:count]
 
 
-def single(axes: Any, size: tuple[float, float]) -> tuple["Figure", Any]:
+def single(axes: Any, size: tuple[float, float]) -> tuple["Figure", "Axes"]:
     """The figure and the axes to draw on: those given, or new ones of `size` inches."""
     if axes is not None:
         return axes.figure, axes
@@ -159,7 +161,7 @@ def file_of(figure: "Figure", kind: str, dpi: int = DPI) -> bytes:
     return buffer.getvalue()
 
 
-def thousands(value: float, _: Any = None) -> str:
+def thousands(value: float, _: object = None) -> str:
     """12000 -> 12k, 3000000 -> 3M: for axes of steps."""
     if abs(value) >= 1e9:
         return f"{value:.0e}".replace("e+0", "e").replace("e+", "e")
@@ -169,7 +171,7 @@ def thousands(value: float, _: Any = None) -> str:
     return f"{value:g}"
 
 
-def plain_log(side: Any) -> None:
+def plain_log(side: "Axis") -> None:
     """Ticks of a logarithmic axis as numbers, with 2 and 5 between powers of ten where there are few of these."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
