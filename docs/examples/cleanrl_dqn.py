@@ -3,8 +3,8 @@
     pharos benchmark run --agent docs/examples/cleanrl_dqn.py:learn --out results/cleanrl_dqn
 
 After the structure of cleanrl/dqn.py (https://github.com/vwxyzjn/cleanrl, MIT licence, Copyright (c) 2019 CleanRL
-developers), without logs, videos and command line. What was a script is a generator here: the environment is given,
-counts its steps, and ends the training by an exception; each policy that is yielded is asked about all states.
+developers), without logs, videos, command line and GPU. What was a script is a generator here: the environment is
+given, counts its steps, and ends the training by an exception; each policy that is yielded is asked about all states.
 """
 
 import random
@@ -33,15 +33,15 @@ class Args:
     start_e: float = 1.0
     end_e: float = 0.05
     exploration_fraction: float = 0.5
-    learning_starts: int = 1000  # pharos: 10,000 of half a million steps there
+    learning_starts: int = 1000  # pharos: 10,000 there, a third of the steps here
     train_frequency: int = 10
 
 
 class QNetwork(nn.Module):
     def __init__(self, env):
         super().__init__()
+        self.high = 255 if env.single_observation_space.dtype == np.uint8 else 1  # pharos: some tasks show images
         self.network = nn.Sequential(
-            nn.Flatten(),  # pharos: some tasks show images
             nn.Linear(int(np.prod(env.single_observation_space.shape)), 120),
             nn.ReLU(),
             nn.Linear(120, 84),
@@ -50,7 +50,7 @@ class QNetwork(nn.Module):
         )
 
     def forward(self, x):
-        return self.network(x.float())  # pharos: of bytes
+        return self.network(x.flatten(1).float() / self.high)  # pharos
 
 
 def linear_schedule(start_e, end_e, duration, t):
@@ -82,7 +82,7 @@ def learn(env, steps, seed):  # pharos: in place of `if __name__ == "__main__"`
             args.start_e, args.end_e, args.exploration_fraction * args.total_timesteps, global_step
         )
         if random.random() < epsilon:
-            actions = np.array([random.randrange(envs.single_action_space.n) for _ in range(envs.num_envs)])
+            actions = np.array([envs.single_action_space.sample() for _ in range(envs.num_envs)])
         else:
             actions = torch.argmax(q_network(torch.Tensor(obs).to(device)), dim=1).cpu().numpy()
 

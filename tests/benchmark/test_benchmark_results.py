@@ -82,4 +82,9 @@ def test_results_that_are_nowhere(tmp_path):
     for source in (tmp_path, tmp_path / "none", "no_such_baseline"):
         with pytest.raises(ParameterError):
             AgentResults.read(source)
+    run = tmp_path / "interrupted" / "runs" / "sea" / "seed-0"
+    run.mkdir(parents=True)
+    (run / "curve.parquet").touch()
+    with pytest.raises(ParameterError, match=r"1 so far: the same command goes on"):
+        AgentResults.read(tmp_path / "interrupted")
     assert baselines("no such suite") == ()

@@ -84,7 +84,7 @@ def test_an_agent_with_itself_differs_in_nothing_and_certain_runs_do():
 def test_one_seed_shows_nothing():
     found = compared(drawn(seeds=1), drawn(1, worse=0.5))
     for one in (found.core, found.axes["noise"].score, *found.tasks.values()):
-        assert math.isnan(one.p_value) and math.isnan(one.interval.low) and one.verdict == "not shown to differ"
+        assert math.isnan(one.p_value) and math.isnan(one.interval.low) and one.verdict == "one seed"
 
 
 def test_tasks_that_one_lacks_are_left_out_and_said():

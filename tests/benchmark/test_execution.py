@@ -66,10 +66,10 @@ def always(action):
     return lambda observations: np.full(len(observations), action)
 
 
-def curve_of(learn, task=TASKS[0], **changes):
+def curve_of(learn, task=TASKS[0], seed=0, **changes):
     protocol = replace(PROTOCOL, **changes)
     solved = task.training_task(protocol)
-    return solved, generated_curve(learn, solved, steps=protocol.steps, evaluations=protocol.evaluations, seed=0)
+    return solved, generated_curve(learn, solved, steps=protocol.steps, evaluations=protocol.evaluations, seed=seed)
 
 
 # Reference policies ---------------------------------------------------------------------------------------------------
@@ -197,6 +197,18 @@ def test_copies_share_the_budget_and_have_other_random_numbers():
     assert any(len(set(row)) > 1 for row in seen["states"])
 
 
+def test_the_action_space_is_that_of_the_seed():
+    drawn = []
+
+    def learn(env, steps, seed):
+        drawn.append([env.action_space.sample() for _ in range(40)])
+        yield always(0)
+
+    for seed in (0, 0, 1):
+        curve_of(learn, seed=seed)
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
 def test_tables_probabilities_and_networks_in_a_wrapper_are_policies():
     def yielding(policy):
         def learn(env, steps, seed):
@@ -283,7 +295,8 @@ def test_a_folder_holds_one_agent_with_one_setting_of_one_suite(suite, file, tmp
 def test_what_is_wrong_is_said_before_anything_runs(suite, file, tmp_path):
     for options, error, said in (
         ({"agent": "dqm"}, UnknownName, "did you mean 'dqn'"),
-        ({"agent": f"{file}:nothing"}, ParameterError, "mine.py:nothing"),
+        ({"agent": f"{file}:nothing"}, ParameterError, "mine.py has no 'nothing'"),
+        ({"agent": str(file)}, ParameterError, "mine.py:learn"),
         ({"agent": "dqn", "hyperparameters": {"learning_rat": 1}}, ParameterError, "learning_rat"),
         ({"agent": "oracle", "hyperparameters": {"a": 1}}, ParameterError, "no hyperparameters"),
         ({"agent": f"{file}:learn", "hyperparameters": {"a": 1}}, ParameterError, "in its code"),

@@ -121,6 +121,8 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
         if setting:
             raise ParameterError(f"agent {agent!r} has no hyperparameters; found {', '.join(setting)}")
         return Exact(agent, "exact")
+    if agent.endswith(".py"):
+        raise ParameterError(f"agent {agent!r}: expected what in the file, such as {agent}:learn")
     if is_reference(agent) and not is_known(agent):
         source = find(agent)
         code = load(source)
@@ -214,6 +216,9 @@ class Trained(Form):
 
 def _function(code: object, source: Source | None, setting: Mapping[str, Any]) -> Form:
     name = source.name if source is not None else getattr(code, "__qualname__", repr(code))
+    if code is None and source is not None:
+        where, _, attribute = source.name.rpartition(":")
+        raise ParameterError(f"agent {name!r}: {where} has no {attribute!r}; expected the name of a class or function")
     if not callable(code):
         raise ParameterError(
             f"agent {name!r} is {code!r}; expected a class for Stable-Baselines3, or a function learn(env, steps, seed)"

@@ -59,14 +59,16 @@ class Budget:
 class CountedEnv(gymnasium.Wrapper):
     """The environment of a task, whose steps count against a budget.
 
-    Without a seed in its first `reset` it has that of the run, so that a run is the same again. `copy()` gives another
-    one with the same budget, for vector environments: `gymnasium.vector.SyncVectorEnv([env.copy] * 8)`.
+    Without a seed in its first `reset` it has that of the run, as its action space has, so that a run is the same
+    again. `copy()` gives another one with the same budget, for vector environments:
+    `gymnasium.vector.SyncVectorEnv([env.copy] * 8)`.
     """
 
     def __init__(self, task: Task, budget: Budget, seed: int):
         super().__init__(GymEnv(task.env, **task.interaction))
         self.task, self.budget, self.seed = task, budget, seed
         self.seeds = np.random.SeedSequence(seed)
+        self.action_space.seed(seed)
         self._return, self._is_seeded = 0.0, False
 
     def copy(self) -> "CountedEnv":

@@ -35,7 +35,7 @@ SIGNIFICANCE = 1.0 - CONFIDENCE
 POWER = 0.8
 SEEDS = (3, 5, 10, 20)
 MOST_SEEDS = 100_000
-BETTER, WORSE, UNDECIDED = "better", "worse", "not shown to differ"
+BETTER, WORSE, UNDECIDED, UNKNOWN = "better", "worse", "not shown to differ", "one seed"
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Difference:
         improvement: how probable it is that a run of the first scores higher, ties half, mean over the tasks.
         p_value: two-sided; NaN with one seed.
         adjusted: the same after Holm's correction in its family.
-        verdict: "better" or "worse" where adjusted < 0.05, else "not shown to differ".
+        verdict: "better" or "worse" where adjusted < 0.05, else "not shown to differ"; "one seed" without a p-value.
     """
 
     ours: float
@@ -252,7 +252,8 @@ def _judged(differences: Mapping[str, Difference]) -> dict[str, Difference]:
     judged = {}
     adjusted = holm([each.p_value for each in differences.values()])
     for (name, each), p in zip(differences.items(), adjusted, strict=True):
-        verdict = UNDECIDED if not p < SIGNIFICANCE else BETTER if each.interval.value > 0 else WORSE
+        verdict = UNDECIDED if p >= SIGNIFICANCE else BETTER if each.interval.value > 0 else WORSE
+        verdict = UNKNOWN if math.isnan(p) else verdict
         judged[name] = replace(each, adjusted=p, verdict=verdict)
     return judged
 

@@ -79,7 +79,11 @@ class AgentResults:
         if path.is_dir():
             path = path / FILE
             if not path.is_file():
-                raise ParameterError(f"{path}: no such file; `pharos benchmark run` writes it when its runs have ended")
+                finished = len(list(Path(source).glob("runs/*/*/curve.parquet")))
+                raise ParameterError(
+                    f"{path}: no such file; `pharos benchmark run` writes it when its runs have ended, {finished} so "
+                    f"far: the same command goes on; with `--seeds` or `--tasks` of what is there it ends here"
+                )
         elif not path.exists() and "/" not in suite and label in baselines(suite):
             path = BASELINES / suite / f"{label}.safetensors"
         elif not path.is_file():

@@ -342,7 +342,7 @@ def _print(suite: "Suite") -> None:
     tasks = many(len(suite.tasks), "task")
     screen.print(f"[bold]{escape(suite.name)}[/bold], {tasks}: {suite.digest}", soft_wrap=True)
     screen.print(
-        f"{protocol.steps:,} steps, {many(protocol.evaluations, 'evaluation')}, {many(protocol.seeds, 'seed')}, "
+        f"{protocol.steps:,} steps a task, {many(protocol.evaluations, 'evaluation')}, {many(protocol.seeds, 'seed')}, "
         f"gamma {protocol.gamma:g}, horizon {protocol.horizon}"
     )
     screen.print()
@@ -363,7 +363,7 @@ def _print(suite: "Suite") -> None:
     text = "Regret as predicted before any run: 0 is optimal, 1 is uniform play."
     if minutes := _minutes(suite):
         times = ", ".join(f"{agent.upper()} {value:.0f}" for agent, value in minutes.items())
-        text += f" Minutes of one processor for all seeds: {times}"
+        text += f" Minutes of one processor, all seeds, as shipped: {times}"
     screen.print(f"[dim]{text}[/dim]", soft_wrap=True)
 
 
@@ -430,8 +430,9 @@ def _print_comparison(comparison: "Comparison", tasks: bool) -> None:
         add(name, difference)
     screen.print(table)
     if comparison.left_out:
-        left_out = ", ".join(comparison.left_out)
-        screen.print(f"[dim]without what one of them has not run: {escape(left_out)}[/dim]", soft_wrap=True)
+        number = many(len(comparison.left_out), "task")
+        left_out = ", ".join(comparison.left_out[:3]) + (", ..." if len(comparison.left_out) > 3 else "")
+        screen.print(f"[dim]without {number} that one of them has not run: {escape(left_out)}[/dim]", soft_wrap=True)
     if any(each.p_value != each.p_value for each in comparison.tasks.values()):
         screen.print("[dim]one seed has no interval; run two or more of both[/dim]")
 
