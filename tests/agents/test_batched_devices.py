@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from pharos.agents.batched import BatchRun, ObservationSource, group_key, layers, make_batch, observed
-from pharos.agents.batched import device_buffers as handover
-from pharos.agents.batched.device_buffers import CudaGraph, PinnedBuffer
+from pharos.agents.batched import BatchRun, ObservationSource, arithmetic, group_key, make_batch, networks
+from pharos.agents.batched import lane as lanes
+from pharos.agents.batched.arithmetic import CudaGraph, PinnedBuffer
 from pharos.environments import make
 from pharos.errors import ParameterError
 from pharos.training import Task
@@ -91,13 +91,13 @@ def test_a_batch_elsewhere_goes_on_from_its_state_bit_for_bit(agent):
 
 def test_convolutions_side_by_side_are_those_run_by_run(monkeypatch):
     generator = torch.Generator().manual_seed(0)
-    parameters = layers.Parameters()
-    layer = layers.Convolution(parameters, "c", (2, 12, 12), 5, 4, 2, 1 / 255)
+    parameters = networks.Parameters()
+    layer = networks.Convolution(parameters, "c", (2, 12, 12), 5, 4, 2, 1 / 255)
     rows = torch.randn(3, parameters.length, generator=generator)
     values, x = parameters.views(rows), 255 * torch.rand(3, 4, layer.inputs, generator=generator)
     dy, answers = torch.randn(3, 4, layer.outputs, generator=generator), []
     for one_by_one in (True, False):
-        monkeypatch.setattr(layers, "is_one_by_one", lambda x, answer=one_by_one: answer)
+        monkeypatch.setattr(networks, "is_one_by_one", lambda x, answer=one_by_one: answer)
         gradients = torch.zeros_like(rows)
         y = layer.forward(values, x).clone()
         dx = layer.backward(values, parameters.views(gradients), x, dy.clone(), onward=True)
@@ -140,7 +140,7 @@ def recorder(monkeypatch):
         told.append("record")
         yield
 
-    monkeypatch.setattr(handover, "is_gpu", lambda device: True)
+    monkeypatch.setattr(arithmetic, "is_gpu", lambda device: True)
     monkeypatch.setattr(torch.cuda, "CUDAGraph", Graph)
     monkeypatch.setattr(torch.cuda, "graph", recording)
     return told
@@ -168,7 +168,7 @@ def test_a_program_that_cannot_be_recorded_is_run_as_it_is(recorder):
 
 
 def test_observations_that_do_not_fit_on_the_device_are_counted(monkeypatch):
-    monkeypatch.setattr(observed, "is_gpu", lambda device: True)
+    monkeypatch.setattr(lanes, "is_gpu", lambda device: True)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (1 << 12, 1 << 30))
     with pytest.raises(MemoryError, match="of 52 states take 0 MiB on cpu:0, more than 50%"):
         make_batch("dqn", runs_of("dqn", "simple_image", (4, 6), 1), device=ELSEWHERE)

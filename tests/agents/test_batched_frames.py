@@ -12,7 +12,8 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 import pharos
 from pharos.agents import make_model
-from pharos.agents.batched import BatchRun, ObservationSource, group_key, make_batch, observed
+from pharos.agents.batched import BatchRun, ObservationSource, group_key, make_batch
+from pharos.agents.batched import lane as lanes
 from pharos.errors import ParameterError
 from pharos.interaction import make_sb3_vec
 from pharos.kernels import batched
@@ -181,7 +182,7 @@ def test_a_run_with_frames_is_the_same_alone_among_others_and_drawn(agent, monke
     assert outcome(together, 5) == alone
     assert all(outcome(together, i) == outcome(backwards, 10 - i) for i in range(11))
     assert len({outcome(together, i) for i in range(11)}) == 11
-    monkeypatch.setattr(observed, "LARGEST_TABLE", 0)
+    monkeypatch.setattr(lanes, "LARGEST_TABLE", 0)
     assert outcome(learned(agent, runs[5:6]), 0) == alone
 
 
@@ -220,7 +221,7 @@ def test_what_is_looked_up_is_what_is_drawn(sight, monkeypatch):
     task = task_of(sight)
     runs = runs_of(task, DQN_OPTIONS, 1)
     in_table, drawn = make_batch("dqn", runs).lanes[0], None
-    monkeypatch.setattr(observed, "LARGEST_TABLE", 0)
+    monkeypatch.setattr(lanes, "LARGEST_TABLE", 0)
     drawn = make_batch("dqn", runs).lanes[0]
     assert in_table.seen._table is not None and drawn.seen._table is None
     histories = np.random.default_rng(0).integers(0, task.space.num_states, (in_table.width, 7, *in_table.depth))
@@ -285,7 +286,7 @@ def bytes_of(folder):
 @pytest.mark.long
 @pytest.mark.parametrize(("agent", "chance"), [("dqn", {}), ("dqn", {"random": 0.1}), ("ppo", {})])
 def test_runs_with_frames_are_measured_exactly_kept_and_resumed(agent, chance, tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("pharos.training.run_folder"), "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(importlib.import_module("pharos.training.results"), "CHECKPOINT_SECONDS", 0.0)
     small = (
         {"learning_starts": 50, "buffer_size": 100}
         if agent == "dqn"

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from pharos.agents.batched import BatchRun, ObservationSource, make_batch, observed
+from pharos.agents.batched import BatchRun, ObservationSource, make_batch
+from pharos.agents.batched import lane as lanes
 from pharos.agents.batched.lane import BatchedEpisodes
 from pharos.environments import make
 from pharos.interaction.reward_channel import RewardChannel
@@ -177,5 +178,5 @@ def test_observations_that_fit_no_table_change_nothing(monkeypatch, observation)
     source = ObservationSource.of(task.space, task.sight.observe)
     runs = [BatchRun(task.mdp, source, 20, DQN, 60, i, i) for i in range(2)]
     in_table = learned(runs)
-    monkeypatch.setattr(observed, "LARGEST_TABLE", 0)
+    monkeypatch.setattr(lanes, "LARGEST_TABLE", 0)
     assert in_table == learned(runs)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pharos.study.processes import one_thread
+from pharos.study.worker import one_thread
 
 CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link", "os.symlink")
 """What Python reports (`sys.addaudithook`) of a process that changes files, beside files that it opens."""
@@ -90,13 +90,13 @@ def _prepare(programs: dict[Path, list[list[str]]]) -> None:
     """Load, and execute what compiles; let small worlds pass through many blocks and checkpoints."""
     from pharos import state_space
     from pharos.system import memory
-    from pharos.training import run_folder
+    from pharos.training import results
 
     search = importlib.import_module("pharos.state_space.search")
     search.CHUNK, search.WIDE = 512, 200  # type: ignore[attr-defined]
     state_space.build.__kwdefaults__["checkpoint_seconds"] = 0.0
     memory.LEAST_MEMORY = 1 << 16
-    run_folder.CHECKPOINT_SECONDS = 0.0
+    results.CHECKPOINT_SECONDS = 0.0
     os.fsync = lambda _: None  # type: ignore[assignment]  # what is killed loses nothing that is not on the disk yet
     fork = multiprocessing.get_context("fork")
     multiprocessing.get_context = lambda method=None: fork  # type: ignore[assignment]

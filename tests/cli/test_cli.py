@@ -18,7 +18,7 @@ import command_line
 from pharos import TabularMDP, build, hardness, importers
 from pharos.cli import answers, app
 from pharos.cli.options import parse_parameters, parse_size, parse_value
-from pharos.cli.play import Game
+from pharos.cli.render import Game
 from pharos.environments import classes, make, named_instances
 from pharos.errors import ParameterError
 

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from pharos import Layer, make
-from pharos.cli.play import Game
+from pharos.cli.render import Game
 from pharos.drawing import (
     SHAPES,
     colored_text,

@@ -10,10 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pharos.study.curves import Curves, Line, Panel, regret_curves
-from pharos.study.figures import lines
-from pharos.study.report.page import image, render, table
-from pharos.study.report.section import Section
+from pharos.study.figures import Curves, Line, Panel, lines, regret_curves
+from pharos.study.report.page import Section, image, render, table
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 

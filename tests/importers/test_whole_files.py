@@ -11,7 +11,7 @@ import pytest
 
 import pharos
 from pharos import drawing, exporters, hardness, importers
-from pharos.cli.solve import save
+from pharos.cli.evaluate import save
 from pharos.errors import FileFormatError
 from pharos.mdp import TabularMDP
 from pharos.plots import save as save_figure

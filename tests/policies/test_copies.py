@@ -10,7 +10,7 @@ from pharos.agents.batched import make_batch
 from pharos.mdp import TabularMDP, lazy_actions, random_actions, sticky_actions
 from pharos.policies import Evaluation, TableAnswers, is_small_table, table_values
 from pharos.training import ChanceSetting, RunConfig, TaskCache, evaluate_agent
-from pharos.training.evaluation import values_together
+from pharos.training.curve import values_together
 
 SETTING = {"steps": 300, "horizon": 16, "evaluation_interval": 100, "engine": "batched"}
 

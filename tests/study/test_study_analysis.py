@@ -9,7 +9,7 @@ from pharos import study
 from pharos.errors import ParameterError
 from pharos.study import tables
 from pharos.study import worker as _worker
-from pharos.study.latex import returns_table
+from pharos.study.figures import returns_table
 from pharos.study.tables import _chosen, _last_return, _number
 
 SPECIFICATION = {

@@ -13,8 +13,8 @@ import fake_training
 from command_line import process
 from pharos import study
 from pharos.study import worker as _worker
-from pharos.study.curves import same_steps
 from pharos.study.execution import claim
+from pharos.study.figures import same_steps
 from pharos.study.report import files, number
 from pharos.study.report.page import table
 from pharos.system.wording import latex_text

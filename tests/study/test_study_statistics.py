@@ -16,8 +16,7 @@ from pharos.study import (
     paper_returns,
     stratified_interval,
 )
-from pharos.study.profiles import improvements, profiles
-from pharos.study.statistics import performance_profile, probability_of_improvement
+from pharos.study.statistics import improvements, performance_profile, probability_of_improvement, profiles
 from pharos.training import bootstrap_interval
 
 

@@ -24,16 +24,16 @@ from pharos.training import (
     train_many,
     tune,
 )
-from pharos.training.process_pool import parts_of
 from pharos.training.results import COLUMNS
+from pharos.training.runs import parts_of
 
-run_folder = importlib.import_module("pharos.training.run_folder")
+_results = importlib.import_module("pharos.training.results")
 
 
 @pytest.fixture
 def engine(monkeypatch):
     monkeypatch.setitem(sys.modules, "pharos.agents.batched", fake_engine)
-    monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
     fake_engine.made.clear()
     return fake_engine
 
@@ -194,7 +194,7 @@ def test_tables_of_many_seeds_are_those_of_single_runs(tmp_path):
 
 
 def test_tables_that_were_killed_go_on_together_to_the_same_bytes(tmp_path, monkeypatch):
-    monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
     options = {"agent": "q_learning", "steps": 4000, "evaluation_interval": 1000, "sticky": 0.25}
     many(tmp_path / "whole", **options)
     with pytest.raises(Killed):
@@ -262,7 +262,7 @@ def test_an_engine_that_lacks_the_agent_is_refused_with_the_one_that_has_it():
 
 @pytest.mark.long
 def test_what_the_engine_itself_has_learnt_is_read_and_resumed(tmp_path, monkeypatch):
-    monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
     small = {"learning_starts": 50, "buffer_size": 500, "target_update_interval": 50}
     options = {"steps": 400, "evaluation_interval": 100, "hyperparameters": small, "random": 0.1}
     many(tmp_path / "whole", seeds=(0, 1, 2), **options)
@@ -313,7 +313,7 @@ def test_whole_lanes_are_dealt_out_to_processes():
 
 @pytest.mark.long
 def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("pharos.training.process_pool"), "lane_width", lambda *_: 2)
+    monkeypatch.setattr(importlib.import_module("pharos.training.runs"), "lane_width", lambda *_: 2)
     small = {"learning_starts": 50, "buffer_size": 500, "optimize_memory_usage": False}
     options = {"seeds": (0, 1, 2), "steps": 200, "evaluation_interval": 100, "hyperparameters": small}
     done = []

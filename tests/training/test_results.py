@@ -1,6 +1,5 @@
 """Files of runs: replaced whole, the same bytes for the same rows, and what is damaged or failed is said to be."""
 
-import importlib
 import json
 import math
 import os
@@ -19,8 +18,6 @@ from pharos.errors import FileFormatError, FolderLocked, ResultCorrupted
 from pharos.system import storage
 from pharos.training import evaluate_agent, load_agent, read_curve, read_record, run_id, train
 from pharos.training import results as _results
-
-run_folder = importlib.import_module("pharos.training.run_folder")
 
 ROW = {name: 1 if dtype == "int64" else True if dtype == "bool" else 0.5 for name, dtype in _results.COLUMNS.items()}
 values = st.recursive(
@@ -90,7 +87,7 @@ def test_a_run_that_fails_says_why_and_can_be_started_again(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("agent", "file"), [("q_learning", "q_learning.npz"), ("dqn", "parameters.pt")])
 def test_a_damaged_checkpoint_is_said_to_be_one(agent, file, tmp_path, monkeypatch):
-    monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
     options = {"steps": 400, "evaluation_interval": 100, "out": tmp_path / "run"}
     with pytest.raises(CallbackError):
         train(agent, "simple_grid/4x4-plain", progress=stop, **options)
@@ -110,7 +107,7 @@ def test_a_damaged_checkpoint_is_said_to_be_one(agent, file, tmp_path, monkeypat
     ],
 )
 def test_one_digit_of_a_checkpoint_is_not_learnt_from(agent, engine, file, tmp_path, monkeypatch):
-    monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
     options = {"steps": 400, "evaluation_interval": 100, "out": tmp_path / "run", "engine": engine}
     with pytest.raises((CallbackError, RuntimeError)):
         train(agent, "simple_grid/4x4-plain", progress=stop, **options)

@@ -27,14 +27,14 @@ from pharos.training.learners import Deep
 from pharos.training.results import COLUMNS
 from pharos.training.task import Task
 
-run_folder = importlib.import_module("pharos.training.run_folder")
+_results = importlib.import_module("pharos.training.results")
 
 SMALL = {"learning_starts": 50, "buffer_size": 1000, "target_update_interval": 50}
 
 
 @pytest.fixture(autouse=True)
 def always_checkpoint(monkeypatch):
-    monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
 
 
 def short(agent, out=None, steps=400, seed=1, progress=None, **options):
@@ -177,7 +177,7 @@ def test_a_checkpoint_is_on_the_disk_before_the_older_one_goes(tmp_path, monkeyp
 
     monkeypatch.setattr(os, "fsync", syncing)
     monkeypatch.setattr(os, "replace", replacing)
-    checkpoint = run_folder.Checkpoint(tmp_path / "checkpoint", "id")
+    checkpoint = _results.Checkpoint(tmp_path / "checkpoint", "id")
     for _ in range(2):
         synced.clear()
         checkpoint.save(Learner(), [], 0.0)

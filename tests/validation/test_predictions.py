@@ -13,12 +13,12 @@ from pharos.agents import hyperparameters
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.hardness import registry
 from pharos.study import specification
-from pharos.study.report.unseen_section import winners
+from pharos.study.report.model_sections import winners
 from pharos.validation import (
     POLICY_PREDICTORS,
     PREDICTORS,
     learners,
-    prediction_files,
+    prediction,
     read_predictions,
     write_predictions,
 )
@@ -143,7 +143,7 @@ def test_predictions_stay_where_others_cannot_be_written(predicted, tmp_path, mo
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(prediction_files.training, "write_table", full)
+    monkeypatch.setattr(prediction.training, "write_table", full)
     with pytest.raises(OSError, match="No space left"):
         write_predictions(spec, predicted.assign(kernel_regret=1.0), file)
     assert file.read_bytes() == before and list(tmp_path.iterdir()) == [file]

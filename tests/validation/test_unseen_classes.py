@@ -9,8 +9,9 @@ from pharos import study
 from pharos.errors import ParameterError
 from pharos.study.specification import specification
 from pharos.training import CELL
-from pharos.validation import PredictedCells, leave_one_class_out, prediction_files
+from pharos.validation import PredictedCells, leave_one_class_out
 from pharos.validation import cross_validation as held_out
+from pharos.validation import prediction as _prediction
 
 
 def design(classes=5, instances=3, predictors=2, seed=0):
@@ -243,13 +244,13 @@ def test_seeds_without_an_outcome_do_not_count_for_its_noise():
 
 def test_runs_that_had_begun_are_told():
     runs = pd.DataFrame({"id": [*"abc"], "began": ["2026-01-01T00:00:00Z", "2026-01-02T00:00:01Z", ""]})
-    assert prediction_files.late(runs, {"date": "2026-01-02T00:00:00Z"}) == (1, 1)
+    assert _prediction.late(runs, {"date": "2026-01-02T00:00:00Z"}) == (1, 1)
 
 
 def test_predictions_that_came_after_runs_are_no_predictions():
     from types import SimpleNamespace
 
-    from pharos.study.report.unseen_section import doubts
+    from pharos.study.report.model_sections import doubts
 
     about = PredictedCells([(pd.DataFrame(columns=CELL), {"date": "2026-01-02T00:00:00Z"})])
     results = SimpleNamespace(runs=pd.DataFrame({"id": ["a"], "began": ["2026-01-02T00:00:01Z"]}))

@@ -14,12 +14,13 @@ from pharos.agents.deep import (
     check_hyperparameters,
     extractor,
     is_known,
+    joined_states,
     make_model,
+    state_of,
 )
 from pharos.agents.hyperparameters import hyperparameters
 from pharos.agents.q_learning import DEFAULTS as Q_LEARNING_DEFAULTS
 from pharos.agents.q_learning import QLearning
-from pharos.agents.states import joined_states, state_of
 
 __all__ = [
     "QLearning",

@@ -4,7 +4,7 @@ Vectors go through one hidden layer, images through one convolution and one hidd
 and Tian, 2019), both to 128 features; then follows one hidden layer. So a difference between observations is one
 between representations, not between networks (the pharos paper, section 4.2).
 
-What each agent is: tabular or a network, and how figures call it.
+What each agent is: tabular or a network, and how figures call it. States of learners, as checkpoints keep them.
 """
 
 import importlib
@@ -250,3 +250,17 @@ def agent_source(name: str, folder: str | Path | None = None, *, check: bool = T
             f"{name!r}: found {load(source)!r}; expected the class of an algorithm for Stable-Baselines3"
         )
     return source
+
+
+# States of several learners -------------------------------------------------------------------------------------------
+
+
+def joined_states(states: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """One dictionary of arrays of several learners, as checkpoints keep them: "3/q" is `q` of learner 3."""
+    return {f"{i}/{name}": array for i, state in enumerate(states) for name, array in state.items()}
+
+
+def state_of(joined: Mapping[str, np.ndarray], i: int) -> dict[str, np.ndarray]:
+    """State of learner i."""
+    prefix = f"{i}/"
+    return {name[len(prefix) :]: array for name, array in joined.items() if name.startswith(prefix)}

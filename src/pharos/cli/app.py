@@ -13,22 +13,15 @@ from pharos.cli import (
     benchmark,
     build,
     cache,
-    check,
     evaluate,
-    explore,
     hardness,
     import_,
     leaderboard,
     observations,
-    play,
     plot,
-    predict,
     render,
-    solve,
     study,
     train,
-    tune,
-    warm,
 )
 from pharos.cli import (
     list as list_,
@@ -156,21 +149,21 @@ def _options(
 app.command("list")(list_.list_)
 app.command("build")(build.build)
 app.command("count")(build.count)
-app.command("check")(check.check)
-app.command("solve")(solve.solve)
+app.command("check")(build.check)
+app.command("solve")(evaluate.solve)
 app.command("hardness")(hardness.hardness)
-app.command("predict")(predict.predict)
+app.command("predict")(hardness.predict)
 app.command("evaluate")(evaluate.evaluate)
 app.command("observations")(observations.observations)
 app.command("render")(render.render)
-app.command("play")(play.play)
-app.command("explore")(explore.explore)
+app.command("play")(render.play)
+app.command("explore")(plot.explore)
 app.command("train")(train.train)
-app.command("tune")(tune.tune)
+app.command("tune")(train.tune)
 app.command("submit")(leaderboard.submit)
 app.command("verify")(leaderboard.verify)
 app.command("board")(leaderboard.board)
-app.command("warm")(warm.warm)
+app.command("warm")(cache.warm)
 app.add_typer(plot.app, name="plot")
 app.add_typer(study.app, name="study")
 app.add_typer(benchmark.app, name="benchmark")

@@ -19,7 +19,7 @@ import operator
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from types import UnionType
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
 import typer
 from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
@@ -28,6 +28,9 @@ from pharos.cli.answers import Answer
 from pharos.cli.options import parse_parameters
 from pharos.environments import declared_parameters
 from pharos.system.records import first_sentence, meanings
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 JSON = OptionInfo(default=False, param_decls=("--json",), help="One JSON object on standard output, nothing else.")
 Words = list[str] | None
@@ -56,7 +59,7 @@ def command(function: Callable[..., Any]) -> Callable[..., None]:
     texts, signature = meanings(function), inspect.signature(function)
     for each in signature.parameters.values():
         cls, *names = get_args(each.annotation) if get_origin(each.annotation) is Annotated else (each.annotation,)
-        if dataclasses.is_dataclass(cls):
+        if isinstance(cls, type) and dataclasses.is_dataclass(cls):
             made = [*_of_fields(cls, None if each.default is each.empty else each.default, texts)]
             made = [one for one in made if not names or one.name in names[0].split()]
             objects[each.name] = (each, cls, [one.name for one in made])
@@ -89,16 +92,16 @@ def command(function: Callable[..., Any]) -> Callable[..., None]:
     return run
 
 
-def _of_fields(cls: Any, values: object, said: Mapping[str, str]) -> Iterator[inspect.Parameter]:
+def _of_fields(cls: "type[DataclassInstance]", values: object, said: Mapping[str, str]) -> Iterator[inspect.Parameter]:
     """A parameter for each field of a dataclass, and of those of its fields that are dataclasses.
 
     Args:
         values: the defaults. said: help texts that go before those of the class.
     """
     texts, declared = meanings(cls), declared_parameters(cls)
-    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+    for field in dataclasses.fields(cls):
         default = getattr(values, field.name) if values is not None else field.default
-        if dataclasses.is_dataclass(field.type):
+        if isinstance(field.type, type) and dataclasses.is_dataclass(field.type):
             yield from _of_fields(field.type, None if default is dataclasses.MISSING else default, said)
         elif field.init:
             text = said.get(field.name) or first_sentence(texts.get(field.name, ""))

@@ -12,8 +12,7 @@ import typer
 
 from pharos.cli.answers import Answer, written
 from pharos.cli.command import Commands
-from pharos.cli.options import Count, Discount, Gamma, check_format
-from pharos.cli.target import Target
+from pharos.cli.options import Count, Discount, Gamma, Target, check_format
 from pharos.errors import ParameterError, UnknownName
 from pharos.mdp import ChanceSetting
 from pharos.system.wording import many

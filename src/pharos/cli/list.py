@@ -90,7 +90,7 @@ def rules_of(cls: type["Environment"]) -> list[tuple[str, str]]:
     return blocks
 
 
-def _annotation(annotation: Any) -> str:
+def _annotation(annotation: object) -> str:
     text = annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
     words = {"int": "integer", "float": "number", "bool": "true or false", "str": "text"}
     return words.get(text.removesuffix(" | None"), text)
@@ -100,13 +100,13 @@ def _first_line(cls: type) -> str:
     return " ".join((cls.__doc__ or "").strip().split("\n\n")[0].split()).replace("`", "")
 
 
-def _default(field: dataclasses.Field) -> Any:
+def _default(field: dataclasses.Field) -> object:
     if field.default is not dataclasses.MISSING:
         return field.default
     return field.default_factory() if field.default_factory is not dataclasses.MISSING else None
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 

@@ -5,8 +5,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pharos.cli.answers import Answer, console, describe_chance, progress_bar, progress_line
-from pharos.cli.options import Gamma, Seconds, discount
-from pharos.cli.target import Building, Target
+from pharos.cli.options import Building, Gamma, Seconds, Target, discount
 from pharos.errors import ParameterError
 from pharos.mdp import ChanceSetting
 from pharos.system.wording import many

@@ -19,7 +19,7 @@ from pharos.observations import title
 from pharos.system.wording import many
 
 if TYPE_CHECKING:
-    from pharos.study import Specification
+    from pharos.study import RunLog, Specification, Status
 
 app = Commands(help="Run a grid of training runs, and make the paper's figures and tables of it.")
 
@@ -163,11 +163,11 @@ def run(
     return _answer(end, failed=bool(end.failed))
 
 
-def _logging(logs: Any, progress: Callable[[Any], None]) -> Callable[[Any], None]:
+def _logging(logs: "RunLog", progress: "Callable[[Status], None]") -> "Callable[[Status], None]":
     """Progress that also writes the curves of runs that have finished, every LINE_SECONDS at most."""
     written = time.monotonic()
 
-    def tell(status: Any) -> None:
+    def tell(status: "Status") -> None:
         nonlocal written
         progress(status)
         if time.monotonic() - written > LINE_SECONDS:
@@ -177,7 +177,7 @@ def _logging(logs: Any, progress: Callable[[Any], None]) -> Callable[[Any], None
     return tell
 
 
-def _say(forecast: Any) -> None:
+def _say(forecast: object) -> None:
     """How long it will take, on standard error."""
     console(stderr=True).print(str(forecast), soft_wrap=True)
 
@@ -319,7 +319,7 @@ def unpack(
     return Answer({"folder": str(folder), "added": number}, said)
 
 
-def _answer(status: Any, failed: bool = False) -> Answer:
+def _answer(status: "Status", failed: bool = False) -> Answer:
     def text() -> None:
         print(status)
         if status.missing:
@@ -337,12 +337,12 @@ def _answer(status: Any, failed: bool = False) -> Answer:
 
 
 @contextlib.contextmanager
-def _progress() -> Iterator[Callable[[Any], None]]:
+def _progress() -> "Iterator[Callable[[Status], None]]":
     """A bar on a terminal; elsewhere a line on standard error now and then."""
     if not sys.stderr.isatty():
         last_line = time.monotonic()
 
-        def say(status: Any) -> None:
+        def say(status: "Status") -> None:
             nonlocal last_line
             if time.monotonic() - last_line > LINE_SECONDS:
                 last_line = time.monotonic()
@@ -357,7 +357,7 @@ def _progress() -> Iterator[Callable[[Any], None]]:
     ) as bar:
         task = bar.add_task("", total=None)
 
-        def show(status: Any) -> None:
+        def show(status: "Status") -> None:
             bar.update(task, total=status.total, completed=status.finished + status.failed, description=str(status))
 
         yield show

@@ -99,7 +99,7 @@ CELLS = (8, 16, 24, 32, 40, 48, 64)  # pixels of a cell; multiples of 8, so that
 LEAST_PICTURE = 400  # pixels of the longer side of a picture that a class has of its own
 NIGHT, INK = (16, 18, 24), (226, 228, 232)
 
-# States -> pictures -------------------------------------------------------------------------------------------------
+# States -> pictures ---------------------------------------------------------------------------------------------------
 
 
 def human(env: Environment, state: Sequence[int], *, cell: int | None = None) -> np.ndarray:
@@ -128,7 +128,7 @@ def human(env: Environment, state: Sequence[int], *, cell: int | None = None) ->
     return np.rint(canvas).astype(np.uint8)
 
 
-# Pictures -> files --------------------------------------------------------------------------------------------------
+# Pictures -> files ----------------------------------------------------------------------------------------------------
 
 
 def image(picture: np.ndarray, caption: str = "") -> "Image":
@@ -191,7 +191,7 @@ def _fitting_cell(rows: int, columns: int) -> int:
     return fits[-1] if fits else CELLS[0]
 
 
-# Episodes -----------------------------------------------------------------------------------------------------------
+# Episodes -------------------------------------------------------------------------------------------------------------
 
 Policy = Callable[[State], int]
 
@@ -243,7 +243,7 @@ def inside(picture: np.ndarray, margin: Margin) -> np.ndarray:
     return picture[top : len(picture) - bottom, left : picture.shape[1] - right]
 
 
-# Of pictures for people: cells are square, and margins even ---------------------------------------------------------
+# Of pictures for people: cells are square, and margins even -----------------------------------------------------------
 
 
 def _plain(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
@@ -291,7 +291,7 @@ def _ice(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     court[scratch] = (206, 229, 243)
 
 
-# Of complex images --------------------------------------------------------------------------------------------------
+# Of complex images ----------------------------------------------------------------------------------------------------
 
 ASPHALT, PAVEMENT, KERB, WHITE, YELLOW = (142, 142, 142), (170, 170, 170), (96, 96, 96), (214, 214, 214), (210, 210, 64)
 WALL = (142, 142, 142)

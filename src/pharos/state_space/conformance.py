@@ -170,7 +170,7 @@ def _note_unseen_values(env: Environment, states: list[State], complete: bool, n
             notes.append(f"{variable} is declared as {low} to {high}; {where} it takes {description}")
 
 
-# The rules, compiled ------------------------------------------------------------------------------------------------
+# The rules, compiled --------------------------------------------------------------------------------------------------
 
 
 def _check_compiled(env: Environment, check: InterpretedCheck, states: list[State], notes: list[str]) -> bool:

@@ -16,18 +16,17 @@ from pharos.study.analysis import (
     paper_returns,
 )
 from pharos.study.archive import pack, unpack
+from pharos.study.batches import has_regret
 from pharos.study.blocks import Run, Specification
 from pharos.study.clusters import run_on_ray, submit
 from pharos.study.execution import Status, opened, run, status
 from pharos.study.findings import findings
 from pharos.study.logs import LOGGERS, RunLog, log
-from pharos.study.predictions import predict
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study.report import StudyReport, report
 from pharos.study.specification import presets, specification
 from pharos.study.statistics import Estimate, interquartile_mean, stratified_interval
-from pharos.study.tables import cells, curves, hardness_table, paper_instance, table
-from pharos.study.values import has_regret
+from pharos.study.tables import cells, curves, hardness_table, paper_instance, predict, table
 from pharos.training import run_id
 
 __all__ = [

@@ -1,30 +1,97 @@
-"""Runs of a study that are trained as one program: which fit together, and what trains them.
+"""Runs of a study that are trained as one program: which fit together, what trains them, and the values they share.
 
 A run belongs to a batch where the study says `engine: batched`. Batches are formed when a worker is free, from the
 runs that are missing then; a run does not depend on its batch, so neither do results. While a batch is trained, its
 checkpoints are in DIR/batches; a batch that was killed goes on from there with the runs that it had.
+
+Values at the start of each task are solved once for all runs of a study, and kept in the user's cache. A run needs the
+values of the optimal, the uniform and the worst policy only where episodes start; solving a large instance again for
+each run would take longer than some training.
 """
 
 import contextlib
 import json
+import math
 import shutil
 import time
 from collections import deque
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pharos.agents.batched import lane_width
-from pharos.environments import Environment
-from pharos.study import values as _values
+from pharos.environments import Environment, start_distribution
+from pharos.solvers import ReferenceValues
 from pharos.study.blocks import Run
 from pharos.study.worker import BATCHES
 from pharos.system import storage
+from pharos.system.paths import cache_directory
+from pharos.system.storage import ResultCache
+from pharos.training import RunConfig
+
+if TYPE_CHECKING:
+    from pharos.training import Task
 
 TABLES = 16  # runs of one program that learn tables
+
+
+def task_of(config: Mapping[str, Any]) -> "Task":
+    """The task of a run of a study that was read already, so that code which it names is trusted."""
+    return RunConfig.from_dict(config).task(trust=True, strict=True)
+
+
+def solve(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The values at the start of a task, as `TaskValues.to_dict` writes them; solved now unless they are stored."""
+    values = stored_values(config)
+    if values is None:
+        from pharos.training import TaskValues  # loads what an MDP needs
+
+        task = task_of(config)
+        values = TaskValues(task.reference, task.return_range).to_dict()
+        _cache().put(_dependencies(config), values=values)
+    return values
+
+
+def stored_values(config: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The stored values for these rules; None where there are none, or where the file was changed."""
+    stored = _cache().get(_dependencies(config))
+    return None if stored is None else stored["values"]
+
+
+def has_regret(config: Mapping[str, Any]) -> bool:
+    """False where the stored values of the task say that no policy is better than uniform play."""
+    values = stored_values(config)
+    return values is None or not math.isnan(ReferenceValues(**values["reference"]).spread())
+
+
+def _cache() -> ResultCache:
+    return ResultCache(cache_directory() / "values")
+
+
+def _dependencies(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What the values depend on: parameters, rules by their code, start states, chance and setting."""
+    from pharos.rules import fingerprint_of_rules
+
+    env = task_of(config).env
+    states, probabilities = start_distribution(env)
+    setting = {name: config[name] for name in ("environment", "parameters", "chance", "gamma", "horizon")}
+    return json.loads(
+        json.dumps(
+            {
+                **setting,
+                "format": 2,
+                "version": env.version,
+                "rules": fingerprint_of_rules(env, ("transition", "is_terminal", "reward")),
+                "start": [[list(map(int, state)) for state in states], probabilities.tolist()],
+            }
+        )
+    )
+
+
+# Batches --------------------------------------------------------------------------------------------------------------
 
 
 def train_batch(
@@ -34,7 +101,7 @@ def train_batch(
     from pharos.training import FailedRun, RunConfig, TaskCache, TaskValues, train_configs
 
     def values(config: RunConfig) -> TaskValues | None:
-        stored = _values.stored_values(config.to_dict())
+        stored = stored_values(config.to_dict())
         return None if stored is None else TaskValues.from_dict(stored)
 
     members = TaskCache(values, trust=True, strict=True, device=device)

@@ -104,7 +104,7 @@ class Run:
         return (config.environment, config.agent, config.observation, config.engine)
 
 
-def _entry(value: object) -> Any:
+def _entry(value: object) -> object:
     return {"name": value} if isinstance(value, str) else value
 
 
@@ -116,7 +116,7 @@ def _chance(value: object) -> ChanceSetting:
     return ChanceSetting()
 
 
-def _seeds(value: object) -> Any:
+def _seeds(value: object) -> object:
     if isinstance(value, list):
         return value
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
@@ -219,7 +219,7 @@ class Hardness(_Part):
         return [name for name in names if name in self.measures] or list(self.measures)
 
 
-def _engines(value: object) -> Any:
+def _engines(value: object) -> object:
     for engine in value.values() if isinstance(value, dict) else [value]:
         if engine not in ENGINES:
             raise UnknownName("engine", engine, ENGINES)

@@ -18,18 +18,19 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import connection
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
 from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, PharosError, StateSpaceLocked
 from pharos.state_space import build
 from pharos.study import batches as _batches
-from pharos.study import values as _values
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
-from pharos.study.processes import end_processes, one_thread, processors, ready, worker_context
 from pharos.study.specification import Source
 from pharos.study.status import Forecast, Status, claim, duration, opened, status
+from pharos.study.worker import end_processes, one_thread, processors, ready, worker_context
 from pharos.system.storage import replace_json
 from pharos.system.wording import in_one_line, many
 from pharos.system.workers import check_guard, end_with_parent, without_interrupts, without_main
@@ -54,7 +55,7 @@ def train(config: Mapping[str, Any], folder: Path) -> None:
     """The runner of studies: trains as `config` says and writes run.json and curve.parquet into `folder`."""
     from pharos.training import TaskValues, train_config
 
-    values = _values.stored_values(config)
+    values = _batches.stored_values(config)
     task_values = None if values is None else TaskValues.from_dict(values)
     train_config(config, folder, values=task_values, trust=True, strict=True)
 
@@ -220,7 +221,7 @@ class Execution:
                 if run.id not in there or run.id in self.repeated or not self.note(run)
             )
 
-    def _start(self, context: object) -> None:
+    def _start(self, context: "_worker.Context") -> None:
         for _ in range(len(self.pending)):
             if len(self.running) >= self.options.workers:
                 return
@@ -251,7 +252,7 @@ class Execution:
             ) from error
         time.sleep(BUSY_SECONDS)
 
-    def _worker(self, context: Any, unit: tuple[Run, ...]) -> Any:
+    def _worker(self, context: "_worker.Context", unit: tuple[Run, ...]) -> BaseProcess:
         arguments = (*self.job(unit), dict(os.environ))
         process = context.Process(target=_worker.main, args=arguments, name=unit[0].id)
         definitions = [each for run in unit for each in run.configuration.definitions]
@@ -413,8 +414,8 @@ POLL_SECONDS = 2.0
 
 def prepare_instance(config: Mapping[str, Any]) -> None:
     """Build the state space of a run into the cache, and keep the values of its task at the start."""
-    build(_values.task_of(config).env, wait=False)
-    _values.solve(config)
+    build(_batches.task_of(config).env, wait=False)
+    _batches.solve(config)
 
 
 def prepare_instances(
@@ -464,7 +465,7 @@ def _prepare(
 
 
 def _prepare_all(
-    prepare: Callable[[Mapping[str, Any]], Any], configs: Iterable[Mapping[str, Any]], sender: Any
+    prepare: Callable[[Mapping[str, Any]], Any], configs: Iterable[Mapping[str, Any]], sender: Connection
 ) -> None:
     """Prepare instances one after the other; send "" after each, and why where it waits."""
     _worker.end_cleanly()

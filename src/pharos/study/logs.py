@@ -6,16 +6,19 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pharos.errors import FileFormatError, MissingExtra, UnknownName
 from pharos.plots import slug
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
-from pharos.study.curves import label
+from pharos.study.figures import label
 from pharos.study.specification import Source
 from pharos.study.status import opened
 from pharos.study.tables import described, read_curve
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LOGGERS = ("tensorboard", "wandb")
 SCALARS = ("value", "expected_regret", "cumulative_expected_regret", "normalized_regret", "mean_return", "episodes")
@@ -162,7 +165,7 @@ def _settings(run: Run) -> dict[str, Any]:
             {**described(run), **own}.items()}  # fmt: skip
 
 
-def _points(curve: Any) -> Iterator[tuple[int, float, dict[str, float]]]:
+def _points(curve: "pd.DataFrame") -> Iterator[tuple[int, float, dict[str, float]]]:
     """(step, seconds since the run began, what was measured there), each finite."""
     for row in curve.to_dict("records"):
         values = {key: float(row[key]) for key in SCALARS if key in row}

@@ -59,7 +59,7 @@ Loader.add_implicit_resolver(
 )
 
 
-def where(name: str, root: Any, loc: Loc) -> str:
+def where(name: str, root: "yaml.Node | None", loc: Loc) -> str:
     """`file:line`, the line of the innermost node on the path that exists; the path itself where there is no file."""
     if root is None:
         return ".".join(map(str, (name, *loc)))
@@ -78,7 +78,7 @@ def where(name: str, root: Any, loc: Loc) -> str:
     return f"{name}:{line + 1}"
 
 
-def check_nodes(root: Any, name: str) -> None:
+def check_nodes(root: "yaml.Node", name: str) -> None:
     """Refuse what no specification needs: keys that are no words or repeated, nodes within themselves, millions by
     aliases.
 
@@ -86,7 +86,7 @@ def check_nodes(root: Any, name: str) -> None:
     """
     sizes: dict[int, int] = {}
 
-    def size(node: Any) -> int:
+    def size(node: "yaml.Node") -> int:
         """How many nodes stand below this one, aliases written out."""
         if id(node) in sizes:
             if not sizes[id(node)]:
@@ -109,7 +109,7 @@ def check_nodes(root: Any, name: str) -> None:
     size(root)
 
 
-def _check_keys(node: Any, name: str) -> None:
+def _check_keys(node: "yaml.Node", name: str) -> None:
     lines: dict[str, int] = {}
     for key, _ in node.value:
         line = key.start_mark.line + 1

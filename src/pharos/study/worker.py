@@ -6,27 +6,37 @@
 
 A process that is killed leaves a folder in `partial`, which the next attempt throws away, unless its result is
 complete, or unless it is to be resumed: then the runner finds there what it wrote before.
+
+The processes of workers: how they are made, and how they end.
 """
 
 import contextlib
+import multiprocessing
 import os
 import shutil
 import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pharos import training
 from pharos.errors import FileFormatError, FolderLocked
 from pharos.system import storage
 from pharos.system.wording import in_one_line
-from pharos.system.workers import end_with_parent
+from pharos.system.workers import end_with_parent, without_interrupts
+
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkServerContext, SpawnContext
+
+    Context: TypeAlias = ForkServerContext | SpawnContext
 
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 EXIT_BUSY = 75
+TERMINATION_SECONDS = 5.0
 # Seconds in a record that no run can take: ten thousand years
 LONGEST = 3e11
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -206,7 +216,7 @@ def log(path: Path):
                 os.close(old)
 
 
-# As a process --------------------------------------------------------------------------------------------------------
+# As a process ---------------------------------------------------------------------------------------------------------
 
 
 def main(
@@ -268,3 +278,56 @@ def use_one_thread() -> None:
         sys.modules["torch"].set_num_threads(1)
     if "numba" in sys.modules:
         sys.modules["numba"].set_num_threads(1)
+
+
+# Processes ------------------------------------------------------------------------------------------------------------
+
+
+def processors() -> int:
+    """The processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """What starts here, and whatever it forks, uses one thread, unless the user's variables say otherwise.
+
+    Numba reads its variable when it is loaded, which is before any line of the new process.
+    """
+    added = [name for name in THREAD_VARIABLES if name not in os.environ]
+    os.environ.update(dict.fromkeys(added, "1"))
+    try:
+        yield
+    finally:
+        for name in added:
+            del os.environ[name]
+
+
+def end_processes(processes: Sequence[BaseProcess]) -> None:
+    """End processes cleanly; at once those that take too long."""
+    for process in processes:
+        process.terminate()
+    latest = time.monotonic() + TERMINATION_SECONDS
+    for process in processes:
+        process.join(max(0.0, latest - time.monotonic()))
+        if process.is_alive():
+            process.kill()
+            process.join()
+
+
+def worker_context(warm: bool) -> "Context":
+    """Processes are forked from one that has loaded everything; where the system cannot do that, started anew."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["pharos.study.warm" if warm else "pharos.study.worker"])
+    return context
+
+
+def ready(context: "Context") -> None:
+    """See to it that the process which forks workers is there; it loads much, and leaves interrupts to this one."""
+    if context.get_start_method() == "forkserver":
+        from multiprocessing import forkserver
+
+        with without_interrupts():
+            forkserver.ensure_running()

@@ -14,7 +14,6 @@ import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from pharos.errors import ParameterError
 from pharos.system import paths
@@ -89,7 +88,7 @@ def _listen() -> None:
     vars(config)["CACHE_DIR"] = os.environ.get("NUMBA_CACHE_DIR", "")  # Numba may have been loaded before
 
     class Compiling(event.Listener):
-        def on_start(self, event: Any) -> None:
+        def on_start(self, event: event.Event) -> None:
             global _running, _began
             with _lock:
                 if not _running:

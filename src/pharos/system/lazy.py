@@ -12,10 +12,9 @@ import importlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 
-def attributes(package: str) -> Callable[[str], Any]:
+def attributes(package: str) -> Callable[[str], object]:
     """The `__getattr__` of a package: the names that its `__init__.py` imports under `TYPE_CHECKING`.
 
     Args:
@@ -31,7 +30,7 @@ def attributes(package: str) -> Callable[[str], Any]:
         imports = [node for block in blocks for node in block.body if isinstance(node, ast.ImportFrom)]
         return {alias.name: str(node.module) for node in imports for alias in node.names}
 
-    def attribute(name: str) -> Any:
+    def attribute(name: str) -> object:
         if name.startswith("__") or name not in modules():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         value = getattr(importlib.import_module(modules()[name]), name)

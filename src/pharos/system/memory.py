@@ -20,7 +20,7 @@ import weakref
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -34,6 +34,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
+R = TypeVar("R", bound=np.ndarray | PackedIndices)
 LEAST_MEMORY = 1 << 24  # bytes that a build needs
 _PROC, _GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
@@ -205,7 +206,7 @@ def rows_with_room(rows: object, low: int, high: int) -> int:
     return high if high - low <= room else min(max(low, low + room - 4 * PIECE), high)
 
 
-def pieces_from_the_end(rows: Any, low: int, high: int, border: int) -> Iterator[tuple[Any, int, int]]:
+def pieces_from_the_end(rows: R, low: int, high: int, border: int) -> Iterator[tuple[R | np.ndarray, int, int]]:
     """(array, start, stop): ranges that make up [low, high), the last one first, each with an array that has its rows.
 
     They are those of `ranges_from_the_end` as far as `border`, see `rows_with_room`. Rows from there on are read into
@@ -234,10 +235,13 @@ def pieces_from_the_end(rows: Any, low: int, high: int, border: int) -> Iterator
 class _UncachedFile:
     """The file of a mapped array, read past the memory of the system where that is possible."""
 
-    def __init__(self, rows: np.memmap):
+    def __init__(self, rows: object):
+        assert isinstance(rows, np.memmap), "arrays in memory have room"
         self._rows, self._row = rows, rows.strides[0]
+        mapping = _mapping_of(rows)
+        assert mapping is not None
         begin = rows.offset // mmap.ALLOCATIONGRANULARITY * mmap.ALLOCATIONGRANULARITY  # of the mapping, in the file
-        self._offset = begin + rows.ctypes.data - np.frombuffer(_mapping_of(rows), np.uint8).ctypes.data
+        self._offset = begin + rows.ctypes.data - np.frombuffer(mapping, np.uint8).ctypes.data
         path = str(rows.filename)
         try:
             self._file = os.open(path, os.O_RDONLY | os.O_DIRECT)
@@ -276,7 +280,7 @@ class _Rows:
         self.__array_interface__ = {**like.__array_interface__, "data": (address, True)}
 
 
-def _mapping_of(array: np.memmap) -> Any:
+def _mapping_of(array: np.memmap) -> mmap.mmap | None:
     return getattr(array, "_mmap", None)
 
 

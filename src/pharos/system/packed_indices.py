@@ -6,9 +6,10 @@ kernels/outcomes.py the same to compiled loops. docs/decisions/0017-indices-of-4
 """
 
 from collections.abc import Iterator
-from typing import Any
+from types import EllipsisType
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 INT40 = "<i5"
 """What manifests call the type, after the names that NumPy gives to others."""
@@ -18,6 +19,9 @@ PACKED = np.dtype([("low", "<u4"), ("high", "i1")])
 
 INT32_STATES, INT40_STATES = 2**31 - 1, 2**39 - 1
 """States that indices of 32 and of 40 bits can number."""
+
+Where = int | np.integer | slice | np.ndarray | tuple[int | slice | np.ndarray | EllipsisType, ...]
+"""What an array is indexed by."""
 
 # Entries that are unpacked at a time.
 _BLOCK = 1 << 20
@@ -68,21 +72,21 @@ class PackedIndices:
     def __len__(self) -> int:
         return len(self.packed)
 
-    def __getitem__(self, where: Any) -> Any:
+    def __getitem__(self, where: Where) -> np.ndarray:
         return unpacked(self.packed[where])
 
-    def __setitem__(self, where: Any, values: Any) -> None:
+    def __setitem__(self, where: Where, values: object) -> None:
         self.packed[where] = packed(np.asarray(values))
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
         return unpacked(self.packed).astype(dtype or np.int64, copy=False)
 
     def __repr__(self) -> str:
         return f"PackedIndices(shape={self.shape})"
 
-    def reshape(self, *shape: Any) -> "PackedIndices":
+    def reshape(self, shape: int | tuple[int, ...], *others: int) -> "PackedIndices":
         """The same entries in another shape; nothing is copied."""
-        return PackedIndices(self.packed.reshape(*shape))
+        return PackedIndices(self.packed.reshape(shape if isinstance(shape, tuple) else (shape, *others)))
 
     def rows(self, start: int, stop: int) -> "PackedIndices":
         """Entries [start, stop) of the first axis; nothing is copied."""
@@ -101,7 +105,7 @@ def packed(values: np.ndarray) -> np.ndarray:
     return entries
 
 
-def unpacked(entries: Any) -> Any:
+def unpacked(entries: np.ndarray) -> np.ndarray:
     """The int64 of some entries of type `PACKED`, or of one."""
     return (entries["high"].astype(np.int64) << 32) | entries["low"]
 

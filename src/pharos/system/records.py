@@ -11,7 +11,7 @@ import operator
 import re
 import types
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import MISSING, fields, is_dataclass, replace
+from dataclasses import MISSING, Field, fields, is_dataclass, replace
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from pharos.errors import FileFormatError
@@ -49,23 +49,28 @@ def first_sentence(text: str) -> str:
     return sentence[:1].upper() + sentence[1:] if re.match(r"[a-z]+[ ;:]", sentence) else sentence
 
 
+def _fields(cls: type) -> tuple[Field, ...]:
+    """Fields of a dataclass, or TypeError."""
+    return fields(cls)  # type: ignore[arg-type]
+
+
 @functools.cache
-def parts(cls: Any) -> dict[str, type]:
+def parts(cls: type) -> dict[str, type]:
     """Field -> its class, of the fields that are dataclasses themselves."""
     hints = get_type_hints(cls)
-    return {each.name: hints[each.name] for each in fields(cls) if is_dataclass(hints[each.name])}
+    return {each.name: hints[each.name] for each in _fields(cls) if is_dataclass(hints[each.name])}
 
 
 def option_names(cls: type) -> set[str]:
     """Names of the fields of a dataclass, and of those of its parts."""
-    return {each.name for owner in (cls, *parts(cls).values()) for each in fields(owner)}
+    return {each.name for owner in (cls, *parts(cls).values()) for each in _fields(owner)}
 
 
 def joined(cls: type, options: Mapping[str, Any]) -> dict[str, Any]:
     """Options of a dataclass, with fields of its parts given by their own names: `sticky=0.1` as `chance=...`."""
     own = dict(options)
     for name, part in parts(cls).items():
-        inside = {each.name: own.pop(each.name) for each in fields(part) if each.name in own}
+        inside = {each.name: own.pop(each.name) for each in _fields(part) if each.name in own}
         if inside:
             own[name] = replace(own.get(name, part()), **inside)
     return own
@@ -81,15 +86,15 @@ def flat(cls: type[T]) -> type[T]:
 
     cls.__init__ = flat_init  # type: ignore[method-assign, assignment]
     for name, part in parts(cls).items():  # type: ignore[arg-type]
-        for each in fields(part):  # type: ignore[arg-type]
+        for each in _fields(part):
             setattr(cls, each.name, property(operator.attrgetter(f"{name}.{each.name}")))
     return cls
 
 
-def takes(cls: Any, **defaults: object) -> Callable[[F], F]:
+def takes(cls: type, **defaults: object) -> Callable[[F], F]:
     """Decorator: the signature of a function shows the options of a dataclass and its parts before `**options`."""
-    own = [each for each in fields(cls) if each.name not in parts(cls)]
-    leaves = [*own, *(each for part in parts(cls).values() for each in fields(part))]  # type: ignore[arg-type]
+    own = [each for each in _fields(cls) if each.name not in parts(cls)]
+    leaves = [*own, *(each for part in parts(cls).values() for each in _fields(part))]
 
     def shown(function: F) -> F:
         signature = inspect.signature(function)
@@ -128,7 +133,7 @@ def read(cls: type[T], entry: object, whose: str, optional: Collection[str] = ()
     Raises:
         FileFormatError: an entry is missing, unknown or of another type.
     """
-    names = [each.name for each in fields(cls)]  # type: ignore[arg-type]
+    names = [each.name for each in _fields(cls)]
     if not isinstance(entry, Mapping):
         raise FileFormatError(f"{whose} is {repr(entry)[:SHOWN]}; expected {', '.join(names)}")
     missing = [name for name in names if name not in entry and name not in optional]
@@ -140,7 +145,7 @@ def read(cls: type[T], entry: object, whose: str, optional: Collection[str] = ()
     return cls(**{name: _checked(value, hints[name], f"{whose}: {name}") for name, value in entry.items()})
 
 
-def _checked(value: Any, hint: Any, whose: str) -> Any:
+def _checked(value: object, hint: object, whose: str) -> object:
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if is_dataclass(hint) and isinstance(hint, type) and isinstance(value, Mapping):
         return getattr(hint, "from_dict", lambda entry: read(hint, entry, whose))(value)
@@ -149,6 +154,6 @@ def _checked(value: Any, hint: Any, whose: str) -> Any:
     if kind is not Any and (is_number or not isinstance(value, kinds)):
         expected = getattr(hint, "__name__", hint) if not inner or kind is types.UnionType else "an object"
         raise FileFormatError(f"{whose} is {repr(value)[:SHOWN]}; expected {expected}")
-    if kind is Mapping and inner[1] is not Any:
+    if isinstance(value, Mapping) and kind is Mapping and inner[1] is not Any:
         return {name: _checked(each, inner[1], f"{whose}: {name}") for name, each in value.items()}
     return value

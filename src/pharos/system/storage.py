@@ -19,7 +19,7 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TextIO
 
 import xxhash
 
@@ -145,7 +145,7 @@ _BEGIN = 2  # SYNC_FILE_RANGE_WRITE
 
 
 @cache
-def _sync_file_range() -> Any:
+def _sync_file_range() -> Callable[[int, int, int, int], int] | None:
     import ctypes
 
     try:
@@ -262,7 +262,7 @@ def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = 
             file.truncate(0)
 
 
-def _is_at(path: Path, file: Any) -> bool:
+def _is_at(path: Path, file: TextIO) -> bool:
     try:
         return os.path.samestat(path.stat(), os.fstat(file.fileno()))
     except FileNotFoundError:
@@ -289,7 +289,7 @@ def waiting_lock(
             time.sleep(WAITING_SECONDS)
 
 
-def _flock(file: Any, folder: Path, error: type[PharosError], activity: str) -> bool:
+def _flock(file: TextIO, folder: Path, error: type[PharosError], activity: str) -> bool:
     """Take the lock; False where the file system has none."""
     if fcntl is None:
         return False

@@ -12,13 +12,15 @@ if TYPE_CHECKING:
     from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
     from pharos.training.batch import Progress, train_configs
     from pharos.training.config import CELL, RunConfig, run_id
-    from pharos.training.curve import Curve, RegretCurve, bootstrap_interval
-    from pharos.training.evaluation import Evaluation, evaluate_agent
+    from pharos.training.curve import Curve, Evaluation, RegretCurve, bootstrap_interval, evaluate_agent
+    from pharos.training.learners import FailedRun, TaskCache
     from pharos.training.options import ENGINES, Horizon, TrainingOptions
-    from pharos.training.process_pool import train_parts
     from pharos.training.results import (
+        TrainingResult,
         check_agent,
+        clear_run,
         digest_of_curve,
+        load_agent,
         read_curve,
         read_curve_table,
         read_record,
@@ -30,10 +32,8 @@ if TYPE_CHECKING:
         write_record,
         write_table,
     )
-    from pharos.training.run_folder import TrainingResult, clear_run, load_agent
-    from pharos.training.runs import train, train_config, train_many
+    from pharos.training.runs import train, train_config, train_many, train_parts
     from pharos.training.task import Task, TaskValues
-    from pharos.training.task_cache import FailedRun, TaskCache
     from pharos.training.tuning import SPACES, TuningResult, tune
 
 __all__ = [

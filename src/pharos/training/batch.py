@@ -26,10 +26,9 @@ from pharos.system.storage import digest_of_json, lock, read_json, remove_leftov
 from pharos.system.wording import in_one_line, many
 from pharos.training import results as _results
 from pharos.training.config import RunConfig
-from pharos.training.evaluation import values_together
-from pharos.training.learners import make_learner
-from pharos.training.run_folder import Checkpoint, Record, TrainingResult, clear_run, finished_result
-from pharos.training.task_cache import FailedRun, Member, TaskCache
+from pharos.training.curve import values_together
+from pharos.training.learners import FailedRun, Learner, Member, TaskCache, make_learner
+from pharos.training.results import Checkpoint, Record, TrainingResult, clear_run, finished_result
 
 # What a member is begun anew from, where its batch is halved.
 BEGINNING = ("place", "config", "folder", "task", "hyperparameters", "run", "key")
@@ -251,9 +250,10 @@ class TrainingJobs:
 class TrainingGroup:
     """Runs under one loop: trained, evaluated, resumed, and brought into their folders."""
 
+    learner: Learner  # from when the runs begin; gone where they failed
+
     def __init__(self, jobs: TrainingJobs, group: list[Member]):
         self.jobs, self.group, self.config, self.is_alone = jobs, group, group[0].config, group[0].is_alone
-        self.learner: Any = None
         self.has_begun = self.holds = False  # whether runs are marked as running; whether checkpoints are this batch's
         self.held = contextlib.ExitStack()  # the folder of checkpoints, or that of a run alone
 
@@ -270,7 +270,8 @@ class TrainingGroup:
                     self.group[0].fail(said)
                 raise said from None
             except Exception as error:
-                self.learner, failure = None, error
+                failure = error
+                vars(self).pop("learner", None)
                 self._remove_checkpoint()
         if len(self.group) == 1:
             self._fail(failure)

@@ -1,24 +1,207 @@
-"""What learns: N >= 1 runs under one loop, each as it is alone; all of it can be stored and resumed.
+"""Runs with their tasks, and what learns them: N >= 1 runs under one loop, each as it is alone.
 
-`Tables` of Q-learning, `Networks` of the batched engine, or one model of Stable-Baselines3 (`Deep`).
+A `Member` is a run before it is trained: with its task, what it sees, and its hyperparameters, checked. Learners are
+`Tables` of Q-learning, `Networks` of the batched engine, or one model of Stable-Baselines3 (`Deep`); all of each can be
+stored and resumed.
 """
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
 from pharos.agents import QLearning, check_hyperparameters, joined_states, make_model, state_of
-from pharos.errors import FileFormatError
+from pharos.agents import hyperparameters as hyperparameters_of
+from pharos.errors import FileFormatError, ParameterError
+from pharos.mdp import TabularMDP
 from pharos.policies import PolicyLike, deep_policy
+from pharos.state_space import StateSpace
+from pharos.system.wording import in_one_line
 from pharos.training import results
-from pharos.training.task import Task
+from pharos.training.config import RunConfig
+from pharos.training.curve import Curve
+from pharos.training.results import Record
+from pharos.training.task import Task, TaskValues
 
 if TYPE_CHECKING:
-    from pharos.training.task_cache import Member
+    from stable_baselines3.common.buffers import ReplayBuffer
+
+    from pharos.agents.batched import Batch
+    from pharos.interaction import SB3VecEnv
+
+T = TypeVar("T")
+# What of a configuration decides about rewards and states, about the task, about what is seen
+WORLD = ("environment", "parameters", "gamma", "sources")
+TASK = ("environment", "parameters", "chance", "observation", "observation_options", "gamma", "horizon", "sources")
+SIGHT = ("environment", "parameters", "observation", "observation_options", "sources")
+
+
+@dataclass(frozen=True)
+class FailedRun:
+    """A run that has no result, and why."""
+
+    config: dict[str, Any]
+    folder: Path | None
+    exception: Exception
+
+    @property
+    def error(self) -> str:
+        """The reason in one line."""
+        return in_one_line(self.exception)
+
+
+@dataclass(eq=False)
+class Member:
+    """A run that waits for its learner, or is learnt.
+
+    Attributes:
+        place: among the configurations; None for a run of a checkpoint that nobody asks for.
+        run: what its learner is made of: a BatchRun, a function that makes a table, or an algorithm.
+        key: runs with equal keys can be trained together.
+        is_alone: whether it has checkpoints in its own folder, and holds that.
+    """
+
+    place: int | None
+    config: RunConfig
+    folder: Path | None
+    task: Task
+    hyperparameters: dict[str, Any]
+    run: Any
+    key: Hashable
+    is_alone: bool = False
+    error: Exception | None = None
+    curve: Curve = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.curve = Curve(self.task)
+
+    @property
+    def record(self) -> Record:
+        """Its run.json."""
+        return Record(self.folder, self.config, self.hyperparameters)
+
+    def fail(self, error: Exception) -> None:
+        """It has failed; the reason is kept in run.json."""
+        self.error = error
+        self.record.write("failed", error=in_one_line(error))
+
+
+class TaskCache:
+    """Makes members of batches; what several runs share is made once: spaces, rewards, solved values, observations.
+
+    Args:
+        values: config -> values at the start of its task, where they are known.
+        trust, strict: as for `RunConfig.task`.
+        device: where networks are trained, which decides about what fits together.
+    """
+
+    def __init__(
+        self,
+        values: Callable[[RunConfig], TaskValues | None] | None = None,
+        *,
+        trust: bool = False,
+        strict: bool = False,
+        device: str = "cpu",
+    ):
+        self.values, self.trust, self.strict, self.device = values, trust, strict, device
+        self.made: dict[str, Any] = {}
+
+    def task(self, config: RunConfig) -> Task:
+        """The task of a run, the same object for all that have it; spaces and rewards are those of other tasks."""
+        return self._once("task", config, TASK, lambda: self._task(config))
+
+    def adopt(self, config: RunConfig, task: Task) -> None:
+        """Take a task that is made already for that of a run."""
+        self._once("task", config, TASK, lambda: task)
+
+    def _task(self, config: RunConfig) -> Task:
+        values = self.values(config) if self.values is not None else None
+        task = config.task(values, trust=self.trust, strict=self.strict)
+        space, plain = self._world(config, task)
+        vars(task).update(space=space, mdp=task.chance.of(plain.with_horizon(task.horizon_steps)))
+        return task
+
+    def _world(self, config: RunConfig, task: Task) -> tuple[StateSpace, TabularMDP]:
+        """The states of a task, and their MDP without chance and horizon; the same for all tasks of a world."""
+        return self._once("world", config, WORLD, lambda: (task.space, task.space.mdp(gamma=task.gamma)))
+
+    def member(self, place: int | None, config: RunConfig, folder: Path | None, *, is_alone: bool = False) -> Member:
+        """A run, ready to be grouped.
+
+        Raises:
+            ParameterError: a hyperparameter is wrong, or the engine lacks it.
+        """
+        chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
+        key: Hashable = (config.agent, config.steps, config.evaluation_interval)
+        if config.engine != "batched":
+            algorithm, task = config.algorithm(trust=self.trust, strict=self.strict), self.task(config)
+
+            def table() -> QLearning:
+                limit, noise, delay = task.time_limit, task.chance.reward_noise, task.chance.reward_delay
+                return QLearning(
+                    task.mdp,
+                    total_steps=config.steps,
+                    seed=config.seed,
+                    time_limit=limit,
+                    reward_noise=noise,
+                    reward_delay=delay,
+                    **chosen,
+                )
+
+            if config.is_tabular and not is_alone:
+                table()  # what is wrong is said before others are concerned
+            make = table if config.is_tabular else algorithm
+            return Member(place, config, folder, task, chosen, make, key, is_alone)
+        from pharos.agents.batched import OURS, BatchRun, ObservationSource, group_key, supports
+
+        check_hyperparameters(config.agent, chosen, OURS)
+        lacking = supports(config.agent, chosen)
+        if lacking is not None:
+            raise ParameterError(f"the batched engine: {lacking}; the engine sb3 has it")
+        task, chance = self.task(config), config.chance
+        run = BatchRun(
+            mdp=replace(chance, lazy=0.0).of(self._world(config, task)[1]) if chance.lazy else task.mdp,
+            observe=self._once("sight", config, SIGHT, lambda: ObservationSource.of(task.space, task.sight.observe)),
+            time_limit=task.time_limit,
+            hyperparameters=chosen,
+            steps=config.steps,
+            seed=config.seed,
+            key=int(config.id, 16),
+            gamma=config.gamma,
+            outcome_rewards=self._once("rewards", config, WORLD, lambda: _drawn_rewards(task)),
+            chance=chance,
+            staying=self._once("staying", config, WORLD, lambda: _staying(task)) if chance.lazy else None,
+        )
+        return Member(place, config, folder, task, chosen, run, (key, group_key(config.agent, run, self.device)))
+
+    def _once(self, what: str, config: RunConfig, names: Sequence[str], make: Callable[[], T]) -> T:
+        entry = config.to_dict()
+        key = json.dumps([what, *(entry.get(name) for name in names)], sort_keys=True)
+        if key not in self.made:
+            self.made[key] = make()
+        return self.made[key]
+
+
+def _staying(task: Task) -> np.ndarray:
+    """(S, A) what an action without effect pays."""
+    from pharos.mdp import rewards_of_staying
+
+    return rewards_of_staying(task.space).array.astype(float)
+
+
+def _drawn_rewards(task: Task) -> np.ndarray | None:
+    """What each outcome pays where the rules have chance; None where rewards belong to pairs."""
+    from pharos.mdp import rewards_of_outcomes
+
+    return rewards_of_outcomes(task.space) if task.space.has_chance else None
+
+
+# Learners -------------------------------------------------------------------------------------------------------------
+
 
 AtPoint = Callable[[int], Mapping[str, Any] | None]
 """at_point(steps) -> row of the curve of the first run, which TensorBoard shows."""
@@ -40,7 +223,7 @@ class Learner(Protocol):
     def learn(self, points: Sequence[int], at_point: AtPoint) -> None:
         """Go on until the last of `points`, and call `at_point` at each."""
 
-    def policy(self, i: int) -> Any:
+    def policy(self, i: int) -> PolicyLike:
         """What run i has learnt, as `evaluate_agent` takes it."""
 
     def greedy_actions(self, places: Sequence[int]) -> dict[int, np.ndarray] | None:
@@ -56,7 +239,7 @@ class Learner(Protocol):
         """Write what run i has learnt into its folder, as `load_agent` reads it."""
 
 
-def make_learner(members: "Sequence[Member]", device: str = "cpu", logs: Path | None = None) -> Learner:
+def make_learner(members: Sequence[Member], device: str = "cpu", logs: Path | None = None) -> Learner:
     """The learner of runs that fit together.
 
     Args:
@@ -134,18 +317,18 @@ class Tables(_Arrays):
 class Networks(_Arrays):
     """A batch of the batched engine."""
 
-    def __init__(self, batch: Any):
+    def __init__(self, batch: "Batch"):
         self.batch = batch
         self.learn, self.policy, self.best_actions = batch.learn, batch.policy, batch.best_actions
         self.greedy_actions, self.state, self.restore = batch.greedy_actions, batch.state, batch.restore
 
     @property
     def episodes(self) -> np.ndarray:
-        return self.batch.episodes  # type: ignore[no-any-return]
+        return self.batch.episodes
 
     @property
     def returns(self) -> np.ndarray:
-        return self.batch.returns  # type: ignore[no-any-return]
+        return self.batch.returns
 
     def publish(self, i: int, folder: Path) -> None:
         """The network, as `Deep` reads it, with the names of parameters in the policy of Stable-Baselines3."""
@@ -284,14 +467,14 @@ def _said_to_be_damaged(folder: Path) -> Iterator[None]:
 _COUNTERS = ("num_timesteps", "_n_updates", "_n_calls", "_episode_num")
 
 
-def vector_environment(task: Task, num_envs: int, seed: int) -> Any:
+def vector_environment(task: Task, num_envs: int, seed: int) -> "SB3VecEnv":
     """The environment of a task for Stable-Baselines3, all copies advanced by one compiled call."""
     from pharos.interaction import make_sb3_vec
 
     return make_sb3_vec(task.env, num_envs, seed=seed, **task.interaction)
 
 
-def _buffer_arrays(buffer: Any) -> dict[str, np.ndarray]:
+def _buffer_arrays(buffer: "ReplayBuffer") -> dict[str, np.ndarray]:
     """The filled part of a replay buffer."""
     size = buffer.buffer_size if buffer.full else buffer.pos
     arrays = {"place": np.array([buffer.pos, int(buffer.full)])}
@@ -304,9 +487,9 @@ def _buffer_arrays(buffer: Any) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _restore_buffer(buffer: Any, arrays: Any) -> None:
+def _restore_buffer(buffer: "ReplayBuffer", arrays: Mapping[str, np.ndarray]) -> None:
     buffer.pos, buffer.full = int(arrays["place"][0]), bool(arrays["place"][1])
-    for name in arrays.files:
+    for name in arrays:
         if name == "place":
             continue
         owner, slash, key = name.partition("/")

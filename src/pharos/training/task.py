@@ -11,6 +11,7 @@ import numpy as np
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError
 from pharos.mdp import ChanceSetting, TabularMDP
+from pharos.observations import OwnObservation
 from pharos.policies import ReachableRows, Sight, reachable_rows
 from pharos.solvers import ReferenceValues, Solution, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
@@ -66,7 +67,7 @@ class Task:
 
     env: Environment
     chance: ChanceSetting = ChanceSetting()
-    observation: Any = "vector"
+    observation: OwnObservation | str = "vector"
     observation_options: Mapping[str, Any] = field(default_factory=dict)
     previous_action: bool = False
     gamma: float = 1.0

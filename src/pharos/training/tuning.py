@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,14 +32,17 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, FolderLocked, MissingExtra, ParameterError
 from pharos.mdp import ChanceSetting
-from pharos.observations import own_observation
+from pharos.observations import OwnObservation, own_observation
 from pharos.system import storage
 from pharos.system.wording import many
 from pharos.training import results as _results
 from pharos.training.batch import Progress, train_configs
 from pharos.training.config import RunConfig, run_id
+from pharos.training.learners import FailedRun, TaskCache
 from pharos.training.task import Task
-from pharos.training.task_cache import FailedRun, TaskCache
+
+if TYPE_CHECKING:
+    import optuna
 
 EVALUATIONS = 20  # of a run
 JOURNAL = "journal.log"
@@ -232,7 +235,7 @@ class _Search:
         return str(self._observed)
 
     @cached_property
-    def _observed(self) -> Any:
+    def _observed(self) -> OwnObservation | str:
         requested = agent_kind(self.agent).observation(self.observation)
         return own_observation(requested) or requested
 
@@ -274,11 +277,11 @@ class _Search:
                     f"{task.env}: acting at random is optimal, so regret cannot be normalised; leave it out"
                 )
 
-    def proposal(self, trial: Any) -> dict[str, Any]:
+    def proposal(self, trial: "optuna.Trial") -> dict[str, object]:
         """The hyperparameters that Optuna's trial proposes."""
         return {key: suggested_value(trial, key, choices) for key, choices in self.space.items()}
 
-    def score(self, trial: Any, pruned: type[Exception]) -> float:
+    def score(self, trial: "optuna.Trial", pruned: type[Exception]) -> float:
         """The mean normalised regret of evaluations after the first, over all runs; `pruned` is raised on the way."""
         chosen = self.proposal(trial)
         configs: list[RunConfig] = []
@@ -332,7 +335,7 @@ def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dic
     return {name: tuple(choices) for name, choices in searched.items()}
 
 
-def suggested_value(trial: Any, name: str, choices: tuple[Any, ...]) -> Any:
+def suggested_value(trial: "optuna.Trial", name: str, choices: tuple[Any, ...]) -> object:
     """The value that Optuna's trial takes."""
     kind, *values = choices
     if kind == "one of":
@@ -340,7 +343,7 @@ def suggested_value(trial: Any, name: str, choices: tuple[Any, ...]) -> Any:
     return trial.suggest_float(name, *values, log=kind == "log")
 
 
-def _default_value(agent: str, name: str) -> Any:
+def _default_value(agent: str, name: str) -> object:
     """What the agent itself takes for a hyperparameter that the table leaves out; None: it says nothing."""
     if agent_kind(agent).is_tabular:
         return Q_LEARNING_DEFAULTS.get(name)
@@ -356,7 +359,7 @@ def _allows(choices: tuple[Any, ...], value: object) -> bool:
     return isinstance(value, int | float) and values[0] <= value <= values[1]
 
 
-def _study(optuna: ModuleType, search: _Search, records: Sequence[Mapping[str, Any]]) -> Any:
+def _study(optuna: ModuleType, search: _Search, records: Sequence[Mapping[str, Any]]) -> "optuna.Study":
     """Optuna's study with the trials that are over; its first trial is what the table says."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # what fails is raised
     pruner = optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=10)
@@ -398,7 +401,9 @@ def _most_promising(
     return min(proposals, key=lambda proposal: predicted({**search.table, **proposal}))
 
 
-def _sampler(optuna: ModuleType, search: _Search, done: int, trials: int, *number: int) -> Any:
+def _sampler(
+    optuna: ModuleType, search: _Search, done: int, trials: int, *number: int
+) -> "optuna.samplers.BaseSampler":
     """What proposes the next trial, from those that are done: a search that was killed goes on as it would have."""
     seed = int(np.random.SeedSequence([search.search_seed, done, *number]).generate_state(1)[0])
     return optuna.samplers.TPESampler(
@@ -480,7 +485,7 @@ def _write(folder: Path, search: _Search, trials: Sequence[dict[str, Any]]) -> N
     (folder / JOURNAL).unlink(missing_ok=True)
 
 
-def _record(trial: Any) -> dict[str, Any]:
+def _record(trial: "optuna.trial.FrozenTrial") -> dict[str, Any]:
     """A trial that is over, as tuning.json keeps it."""
     return {
         "number": trial.number,

@@ -11,14 +11,17 @@ from pharos.validation.learners import (
 )
 from pharos.validation.leave_one_class_out import OUTCOMES, Cells, outcomes, unseen_classes
 from pharos.validation.prediction import (
+    PredictedCells,
     PredictedRegret,
     Prediction,
+    Predictions,
     Published,
     predict,
     published,
+    read_predictions,
     regret_predictor,
+    write_predictions,
 )
-from pharos.validation.prediction_files import PredictedCells, Predictions, read_predictions, write_predictions
 
 __all__ = [
     "Prediction",

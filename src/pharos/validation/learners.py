@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
     from pharos.training import Task
 
+Network = str | Callable[[tuple[int, ...]], Any]
+"""A name, or a function of the shape of an input: `pharos.observations.representation`."""
 MEASURES = ("kernel_regret", "kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time")
 PREDICTORS = (
     *("kernel_regret", "kernel_regret_played", "adam_regret", "adam_regret_played"),
@@ -93,7 +95,7 @@ def own_measures() -> list[str]:
     return [name for name, measure in measures().items() if not measure.function.__module__.startswith("pharos.")]
 
 
-def _options(task: "Task", network: Any, initialisation: str, landmarks: int | None = None) -> dict[str, Any]:
+def _options(task: "Task", network: Network, initialisation: str, landmarks: int | None = None) -> dict[str, Any]:
     """Options of `pharos.hardness.report` that measure a network's representation of a task's observation."""
     from pharos.observations import representation
 
@@ -143,7 +145,10 @@ class PrimaryRegret:
 
 
 def primary_regret(
-    config: Mapping[str, Any], task: "Task", network: Any = None, landmarks: int | None = None
+    config: Mapping[str, Any],
+    task: "Task",
+    network: Network | None = None,
+    landmarks: int | None = None,
 ) -> tuple[PrimaryRegret, str]:
     """Return the regret of a run's idealised learner by PRIMARY, and the name of the network.
 
@@ -158,7 +163,8 @@ def primary_regret(
     from pharos.hardness import report
 
     agent = config["agent"]
-    name, initialisation = network_of(config, task)
+    own_network, initialisation = network_of(config, task)
+    name: Network = own_network
     if network is not None:
         name = f"{network}+tanh" if isinstance(network, str) and agent != "dqn" and _is_named(network) else network
     options = _options(task, name, initialisation, landmarks)
@@ -245,7 +251,7 @@ def _curve(regret: Mapping[str, Any], of: str = "greedy") -> str:
     )
 
 
-def network_of(config: Mapping[str, Any], task: Any) -> tuple[str, str]:
+def network_of(config: Mapping[str, Any], task: "Task") -> tuple[str, str]:
     """The name and the initialisation of the network of an agent of pharos."""
     from pharos.observations import default_network, observe
 

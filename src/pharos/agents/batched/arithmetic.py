@@ -1,17 +1,94 @@
-"""Losses, their gradients and Adam, in two ways: compiled loops on the processor, tensor operations elsewhere.
+"""What W runs compute on a device: pinned buffers and recorded CUDA graphs; losses, their gradients and Adam.
 
-Both take and give tensors; the loops see them as arrays. What they compute is in kernels/batched.py. Tensor operations
-wait for nothing, so that a GPU can record them.
+The arithmetic is there in two ways: compiled loops on the processor, tensor operations elsewhere. Both take and give
+tensors; the loops see them as arrays. What they compute is in kernels/batched.py.
+Tensor operations wait for nothing, so that a GPU can record them.
 """
 
-from typing import Any
+import warnings
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pharos.agents.batched.device_buffers import PinnedBuffer, is_gpu
 from pharos.kernels import batched as kernels
+
+
+class PinnedBuffer:
+    """An array of the processor's, and the tensor on a device that it is sent to or fetched from.
+
+    On the processor both are one. Elsewhere the array lies where a GPU can reach it, so that neither waits; whoever
+    writes into it, or reads from it, waits for the device first (`wait`).
+
+    Attributes:
+        array: on the processor.
+        tensor: on the device.
+    """
+
+    def __init__(self, shape: tuple[int, ...], dtype: torch.dtype, device: str):
+        self._kept = torch.zeros(shape, dtype=dtype, pin_memory=is_gpu(device))
+        self.array: np.ndarray = self._kept.numpy()
+        self.tensor = self._kept if device == "cpu" else torch.zeros(shape, dtype=dtype, device=device)
+
+    def send(self) -> None:
+        """Copy the array to the device."""
+        if self.tensor is not self._kept:
+            self.tensor.copy_(self._kept, non_blocking=True)
+
+    def fetch(self) -> None:
+        """Copy the tensor back."""
+        if self.tensor is not self._kept:
+            self._kept.copy_(self.tensor, non_blocking=True)
+
+
+class CudaGraph:
+    """Operations on tensors that stay in their places. A GPU records them, and runs them as one launch.
+
+    The first call runs them one by one, which also takes all the room that they need; the second one records them.
+    Where that fails they are run one by one, with a warning, as recording changes no result.
+    """
+
+    def __init__(self, operations: Callable[[], None], device: str):
+        self._operations, self._is_recorded = operations, is_gpu(device)
+        self._has_run = False
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self) -> None:
+        if self._graph is not None:
+            self._graph.replay()
+        elif self._is_recorded and self._has_run and self._record():
+            self()
+        else:
+            self._operations()
+            self._has_run = True
+
+    def _record(self) -> bool:
+        graph = torch.cuda.CUDAGraph()
+        try:
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                self._operations()
+        except RuntimeError as error:
+            self._is_recorded = False
+            reason = (str(error).splitlines() or [""])[0]
+            warnings.warn(f"the GPU does not record the updates, which are slower so: {reason}", stacklevel=2)
+            return False
+        self._graph = graph
+        return True
+
+
+def is_gpu(device: str) -> bool:
+    """Whether a device of torch records programs."""
+    return torch.device(device).type == "cuda"
+
+
+def wait(device: str) -> None:
+    """Until the device has done what it was told."""
+    if is_gpu(device):
+        torch.cuda.current_stream().synchronize()
+
+
+# Losses and Adam ------------------------------------------------------------------------------------------------------
 
 
 class CompiledArithmetic:
@@ -19,10 +96,10 @@ class CompiledArithmetic:
 
     def __init__(self, device: str, width: int):
         self.device = device
-        self._steps: Any = None  # what the next step of Adam takes
+        self._steps: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float] | None = None  # of the next `adam`
 
     def huber(
-        self, q: Tensor, q_next: Tensor, q_choice: Tensor, minibatch: Any, dq: Tensor, loss: PinnedBuffer
+        self, q: Tensor, q_next: Tensor, q_choice: Tensor, minibatch: Sequence[Tensor], dq: Tensor, loss: PinnedBuffer
     ) -> None:
         """The loss of DQN (W,) and its gradient; minibatch: (actions, rewards, discounts) (W, B)."""
         q_arrays = q.numpy(), q_next.numpy(), q_choice.numpy()
@@ -30,8 +107,8 @@ class CompiledArithmetic:
         kernels.huber(*q_arrays, actions, rewards, discounts, dq.numpy(), loss.array)
 
     def clipped_loss(
-        self, scores: Tensor, values: Tensor, minibatch: Any, weights: Any, gradients: Any, loss: PinnedBuffer,
-        divergence: PinnedBuffer,
+        self, scores: Tensor, values: Tensor, minibatch: Sequence[Tensor], weights: Sequence[Tensor],
+        gradients: Sequence[Tensor], loss: PinnedBuffer, divergence: PinnedBuffer,
     ) -> None:  # fmt: skip
         """The loss of PPO and its gradients; minibatch: (actions, old log p, advantages, returns) (W, B).
 
@@ -45,7 +122,9 @@ class CompiledArithmetic:
         written = (*(gradient.numpy() for gradient in gradients), loss.array, divergence.array)
         kernels.clipped_loss(scores.numpy(), values.numpy(), arrays, *own, *written)
 
-    def plan(self, counts: np.ndarray, is_active: np.ndarray, rates: Any, max_norms: Any, eps: float) -> None:
+    def plan(
+        self, counts: np.ndarray, is_active: np.ndarray, rates: np.ndarray, max_norms: np.ndarray, eps: float
+    ) -> None:
         """Say what the next `adam` does: a step for the active runs (W,), which `counts` (W,) goes up for.
 
         Args:
@@ -53,9 +132,11 @@ class CompiledArithmetic:
         """
         self._steps = counts, is_active, rates, max_norms, eps
 
-    def adam(self, state: Any) -> None:
+    def adam(self, state: Sequence[Tensor]) -> None:
         """The step that was planned; state: (parameters, gradients, means, squares), (W, P) each."""
-        kernels.adam(*(tensor.numpy() for tensor in state), *self._steps)
+        assert self._steps is not None
+        parameters, gradients, means, squares = (tensor.numpy() for tensor in state)
+        kernels.adam(parameters, gradients, means, squares, *self._steps)
 
 
 class TensorArithmetic(CompiledArithmetic):
@@ -67,7 +148,7 @@ class TensorArithmetic(CompiledArithmetic):
         self._fused = fused_adam() if is_gpu(device) else None
 
     def huber(
-        self, q: Tensor, q_next: Tensor, q_choice: Tensor, minibatch: Any, dq: Tensor, loss: PinnedBuffer
+        self, q: Tensor, q_next: Tensor, q_choice: Tensor, minibatch: Sequence[Tensor], dq: Tensor, loss: PinnedBuffer
     ) -> None:
         """See `CompiledArithmetic`."""
         actions, rewards, discounts = minibatch
@@ -80,8 +161,8 @@ class TensorArithmetic(CompiledArithmetic):
         dq.zero_().scatter_(2, actions[..., None], (difference.clamp(-1.0, 1.0) / q.shape[1])[..., None])
 
     def clipped_loss(
-        self, scores: Tensor, values: Tensor, minibatch: Any, weights: Any, gradients: Any, loss: PinnedBuffer,
-        divergence: PinnedBuffer,
+        self, scores: Tensor, values: Tensor, minibatch: Sequence[Tensor], weights: Sequence[Tensor],
+        gradients: Sequence[Tensor], loss: PinnedBuffer, divergence: PinnedBuffer,
     ) -> None:  # fmt: skip
         """See `CompiledArithmetic`."""
         actions, old, advantages, returns = minibatch
@@ -105,7 +186,9 @@ class TensorArithmetic(CompiledArithmetic):
         dscores.add_(of_log_p * (chosen - p))
         dvalues.copy_((2.0 * of_value * error / number)[..., None])
 
-    def plan(self, counts: np.ndarray, is_active: np.ndarray, rates: Any, max_norms: Any, eps: float) -> None:
+    def plan(
+        self, counts: np.ndarray, is_active: np.ndarray, rates: np.ndarray, max_norms: np.ndarray, eps: float
+    ) -> None:
         """See `CompiledArithmetic`."""
         counts += is_active
         steps = np.maximum(counts, 1)
@@ -115,7 +198,7 @@ class TensorArithmetic(CompiledArithmetic):
         for row, values in zip(self._planned.array, rows, strict=True):
             row[:, 0] = values
 
-    def adam(self, state: Any) -> None:
+    def adam(self, state: Sequence[Tensor]) -> None:
         """See `CompiledArithmetic`."""
         parameters, gradients, means, squares = state
         self._planned.send()
@@ -131,10 +214,10 @@ class TensorArithmetic(CompiledArithmetic):
         parameters.sub_((means * step).div_(squares.sqrt().add_(eps)))
 
 
-def fused_adam() -> Any:
+def fused_adam() -> Callable[[Sequence[Tensor], Tensor], None] | None:
     """Adam in one pass over a GPU's memory, by Triton, which torch for CUDA brings along; None where it does not."""
     try:
-        from pharos.agents.batched.fused import adam
+        from pharos.agents.batched import fused
     except ImportError:
         return None
-    return adam
+    return fused.adam

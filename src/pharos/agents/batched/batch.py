@@ -5,12 +5,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from pharos.agents.batched.device_buffers import is_gpu
+from pharos.agents.batched.arithmetic import is_gpu
 from pharos.agents.batched.dqn import DQNLane
 from pharos.agents.batched.lane import Lane, RunPolicy
 from pharos.agents.batched.ppo import PPOLane
 from pharos.agents.batched.runs import BatchRun, group_key, lane_width, lane_widths
-from pharos.agents.states import joined_states, state_of
+from pharos.agents.deep import joined_states, state_of
 from pharos.errors import ParameterError
 
 LANES: dict[str, type[Lane]] = {"dqn": DQNLane, "ppo": PPOLane}
@@ -54,7 +54,7 @@ class Batch:
         """(N,) float64, the sums of the returns of finished episodes."""
         return np.concatenate([lane.worlds.returns[: lane.number] for lane in self.lanes])
 
-    def learn(self, points: Sequence[int], at_point: Callable[[int], None]) -> None:
+    def learn(self, points: Sequence[int], at_point: Callable[[int], object]) -> None:
         """Go on from `steps`, and call `at_point` at each of the points.
 
         As in Stable-Baselines3's callbacks that is before the update that is due then; at the last step of the

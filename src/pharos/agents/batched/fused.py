@@ -1,6 +1,6 @@
 """Adam in one pass over a GPU's memory. Tensor operations read and write moments and parameters some twenty times."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import triton
 import triton.language as tl
@@ -31,7 +31,7 @@ def step_of_adam(parameters, gradients, means, squares, plans, length, size: tl.
         tl.store(parameters + place, old - step * mean / (tl.sqrt(square) + eps), mask=inside)
 
 
-def adam(state: Any, plans: Tensor) -> None:
+def adam(state: Sequence[Tensor], plans: Tensor) -> None:
     """A step for each run whose step is not 0; state: (parameters, gradients, means, squares) (W, P), plans (W, 5)."""
     width, length = state[0].shape
     step_of_adam[(width, triton.cdiv(length, BLOCK))](*state, plans, length, BLOCK)

@@ -1,31 +1,345 @@
-"""The networks of agents/deep.py with the heads that Stable-Baselines3 puts on them, for W runs at once."""
+"""W networks of one shape as one: those of agents/deep.py, with the heads that Stable-Baselines3 puts on them.
+
+Layers have parameters with a leading axis of runs, and their gradients are written out.
+
+Parameters of all runs lie in one (W, P) array and their gradients in another, so that clipping and Adam are one pass
+over each. Weights of linear layers are kept (in, out), the transpose of Stable-Baselines3's, which multiplies faster.
+"""
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from pharos.agents.batched.layers import (
-    NONE,
-    RELU,
-    TANH,
-    Convolution,
-    Layer,
-    Linear,
-    Parameters,
-    PatchConvolution,
-    Stack,
-    Values,
-)
 from pharos.agents.batched.runs import is_small
+from pharos.kernels.batched import linear_row
 
+ALIGNED = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
+RELU, TANH, NONE = "relu", "tanh", "none"
+ROWS = "all parameters"
+MASK = "which pixels there are"
+KERNEL, FILTERS = 3, 16  # of the small convolution
 FEATURES = 128
-FILTERS = 16
 
+Values = dict[str, Tensor]
+NetArch = Sequence[int] | dict[str, Sequence[int]]
 Draws = Callable[[int], np.ndarray]
 """number of draws -> (W, number) uniform in (0, 1)."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One parameter.
+
+    Attributes:
+        name: in Stable-Baselines3.
+        shape: of one run's, here.
+        offset: where it begins in a row of parameters.
+        fan_in: of the layer.
+        stored: (shape) -> the array as Stable-Baselines3 has it.
+        own: the array as Stable-Baselines3 has it -> as it is kept here.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    offset: int
+    fan_in: int
+    stored: Callable[[np.ndarray], np.ndarray]
+    own: Callable[[np.ndarray], np.ndarray]
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape)
+
+
+class Parameters:
+    """The places of all parameters of a network in a row of P numbers.
+
+    Attributes:
+        shapes: in their order.
+        length: P.
+    """
+
+    def __init__(self) -> None:
+        self.shapes: list[Shape] = []
+        self.length = 0
+
+    def add(
+        self,
+        name: str,
+        shape: tuple[int, ...],
+        fan_in: int,
+        stored: Callable[[np.ndarray], np.ndarray],
+        own: Callable[[np.ndarray], np.ndarray],
+    ) -> None:
+        """Make room for one more."""
+        self.shapes.append(Shape(name, shape, self.length, fan_in, stored, own))
+        self.length += -(-self.shapes[-1].size // ALIGNED) * ALIGNED
+
+    def views(self, rows: Tensor) -> Values:
+        """name -> (W, ...) view of (W, P); all of it under the name ROWS."""
+        views = {
+            each.name: rows[:, each.offset : each.offset + each.size].view(len(rows), *each.shape)
+            for each in self.shapes
+        }
+        return {**views, ROWS: rows}
+
+
+def room(width: int, *shape: int, device: str | torch.device | None = None) -> Tensor:
+    """(W, ...) float32 whose runs begin at multiples of 64 bytes, so that a run's place changes nothing."""
+    size = math.prod(shape)
+    rows = torch.zeros((width, -(-size // ALIGNED) * ALIGNED), device=device)
+    return rows[:, :size].view(width, *shape)
+
+
+def whole(y: Tensor) -> Tensor:
+    """All the memory of a `room`, in which each run has a multiple of 64 bytes: none is at a loop's ragged end."""
+    return y.as_strided((y.shape[0], y.stride(0)), (y.stride(0), 1))
+
+
+class Layer:
+    """x (W, B, in) -> (W, B, out); keeps room for the results of each number of rows until it is called again."""
+
+    def __init__(self, name: str, inputs: int, outputs: int, activation: str):
+        self.name, self.inputs, self.outputs, self.activation = name, inputs, outputs, activation
+        self._rooms: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
+
+    def forward(self, values: Values, x: Tensor) -> Tensor:
+        """The outputs."""
+        raise NotImplementedError
+
+    def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> Tensor | None:
+        """Write the gradients of the parameters, after `forward` of x; return that of x where it goes `onward`."""
+        raise NotImplementedError
+
+    def _room(self, x: Tensor, *, onward: bool = False) -> tuple[Tensor, Tensor]:
+        """Room for y and for the gradient of x."""
+        key = (x.shape[0], x.shape[1])
+        y, dx = self._rooms.get(key, (None, None))
+        if y is None:
+            y = room(*key, self.outputs, device=x.device)
+        if dx is None or (onward and not dx.numel()):
+            dx = room(*key, self.inputs, device=x.device) if onward else y[:0]
+        self._rooms[key] = y, dx
+        return y, dx
+
+    def _activate(self, y: Tensor) -> None:
+        if self.activation == RELU:
+            y.clamp_(min=0.0)
+        elif self.activation == TANH:
+            whole(y).tanh_()
+
+    def _before_activation(self, dy: Tensor, y: Tensor) -> Tensor:
+        """The gradient before the activation, in the place of dy."""
+        if self.activation == RELU:
+            return torch.ops.aten.threshold_backward.grad_input(dy, y, 0, grad_input=dy)
+        if self.activation == TANH:
+            return torch.ops.aten.tanh_backward.grad_input(dy, y, grad_input=dy)
+        return dy
+
+
+class Linear(Layer):
+    """y = activation(x w + b).
+
+    Args:
+        pixels: where the inputs are `pixels` places of a picture with all channels each; Stable-Baselines3 has the
+            channels outside.
+    """
+
+    def __init__(
+        self, parameters: Parameters, name: str, inputs: int, outputs: int, activation: str, *, pixels: int = 1
+    ):
+        super().__init__(name, inputs, outputs, activation)
+        channels = inputs // pixels
+
+        def stored(w: np.ndarray) -> np.ndarray:
+            return w.reshape(pixels, channels, outputs).transpose(2, 1, 0).reshape(outputs, inputs)
+
+        def own(w: np.ndarray) -> np.ndarray:
+            return w.reshape(outputs, channels, pixels).transpose(2, 1, 0).reshape(inputs, outputs)
+
+        parameters.add(f"{name}.weight", (inputs, outputs), inputs, stored, own)
+        parameters.add(f"{name}.bias", (1, outputs), inputs, np.ravel, np.atleast_2d)
+        self._offsets = tuple(each.offset for each in parameters.shapes[-2:])
+
+    def forward(self, values: Values, x: Tensor) -> Tensor:
+        """The outputs."""
+        y, _ = self._room(x)
+        if x.shape[1] == 1 and x.device.type == "cpu" and self.activation != TANH:
+            # to act once is to read all weights; those of inputs that a ReLU made 0 need not be
+            rows = values[ROWS].numpy()
+            weight, bias = self._offsets
+            linear_row(rows, weight, bias, x[:, 0].numpy(), self.activation == RELU, y[:, 0].numpy())
+            return y
+        torch.baddbmm(values[f"{self.name}.bias"], x, values[f"{self.name}.weight"], out=y)
+        self._activate(y)
+        return y
+
+    def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> Tensor | None:
+        """See `Layer`."""
+        y, dx = self._room(x, onward=onward)
+        dy = self._before_activation(dy, y)
+        torch.sum(dy, 1, keepdim=True, out=gradients[f"{self.name}.bias"])
+        torch.bmm(x.transpose(1, 2), dy, out=gradients[f"{self.name}.weight"])
+        return torch.bmm(dy, values[f"{self.name}.weight"].transpose(1, 2), out=dx) if onward else None
+
+
+class PatchConvolution(Layer):
+    """A convolution of 3 x 3 with padding as one product: x holds the 9 C neighbours of each pixel, from 0 to 255.
+
+    They come out of a table, so that nothing is unfolded here; 1 / 255 is a factor of the weights. y is (W, B, pixels
+    x filters). Runs whose pictures are smaller than those of others in their lane have a mask (W, pixels) among the
+    values, which keeps what is no pixel of theirs at 0.
+    """
+
+    def __init__(self, parameters: Parameters, name: str, shape: tuple[int, ...], filters: int):
+        channels, height, width = shape
+        self.pixels, self.neighbours, self.filters = height * width, channels * KERNEL**2, filters
+        super().__init__(name, self.pixels * self.neighbours, self.pixels * filters, RELU)
+        outside = (filters, channels, KERNEL, KERNEL)
+        parameters.add(
+            f"{name}.weight",
+            (self.neighbours, filters),
+            self.neighbours,
+            lambda w: w.T.reshape(outside),
+            lambda w: w.reshape(filters, -1).T,
+        )
+        parameters.add(f"{name}.bias", (1, filters), self.neighbours, np.ravel, np.atleast_2d)
+
+    def forward(self, values: Values, x: Tensor) -> Tensor:
+        """The outputs."""
+        y, _ = self._room(x)
+        weights = values[f"{self.name}.weight"] * (1 / 255)
+        torch.baddbmm(values[f"{self.name}.bias"], self._rows(x), weights, out=self._rows(y))
+        self._activate(y)
+        if MASK in values:
+            y.view(*y.shape[:2], self.pixels, self.filters).mul_(values[MASK][:, None, :, None])
+        return y
+
+    def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
+        """See `Layer`; there is no gradient of the input."""
+        y, _ = self._room(x)
+        rows = self._rows(self._before_activation(dy, y))
+        torch.sum(rows, 1, keepdim=True, out=gradients[f"{self.name}.bias"])
+        gradient = gradients[f"{self.name}.weight"]
+        torch.bmm(self._rows(x).transpose(1, 2), rows, out=gradient).mul_(1 / 255)
+
+    def _rows(self, x: Tensor) -> Tensor:
+        return x.view(x.shape[0], x.shape[1] * self.pixels, -1)
+
+
+class Convolution(Layer):
+    """A strided convolution without padding; on the processor run by run, else as one grouped one.
+
+    Args:
+        shape: (C, H, W) of its inputs; scale: a factor of them.
+    Attributes:
+        shape_out: (filters, H, W).
+    """
+
+    def __init__(
+        self, parameters: Parameters, name: str, shape: tuple[int, ...], filters: int, kernel: int, stride: int,
+        scale: float = 1.0,
+    ):  # fmt: skip
+        channels, height, width = shape
+        self.shape_in, self.stride, self.scale = shape, stride, scale
+        self.shape_out = (filters, (height - kernel) // stride + 1, (width - kernel) // stride + 1)
+        super().__init__(name, math.prod(shape), math.prod(self.shape_out), RELU)
+        fan_in = channels * kernel**2
+
+        def same(w: np.ndarray) -> np.ndarray:
+            return w
+
+        parameters.add(f"{name}.weight", (filters, channels, kernel, kernel), fan_in, same, same)
+        parameters.add(f"{name}.bias", (1, filters), fan_in, np.ravel, np.atleast_2d)
+
+    def forward(self, values: Values, x: Tensor) -> Tensor:
+        """The outputs."""
+        y, _ = self._room(x)
+        weights, bias = values[f"{self.name}.weight"] * self.scale, values[f"{self.name}.bias"]
+        if is_one_by_one(x):
+            for i in range(len(x)):
+                images = x[i].view(-1, *self.shape_in)
+                y[i] = torch.nn.functional.conv2d(images, weights[i], bias[i, 0], self.stride).flatten(1)
+        else:
+            images = self._side_by_side(x, self.shape_in)
+            out = torch.nn.functional.conv2d(images, weights.flatten(0, 1), bias.flatten(), self.stride, groups=len(x))
+            y.copy_(self._apart(out, y))
+        self._activate(y)
+        return y
+
+    def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> Tensor | None:
+        """See `Layer`."""
+        y, dx = self._room(x, onward=onward)
+        dy = self._before_activation(dy, y)
+        if is_one_by_one(x):
+            for i in range(len(x)):
+                images, out = x[i].view(-1, *self.shape_in), dy[i].view(-1, *self.shape_out)
+                self._gradients(values, gradients, slice(i, i + 1), images, out, dx[i : i + 1] if onward else None)
+        else:
+            images, out = self._side_by_side(x, self.shape_in), self._side_by_side(dy, self.shape_out)
+            self._gradients(values, gradients, slice(None), images, out, dx if onward else None)
+        return dx if onward else None
+
+    def _gradients(
+        self, values: Values, gradients: Values, runs: slice, images: Tensor, out: Tensor, dx: Tensor | None
+    ) -> None:
+        """Write those of some runs, whose images (B, runs x C, H, W) and gradients of outputs are side by side."""
+        own = values[f"{self.name}.weight"][runs]
+        weights, steps = own.flatten(0, 1), [self.stride] * 2
+        of_x, of_weights, of_bias = torch.ops.aten.convolution_backward(
+            out, images, weights, [len(weights)], steps, [0, 0], [1, 1], False, [0, 0], len(own),
+            [dx is not None, True, True],
+        )  # fmt: skip
+        torch.mul(of_weights.view(own.shape), self.scale, out=gradients[f"{self.name}.weight"][runs])
+        gradients[f"{self.name}.bias"][runs, 0] = of_bias.view(len(own), -1)
+        if dx is not None:
+            dx.copy_(self._apart(of_x, dx))
+
+    @staticmethod
+    def _side_by_side(x: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """(B, W C, H, W') of (W, B, C H W')."""
+        return x.view(*x.shape[:2], *shape).transpose(0, 1).flatten(1, 2)
+
+    @staticmethod
+    def _apart(x: Tensor, like: Tensor) -> Tensor:
+        """The reverse, as a view: (W, B, C H W')."""
+        return x.reshape(like.shape[1], like.shape[0], -1).transpose(0, 1)
+
+
+def is_one_by_one(x: Tensor) -> bool:
+    """Whether convolutions go run by run, which is faster on the processor."""
+    return x.device.type == "cpu"
+
+
+class Stack:
+    """Layers one after another."""
+
+    def __init__(self, layers: Sequence[Layer]):
+        self.layers = list(layers)
+        self._inputs: list[Tensor] = []
+
+    def forward(self, values: Values, x: Tensor) -> Tensor:
+        """The outputs of the last layer."""
+        self._inputs = []
+        for layer in self.layers:
+            self._inputs.append(x)
+            x = layer.forward(values, x)
+        return x
+
+    def backward(self, values: Values, gradients: Values, dy: Tensor, *, onward: bool = False) -> Tensor:
+        """Write the gradients of all parameters, after `forward`; return that of the input where it goes `onward`."""
+        for i in range(len(self.layers) - 1, -1, -1):
+            dx = self.layers[i].backward(values, gradients, self._inputs[i], dy, onward=onward or i > 0)
+            dy = dy if dx is None else dx
+        return dy
+
+
+# Networks -------------------------------------------------------------------------------------------------------------
 
 
 def extractor(parameters: Parameters, name: str, shape: tuple[int, ...], is_image: bool) -> list[Layer]:
@@ -64,7 +378,7 @@ def hidden(parameters: Parameters, name: str, sizes: Sequence[int], activation: 
     return [Linear(parameters, f"{name}.{2 * i}", inputs[i], outputs, activation) for i, outputs in enumerate(sizes)]
 
 
-def sizes_of(net_arch: Any, head: str = "pi") -> list[int]:
+def sizes_of(net_arch: NetArch, head: str = "pi") -> list[int]:
     """The hidden layers of a head: net_arch is a list for all heads, or a dict of lists."""
     return list(net_arch.get(head, ())) if isinstance(net_arch, dict) else list(net_arch)
 
@@ -77,12 +391,31 @@ def names_of(name: str) -> list[str]:
     return [*extractors, *(each.replace(".layers.0.", ".convolutions.") for each in extractors if ".layers.0." in each)]
 
 
+class Network(Protocol):
+    """W networks of one shape, as a lane asks them.
+
+    Attributes:
+        parameters: their places. eps: of Adam.
+    """
+
+    parameters: Parameters
+    eps: float
+
+    def scores(self, values: Values, x: Tensor) -> Tensor:
+        """(W, B, A) scores of actions in observations (W, B, size)."""
+        ...
+
+    def initial(self, draws: Draws) -> np.ndarray:
+        """(W, P): the first parameters."""
+        ...
+
+
 class QNetworks:
     """A value for each action: `net_arch` hidden layers after the features. torch's own initialisation."""
 
     eps = 1e-8  # of Adam
 
-    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: object, num_actions: int):
+    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: NetArch, num_actions: int):
         self.parameters = parameters = Parameters()
         sizes = sizes_of(net_arch)
         layers = extractor(parameters, "q_net.features_extractor", shape, is_image)
@@ -112,7 +445,7 @@ class ActorCritics:
 
     eps = 1e-5
 
-    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: object, num_actions: int):
+    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: NetArch, num_actions: int):
         self.parameters = parameters = Parameters()
         self.trunk = Stack(extractor(parameters, "features_extractor", shape, is_image))
         actor, critic = sizes_of(net_arch, "pi"), sizes_of(net_arch, "vf")

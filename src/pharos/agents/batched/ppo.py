@@ -1,19 +1,20 @@
 """PPO of W runs at once (Schulman et al., 2017), as Stable-Baselines3 has it."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from pharos.agents.batched.device_buffers import CudaGraph, PinnedBuffer, wait
+from pharos.agents.batched.arithmetic import CudaGraph, PinnedBuffer, wait
 from pharos.agents.batched.lane import Lane
 from pharos.agents.batched.networks import ActorCritics
+from pharos.agents.batched.runs import BatchRun
 from pharos.kernels import batched as kernels
 
 WEIGHTS = ("clip_range", "ent_coef", "vf_coef")
 
 
-class PPOLane(Lane):
+class PPOLane(Lane[ActorCritics]):
     """W runs of PPO.
 
     Attributes:
@@ -28,7 +29,7 @@ class PPOLane(Lane):
 
     agent = "ppo"
 
-    def __init__(self, runs: Any, width: int, device: str = "cpu"):
+    def __init__(self, runs: Sequence[BatchRun], width: int, device: str = "cpu"):
         super().__init__(runs, width, device)
         shape = (width, int(self.shared["n_steps"]), self.copies)
         self.states, self.next_states = (np.zeros((*shape, *self.depth), np.int64) for _ in range(2))

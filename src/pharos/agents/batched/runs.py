@@ -155,7 +155,7 @@ class BatchRun:
     """
 
     mdp: TabularMDP
-    observe: Any
+    observe: ObservationSource
     time_limit: int
     hyperparameters: Mapping[str, Any]
     steps: int

@@ -27,7 +27,7 @@ from pharos.environments.mini_grid.canvas import (
 )
 from pharos.errors import ParameterError
 
-# The kinds ----------------------------------------------------------------------------------------------------------
+# The kinds ------------------------------------------------------------------------------------------------------------
 
 
 def _walled(width: int, height: int, seed: int | None) -> Canvas:
@@ -153,7 +153,7 @@ def key_corridor(size: int, rows: int, seed: int) -> Layout:
     return canvas.layout(ball)
 
 
-# A chain of rooms of random sizes -----------------------------------------------------------------------------------
+# A chain of rooms of random sizes -------------------------------------------------------------------------------------
 
 SMALLEST_ROOM, TRIES, CHAINS = 4, 8, 5_000
 MULTI_ROOM_SIDE = 25

@@ -4,16 +4,14 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pharos.plots import save_for_page, unseen_figures
-from pharos.study.curves import all_curves
-from pharos.study.figures import all_figures
-from pharos.study.latex import tables_of
+from pharos.study.figures import all_curves, all_figures, tables_of
+from pharos.study.report.model_sections import doubts, judged, unseen_section
 from pharos.study.report.page import render
 from pharos.study.report.results import Results, coefficients, results_of
 from pharos.study.report.sections import sections_of
-from pharos.study.report.unseen_section import doubts, judged, unseen_section
 from pharos.study.specification import Source
 from pharos.study.status import opened
 from pharos.system.storage import replace_file
@@ -136,7 +134,7 @@ def spreadsheet_safe(data: "pd.DataFrame") -> "pd.DataFrame":
     return safe
 
 
-def _no_formula(value: object) -> Any:
+def _no_formula(value: object) -> object:
     """Text that a spreadsheet would run gets an apostrophe, which spreadsheets take for "this is text"."""
     if not isinstance(value, str) or not value.startswith(FORMULA):
         return value

@@ -1,17 +1,23 @@
-"""The sections on models of regret, and on the agreement of agents."""
+"""The sections on models of regret, on the agreement of agents, and on classes that a predictor has not seen."""
 
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.plots import agent_name
+from pharos.errors import ParameterError
+from pharos.plots import agent_name, slug
 from pharos.study.analysis import REGRETS, Models, agreement, paper_agreement
 from pharos.study.figures import agents_figure
 from pharos.study.regression import Fit
-from pharos.study.report.page import Figures, image, table
+from pharos.study.report.page import Figures, Section, Table, image, table
 from pharos.study.report.results import Results, coefficients
-from pharos.study.report.section import Section
-from pharos.system.wording import many
+from pharos.system.wording import in_words, many
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from pharos.validation import PredictedCells
 
 
 def models_section(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
@@ -114,3 +120,218 @@ def agreement_section(results: Results, figures: Figures, left_out: list[str]) -
         lines=lines,
         figures=[each for each in drawn if each is not None],
     )
+
+
+# Classes that a predictor has not seen: tables, figures, and what the file of predictions says ------------------------
+
+
+FEW_PERMUTATIONS = 499
+
+
+def judged(results: Results, predictions: "PredictedCells | None") -> "tuple[pd.DataFrame | None, pd.DataFrame]":
+    """(statistics of predictors, or None where there are fewer than two classes; cells with outcomes).
+
+    Raises:
+        ParameterError: there are predictions, but of other cells, or of fewer than three classes.
+    """
+    from pharos.validation import outcomes, unseen_classes
+
+    cells = outcomes(results.runs, results.points)
+    if predictions is not None:
+        return unseen_classes(predictions.cells, cells, measures=results.hardness), cells
+    own = cells[cells["agent"].isin(results.agents)]
+    try:
+        judgement = unseen_classes(None, own, measures=results.hardness, least_classes=2, permutations=FEW_PERMUTATIONS)
+    except ParameterError:
+        return None, cells
+    return (judgement if len(judgement) else None), cells
+
+
+def unseen_section(
+    judgement: "pd.DataFrame",
+    results: Results,
+    predictions: "PredictedCells | None",
+    figures: Figures,
+) -> Section:
+    """What came true of predictors on classes, MDPs and observations; baselines beside."""
+    parts = []
+    for agent in dict.fromkeys(judgement["agent"]):
+        for outcome in dict.fromkeys(judgement["outcome"]):
+            rows = judgement[(judgement["agent"] == agent) & (judgement["outcome"] == outcome)]
+            rows = rows.sort_values("baseline", ascending=False, kind="stable")
+            if len(rows):
+                parts.append(_part(str(agent), str(outcome), rows, figures))
+    return Section.of(
+        "Unseen classes",
+        "unseen",
+        text=_text(judgement),
+        said=_said(results, predictions),
+        parts=parts,
+    )
+
+
+def _text(judgement: "pd.DataFrame") -> list[str]:
+    number = int(judgement["tests"].max())
+    return [
+        *winners(judgement),
+        "Does a number that is known before training predict regret on classes that it has not met? Each class is "
+        "predicted by a line through the others, classes weighing alike; baselines stand first, and a measure that "
+        "does not beat them says nothing that is new. R² below 0 is worse than the mean of all classes.",
+        f"{many(number, 'test')} in all; p-values are corrected for that number (Holm). Intervals are over classes "
+        "drawn anew, and permutations exchange whole classes: instances and observations of a class are not "
+        "independent. The floor is what 95 % of such permutations stay below; the ceiling is what noise over "
+        "seeds leaves.",
+    ]
+
+
+def winners(judgement: "pd.DataFrame") -> list[str]:
+    """A sentence for each agent: which predictor has the largest R2 on classes left out, and the best baseline."""
+    sentences = []
+    for agent, rows in judgement[judgement["outcome"] == "greedy"].groupby("agent", sort=False):
+        best = {
+            is_baseline: some.loc[some["r_squared"].idxmax()]
+            for is_baseline, some in rows.dropna(subset="r_squared").groupby("baseline")
+        }
+        if best:
+            said = [f"{best[key]['predictor']} (R² {best[key]['r_squared']:.2f})" for key in sorted(best)]
+            beside = f"; of the baselines {said[1]}" if len(said) > 1 else ""
+            sentences.append(f"{agent_name(str(agent))}: on classes left out {said[0]} predicts best{beside}.")
+    return sentences
+
+
+def _said(results: Results, predictions: "PredictedCells | None") -> list[str]:
+    """What files of predictions say of themselves, and whether they came first."""
+    if predictions is None:
+        return ["Without predictions (pharos study predict), of tabular measures alone."]
+    lines = [
+        f"Predictions written {about['date']} by pharos {about['version']}, sha256 {about['sha256']}."
+        for _, about in predictions.parts
+    ]
+    return [*lines, *(doubts(results, predictions) or ["All runs began after that."])]
+
+
+def doubts(results: Results, predictions: "PredictedCells") -> list[str]:
+    """Why predictions may be none: runs that had begun when they were written, or that do not say when they were."""
+    before, unknown = predictions.late(results.runs)
+    total, reasons = f"of {many(len(results.runs), 'run')}", []
+    if before:
+        reasons.append(f"not a prediction: {before:,} {total} had begun when the predictions were written")
+    if unknown:
+        reasons.append(f"{unknown:,} {total} do not say whether they began after the predictions were written")
+    return reasons
+
+
+def _part(agent: str, outcome: str, rows: "pd.DataFrame", figures: Figures) -> dict[str, Any]:
+    from pharos.validation import OUTCOMES
+
+    drawn = []
+    if outcome == "greedy":
+        texts = {
+            "predicted_by_class": "Regret against what was predicted for it when its class was left out; a point a "
+            "cell. On the dotted line the prediction was right.",
+            "observations_of_mdps": "The same MDP under its observations: regret of the agent (full) and as predicted "
+            "(hollow).",
+            "idealised_curves": "Regret of the learnt policy while learning: of the agent (full line, the mean over "
+            "seeds; of actor-critics the distribution over actions) and of the greedy policy of the idealised learner "
+            "(dashed), which was never trained.",
+        }
+        drawn = [image(figures, f"{name}_{slug(agent)}", text) for name, text in texts.items()]
+    return {
+        "title": f"{agent_name(agent)}: {OUTCOMES[outcome]}",
+        "tables": [each for each in (_left_out(rows), _within(rows), _mixed(rows)) if each is not None],
+        "figures": [each for each in drawn if each is not None],
+    }
+
+
+def _left_out(rows: "pd.DataFrame") -> Table:
+    import pandas as pd
+
+    shown = pd.DataFrame(
+        {
+            "predictor": [_name(row) for row in rows.to_dict("records")],
+            "cells": rows["cells"],
+            "classes": rows["classes"],
+            "R²": _with_interval(rows, "r_squared"),
+            "rho": _with_interval(rows, "rho"),
+            "floor of rho": rows["floor_rho"],
+            "p": [_p(value) for value in rows["p_rho_holm"]],
+            "R² of MDPs": rows["r_squared_mdp"],
+            "calibration": rows["calibration"],
+            "ceiling of R²": rows["ceiling"],
+        }
+    )
+    caption = (
+        "Classes left out one by one (R² of MDPs: instances one by one): R², Spearman's rho, with 95 % intervals; "
+        "calibration: slope of the outcome on what was predicted, 1 is perfect."
+    )
+    return table(shown, caption, digits=2)
+
+
+def _within(rows: "pd.DataFrame") -> Table | None:
+    import pandas as pd
+
+    rows = rows[(rows["pairs"] > 0) & rows["p_agreement"].notna() | rows["agreement_lower"].notna()]
+    if not len(rows):
+        return None
+    shown = pd.DataFrame(
+        {
+            "predictor": [_name(row) for row in rows.to_dict("records")],
+            "pairs": rows["pairs"],
+            "rightly ordered": _with_interval(rows, "agreement"),
+            "ceiling": rows["agreement_ceiling"],
+            "p": [_p(value) for value in rows["p_agreement_holm"]],
+            "image and vector": rows["image_pairs"],
+            "rightly ordered of these": rows["image_agreement"],
+            "rho within a class": rows["rho_within"],
+        }
+    )
+    caption = (
+        "Pairs of observations of one MDP whose outcomes differ by more than 0.05, and the share that is ordered "
+        "rightly. Tabular measures have no opinion, 0.5. Ceiling: what noise over seeds leaves. p: observations change "
+        "names, in all MDPs of a class alike."
+    )
+    return table(shown, caption, digits=2)
+
+
+def _mixed(rows: "pd.DataFrame") -> Table | None:
+    import pandas as pd
+
+    rows = rows[rows["slope"].notna()]
+    if not len(rows):
+        return None
+    shown = pd.DataFrame(
+        {
+            "predictor": [_name(row) for row in rows.to_dict("records")],
+            "slope": rows["slope"],
+            "error": rows["slope_error"],
+            "p": [_p(value) for value in rows["p_slope_holm"]],
+            "classes' share": rows["class_share"],
+            "MDPs' share": rows["mdp_share"],
+            "rho given tabular measures": _with_interval(rows, "given_tabular"),
+            "rho given the tabular learner": _with_interval(rows, "given_tabular_regret"),
+        }
+    )
+    caption = (
+        "Mixed models: slope of the standardised predictor, with random intercepts of classes and of MDPs, and their "
+        "shares of the variance that is left. Partial rank correlations, 95 % intervals over classes."
+    )
+    return table(shown, caption, digits=2)
+
+
+def _name(row: Mapping[str, Any]) -> str:
+    return f"{in_words(str(row['predictor']))}{', baseline' if row['baseline'] else ''}"
+
+
+def _with_interval(rows: "pd.DataFrame", name: str) -> list[str]:
+    """`0.61 (0.36 to 0.79)`."""
+    texts = []
+    for value, low, high in zip(rows[name], rows[f"{name}_lower"], rows[f"{name}_upper"], strict=True):
+        if not np.isfinite(value):
+            texts.append("–")
+        else:
+            texts.append(f"{value:.2f}" + (f" ({low:.2f} to {high:.2f})" if np.isfinite(low) else ""))
+    return texts
+
+
+def _p(value: float) -> str:
+    return "–" if not np.isfinite(value) else "< 0.001" if value < 0.001 else f"{value:.3f}"

@@ -1,4 +1,4 @@
-"""The HTML page: data as the templates want them, and the rendering. Templates escape whatever they print.
+"""The HTML page: its sections, data as the templates want them, and the rendering. Templates escape what they print.
 
 The page runs one script, its own (templates/page.js.j2), named by its digest: a browser runs no other and loads
 nothing.
@@ -7,8 +7,8 @@ nothing.
 import base64
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,11 +17,34 @@ from pharos.system.wording import in_words, templates
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pharos.study.report.sections import Section
-
 Figures = Mapping[str, Mapping[str, bytes] | None]
 # A column of texts up to this long is not broken over lines
 SHORT = 30
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of the page: its title, the template that prints it, and what that needs, by name."""
+
+    title: str
+    template: str
+    context: Mapping[str, Any] = field(default_factory=dict)
+
+    @staticmethod
+    def of(title: str, template: str, **context: object) -> "Section":
+        """The section that `template`.html.j2 prints with this context."""
+        return Section(title, f"{template}.html.j2", context)
+
+    @property
+    def anchor(self) -> str:
+        """Where links lead to."""
+        return self.title.lower().replace(" ", "-")
+
+    def __getitem__(self, name: str) -> object:
+        return self.context[name]
+
+
+# Tables and figures ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -55,7 +78,7 @@ class Image:
     curves: str = ""
 
 
-def render(title: str, description: str, sections: "Sequence[Section]") -> str:
+def render(title: str, description: str, sections: Sequence[Section]) -> str:
     """The page as text."""
     page = templates("pharos.study.report", "the report of a study")
     script = page.get_template("page.js.j2").render()

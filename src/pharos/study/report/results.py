@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.study.analysis import REGRETS, Comparison, Models, compare, intervals, models
 from pharos.study.findings import findings
-from pharos.study.profiles import aliasing_table, improvements, profiles, with_aliasing
 from pharos.study.specification import Specification
+from pharos.study.statistics import aliasing_table, improvements, profiles, with_aliasing
 from pharos.study.status import Status, duration, status
 from pharos.study.tables import cells, finished_runs, hardness_cost, hardness_table, paper_instance
 

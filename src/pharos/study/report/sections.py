@@ -13,13 +13,10 @@ from pharos.environments import start_distribution
 from pharos.errors import PharosError
 from pharos.plots import agent_name, slug
 from pharos.study.analysis import IMAGE, VECTOR
-from pharos.study.curves import label
-from pharos.study.figures import pairs_of, representations_figure
-from pharos.study.latex import returns_table
+from pharos.study.figures import label, pairs_of, representations_figure, returns_table
 from pharos.study.report.model_sections import agreement_section, models_section
-from pharos.study.report.page import Figures, data_url, image, table
+from pharos.study.report.page import Figures, Section, data_url, image, table
 from pharos.study.report.results import Results
-from pharos.study.report.section import Section
 from pharos.study.specification import Specification
 from pharos.study.status import duration
 from pharos.system.wording import in_words, many
