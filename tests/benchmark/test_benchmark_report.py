@@ -11,7 +11,16 @@ import pytest
 from pharos import benchmark
 from pharos.benchmark import AgentResults
 from pharos.benchmark.charts import element, frontier_text, shade
-from pharos.benchmark.contents import contents_of, residuals, sentence
+from pharos.benchmark.contents import (
+    contents_of,
+    description,
+    learning_curve,
+    learning_sentence,
+    number,
+    residuals,
+    sentence,
+    unclipped_regret,
+)
 from pharos.benchmark.latex import latex_of
 from pharos.benchmark.page import page
 from pharos.benchmark.scores import Interval
@@ -114,7 +123,7 @@ def test_an_agent_beside_itself_is_shown_to_differ_nowhere():
 
 def test_core_tasks_stand_beside_the_nearest_baseline_the_worst_first(contents):
     text = Elements(page(contents)).text.split("Core tasks beside ")[1]
-    assert text.startswith("DQN")  # apart by 0.1, 0.5, 0.1; PPO by 0.5, 0.8, 0.7
+    assert text.startswith("DQN") and "DQN is the nearest" in text  # apart by 0.1, 0.5, 0.1; PPO by 0.5, 0.8, 0.7
     order = [text.index(name) for name in ("hard", "easy", "odd")]
     assert order[0] < min(order[1:])
     assert "-0.50" in text and "+0.10" in text and "scores are 0.23 apart" in text
@@ -182,7 +191,7 @@ def test_results_of_few_seeds_and_tasks_are_preliminary():
     own = contents_of(own, beside=[results("dqn", DQN)], suite=SUITE)
     text = Elements(page(own)).text
     assert "Preliminary: 3 seeds, and 11 tasks without results; a result has 10 seeds and all tasks." in text
-    assert "the ladders were not run" in text and "Ladders" not in text
+    assert "The ladders were not run" in text and "Ladders" not in text
     assert "Preliminary" not in page(contents_of(results("a", MINE), beside=[], suite=SUITE))
 
 
@@ -257,3 +266,165 @@ def test_an_agent_keeps_its_colour_where_another_one_has_not_run():
     text = page(contents_of(own, beside=[first, second], suite=SUITE))
     chart = text.split('aria-label="exploration: scores of agents"')[1].split("</svg>")[0]
     assert re.findall(r'class="(f\d)"', chart) == ["f0", "f2"]
+
+
+CORE = ("easy", "hard", "odd")
+
+
+def learner(agent, curves, seeds=4, spread=0.01):
+    """Results on the core: a curve of regret for each task, and runs that differ a little."""
+    noise = spread * np.linspace(-1, 1, seeds)[:, None]
+    own = {name: np.array(curve) + noise for name, curve in zip(CORE, curves, strict=False)}
+    return AgentResults(agent, SUITE.name, SUITE.digest, tuple(range(seeds)), own)
+
+
+LATE = ((3.0, 1.5, 1.2, 0.9, 0.1), (1.0, 1.0, 1.0, 1.0, 0.2), (0.9, 0.5, 0.4, 0.2, 0.1))
+STEADY = ((0.3,) * 5, (0.2,) * 5, (0.1,) * 5)
+
+
+def test_the_learning_curve_is_the_mean_over_core_tasks_with_runs_clipped():
+    own = contents_of(learner("a", LATE, spread=0.0), beside=[results("dqn", DQN)], suite=SUITE)
+    values = [each.value for each in learning_curve(own.agent, CORE)]
+    assert values == pytest.approx([2.9 / 3, 2.5 / 3, 2.4 / 3, 2.1 / 3, 0.4 / 3])
+    assert [each.value for each in learning_curve(own.beside[0], CORE)] == pytest.approx([0.3] * 5)
+    text = page(own)
+    assert "200 steps: regret 0.97" in text and "1,000 steps: regret 0.13" in text
+    assert "1,000 steps: regret 0.30" in text and "Without" not in text
+
+
+def test_an_agent_that_lacks_a_task_has_no_learning_curve():
+    own = contents_of(learner("a", LATE), beside=[learner("dqn", STEADY[:2])], suite=SUITE)
+    assert learning_curve(own.beside[0], CORE) == []
+    assert "Without DQN, which did not run all of these." in page(own)
+
+
+@pytest.mark.parametrize(
+    ("curves", "text"),
+    [
+        (
+            LATE,  # means 1.34, 0.84, 0.42: the first is clipped
+            "Ends at a score of 0.87, averages 0.25: it learns late. At step 200 its policy is not shown to be better "
+            "than random play on 2 of 3 tasks, at the end on 0.",
+        ),
+        (STEADY, "Ends at a score of 0.80, averages 0.80."),
+        (tuple(curve[::-1] for curve in LATE[1:]), "Ends at a score of 0.05, averages 0.37: it ends worse than"),
+    ],
+)
+def test_the_sentence_on_learning_says_what_numbers_show(curves, text):
+    said = learning_sentence(contents_of(learner("a", curves), beside=[], suite=SUITE))
+    assert said.startswith(text) and ("late" in said) == ("late" in text)
+
+
+def test_late_learning_is_not_said_without_an_interval_that_shows_it():
+    curves = {name: np.array([[1.0, 1.0, 1.0, 1.0, end] for end in (0.0, 0.0, 0.9, 0.9)]) for name in ("easy",)}
+    for seeds, is_late in ((4, False), (2, True), (1, False)):
+        own = {name: curve[:seeds] for name, curve in curves.items()}
+        own = AgentResults("a", SUITE.name, SUITE.digest, tuple(range(seeds)), own)
+        assert ("late" in learning_sentence(contents_of(own, beside=[], suite=SUITE))) == is_late
+
+
+def test_residuals_say_the_regret_at_the_end():
+    own = learner("mine.py:DQN", ((1.0, 1.0, 0.5, 0.0, 0.0), (1.0,) * 5, (0.1,) * 5), spread=0.0)
+    section = page(contents_of(own, beside=[], suite=SUITE)).split("Residuals: ")[1].split("</section>")[0]
+    assert "near 0, the agent is slow; near 1, it never learns the task" in section
+    rows = [re.findall(r">([^<>]+)</(?:span|td)>", row) for row in section.split("<tr>")[2:]]
+    assert rows == [["hard", "1.00", "0.10", "+0.90", "1.00"], ["easy", "0.50", "0.10", "+0.40", "0.00"]]
+
+
+@pytest.mark.parametrize(("agent", "other"), [("f.py:PPO", "PPO"), ("f.py:A2C", "PPO"), ("f.py:learn", "DQN")])
+def test_core_tasks_stand_beside_the_baseline_of_the_same_kind(agent, other):
+    own = contents_of(results(agent, MINE), beside=[results("dqn", DQN), results("ppo", PPO)], suite=SUITE)
+    text = Elements(page(own)).text
+    assert f"Core tasks beside {other}" in text
+    assert f"{other} is {'of the same kind' if other == 'PPO' else 'the nearest'}" in text
+
+
+def test_names_of_tasks_show_what_the_task_is(contents):
+    own = BenchmarkTask(
+        "x", "deep_sea", {"size": 8}, "hash", observation_options={"bits": 64}, chance={"random": 0.1}, digest="x"
+    )
+    assert description(own) == "deep_sea, size 8; observation hash (bits 64); chance random 0.1"
+    assert description(task("y")) == "deep_sea; observation vector; no chance added"
+    text = page(contents)
+    assert '<span title="deep_sea; observation vector; no chance added">hard</span>' in text
+    assert "<title>hard: deep_sea; observation vector; no chance added; regret 0.90</title>" in text
+
+
+def test_without_ladders_the_sentence_begins_with_the_core_and_its_place():
+    four = [BenchmarkTask(name, "deep_sea", digest=name) for name in "abcd"]
+    suite = Suite("small", SUITE.protocol, tuple(four), (), "d1")
+
+    def of(agent, *regrets, seeds=10):
+        noise = 0.05 * np.linspace(-1, 1, seeds)[:, None]
+        curves = {each.name: np.full((seeds, 5), x) + noise for each, x in zip(four, regrets, strict=False)}
+        return AgentResults(agent, "small", "d1", tuple(range(seeds)), curves)
+
+    beside = [of("dqn", 0.2, 0.2, 0.2, 0.2), of("ppo", 0.9, 0.9), of("x", 0.41, 0.6, 0.7, 0.3), of("y", 0.5, seeds=1)]
+    text = sentence(contents_of(of("mine", 0.4, 0.6, 0.7, 0.3), beside=beside, suite=suite))
+    assert text == (
+        "Core score 0.50 (0.49 to 0.51) on 4 tasks, below DQN's 0.80, above PPO's 0.10 on 2 tasks in common, not shown "
+        "to differ from x's 0.50, beside y's 0.55 on 1 task in common; worst on c, b and a. The ladders were not run, "
+        "so there are no frontiers."
+    )
+
+
+def test_the_heading_of_scores_names_axes_where_there_are_some(contents):
+    assert "Scores on the core and on each axis" in page(contents)
+    text = page(contents_of(learner("a", LATE), beside=[], suite=SUITE))
+    assert "<h2>Score on the core</h2>" in text and "each axis" not in text
+
+
+def test_axes_of_the_plane_say_regret(contents):
+    text = page(contents)
+    assert ">extra regret of the idealised DQN</text>" in text and "representation<" not in text
+    assert ">over a table (negative: it generalises)</text>" in text and ">regret of an idealised table</text>" in text
+
+
+def test_regret_without_clipping_is_said_only_where_it_differs():
+    own = contents_of(learner("a", ((28.0,) * 5, (0.5,) * 5, (0.5,) * 5)), beside=[], suite=SUITE)
+    assert unclipped_regret(own) == "mean regret 9.67, not clipped (most of it from easy)"
+    even = contents_of(learner("a", ((2.0,) * 5, (1.9,) * 5, (1.8,) * 5)), beside=[], suite=SUITE)
+    assert unclipped_regret(even) == "mean regret 1.90, not clipped (the largest part from easy)"
+    near = contents_of(learner("a", ((1.2,) * 5, (0.5,) * 5, (0.5,) * 5)), beside=[], suite=SUITE)
+    assert unclipped_regret(near) == "" and "not clipped" not in page(near) and "not clipped" in page(even)
+
+
+def test_zero_has_no_sign():
+    assert number(Interval(-0.001, -0.004, 0.02), "+.2f") == "+0.00 (+0.00 to +0.02)"
+    assert number(Interval(-0.0)) == "0.00" and number(Interval(-0.006, -0.2, 0.0)) == "-0.01 (-0.20 to 0.00)"
+
+
+@pytest.mark.parametrize(("exact", "text"), [((1, 1), "exact on all tasks"), ((1, 0), "exact on 1 of 2 tasks, else")])
+def test_how_policies_were_evaluated(exact, text):
+    own = results("a", MINE, exact=dict(zip(("easy", "hard"), map(bool, exact), strict=True)))
+    assert text in page(contents_of(own, beside=[], suite=SUITE))
+
+
+def test_one_seed_is_said_once_and_leaves_no_verdicts():
+    own = contents_of(results("a", MINE, 1, 0.0), beside=[results("dqn", DQN), results("b", PPO)], suite=SUITE)
+    text = Elements(page(own)).text
+    assert text.count("One seed: no verdict.") == 1 and "One seed: no verdict beside DQN and b." in text
+    assert "shown to" not in text.replace("not shown to be better than random", "") and "Better" not in text
+    assert "with seed 0." in latex_of(own)
+    other = page(contents_of(results("a", MINE), beside=[results("dqn", DQN, 1, 0.0)], suite=SUITE))
+    assert "seed 0<" in other and "seeds 0<" not in other
+
+
+def test_agents_of_one_name_have_distinct_columns(tmp_path):
+    for folder in ("one", "two", "deep/two"):
+        (tmp_path / folder).mkdir(parents=True)
+        results("mine", MINE).write(tmp_path / folder / "results.safetensors")
+    results("Mine", MINE).write(tmp_path / "run.safetensors")
+    sources = [*(tmp_path / name for name in ("two", "deep/two", "run.safetensors")), results("mine", MINE)]
+    own = contents_of(tmp_path / "one", beside=sources, suite=SUITE)
+    names = ["mine", "mine (two)", "mine (2)", "Mine (run)", "mine (3)"]
+    assert [each.name for each in own.agents] == names
+    assert " & ".join(("", *names)) in latex_of(own) and all(f">{name}</li>" in page(own) for name in names)
+
+
+def test_on_narrow_screens_bars_are_hidden_with_their_heading(contents):
+    text = page(contents)
+    section = text.split("Core tasks beside")[1].split("</section>")[0]
+    assert section.count('<th class="bar">') == 1 and section.count('<td class="bar">') == 3
+    narrow = text.split("@media (max-width: 640px) {")[1].split("} }")[0]
+    assert ".bar { display: none; }" in narrow and "td.n, th.n { white-space: normal; }" in narrow

@@ -44,14 +44,21 @@ svg .faint { fill: var(--soft); }
 .edge { stroke: var(--soft); fill: none; }
 .theory { stroke: var(--ink); stroke-width: 1.6; stroke-dasharray: 2 4; stroke-linecap: round; fill: none; }
 .scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums; }
+table { border-collapse: collapse; width: 100%; font-size: 14px; font-variant-numeric: tabular-nums; }
 th, td { padding: 3px 10px 3px 0; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top; }
 td.n, th.n { text-align: right; white-space: nowrap; }
-td.bar svg { width: 150px; }
+.bar { width: 22%; }
+.bar svg { height: 16px; min-width: 90px; }
+.bar path { vector-effect: non-scaling-stroke; }
+@media (max-width: 640px) {
+  .bar { display: none; }
+  td.n, th.n { white-space: normal; }
+  td, th { padding-right: 6px; }
+  td:first-child { overflow-wrap: anywhere; min-width: 100px; } }
 .words td, .words th { overflow-wrap: anywhere; }
-.words td:first-child { overflow-wrap: normal; }
+.words td:first-child { overflow-wrap: normal; min-width: 0; }
 summary { cursor: pointer; color: var(--soft); }
-.wide { max-width: 640px; }
+.wide { max-width: 760px; }
 .legend { display: flex; flex-wrap: wrap; gap: 2px 18px; list-style: none; margin: 0 0 10px; padding: 0; }
 .legend li { display: flex; align-items: center; gap: 6px; }
 .legend svg { width: 34px; flex: none; }
@@ -93,7 +100,12 @@ def line(x1: float, y1: float, x2: float, y2: float, class_: str) -> Element:
 
 def curve(points: Sequence[tuple[float, float]], class_: str) -> Element:
     """A line through points."""
-    return element("path", d="M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points), class_=class_)
+    return element("path", d=path(points), class_=class_)
+
+
+def path(points: Sequence[tuple[float, float]]) -> str:
+    """A path of straight lines through points."""
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
 
 
 def marker(x: float, y: float, agent: int, title: str = "") -> Element:
@@ -181,10 +193,7 @@ def ladder_panel(
     def down(regret: float) -> float:
         return bottom - height * min(max(regret, 0.0), 1.05)
 
-    shapes = [line(left, down(y), right, down(y), "edge" if y in (0, 1) else "grid") for y in (0, 0.5, 1)]
-    shapes += [
-        label(left - 5, down(y) + 4, text, "end", "faint") for text, y in (("oracle", 0), ("0.5", 0.5), ("random", 1))
-    ]
+    shapes = regret_axis(left, right, down(1), bottom)
     shapes += [label(across(level), bottom + 15, f"{level:.3g}", "middle", "faint") for level in levels]
     shapes.append(label((left + right) / 2, bottom + 32, unit, "middle"))
     low, high = map(across, ends(frontier))
@@ -213,12 +222,52 @@ def difference_bar(difference: Interval) -> Element:
     value, low, high = (65 + 64 * max(-1.0, min(1.0, end)) for end in (difference.value, *ends(difference)))
     bar = {"x": min(65.0, value), "y": 4, "width": abs(value - 65), "height": 8, "class_": "f0" if value > 65 else "f1"}
     shapes = line(65, 0, 65, 16, "edge"), element("rect", **bar), line(low, 8, high, 8, "edge")
-    return drawing(130, 16, "", *shapes)
+    picture = drawing(130, 16, "", *shapes)
+    picture.set("preserveAspectRatio", "none")  # as wide as its column
+    return picture
 
 
-def plane(points: Sequence[tuple[str, float, float, float]], below: str, beside: str, title: str) -> Element:
-    """Tasks as dots: (name, x, y, regret in [0, 1]), the darker the less regret, in a scale for all eyes."""
-    wide, left, right, top, bottom = 560, 52, 470, 12, 300
+def learning_panel(steps: int, lines: Sequence[Sequence[Interval]], title: str) -> Element:
+    """Normalised regret at evaluations, equally far apart up to `steps`: a line for each agent, the first with a band.
+
+    Args:
+        lines: for each agent its regret at each evaluation; empty: it has none, and keeps its colour.
+    """
+    left, right, top, bottom = 54, 540, 12, 220
+    shapes = regret_axis(left, right, top, bottom)
+
+    def at(share: float, regret: float) -> tuple[float, float]:
+        return left + (right - left) * share, bottom - (bottom - top) * regret
+
+    for k in range(4):
+        shapes.append(label(at(k / 3, 0)[0], bottom + 15, f"{steps * k / 3:,.0f}", "middle", "faint"))
+    shapes.append(label((left + right) / 2, bottom + 32, "steps", "middle"))
+    for k, own in reversed([(k, own) for k, own in enumerate(lines) if own]):
+        shares = [place / len(own) for place in range(1, len(own) + 1)]
+        if not k:
+            low, high = ([at(x, ends(each)[end]) for x, each in zip(shares, own, strict=True)] for end in (0, 1))
+            shapes.append(element("path", d=path([*low, *reversed(high)]) + "Z", class_="f0", opacity="0.16"))
+        points = [at(x, each.value) for x, each in zip(shares, own, strict=True)]
+        shapes.append(curve(points, f"l{k % 6}"))
+        for point, x, each in zip(points, shares, own, strict=True):
+            shapes.append(marker(*point, k, f"{steps * x:,.0f} steps: regret {each.value:.2f}"))
+    return drawing(560, bottom + 38, title, *shapes)
+
+
+def regret_axis(left: float, right: float, top: float, bottom: float) -> list[Element]:
+    """Lines of the oracle (below), of half and of random play (above), with their names."""
+    heights = {"oracle": bottom, "0.5": (top + bottom) / 2, "random": top}
+    shapes = [line(left, y, right, y, "grid" if name == "0.5" else "edge") for name, y in heights.items()]
+    return shapes + [label(left - 5, y + 4, name, "end", "faint") for name, y in heights.items()]
+
+
+def plane(points: Sequence[tuple[str, float, float, float]], below: str, beside: Sequence[str], title: str) -> Element:
+    """Tasks as dots: (name, x, y, regret in [0, 1]), the darker the less regret, in a scale for all eyes.
+
+    Args:
+        below, beside: labels of the axes, the vertical one's in one line or two.
+    """
+    wide, left, right, top, bottom = 560, 52 + 16 * len(beside), 470, 12, 300
     xs, ys = (np.array([point[k] for point in points]) for k in (1, 2))
     (x0, x1), (y0, y1) = _range(xs), _range(ys)
 
@@ -233,23 +282,13 @@ def plane(points: Sequence[tuple[str, float, float, float]], below: str, beside:
         _, down = at(x0, y)
         shapes += [line(left, down, right, down, "grid"), label(left - 6, down + 4, f"{y:.2g}", "end", "faint")]
     shapes += [label((left + right) / 2, bottom + 36, below, "middle")]
-    shapes += [
-        element("text", beside, text_anchor="middle", transform=f"translate(12 {(top + bottom) / 2}) rotate(-90)")
-    ]
+    for x, text in zip((12, 28), beside, strict=False):
+        turn = f"translate({x} {(top + bottom) / 2}) rotate(-90)"
+        shapes.append(element("text", text, text_anchor="middle", transform=turn))
     for name, x, y, regret in points:
-        (across, down), tip = at(x, y), element("title", f"{name}: regret {regret:.2f}")
-        shapes.append(
-            element(
-                "circle",
-                tip,
-                cx=across,
-                cy=down,
-                r=7,
-                fill=shade(regret),
-                class_="edge",
-                style=f"fill: {shade(regret)}",
-            )
-        )
+        (across, down), tip = at(x, y), element("title", f"{name}; regret {regret:.2f}")
+        style = {"class_": "edge", "style": f"fill: {shade(regret)}"}
+        shapes.append(element("circle", tip, cx=across, cy=down, r=7, **style))
     for k in range(40):
         shapes.append(
             element("rect", x=490, y=float(bottom - 60 - 4 * k - 4), width=14, height=4.2, fill=shade(k / 39))

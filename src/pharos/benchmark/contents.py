@@ -3,20 +3,27 @@
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
 
-from pharos.benchmark.charts import frontier_text
+import numpy as np
+
+from pharos.benchmark.charts import ends, frontier_text
 from pharos.benchmark.comparison import Comparison, compare, results_of, suite_of_results
-from pharos.benchmark.results import AgentResults, baselines
-from pharos.benchmark.scores import BenchmarkScore, Interval, score
+from pharos.benchmark.results import FILE, AgentResults, baselines
+from pharos.benchmark.scores import BenchmarkScore, Interval, mean_interval, run_regrets, run_scores, score
 from pharos.benchmark.suite import BenchmarkTask, Suite
 from pharos.errors import ParameterError
 from pharos.plots import agent_name
 from pharos.system import storage
+from pharos.system.wording import many
 
 BESIDE = ("dqn", "ppo", "q_learning")
 RESIDUAL = 0.2
+LATE = 0.2  # of an agent that learns late, by which the final score exceeds the mean one, with its whole interval
+WORSE = 0.05  # the same of one that ends worse than it was, by which the final score is lower
 LONGEST = 400  # letters of an entry of the record on the page
 PHRASES = {
     "exploration": "explores to",
@@ -99,19 +106,32 @@ def contents_of(
     if predictor not in (None, "none", *PREDICTORS):
         raise ParameterError(f"predictor {predictor}; expected one of {', '.join(PREDICTORS)}, none")
     others = [results_of(each) for each in beside]
-    names = f"{own.agent} {own.record.get('source')}".lower()
-    return Contents(
-        suite,
-        Agent(own.agent, own, score(own, suite)),
-        [Agent(_name(each.agent), each, score(each, suite)) for each in others],
-        [compare(own, each, suite=suite) for each in others],
-        predictor or next((kind for word, kind in KINDS.items() if word in names), "both"),
-    )
+    agents: list[Agent] = []
+    for source, each in zip((results, *beside), (own, *others), strict=True):
+        names = [agent.name.lower() for agent in agents]
+        name = next(name for name in _names(source, each.agent, not agents) if name.lower() not in names)
+        agents.append(Agent(name, each, score(each, suite)))
+    comparisons = [compare(own, each, suite=suite) for each in others]
+    return Contents(suite, agents[0], agents[1:], comparisons, predictor or kind_of(own))
 
 
-def _name(label: str) -> str:
-    """An agent beside: as pharos spells its own, and whole where it is of a file or a module."""
-    return label if ":" in label else agent_name(label)
+def kind_of(results: AgentResults) -> str:
+    """The idealised learner that an agent is a kind of, by its name and source; "both" where these say nothing."""
+    names = f"{results.agent} {results.record.get('source')}".lower()
+    return next((kind for word, kind in KINDS.items() if word in names), "both")
+
+
+def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:
+    """Names for an agent, the best first: as pharos spells its own, with the folder of its results, with a number.
+
+    The agent that the report is about, and those of a file or a module, have the label that they ran with.
+    """
+    name = label if is_first or ":" in label else agent_name(label)
+    yield name
+    if not isinstance(source, AgentResults) and Path(source).exists():
+        path = Path(source).resolve()
+        yield f"{name} ({path.parent.name if path.name == FILE else path.name.removesuffix('.safetensors')})"
+    yield from (f"{name} ({k})" for k in count(2))
 
 
 def regret_of(agent: Agent, task: BenchmarkTask) -> Interval | None:
@@ -132,9 +152,25 @@ def sentence(contents: Contents) -> str:
         text, ends = _split(frontier_text(own.frontier, own.unit))
         inside = "; ".join(part for part in (ends, ", ".join(others)) if part)
         clauses.append(f"{PHRASES.get(axis, axis + ':')} {text}{f' ({inside})' if inside else ''}")
-    if not clauses:
-        return f"{contents.agent.name}: the ladders were not run, so there are no frontiers."
-    return f"{contents.agent.name} {listed(clauses)}."
+    return f"{contents.agent.name} {listed(clauses)}." if clauses else _core_sentence(contents)
+
+
+def _core_sentence(contents: Contents) -> str:
+    """Sentence on the core alone: below or above which baselines by an interval, and on which tasks it is worst."""
+    core, scores = contents.suite.core, contents.agent.score.tasks
+    names = sorted((task.name for task in core if task.name in scores), key=lambda name: scores[name].value)
+    groups: dict[str, list[str]] = {word: [] for word in ("below", "above", "not shown to differ from", "beside")}
+    for other, comparison in zip(contents.beside, contents.comparisons, strict=True):
+        if comparison.core is not None:
+            own, common = comparison.core.interval, sum(name in comparison.tasks for name in names)
+            word = "below" if own.high < 0 else "above" if own.low > 0 else "not shown to differ from"
+            text = f"{other.name}'s {comparison.core.theirs:.2f}"
+            text += f" on {many(common, 'task')} in common" if common < len(names) else ""
+            groups["beside" if math.isnan(own.low) else word].append(text)
+    parts = [f"Core score {number(contents.agent.score.core)} on {many(len(names), 'task')}"]
+    parts += [f"{word} {listed(texts)}" for word, texts in groups.items() if texts]
+    worst = f"worst on {listed(names[:3])}" if len(names) > 3 else ""
+    return "; ".join(filter(None, (", ".join(parts), worst))) + ". The ladders were not run, so there are no frontiers."
 
 
 def _split(text: str) -> tuple[str, str]:
@@ -156,6 +192,66 @@ def residuals(contents: Contents) -> list[tuple[BenchmarkTask, Interval, float]]
     return [row for row in rows if row[1].value - row[2] > RESIDUAL]
 
 
+def description(task: BenchmarkTask) -> str:
+    """A task in words: `deep_sea, size 8; observation one_hot; chance random 0.1`."""
+    parameters, options, chance = (
+        ", ".join(f"{name} {value}" for name, value in each.items())
+        for each in (task.parameters, task.observation_options, task.chance)
+    )
+    world = f"{task.environment}, {parameters}" if parameters else task.environment
+    sight = f"observation {task.observation}{f' ({options})' if options else ''}"
+    return f"{world}; {sight}; {f'chance {chance}' if chance else 'no chance added'}"
+
+
+def final_regret(agent: Agent, task: BenchmarkTask) -> float:
+    """Normalised regret of an agent at the last evaluation of a task, each run's clipped to [0, 1]."""
+    return float(np.clip(agent.results.curves[task.name][:, -1], 0.0, 1.0).mean())
+
+
+def learning_curve(agent: Agent, names: Sequence[str]) -> list[Interval]:
+    """Mean over tasks of normalised regret at each evaluation, each run's clipped to [0, 1]; empty if one was not run.
+
+    Args:
+        names: of the tasks.
+    """
+    curves = [np.clip(agent.results.curves[name], 0.0, 1.0) for name in names if name in agent.results.curves]
+    if len(curves) < len(names):
+        return []
+    return [mean_interval([own[:, k] for own in curves], (0.0, 1.0)) for k in range(curves[0].shape[1])]
+
+
+def learning_sentence(contents: Contents) -> str:
+    """Sentences on how the agent learns the core: its final and mean score, and tasks still like random play."""
+    own, curves = contents.agent.score, contents.agent.results.curves
+    names = [task.name for task in contents.suite.core if task.name in curves]
+    runs, finals = run_scores(contents.agent.results), run_scores(contents.agent.results, last=True)
+    gain = mean_interval([finals[name] - runs[name] for name in names])
+    word = ": it learns late" if gain.low > LATE else ": it ends worse than it was" if gain.high < -WORSE else ""
+    text = f"Ends at a score of {own.final.value:.2f}, averages {own.core.value:.2f}{word}."
+    evaluations = curves[names[0]].shape[1]
+    third = max(1, evaluations // 3)
+    early, late = (
+        sum(ends(mean_interval([curves[name][:, k - 1]]))[1] > 1 - 1e-6 for name in names) for k in (third, evaluations)
+    )
+    if early or late:
+        step = contents.suite.protocol.steps * third // evaluations
+        text += f" At step {step:,} its policy is not shown to be better than random play on {early} of "
+        text += f"{many(len(names), 'task')}, at the end on {late}."
+    return text
+
+
+def unclipped_regret(contents: Contents) -> str:
+    """The mean regret on the core without clipping, in words, where runs far below random play make it differ."""
+    own = contents.agent.score
+    if own.optimality_gap.value <= 1 - own.core.value + 0.1:
+        return ""
+    runs, core = run_regrets(contents.agent.results), {task.name for task in contents.suite.core}
+    regrets = {name: np.maximum(own, 0.0).mean() for name, own in runs.items() if name in core}
+    worst = max(regrets, key=regrets.__getitem__)
+    share = "most of it" if regrets[worst] > sum(regrets.values()) / 2 else "the largest part"
+    return f"mean regret {own.optimality_gap.value:.2f}, not clipped ({share} from {worst})"
+
+
 def excerpt(value: object) -> str:
     """A value of the record as text, at most 400 letters: `numpy 2.4, pharos 0.1`."""
     if isinstance(value, Mapping):
@@ -164,10 +260,15 @@ def excerpt(value: object) -> str:
     return text if len(text) <= LONGEST else text[:LONGEST] + "…"
 
 
+def seeds_text(results: AgentResults) -> str:
+    """The seeds of results: `seed 0`, `seeds 0, 1, 2`."""
+    return f"seed{'s' * (len(results.seeds) > 1)} {', '.join(map(str, results.seeds))}"
+
+
 def number(interval: Interval, form: str = ".2f") -> str:
     """A score with its interval, which one seed does not have: `0.70 (0.68 to 0.72)`."""
-    ends = "" if math.isnan(interval.low) else f" ({interval.low:{form}} to {interval.high:{form}})"
-    return f"{interval.value:{form}}{ends}"
+    value, low, high = (f"{round(each, 2) + 0.0:{form}}" for each in (interval.value, interval.low, interval.high))
+    return value if math.isnan(interval.low) else f"{value} ({low} to {high})"
 
 
 def signed(interval: Interval) -> str:

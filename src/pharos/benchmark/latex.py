@@ -1,7 +1,7 @@
 """The report in LaTeX: a table for a paper (package booktabs), and a paragraph on methods."""
 
 from pharos.benchmark.charts import frontier_text
-from pharos.benchmark.contents import Contents, excerpt, listed, number
+from pharos.benchmark.contents import Contents, excerpt, listed, number, seeds_text
 from pharos.system.wording import latex_text, many
 
 
@@ -27,7 +27,7 @@ def methods(contents: Contents) -> str:
     lines = (
         rf"We ran {latex_text(contents.agent.name)}{others} on the Pharos Benchmark {latex_text(suite.name)}",
         rf"(SHA-256 of tasks and protocol: \texttt{{{latex_text(suite.digest)}}}): {num_tasks},",
-        f"{protocol.steps:,} steps each, with seeds {', '.join(map(str, own.seeds))}.",
+        f"{protocol.steps:,} steps each, with {seeds_text(own)}.",
         f"The policy was evaluated after each of {protocol.evaluations} equal parts; its normalised regret is",
         r"$(V^* - V^\pi) / (V^* - V^U)$, where $U$ is uniform play. The score of a run is 1 less the mean over",
         "evaluations, clipped to $[0, 1]$; the core score is the mean over tasks. A frontier is the level of",

@@ -17,6 +17,7 @@ from pharos.benchmark.charts import (
     element,
     frontier_text,
     ladder_panel,
+    learning_panel,
     legend,
     plane,
     radar,
@@ -24,18 +25,27 @@ from pharos.benchmark.charts import (
 from pharos.benchmark.contents import (
     PREDICTORS,
     RESIDUAL,
+    Agent,
     Contents,
     Source,
     contents_of,
+    description,
     excerpt,
+    final_regret,
+    kind_of,
+    learning_curve,
+    learning_sentence,
+    listed,
     number,
     regret_of,
     residuals,
+    seeds_text,
     sentence,
     signed,
+    unclipped_regret,
 )
 from pharos.benchmark.latex import latex_of
-from pharos.benchmark.suite import Ladder, Suite
+from pharos.benchmark.suite import BenchmarkTask, Ladder, Suite
 from pharos.system import storage
 from pharos.system.wording import many
 
@@ -93,11 +103,11 @@ def _lead(contents: Contents) -> list[Element]:
     own = contents.agent.score
     lines = [element("p", sentence(contents), class_="lead")]
     core = f"Core score {number(own.core)} on {many(contents.num_run(contents.suite.core), 'task')}"
-    core += "".join(f"; {each.name} {each.score.core.value:.2f}" for each in contents.beside)
-    rest = {"Final score": own.final, "interquartile mean": own.iqm, "optimality gap": own.optimality_gap}
-    more = ", ".join(f"{name} {number(interval)}" for name, interval in rest.items())
+    core += "".join(f"; {each.name} {each.score.core.value:.2f}" for each in contents.beside) + ". "
+    rest = {"Final score": own.final, "interquartile mean": own.iqm}
+    parts = [*(f"{name} {number(interval)}" for name, interval in rest.items()), unclipped_regret(contents)]
     scale = "A score is 1 for the oracle and 0 for random play. Intervals are of 95 %, over seeds."
-    lines.append(element("p", f"{core}. {more}. {scale}"))
+    lines.append(element("p", f"{core if own.axes else ''}{', '.join(filter(None, parts))}. {scale}"))
     if own.preliminary:
         seeds = many(len(contents.agent.results.seeds), "seed")
         missing = f", and {many(len(own.missing), 'task')} without results" if own.missing else ""
@@ -121,7 +131,21 @@ def _axes(contents: Contents) -> Element:
         scores = [{axis: own.score.value for axis, own in each.score.axes.items()} for each in contents.agents]
         figure = _figure("", radar(axes, scores, "scores on all axes"), legend([each.name for each in contents.agents]))
         parts.append(element("details", element("summary", "The same as a radar"), figure))
-    return _section("Scores on the core and on each axis", "Mean over tasks or rungs; lines are intervals.", *parts)
+    title, means = ("Scores on the core and on each axis", "tasks or rungs") if axes else ("Score on the core", "tasks")
+    return _section(title, f"Mean over {means}; lines are intervals.", *parts)
+
+
+def _learning(contents: Contents) -> Element:
+    names = [task.name for task in contents.suite.core if task.name in contents.agent.results.curves]
+    lines = [learning_curve(each, names) for each in contents.agents]
+    without = [each.name for each, own in zip(contents.agents, lines, strict=True) if not own]
+    text = f"Normalised regret of the policy at each evaluation, mean over {many(len(names), 'core task')}. "
+    text += "Each run's is clipped to [0, 1] at each evaluation here; scores clip its mean over the run. The band is "
+    text += f"the interval.{f' Without {listed(without)}, which did not run all of these.' if without else ''}"
+    chart = learning_panel(contents.suite.protocol.steps, lines, "regret on the core while learning")
+    names = [each.name for each in contents.agents]
+    words = element("p", learning_sentence(contents))
+    return _section("Learning curve", text, words, legend(names), _figure("", chart, class_="wide"))
 
 
 def _ladders(contents: Contents) -> Element | None:
@@ -158,30 +182,46 @@ def _core(contents: Contents) -> Element | None:
         {name: each for name, each in comparison.tasks.items() if name in names} for comparison in contents.comparisons
     ]
     distances = [sum(abs(each.interval.value) for each in own.values()) / max(1, len(own)) for own in differences]
-    nearest = min(range(len(distances)), key=distances.__getitem__)
+    kind = kind_of(contents.agent.results)
+    common = [k for k, own in enumerate(differences) if own]
+    same = [k for k in common if kind == kind_of(contents.beside[k].results) and kind not in ("both", "none")]
+    if not common:
+        return None
+    nearest = min(same or common, key=distances.__getitem__)
     other = contents.beside[nearest]
     rows: list[list[str | Element]] = []
     for name, each in sorted(differences[nearest].items(), key=lambda item: item[1].interval.value):
         scores = (f"{agent.score.tasks[name].value:.2f}" for agent in (contents.agent, other))
-        rows.append([name, *scores, signed(each.interval), difference_bar(each.interval), each.verdict])
+        cell = _task(contents.suite.task(name))
+        rows.append([cell, *scores, signed(each.interval), difference_bar(each.interval), each.verdict])
+    heads = ["task", "score", other.name, "difference", "", "verdict"]
+    verdict = "The verdict is after Holm's correction over tasks."
+    if _is_single(contents.agent, other):
+        heads, rows, verdict = heads[:-1], [row[:-1] for row in rows], "One seed: no verdict."
     return _section(
         f"Core tasks beside {other.name}",
-        f"Of the baselines, {other.name} is the nearest: scores are {distances[nearest]:.2f} apart on the average "
-        "task. Sorted by difference, the worst first. The verdict is after Holm's correction over tasks.",
-        _table(["task", "score", other.name, "difference", "", "verdict"], rows, numeric=(1, 2, 3)),
+        f"Of the baselines, {other.name} is {'of the same kind' if same else 'the nearest'}: scores are "
+        f"{distances[nearest]:.2f} apart on the average task. Sorted by difference, the worst first. {verdict}",
+        _table(heads, rows, numeric=(1, 2, 3)),
     )
+
+
+def _is_single(one: Agent, other: Agent) -> bool:
+    return min(len(each.results.seeds) for each in (one, other)) == 1
 
 
 def _plane(contents: Contents) -> Element | None:
     name = "ppo" if contents.predictor == "ppo" else "dqn"
     points = [
-        (task.name, task.predicted["table"], task.predicted[name] - task.predicted["table"], own.value)
+        (f"{task.name}: {description(task)}", table, task.predicted[name] - table, own.value)
         for task in contents.suite.tasks
         if (own := contents.observed(task)) is not None and {"table", name} <= task.predicted.keys()
+        for table in [task.predicted["table"]]
     ]
     if len(points) < 2:
         return None
-    below, beside = "regret of a table: exploration", f"{name.upper()} less table: representation"
+    below = "regret of an idealised table"
+    beside = f"extra regret of the idealised {name.upper()}", "over a table (negative: it generalises)"
     return _section(
         "What makes a task hard, and where the agent fails",
         "Each dot is a task, placed by what theory predicts before any run: to the right, even a learner with a table "
@@ -196,10 +236,11 @@ def _words(contents: Contents) -> Element | None:
     worse: list[str] = []
     better: list[str] = []
     undecided: list[str] = []
+    single = [other.name for other in contents.beside if _is_single(contents.agent, other)]
     for axis, own in contents.agent.score.axes.items():
         groups: list[list[str]] = [[], [], []]
         for other, comparison in zip(contents.beside, contents.comparisons, strict=True):
-            if axis in comparison.axes:
+            if axis in comparison.axes and other.name not in single:
                 difference = comparison.axes[axis].frontier
                 group = groups[0 if difference.high < 0 else 1 if difference.low > 0 else 2]
                 group.append(f"{other.name} {frontier_text(other.score.axes[axis].frontier)}")
@@ -210,7 +251,9 @@ def _words(contents: Contents) -> Element | None:
     for title, lines in (("Worse", worse), ("Better", better), ("Not shown to differ", undecided)):
         if lines:
             parts += [element("h3", title), _list(lines)]
-    if not worse:
+    if single:
+        parts.append(element("p", f"One seed: no verdict beside {listed(single)}."))
+    if not worse and len(single) < len(contents.beside):
         parts.insert(0, element("p", "No frontier is shown to lie below a baseline's."))
     return _section(
         "Strengths and weaknesses in words",
@@ -227,15 +270,23 @@ def _residuals(contents: Contents) -> Element:
     means = PREDICTORS[contents.predictor]
     text = (
         f"Tasks where the regret is more than {RESIDUAL:g} above that of {means}, predicted before any run. Theory "
-        "says that an agent of this kind solves them better: look for a bug or a hyperparameter."
+        "says that an agent of this kind solves them better: look for a bug or a hyperparameter. The last column is "
+        "the regret of the last evaluation: near 0, the agent is slow; near 1, it never learns the task."
     )
     if not rows:
         return _section(title, f"On no task the regret is more than {RESIDUAL:g} above that of {means}.")
-    cells = [
-        [task.name, f"{own.value:.2f}", f"{expected:.2f}", f"{own.value - expected:+.2f}"]
+    cells: list[list[str | Element]] = [
+        [_task(task), *(f"{x:.2f}" for x in (own.value, expected)), f"{own.value - expected:+.2f}", f"{final:.2f}"]
         for task, own, expected in rows
+        for final in [final_regret(contents.agent, task)]
     ]
-    return _section(title, text, _table(["task", "observed", "predicted", "residual"], cells, numeric=(1, 2, 3)))
+    heads = ["task", "observed", "predicted", "residual", "at the end"]
+    return _section(title, text, _table(heads, cells, numeric=(1, 2, 3, 4)))
+
+
+def _task(task: BenchmarkTask) -> Element:
+    """The name of a task, which shows what it is when one points at it."""
+    return element("span", task.name, title=description(task))
 
 
 def _provenance(contents: Contents) -> Element:
@@ -243,13 +294,14 @@ def _provenance(contents: Contents) -> Element:
     exact = own.record.get("exact")
     exact = exact if isinstance(exact, Mapping) else {}
     count = sum(bool(value) for value in exact.values())
+    how = "all tasks" if count == len(exact) else f"{count} of {many(len(exact), 'task')}, else estimated"
     facts = {
         "suite": f"{contents.suite.name}, digest {contents.suite.digest}",
         "protocol": f"{protocol.steps:,} steps, {many(protocol.evaluations, 'evaluation')}, gamma {protocol.gamma:g}, "
         f"horizon {protocol.horizon}",
         "seeds": ", ".join(map(str, own.seeds)),
-        "evaluation": f"exact on {count} of {many(len(exact), 'task')}, else estimated" if exact else "see agent.json",
-        **{f"baseline {each.name}": f"seeds {', '.join(map(str, each.results.seeds))}" for each in contents.beside},
+        "evaluation": f"exact on {how}" if exact else "see agent.json",
+        **{f"baseline {each.name}": seeds_text(each.results) for each in contents.beside},
         "division": str(own.record.get("division") or "one setting for all tasks"),
         **{name: excerpt(value) for name, value in own.record.items() if value and name not in ("exact", "division")},
     }
@@ -267,6 +319,7 @@ def _provenance(contents: Contents) -> Element:
 
 SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
     _axes,
+    _learning,
     _ladders,
     _words,
     _core,
@@ -292,9 +345,9 @@ def _list(texts: Sequence[str]) -> Element:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str | Element]], numeric: Sequence[int] = ()) -> Element:
-    def kind(k: int, cell: str | Element = "") -> str:
-        return "n" if k in numeric else "" if isinstance(cell, str) else "bar"
+    def kind(k: int, cell: str | Element) -> str:
+        return "n" if k in numeric else "bar" if not isinstance(cell, str) and cell.tag == "svg" else ""
 
-    head = element("tr", *(element("th", name, class_=kind(k)) for k, name in enumerate(heads)))
+    head = element("tr", *(element("th", name, class_=kind(k, rows[0][k])) for k, name in enumerate(heads)))
     body = [element("tr", *(element("td", cell, class_=kind(k, cell)) for k, cell in enumerate(row))) for row in rows]
     return element("div", element("table", element("thead", head), element("tbody", *body)), class_="scroll")
