@@ -38,15 +38,13 @@ from cosmic_ray.plugins import get_operator
 NUMBERS = "core/NumberReplacer"
 TESTED_BY = {  # path in src/pharos: weight of its faults (kernels compile again for each), tests
     "mdp/dynamics.py": (1.0, "test_dynamics test_mdp test_occupancy"),
-    "mdp/compiled.py": (1.0, "test_dynamics test_mdp test_solvers"),
-    "mdp/matrices.py": (1.0, "test_mdp test_dynamics test_bisimulation"),
-    "mdp/outcome_table.py": (1.0, "test_outcome_table test_dynamics test_bisimulation"),
-    "mdp/outcome_arrays.py": (1.0, "test_outcome_table test_mdp"),
+    "mdp/table.py": (1.0, "test_dynamics test_mdp test_solvers"),
+    "mdp/outcome_table.py": (1.0, "test_outcome_table test_mdp test_dynamics test_bisimulation"),
     "mdp/chance.py": (1.0, "test_mdp test_dynamics test_q_learning"),
     "mdp/selection.py": (1.0, "test_dynamics test_solvers test_policies"),
     "mdp/rewards.py": (1.0, "test_mdp test_solvers"),
     "mdp/tabular.py": (1.0, "test_mdp test_natural_arguments test_dynamics"),
-    "mdp/tabular_arrays.py": (1.0, "test_mdp test_natural_arguments test_dynamics"),
+    "mdp/arguments.py": (1.0, "test_mdp test_natural_arguments test_dynamics"),
     "solvers/fixed_point.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/policy_iteration.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/values.py": (1.0, "test_error_bounds test_solvers"),

@@ -8,7 +8,7 @@ from pharos.agents.batched import BatchRun, ObservationSource, make_batch
 from pharos.agents.batched import lane as lanes
 from pharos.agents.batched.lane import BatchedEpisodes
 from pharos.environments import make
-from pharos.interaction.reward_channel import RewardChannel
+from pharos.interaction.simulator import RewardChannel
 from pharos.kernels import batched as kernels
 from pharos.mdp import ChanceSetting, TabularMDP, random_actions, sticky_actions
 from pharos.training.task import Task

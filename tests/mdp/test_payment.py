@@ -11,7 +11,7 @@ from naive.learning import paid
 from pharos.agents import QLearning
 from pharos.errors import ParameterError
 from pharos.interaction import GymEnv, make_sb3_vec, make_vec
-from pharos.interaction.reward_channel import RewardChannel
+from pharos.interaction.simulator import RewardChannel
 from pharos.solvers import value_iteration
 from pharos.training import ChanceSetting, RunConfig, Task
 

@@ -15,7 +15,7 @@ from pharos.drawing import planes_of
 from pharos.environments.mini_grid import mini_grid
 from pharos.environments.worlds.freeway import NUM_COLORS
 from pharos.observations import observe
-from pharos.observations.drawn import num_values
+from pharos.observations.images import num_values
 
 NAMES = [name for name in pharos.list_environments() if name.startswith(("breakout/", "freeway/", "game_2048/"))]
 CORRIDOR = "mini_grid/key-corridor-s6r3"

@@ -16,7 +16,7 @@ import pharos
 from pharos.errors import ParameterError
 from pharos.interaction import GymEnv
 from pharos.observations import observe
-from pharos.observations.complex_image import _area_weights, _scaled
+from pharos.observations.images import _area_weights, _scaled
 
 SMALL = {
     "simple_grid": {"height": 4, "width": 5, "rewards": (((1, 1), 0.1),), "penalties": (((0, 2), -0.5),)},

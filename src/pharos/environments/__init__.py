@@ -9,7 +9,20 @@ from pharos.environments.built_in import BUILT_IN, BuiltIn, on_registration
 from pharos.system import lazy
 
 if TYPE_CHECKING:
-    from pharos.environments.base import Components, Environment, State, start_distribution
+    from pharos.environments.base import (
+        Color,
+        Components,
+        Environment,
+        Ground,
+        Layer,
+        Look,
+        Margin,
+        Scenery,
+        Shape,
+        Sprite,
+        State,
+        start_distribution,
+    )
     from pharos.environments.catalog import (
         class_called,
         class_of,
@@ -21,7 +34,6 @@ if TYPE_CHECKING:
         register,
         source_of,
     )
-    from pharos.environments.look import Color, Ground, Layer, Look, Margin, Scenery, Shape, Sprite
     from pharos.environments.mini_grid.mini_grid import MiniGrid
     from pharos.environments.mini_grid.mini_grid_empty import MiniGridEmpty
     from pharos.environments.mini_grid.mini_grid_rooms import MiniGridRooms

@@ -3,21 +3,93 @@
 A state is a vector of D integers. Chance of the world's own is said by outcomes: which ones there are, how likely each
 is, and where each leads. Chance of acting (sticky and random actions), time limits, observations and pixels are added
 outside, so that the same state space serves every one of them.
+
+How a class looks is declared too: `Layer`, `Scenery`, `Look`. `pharos.drawing` paints from these; wherever a name of a
+ground or a shape is expected, a function of one's own may stand.
 """
 
 import dataclasses
 import inspect
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from pharos.environments.look import Layer, Look
 from pharos.environments.parameters import check_parameters, declared_parameters
 from pharos.errors import ParameterError, RuleError
+
+Color = tuple[int, int, int]
+"""(red, green, blue), 0 to 255."""
+
+Rows = tuple[str, ...]
+Sprite = Rows | tuple[Rows, ...] | None
+
+Margin = tuple[int, int, int, int]
+"""Pixels around the cells: (top, right, bottom, left)."""
+
+Ground = Callable[[np.ndarray, tuple[int, int], Margin], None]
+"""Function(picture (H, W, 3) float64, (height, width) of a cell, margin) that paints what lies below all layers."""
+
+Shape = Callable[[np.ndarray, int, str], np.ndarray]
+"""Function(color (3,) float64, pixels of a cell, glyph) -> (cell, cell, 4): red, green, blue, cover in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """How one kind of thing looks. `draw` puts it on its plane; every picture is made from the planes.
+
+    Attributes:
+        glyph: one character for text drawings; several, one for each value 1, 2, ... on the plane.
+        color: (red, green, blue), 0 to 255; or several, one for each value on the plane.
+        sprite: rows of text, '#' where the sprite has the colour and '.' where the ground shows through; digits 1-9
+            pick shades from light to dark; several sprites, one for each value on the plane. None draws a full cell.
+        shape: how pictures for people draw it, in place of the sprite: a name in `pharos.drawing.SHAPES`, or a function
+            (see `Shape`). None: the sprite, or else the shape that is called like the layer ("ball", "agent", "holes",
+            "goal", "paddle"), or else a block.
+    """
+
+    glyph: str | tuple[str, ...]
+    color: Color | tuple[Color, ...]
+    sprite: Sprite = None
+    shape: str | Shape | None = None
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """How complex images of a class look, in pixels of their natural size.
+
+    Attributes:
+        cell: (height, width) of a cell.
+        margin: (top, right, bottom, left) around the cells.
+        ground: a name in `pharos.drawing.GROUNDS`, or a function (see `Ground`).
+        sprites: name of a layer -> sprite in place of its own (see `Layer`), or None: the layer is not drawn.
+        row_colors: name of a layer -> colours of rows 0, 1, ... of the grid, again from the first after the last.
+    """
+
+    cell: tuple[int, int]
+    margin: Margin
+    ground: str | Ground
+    sprites: Mapping[str, Sprite] = field(default_factory=dict)
+    row_colors: Mapping[str, tuple[Color, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a class of environments looks beside its layers.
+
+    Attributes:
+        ground: of pictures for people: a name in `pharos.drawing.GROUNDS`, or a function (see `Ground`).
+        scenery: of complex images; None: square cells on `ground`, with the sprites and shapes of the layers.
+        color: of the class in plots, such as "#0072B2"; None: one that no other class has.
+    """
+
+    ground: str | Ground = "plain"
+    scenery: Scenery | None = None
+    color: str | None = None
+
 
 State = tuple[int, ...]
 Ranges = Any  # range, or a nested sequence of ranges
@@ -111,7 +183,6 @@ class Environment:
     name: ClassVar[str]
     actions: ClassVar[tuple[str, ...]]
     version: ClassVar[int] = 1
-    max_episode_steps: Any = 1000
     layers: ClassVar[dict[str, Layer]] = {}
     look: ClassVar[Look] = Look()
     instances: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
@@ -119,14 +190,27 @@ class Environment:
     hyperparameters: ClassVar[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {}
     foreign_parameters: ClassVar[Mapping[str, str]] = {}
     first_version: ClassVar[int] = 1
-    motion_layers: Any = {}
-    outcomes: Any = 1
+
+    if TYPE_CHECKING:  # attributes, or properties
+
+        @property
+        def max_episode_steps(self) -> int: ...
+
+        @property
+        def motion_layers(self) -> Mapping[str, Layer]: ...
+
+        @property
+        def outcomes(self) -> int: ...
+    else:
+        max_episode_steps = 1000
+        motion_layers = {}
+        outcomes = 1
 
     def __post_init__(self) -> None:
         check_parameters(self)
         self.validate()
 
-    # What an instance is --------------------------------------------------------------------------------------------
+    # What an instance is ----------------------------------------------------------------------------------------------
 
     def validate(self) -> None:
         """Raise ParameterError where parameters do not go together; each has been checked against its declaration."""
@@ -147,10 +231,10 @@ class Environment:
         """(rows, columns) of the drawing."""
         raise NotImplementedError(f"{type(self).__name__} must define grid() to be drawn")
 
-    # The rules ------------------------------------------------------------------------------------------------------
+    # The rules --------------------------------------------------------------------------------------------------------
 
     if TYPE_CHECKING:
-        transition: Any  # takes (state, action, out), or (state, action, outcome, out)
+        transition: Callable[..., None]  # takes (state, action, out), or (state, action, outcome, out)
     else:
 
         def transition(self, state, action, out) -> None:
@@ -170,7 +254,7 @@ class Environment:
         return False
 
     if TYPE_CHECKING:
-        reward: Any  # takes (state, action, next_state), or (state, action, next_state, outcome)
+        reward: Callable[..., float]  # takes (state, action, next_state), or (state, action, next_state, outcome)
     else:
 
         def reward(self, state, action, next_state) -> float:
@@ -193,7 +277,7 @@ class Environment:
         """(states, ...) what an import recorded of each state, for the observation "recorded"; here None: nothing."""
         return None
 
-    # Derived --------------------------------------------------------------------------------------------------------
+    # Derived ----------------------------------------------------------------------------------------------------------
 
     @property
     def num_actions(self) -> int:
@@ -289,7 +373,7 @@ class Environment:
             raise ParameterError(f"{self}: an action has one outcome; found outcome {outcome}, expected 0")
         return tuple(int(value) for value in out)
 
-    def reward_of(self, state: object, action: int, next_state: object, outcome: int = 0) -> Any:
+    def reward_of(self, state: object, action: int, next_state: object, outcome: int = 0) -> float:
         """What a step pays, whichever form of `reward` the class has; interpreted."""
         if type(self).pays_by_outcome():
             return self.reward(state, action, next_state, outcome)
@@ -310,7 +394,7 @@ class Environment:
 
 
 @cache
-def num_arguments(rule: Any) -> int:
+def num_arguments(rule: Callable[..., object]) -> int:
     """How many arguments a rule takes by their places, `self` among them; 0 where Python cannot tell."""
     try:
         parameters = inspect.signature(rule).parameters.values()

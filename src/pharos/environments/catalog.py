@@ -163,5 +163,5 @@ def register(cls: type[Environment]) -> type[Environment]:
     return cls
 
 
-def _is_built_in(cls: Any) -> bool:
+def _is_built_in(cls: type[Environment]) -> bool:
     return getattr(cls, "name", None) in _OWN and cls is class_called(cls.name)

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Layer
+from pharos.environments.base import Environment, Layer
 from pharos.environments.parameters import store
 from pharos.errors import FileFormatError, ParameterError
 from pharos.system import mdp_files, storage
@@ -137,7 +136,7 @@ class ImportedWorld(Environment):
         stretched = shown[state[0]] * (255 // np.maximum(shown.max(axis=(0, 1, 2)), 1)).astype(np.uint8)
         return np.ascontiguousarray(stretched.transpose(1, 0, 2))
 
-    # The table ------------------------------------------------------------------------------------------------------
+    # The table --------------------------------------------------------------------------------------------------------
 
     @property
     def successors(self) -> np.ndarray:

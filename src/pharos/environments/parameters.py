@@ -2,7 +2,7 @@
 
 height: int = parameter(12, low=4)
 restart_on_hit: bool = parameter(True)
-car_speeds: Any = parameter(None, kind=integers("at least 1", lambda period: period >= 1))
+car_speeds: tuple[int, ...] = parameter(None, kind=integers("at least 1", lambda period: period >= 1))
 """
 
 import dataclasses
@@ -11,9 +11,11 @@ import numbers
 import operator
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, SupportsIndex, TypeGuard, TypeVar
 
 from pharos.errors import ParameterError
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,10 @@ class Kind:
     checked: Callable[[Any, str, Any], Any]
 
 
+Cell = tuple[int, int]
+"""(row, column)."""
+
+Bound = float | Callable[..., float] | None
 _DECLARED = "pharos parameter"
 
 
@@ -46,8 +52,8 @@ class Parameter:
     """
 
     kind: type | Kind
-    low: Any = None
-    high: Any = None
+    low: Bound = None
+    high: Bound = None
     optional: bool = False
     added: bool = False
 
@@ -69,7 +75,7 @@ class Parameter:
             return f"{name} in [{low:g}, {high:g}]"
         return name + (f" >= {low:g}" if low is not None else f" <= {high:g}" if high is not None else "")
 
-    def checked(self, env: object, name: str, value: object) -> Any:
+    def checked(self, env: object, name: str, value: object) -> object:
         """The value as it is stored; ParameterError where it is out of range."""
         if value is None and self.optional:
             return None
@@ -85,7 +91,7 @@ class Parameter:
 
 
 def parameter(
-    default: object, *, low: object = None, high: object = None, kind: type | Kind | None = None, added: bool = False
+    default: object, *, low: Bound = None, high: Bound = None, kind: type | Kind | None = None, added: bool = False
 ) -> Any:
     """A field of an environment's dataclass, with the values that it may take.
 
@@ -117,7 +123,7 @@ def check_parameters(env: object) -> None:
         store(env, name, declared[name].checked(env, name, getattr(env, name)))
 
 
-def store(env: object, name: str, value: object) -> Any:
+def store(env: object, name: str, value: T) -> T:
     """Set a field of a frozen dataclass while it is being made."""
     object.__setattr__(env, name, value)
     return value
@@ -134,12 +140,13 @@ def integers(expected: str, allowed: Callable[[int], bool]) -> Kind:
         allowed: whether an integer is.
     """
 
-    def checked(env: Any, name: str, value: Any) -> tuple[int, ...]:
+    def checked(env: object, name: str, value: object) -> tuple[int, ...]:
         try:
             if isinstance(value, str):
                 values = tuple(int(part) for part in value.split(","))
             else:
-                values = tuple(map(operator.index, value)) if isinstance(value, Iterable) else (operator.index(value),)
+                items: Iterable[Any] = value if isinstance(value, Iterable) else (value,)
+                values = tuple(map(operator.index, items))
         except (TypeError, ValueError):
             values = ()
         if not values or not all(map(allowed, values)):
@@ -160,10 +167,17 @@ def one_of(*names: str) -> Kind:
     return Kind(" or ".join(names), checked)
 
 
-def _cell(env: Any, name: str, value: Any) -> tuple[int, int]:
+class Grid(Protocol):
+    """A class with cells."""
+
+    height: int
+    width: int
+
+
+def _cell(env: Grid, name: str, value: object) -> Cell:
     """A cell inside `env.height` x `env.width`, from (row, column) or text such as "3,2"."""
     try:
-        row, column = (int(part) for part in value.split(",")) if isinstance(value, str) else value
+        row, column = map(int, value.split(",")) if isinstance(value, str) else _items(value)
         inside = 0 <= row < env.height and 0 <= column < env.width and int(row) == row and int(column) == column
     except (TypeError, ValueError):
         inside = False
@@ -175,7 +189,7 @@ def _cell(env: Any, name: str, value: Any) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def _valued_cells(env: Any, name: str, value: Any) -> tuple[tuple[tuple[int, int], float], ...]:
+def _valued_cells(env: Grid, name: str, value: object) -> tuple[tuple[Cell, float], ...]:
     """Cells with a number each, from ((row, column), number) pairs or text such as "2,2:0.1; 0,3:0.5"."""
     pairs: list[tuple[Any, Any]]
     try:
@@ -183,7 +197,7 @@ def _valued_cells(env: Any, name: str, value: Any) -> tuple[tuple[tuple[int, int
             texts = [part.split(":") for part in value.split(";") if part.strip()]
             pairs = [(place, float(number)) for place, number in texts]
         else:
-            pairs = [(place, number) for place, number in value]
+            pairs = [(place, number) for place, number in _items(value)]
     except (TypeError, ValueError):
         pairs = [(None, None)]
     if not all(is_real(number) for _, number in pairs):
@@ -194,7 +208,7 @@ def _valued_cells(env: Any, name: str, value: Any) -> tuple[tuple[tuple[int, int
     return tuple((_cell(env, name, place), float(number)) for place, number in pairs)
 
 
-def _cells(env: object, name: str, value: object) -> tuple[tuple[int, int], ...]:
+def _cells(env: Grid, name: str, value: object) -> tuple[Cell, ...]:
     """Cells, from pairs (row, column) or text such as "0,1; 2,3"."""
     places = [part for part in value.split(";") if part.strip()] if isinstance(value, str) else value
     if not isinstance(places, Iterable):
@@ -202,12 +216,18 @@ def _cells(env: object, name: str, value: object) -> tuple[tuple[int, int], ...]
     return tuple(_cell(env, name, place) for place in places)
 
 
+def _items(value: object) -> Iterable[Any]:
+    if not isinstance(value, Iterable):
+        raise TypeError(f"{value!r} has no items")
+    return value
+
+
 CELL = Kind("row,column", _cell)
 CELLS = Kind("row,column; ...", _cells)
 VALUED_CELLS = Kind("row,column:value; ...", _valued_cells)
 
 
-def is_real(value: object) -> bool:
+def is_real(value: object) -> TypeGuard[float]:
     """Whether `value` is a finite real number (and not a bool)."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool):
         return False
@@ -217,10 +237,10 @@ def is_real(value: object) -> bool:
         return False
 
 
-def _integer(env: Any, name: str, value: Any, low: int | None, high: int | None) -> int:
+def _integer(env: object, name: str, value: object, low: float | None, high: float | None) -> int:
     bounds = "" if low is None else f" of at least {low}" if high is None else f" from {low} to {high}"
     try:
-        number = operator.index(value)
+        number = operator.index(value) if isinstance(value, SupportsIndex) else None
     except TypeError:
         number = None
     outside = number is not None and ((low is not None and number < low) or (high is not None and number > high))
@@ -229,7 +249,7 @@ def _integer(env: Any, name: str, value: Any, low: int | None, high: int | None)
     return int(number)
 
 
-def _number(env: Any, name: str, value: Any, low: float, high: float) -> float:
+def _number(env: object, name: str, value: object, low: float, high: float) -> float:
     if not is_real(value) or not low <= value <= high:
         bounds = "" if math.isinf(low) and math.isinf(high) else f" from {low:g} to {high:g}"
         raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected a finite number{bounds}")

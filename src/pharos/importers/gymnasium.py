@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, RuleError, StateSpaceTooLarge
 from pharos.importers.files import MINIGRID_STEPS
@@ -248,7 +249,7 @@ def _state_number(observation: Any, states: int) -> int | None:
 
 
 def matrices(
-    P: object, R: object, *, gamma: float = 0.99, initial: object = 0, horizon: int | None = None
+    P: object, R: npt.ArrayLike, *, gamma: float = 0.99, initial: npt.ArrayLike = 0, horizon: int | None = None
 ) -> TabularMDP:
     """Return the MDP of transition probabilities P and rewards R; as `TabularMDP.from_matrices`."""
     return TabularMDP.from_matrices(P, R, gamma=gamma, initial=initial, horizon=horizon)

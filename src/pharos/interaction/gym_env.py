@@ -6,17 +6,16 @@ needs to be built.
 """
 
 import operator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, SupportsIndex
 
 import gymnasium
 import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.interaction.frame_stack import FrameStack
-from pharos.interaction.reward_channel import RewardChannel
-from pharos.interaction.simulator import Interaction, SimulatedEnv, Simulator, Stream
-from pharos.observations import NO_ACTION, Index
+from pharos.interaction.simulator import FrameStack, Interaction, RewardChannel, SimulatedEnv, Simulator, Stream
+from pharos.observations import NO_ACTION, Index, Seen
 from pharos.system.records import split
 
 if TYPE_CHECKING:
@@ -72,24 +71,25 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._step_one, self._parameters = simulator.rules.step_one, simulator.rules.parameters
         self._ranges, self._num_actions = simulator.ranges, simulator.env.num_actions
         self._limit = simulator.limit if simulator.limit is not None else 1 << 62
-        observation: Any = simulator.context.observation
-        is_vector = simulator.context.is_vector and simulator.context.is_plain
+        observation = simulator.context.observation
+        vector = simulator.context.vector if simulator.context.is_plain else None
+        is_vector = vector is not None
         self._spare = simulator.start_states[0].copy()  # room for the next state
         self._blank: np.ndarray = np.zeros(len(simulator.env.components) if is_vector else 0, np.float32)
-        self._scale = observation.scale if is_vector else np.zeros(0)
+        self._scale = np.zeros(0) if vector is None else vector.scale
         self._step_and_draw = _step_and_draw(simulator)
         self._is_written = is_vector or self._step_and_draw is not None  # whether a step writes the observation itself
         few = self._is_written and len(simulator.start_states) <= 4096
         self._start_observations = observation(simulator.start_states) if few else None
         if self._step_and_draw is not None:
-            self._shades, self._blank = observation.shades, np.zeros(observation.space.shape, np.uint8)
+            self._shades, self._blank = observation.shades, np.zeros(observation.space.shape or (), np.uint8)
         self._has_chance, self._stays, self._lazy = simulator.has_chance, simulator.chance[0], simulator.lazy
         self._has_outcomes, self._num_outcomes = simulator.has_outcomes, int(simulator.env.outcomes)
         self._outcome_one = simulator.rules.outcome_one
         self._stream: Stream | None = None  # of random numbers, where the rules have chance
         self._is_index = simulator.context.is_plain and isinstance(observation, Index)
         self._frame_stack = FrameStack(simulator, 1) if simulator.context.has_more else None
-        self._last: Any = None  # the observation, where it is more than a function of the state
+        self._last: Seen | None = None  # the observation, where it is more than a function of the state
         self._reward_channel = RewardChannel(interaction.chance, 1) if simulator.modifies_rewards else None
         space = simulator.state_space
         self._successors = None if space is None or self._has_outcomes else space.successors
@@ -139,7 +139,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
             observation = self._observation(begins=True)
         return observation, self._info(self._state)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: SupportsIndex) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Choose an action. After a terminal state nothing changes and nothing is paid."""
         executed = operator.index(action)
         if not 0 <= executed < self._num_actions:
@@ -156,14 +156,14 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
             outcome, probability = self._outcome_one(self._parameters, state, executed, self._stream.random())
             branch, probability = executed * self._num_outcomes + outcome, probability * (1.0 - self._lazy)
         next_state = self._spare
-        observation: Any = self._blank.copy()
+        written = self._blank.copy()
         if self._step_and_draw is not None:
             reward, code = self._step_and_draw(
-                self._parameters, self._ranges, state, branch, next_state, self._shades, observation
+                self._parameters, self._ranges, state, branch, next_state, self._shades, written
             )
         else:
             reward, code = self._step_one(
-                self._parameters, self._ranges, self._scale, state, branch, next_state, observation
+                self._parameters, self._ranges, self._scale, state, branch, next_state, written
             )
         if code:
             if code > 1:
@@ -181,8 +181,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
             info["prob"] = probability
             if self.simulator.state_space is not None:
                 info["index"] = self._index = self._index_of(next_state)
-        if not self._is_written:
-            observation = self._observation()
+        observation = written if self._is_written else self._observation()
         if self._window is not None:
             self.render()
         is_truncated = self._elapsed >= self._limit
@@ -199,7 +198,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         observation = self._observation() if self._last is None else self._last
         return observation, 0.0, True, self._elapsed >= self._limit, info
 
-    def render(self) -> Any:
+    def render(self) -> str | np.ndarray | None:
         """The current state in the render mode: text, a picture, or None where there is a window."""
         if self.render_mode is None:
             return None
@@ -237,7 +236,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
             raise gymnasium.error.ResetNeeded(f"{self.environment}: call reset() before step() or render()")
         return self._state
 
-    def _observation(self, *, begins: bool = False) -> Any:
+    def _observation(self, *, begins: bool = False) -> Seen | np.integer:
         if self._is_index:
             return np.int64(self._index)
         if self._frame_stack is not None:
@@ -255,9 +254,9 @@ def _window(simulator: Simulator, fps: int) -> "Window":
     return Window(str(simulator.env), fps)
 
 
-def _step_and_draw(simulator: Simulator) -> Any:
+def _step_and_draw(simulator: Simulator) -> Callable[..., tuple[float, int]] | None:
     """The compiled step that draws as well, for simple images with a pixel for each cell; else None."""
-    observation: Any = simulator.context.observation
+    observation = simulator.context.observation
     if not simulator.context.is_plain or not observation.is_flat:
         return None
     state, image = simulator.start_states[0], observation.one(simulator.start_states[0])

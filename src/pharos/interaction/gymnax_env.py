@@ -26,9 +26,9 @@ class EnvState(environment.EnvState):
         previous: the action that was executed last; A before the first step.
     """
 
-    time: Any
-    index: Any
-    previous: Any
+    time: jax.Array
+    index: jax.Array
+    previous: jax.Array
 
 
 @struct.dataclass
@@ -47,15 +47,15 @@ class EnvParams:
             chosen one is on the first step.
     """
 
-    max_steps_in_episode: Any
-    successors: Any
-    cumulative: Any
-    rewards: Any
-    ends: Any
-    starts: Any
-    start_cumulative: Any
-    observations: Any
-    chance: Any
+    max_steps_in_episode: int
+    successors: jax.Array
+    cumulative: jax.Array
+    rewards: jax.Array
+    ends: jax.Array
+    starts: jax.Array
+    start_cumulative: jax.Array
+    observations: jax.Array
+    chance: jax.Array
 
 
 class GymnaxEnv(environment.Environment):
@@ -123,7 +123,7 @@ class GymnaxEnv(environment.Environment):
         """A."""
         return self._num_actions
 
-    def step_env(self, key: Any, state: Any, action: Any, params: Any) -> tuple[Any, ...]:
+    def step_env(self, key: jax.Array, state: EnvState, action: jax.Array, params: EnvParams) -> tuple[Any, ...]:
         """One step: (observation, state, reward, whether a terminal state was reached, info)."""
         key_which, key_uniform, key_outcome = jax.random.split(key, 3)
         chosen, previous, _, first_chosen = params.chance
@@ -142,7 +142,7 @@ class GymnaxEnv(environment.Environment):
         info = {"discount": jnp.where(is_over, 0.0, 1.0), "executed": executed}
         return self.get_obs(after, params), after, reward, is_over, info
 
-    def reset_env(self, key: Any, params: Any) -> tuple[Any, EnvState]:
+    def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, EnvState]:
         """A start state: (observation, state)."""
         index = params.starts[_drawn(params.start_cumulative, jax.random.uniform(key))]
         state = EnvState(
@@ -150,23 +150,23 @@ class GymnaxEnv(environment.Environment):
         )
         return self.get_obs(state, params), state
 
-    def get_obs(self, state: Any, params: Any = None, key: Any = None) -> Any:
+    def get_obs(self, state: EnvState, params: EnvParams | None = None, key: jax.Array | None = None) -> jax.Array:
         """Observation of a state."""
         return (self._params if params is None else params).observations[state.index]
 
-    def is_terminated(self, state: Any, params: Any) -> Any:
+    def is_terminated(self, state: EnvState, params: EnvParams) -> jax.Array:
         """Whether a terminal state was reached."""
         return params.ends[state.index]
 
-    def action_space(self, params: Any = None) -> Any:
+    def action_space(self, params: EnvParams | None = None) -> spaces.Discrete:
         """Discrete(A)."""
         return spaces.Discrete(self._num_actions)
 
-    def observation_space(self, params: Any = None) -> Any:
+    def observation_space(self, params: EnvParams | None = None) -> spaces.Box:
         """A Box."""
         return self._space
 
-    def state_space(self, params: Any = None) -> Any:
+    def state_space(self, params: EnvParams | None = None) -> spaces.Dict:
         """A Dict of the components of `EnvState`."""
         limit = (self._params if params is None else params).max_steps_in_episode
         return spaces.Dict(
@@ -182,13 +182,15 @@ class JoinedEnds(GymnaxEnv):
     """The same for agents of gymnax before 1.0, such as rejax 0.1: `step` joins terminated and truncated to `done`."""
 
     @partial(jax.jit, static_argnames=("self",))
-    def step(self, key: Any, state: Any, action: Any, params: Any = None) -> tuple[Any, ...]:
+    def step(
+        self, key: jax.Array, state: EnvState, action: jax.Array, params: EnvParams | None = None
+    ) -> tuple[Any, ...]:
         """(observation, state, reward, done, info)."""
         observation, after, reward, terminated, truncated, info = super().step(key, state, action, params)
         return observation, after, reward, jnp.logical_or(terminated, truncated), info
 
 
-def _drawn(cumulative: Any, u: Any) -> Any:
+def _drawn(cumulative: jax.Array, u: jax.Array) -> jax.Array:
     """The first entry whose cumulated probability exceeds u; entries that cannot be drawn come after all others."""
     return jnp.minimum(jnp.sum(u >= cumulative), len(cumulative) - 1)
 

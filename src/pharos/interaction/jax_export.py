@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos.environments import Environment
 from pharos.errors import MissingExtra, ParameterError
 from pharos.mdp import TabularMDP
 from pharos.observations import observe
@@ -18,7 +19,7 @@ BLOCK = 1 << 14  # states that are observed at once
 
 def to_gymnax(
     source: StateSpace | TabularMDP,
-    observation: Any = "vector",
+    observation: object = "vector",
     *,
     observation_options: Mapping[str, Any] | None = None,
     time_limit: int | None = None,
@@ -75,7 +76,9 @@ def to_gymnax(
     return made(mdp, observations, low, high, int(limit), name, reward_noise)
 
 
-def _observed(space: StateSpace, env: Any, name: Any, options: dict[str, Any]) -> tuple[np.ndarray, float, float]:
+def _observed(
+    space: StateSpace, env: Environment, name: object, options: dict[str, Any]
+) -> tuple[np.ndarray, float, float]:
     """(S, ...) observations of all states, and their bounds."""
     observation = observe(env, name, state_space=space, **options)
     blocks = [observation(space.states(slice(first, first + BLOCK))) for first in range(0, space.num_states, BLOCK)]

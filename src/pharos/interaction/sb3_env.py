@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
@@ -31,13 +32,13 @@ class SB3VecEnv(VecEnv):
         self.env = env
         self.render_mode = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        self._actions: Any = None
+        self._actions = np.zeros(env.num_envs, np.int64)
         self.earned = np.zeros(env.num_envs, np.float32)
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, np.int64)
         self._began = time.perf_counter()
 
-    def reset(self) -> Any:
+    def reset(self) -> VecEnvObs:
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         options = {"state": self._options[0]["state"]} if "state" in (self._options[0] or {}) else None
         observations, _ = self.env.reset(seed=seeds, options=options)
@@ -50,7 +51,7 @@ class SB3VecEnv(VecEnv):
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
 
-    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict]]:
+    def step_wait(self) -> tuple[VecEnvObs, np.ndarray, np.ndarray, list[dict]]:
         observations, rewards, terminated, truncated, info = self.env.step(self._actions)
         done = terminated | truncated
         self.earned = info.get("earned_reward", rewards).astype(np.float32)
@@ -74,18 +75,20 @@ class SB3VecEnv(VecEnv):
     def close(self) -> None:
         self.env.close()
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
         raise ParameterError(f"{attr_name!r} cannot be set: the environments share their settings; make another VecEnv")
 
-    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *method_args: object, indices: VecEnvIndices = None, **method_kwargs: object
+    ) -> list[Any]:
         raise ParameterError(
             f"{method_name!r} cannot be called: there are no single environments; use `.env`, a VectorEnv"
         )
 
-    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """Episodes are monitored already, other wrappers there are none."""
         from stable_baselines3.common.monitor import Monitor
 

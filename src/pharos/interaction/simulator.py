@@ -1,23 +1,29 @@
-"""An environment made ready for interaction: the options that single and vector environments share."""
+"""An environment made ready for interaction: what single and vector environments share.
+
+Their options (`Interaction`), rules and chance (`Simulator`), observations beyond the current state (`FrameStack`: the
+frames before, irrelevant coins), and how rewards are paid (`RewardChannel`).
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from pharos.environments import Environment, make, start_distribution
 from pharos.errors import ParameterError, RuleError, StateSpaceTooLarge
 from pharos.kernels import stepping
 from pharos.kernels.stepping import Setting
 from pharos.mdp import Chance, ChanceSetting
-from pharos.observations import NO_ACTION, ObservationInContext, observe
+from pharos.observations import NO_ACTION, ObservationInContext, Seen, observe
 from pharos.rules import rules_of
 from pharos.system.records import flat, option_names
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
+
+Rows = slice | np.ndarray  # which environments of a batch
 
 # States that are built on the way where the observation "index" is asked for without `space`.
 LARGEST_INDEX = 20_000_000
@@ -41,7 +47,7 @@ class Interaction:
             needs it: where none is given, it is taken from the user's cache, or built.
     """
 
-    observation: Any = "vector"
+    observation: object = "vector"
     observation_options: Mapping[str, Any] | None = None
     chance: ChanceSetting = ChanceSetting()
     initial_previous_action: int | None = None
@@ -110,7 +116,7 @@ class Simulator:
         """The executed action, by one uniform number u in [0, 1): chosen, then previous, then uniform."""
         return stepping.executed_by_number.py_func(chosen, previous, self._weights, self.env.num_actions, u)
 
-    def checked_state(self, state: Any) -> np.ndarray:
+    def checked_state(self, state: object) -> np.ndarray:
         """(D,) int64 from what a user gave; ParameterError unless every component is in its range."""
         values = np.asarray(state)
         if values.shape != (len(self.env.components),) or values.dtype.kind not in "iub":
@@ -164,7 +170,7 @@ class SimulatedEnv:
 
     simulator: Simulator
     action_names: tuple[str, ...]
-    _spec: Any = None
+    _spec: EnvSpec | None = None
 
     @property
     def environment(self) -> Environment:
@@ -176,7 +182,7 @@ class SimulatedEnv:
         return list(self.action_names)
 
     @property
-    def spec(self) -> Any:
+    def spec(self) -> EnvSpec | None:
         """Gymnasium's specification, with the limit of this instance; None unless it was made by an id.
 
         The registry says that there is no limit, because it depends on the arguments of `gymnasium.make`: with a number
@@ -186,7 +192,7 @@ class SimulatedEnv:
         return self._spec
 
     @spec.setter
-    def spec(self, spec: gymnasium.envs.registration.EnvSpec | None) -> None:
+    def spec(self, spec: EnvSpec | None) -> None:
         self._spec = None if spec is None else replace(spec, max_episode_steps=self.simulator.limit)
 
 
@@ -253,3 +259,108 @@ def _first_previous(action: int | None, env: Environment) -> int:
             f"initial_previous_action is {action!r}; expected None or an action from 0 to {env.num_actions - 1}"
         )
     return int(action)
+
+
+class FrameStack:
+    """The observations of N environments whose observation has `frames` or is in part `irrelevant`.
+
+    Frames are kept as pictures: a step draws one. Coins are thrown for each observation, from streams of their own, so
+    that steps stay what they are without.
+    """
+
+    def __init__(self, simulator: Simulator, num_envs: int):
+        self.context, self.observation = simulator.context, simulator.context.observation
+        self._rng = np.random.SeedSequence().generate_state(num_envs, np.uint64)
+        self._frames = np.empty((num_envs, 0))
+        if self.observation.frames > 1:
+            one = self.observation.frame(simulator.start_states[:1])
+            self._frames = np.zeros((num_envs, self.observation.frames, *one.shape[1:]), one.dtype)
+
+    def seed(self, seeds: "list[int | None]") -> None:
+        """Seed the coins of each environment; None leaves a stream as it is."""
+        for i, seed in enumerate(seeds):
+            if seed is not None:
+                self._rng[i] = stream_of(seed, 2)[0]
+
+    def push(self, states: np.ndarray, moves: np.ndarray, begins: np.ndarray) -> None:
+        """Environments are in states (N, D) now; (N,) bool: `moves` by a step, `begins` at the start of an episode."""
+        if self.observation.frames > 1:
+            frames = self.observation.frame(states)
+            self._frames[moves, :-1] = self._frames[moves, 1:]
+            self._frames[moves, -1] = frames[moves]
+            self._frames[begins] = frames[begins, None]
+
+    def current(self, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+        """A batch of N observations of where they are; after `push`."""
+        return self._in_context(self._frames, slice(None), states, previous, elapsed)
+
+    def terminal(self, rows: np.ndarray, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+        """The last observations of the episodes of environments `rows`, in states (len(rows), D) that `push` is not
+        told.
+        """
+        frames = self._frames[rows]
+        if self.observation.frames > 1:
+            frames = np.concatenate([frames[:, 1:], self.observation.frame(states)[:, None]], axis=1)
+        return self._in_context(frames, rows, states, previous, elapsed)
+
+    def _in_context(
+        self, frames: np.ndarray, rows: Rows, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray
+    ) -> Seen:
+        stack = self.observation.stacked(frames) if self.observation.frames > 1 else None
+        coins = None
+        if self.observation.irrelevant:
+            rng = self._rng[rows]
+            coins = np.empty((len(states), self.observation.irrelevant), np.float32)
+            stepping.throw(rng, coins)
+            self._rng[rows] = rng
+        return self.context(states, previous, elapsed, seen=stack, coins=coins)
+
+
+class RewardChannel:
+    """Pay of N environments: the reward of `delay` steps before, and noise. Values and regret are of what is earned.
+
+    At step t of an episode of n steps, t = 1 .. n, r_t being what is earned:
+
+        paid_t = r_(t - delay) + noise z_t for t < n, with r_0 = r_-1 = ... = 0
+        paid_n = r_(n - delay) + ... + r_n + noise z_n
+
+    z are independent standard normal numbers. So the sum of what is paid in an episode has the mean of what was earned,
+    however the episode ended. Where it is broken off by a reset, what was not paid yet is lost.
+
+    Noise is drawn from streams of its own, seeded as those of the steps are, so that steps stay what they are without.
+
+    Attributes:
+        earned: (N,) of the last step.
+    Source: the reward delay and reward noise of MDP Playground (Rajan et al. 2023).
+    """
+
+    def __init__(self, chance: ChanceSetting, num_envs: int):
+        self.noise, self.delay = float(chance.reward_noise), int(chance.reward_delay)
+        self.earned = np.zeros(num_envs)
+        self._pending = np.zeros((num_envs, self.delay))
+        self._steps = np.zeros(num_envs, np.int64)
+        self._rng = np.random.SeedSequence().generate_state(num_envs, np.uint64)
+
+    def seed(self, seeds: "list[int | None]") -> None:
+        """Seed the noise of each environment; None leaves a stream as it is."""
+        for i, seed in enumerate(seeds):
+            if seed is not None:
+                self._rng[i] = stream_of(seed, 1)[0]
+
+    def restart(self, mask: np.ndarray) -> None:
+        """Forget what is due in some environments (N,) bool, whose episodes begin."""
+        self._pending[mask] = 0.0
+        self._steps[mask] = 0
+
+    def pay(self, earned: np.ndarray, is_step: np.ndarray, ended: np.ndarray) -> np.ndarray:
+        """Return the pay (N,) of a step.
+
+        Args:
+            earned: (N,), 0 where nothing is played.
+            is_step: (N,) bool, whether an environment was stepped, not reset.
+            ended: (N,) bool, whether its episode is over, so that everything is due.
+        """
+        self.earned = earned
+        amounts = earned.copy()
+        stepping.pay(self._rng, self.noise, self._pending, self._steps, is_step, ended, amounts)
+        return amounts

@@ -7,23 +7,238 @@ random actions, whether it has an effect under lazy ones, then the outcome where
 but one possibility nothing is drawn.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
+import numpy.typing as npt
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.interaction.frame_stack import FrameStack
-from pharos.interaction.reward_channel import RewardChannel
-from pharos.interaction.simulator import Interaction, SimulatedEnv, Simulator, stream_of
-from pharos.interaction.walks import RulesWalk, TableWalk
+from pharos.interaction.simulator import (
+    FrameStack,
+    Interaction,
+    RewardChannel,
+    Rows,
+    SimulatedEnv,
+    Simulator,
+    stream_of,
+)
+from pharos.kernels import stepping
 from pharos.kernels.stepping import DISABLED, SAME_STEP, Batch, first_outside
-from pharos.observations import NO_ACTION
+from pharos.mdp import OutcomeTable, rewards_of_outcomes, rewards_of_staying
+from pharos.observations import NO_ACTION, Index, Seen, in_blocks
+from pharos.system.packed_indices import as_array
 from pharos.system.records import split
+
+if TYPE_CHECKING:
+    from pharos.state_space import StateSpace
+
+BLOCK = 4096  # steps that are worth a thread's while
+LARGEST_TABLE = 1 << 28  # bytes of observations that are computed beforehand
+_NO_VECTORS = np.empty((0, 0), np.float32)
+
+
+class Walk(ABC):
+    """Where the N environments are, and how a step advances them.
+
+    Kernels get Setting and Batch as plain tuples: named ones cost Numba a microsecond a call more.
+
+    Attributes:
+        name: of a place, in `info`.
+        current, final: the places (N, ...) now, and at the ends of episodes that a step ended.
+        final_elapsed: (N,) steps of the episode after the last step.
+    """
+
+    name: str
+    starts: np.ndarray
+
+    def __init__(self, simulator: Simulator, current: np.ndarray):
+        self.simulator, self.current, self.final = simulator, current, np.zeros_like(current)
+        self.final_elapsed = np.zeros(len(current), np.int64)
+
+    def restart(self, mask: np.ndarray, rng: np.ndarray, state: object) -> None:
+        """Begin episodes in the environments of mask (N,): in `state`, or where they are drawn."""
+        if state is not None:
+            self.current[mask] = self.places(_states_of(self.simulator, state, len(mask))[mask])
+            return
+        numbers = np.zeros(len(mask), np.int64)
+        stepping.draw_starts(self.simulator.start_cumulative, rng, mask, numbers)
+        self.current[mask] = self.starts[numbers[mask]]
+
+    @abstractmethod
+    def places(self, states: np.ndarray) -> np.ndarray:
+        """Places of states (N, D)."""
+
+    @abstractmethod
+    def states(self, rows: Rows) -> np.ndarray:
+        """States (n, D) of some environments, a fresh array."""
+
+    @abstractmethod
+    def final_states(self, rows: np.ndarray) -> np.ndarray:
+        """States (n, D) at the ends of episodes."""
+
+    @abstractmethod
+    def vectors(self) -> np.ndarray:
+        """Room for the vectors of the next step; without rows where the compiled step does not write them."""
+
+    @abstractmethod
+    def step(self, batch: Batch) -> None:
+        """Advance every environment."""
+
+    @abstractmethod
+    def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+        """Observations of the current places."""
+
+    @abstractmethod
+    def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+        """Observations at the ends of episodes."""
+
+
+class RulesWalk(Walk):
+    """States (N, D), advanced by the rules."""
+
+    name = "state"
+
+    def __init__(self, simulator: Simulator, num_envs: int, mode: int):
+        length = len(simulator.env.components)
+        super().__init__(simulator, np.zeros((num_envs, length), np.int64))
+        self.starts = simulator.start_states
+        context = simulator.context
+        vector = context.vector if context.is_plain else None  # the compiled step writes vectors as well
+        self._is_fused = vector is not None
+        self._vector = np.empty((0, length), np.float32)
+        self._step_many: Callable[..., int] = simulator.rules.step_many
+        scale = np.zeros(length) if vector is None else vector.scale
+        self._setting = tuple(simulator.setting(mode, simulator.ranges, scale, self.starts))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without compiled functions, as in GymEnv."""
+        return {**self.__dict__, "_step_many": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._step_many = self.simulator.rules.step_many
+
+    def places(self, states: np.ndarray) -> np.ndarray:
+        return states
+
+    def states(self, rows: Rows) -> np.ndarray:
+        return self.current[rows].copy()
+
+    def final_states(self, rows: np.ndarray) -> np.ndarray:
+        return self.final[rows]
+
+    def restart(self, mask: np.ndarray, rng: np.ndarray, state: object) -> None:
+        self._vector = self._vector[:0]
+        super().restart(mask, rng, state)
+
+    def vectors(self) -> np.ndarray:
+        if self._is_fused:
+            self._vector = np.empty(self.current.shape, np.float32)
+        return self._vector
+
+    def step(self, batch: Batch) -> None:
+        self.final_elapsed[:] = batch.elapsed + 1
+        parameters, setting, arrays = self.simulator.rules.parameters, self._setting, tuple(batch)
+        faults: list[int] = []
+
+        def run(first: int, last: int) -> None:
+            fault = self._step_many(parameters, setting, arrays, first, last)
+            if fault >= 0:
+                faults.append(fault)
+
+        in_blocks(run, len(self.current), BLOCK)
+        if faults:
+            i, component = divmod(min(faults), self.current.shape[1])
+            self.simulator.raise_fault(self.current[i], int(batch.executed[i]), component)
+
+    def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+        if len(self._vector):
+            return self._vector
+        return self.simulator.context(self.current, previous, elapsed)
+
+    def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+        return self.simulator.context(self.final[rows], previous, elapsed)
+
+
+class TableWalk(Walk):
+    """Indices (N,) of a built state space, advanced by looking successors up."""
+
+    name = "index"
+
+    def __init__(self, simulator: Simulator, space: "StateSpace", num_envs: int, mode: int):
+        super().__init__(simulator, np.zeros(num_envs, np.int64))
+        self.space = space
+        self.starts = self.places(simulator.start_states)
+        self._transitions, self._rewards = _tables(space)
+        self._staying = rewards_of_staying(space).array if simulator.lazy else np.empty((0, 0))
+        self._setting = tuple(simulator.setting(mode, np.zeros((2, 0), np.int64), np.zeros(0), self.starts))
+        context = simulator.context
+        self._is_index = context.is_plain and isinstance(context.observation, Index)
+        self._table: np.ndarray | None = None
+        one = np.prod(context.observation.space.shape or ()) * np.dtype(context.observation.space.dtype).itemsize
+        if context.is_plain and not self._is_index and one * space.num_states <= LARGEST_TABLE:
+            self._table = context.observation(space.states())
+
+    def places(self, states: np.ndarray) -> np.ndarray:
+        return self.space.indices(states)
+
+    def states(self, rows: Rows) -> np.ndarray:
+        return self.space.states(self.current[rows])
+
+    def final_states(self, rows: np.ndarray) -> np.ndarray:
+        return self.space.states(self.final[rows])
+
+    def vectors(self) -> np.ndarray:
+        return _NO_VECTORS  # tables know none
+
+    def step(self, batch: Batch) -> None:
+        self.final_elapsed[:] = batch.elapsed + 1
+        walk_table: Callable[..., None] = stepping.walk_table
+        terminal, setting, arrays = self.space.terminal, self._setting, tuple(batch)
+
+        def run(first: int, last: int) -> None:
+            walk_table(self._transitions, self._rewards, self._staying, terminal, setting, arrays, first, last)
+
+        in_blocks(run, len(self.current), BLOCK)
+
+    def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+        return self._observed(self.current, previous, elapsed)
+
+    def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+        return self._observed(self.final[rows], previous, elapsed)
+
+    def _observed(self, index: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+        if self._is_index:
+            return index.copy()
+        if self._table is not None:
+            return self._table.take(index, axis=0)
+        return self.simulator.context(self.space.states(index), previous, elapsed)
+
+
+def _tables(space: "StateSpace") -> tuple[object, object]:
+    """(successors, rewards) of executed actions, as `stepping.walk_table` takes them."""
+    if not space.has_chance:
+        return as_array(space.successors), np.ascontiguousarray(space.mdp().rewards, np.float64)
+    dynamics = space.dynamics
+    assert isinstance(dynamics, OutcomeTable)
+    return dynamics.for_kernels, dynamics.for_kernels_with(rewards_of_outcomes(space))
+
+
+def _states_of(simulator: Simulator, state: object, num_envs: int) -> np.ndarray:
+    """(N, D) from one state or N of them, checked."""
+    rows = np.asarray(state)
+    if rows.ndim == 1:
+        return np.tile(simulator.checked_state(rows), (num_envs, 1))
+    if len(rows) != num_envs:
+        raise ParameterError(f"{simulator.env}: {len(rows)} states; expected one, or {num_envs}")
+    return np.stack([simulator.checked_state(row) for row in rows])
+
 
 _MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
 
@@ -89,8 +304,10 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         self._frame_stack = FrameStack(simulator, n) if simulator.context.has_more else None
         self._reward_channel = RewardChannel(interaction.chance, n) if simulator.modifies_rewards else None
         self._num_drawn = n if simulator.has_outcomes else 0  # outcomes that are drawn in a step
-        walk = RulesWalk if simulator.state_space is None else TableWalk
-        self._walk: Any = walk(simulator, n, self._mode)
+        space = simulator.state_space
+        self._walk: Walk = (
+            RulesWalk(simulator, n, self._mode) if space is None else TableWalk(simulator, space, n, self._mode)
+        )
 
     @property
     def states(self) -> np.ndarray:
@@ -119,8 +336,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         """
         options = options or {}
         mask = self._checked_mask(options.get("reset_mask"))
-        self._seed_streams(seed)
-        self._walk.restart(mask, self._rng, options.get("state"))
+        self._walk.restart(mask, self._seeded(seed), options.get("state"))
         self._previous[mask] = self.simulator.first_previous
         self._elapsed[mask] = 0
         self._ended[mask] = False
@@ -130,7 +346,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         info = self._info(executed, np.ones(self._num_drawn))
         return self._observations(mask, mask), info
 
-    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: npt.ArrayLike) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Choose an action (N,) for every environment."""
         if self._rng is None:
             raise gymnasium.error.ResetNeeded(f"{self.environment}: call reset() before step()")
@@ -160,7 +376,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         begins = done if self._mode == SAME_STEP else executed == NO_ACTION
         return self._observations(np.ones_like(done), begins), rewards, terminated, truncated, info
 
-    def _observations(self, moves: np.ndarray, begins: np.ndarray) -> Any:
+    def _observations(self, moves: np.ndarray, begins: np.ndarray) -> Seen:
         """Observations of the current states; `moves`, `begins` (N,) bool: after a step, at the start of an episode."""
         if self._frame_stack is None:
             return self._walk.observations(self._previous, self._elapsed)
@@ -210,14 +426,15 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             info["final_info"].update(prob=np.where(done, info["prob"], 0.0), _prob=done)
             info["prob"] = np.where(done, 1.0, info["prob"])
 
-    def _seed_streams(self, seed: int | Sequence[int | None] | None) -> None:
+    def _seeded(self, seed: int | Sequence[int | None] | None) -> np.ndarray:
+        """The streams of random numbers (N,) uint64, seeded where that is asked for."""
         n = self.num_envs
         if seed is None and self._rng is not None:
-            return
+            return self._rng
         seed = self._seed if seed is None else seed
         if seed is None:
             self._rng = np.random.SeedSequence().generate_state(n, np.uint64)
-            return
+            return self._rng
         seeds: list[int | None] = [seed + i for i in range(n)] if isinstance(seed, int | np.integer) else list(seed)
         if len(seeds) != n:
             raise ParameterError(f"seed has {len(seeds)} entries; expected one integer, or {n}")
@@ -229,8 +446,9 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         for i, one in enumerate(seeds):
             if one is not None:
                 self._rng[i] = stream_of(one)[0]
+        return self._rng
 
-    def _checked_mask(self, mask: Any) -> np.ndarray:
+    def _checked_mask(self, mask: npt.ArrayLike | None) -> np.ndarray:
         if mask is None:
             return np.ones(self.num_envs, np.bool_)
         mask = np.asarray(mask)
@@ -242,7 +460,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             raise gymnasium.error.ResetNeeded(f"{self.environment}: reset all environments first")
         return mask
 
-    def _checked_actions(self, actions: Any) -> np.ndarray:
+    def _checked_actions(self, actions: npt.ArrayLike) -> np.ndarray:
         indices = np.asarray(actions)
         if indices.shape != (self.num_envs,) or indices.dtype.kind not in "iu":
             raise ParameterError(
@@ -264,8 +482,8 @@ def make_vec(name_or_env: Environment | str, num_envs: int = 1, **options: Any) 
     return VectorEnv(name_or_env, num_envs, **options)
 
 
-def _rows_of(batch: Any, number: int) -> list[Any]:
-    if isinstance(batch, Mapping):
+def _rows_of(batch: Seen, number: int) -> list[Seen]:
+    if isinstance(batch, dict):
         return [{name: values[i] for name, values in batch.items()} for i in range(number)]
     return list(batch)
 

@@ -22,9 +22,7 @@ if TYPE_CHECKING:
         shares_of,
     )
     from pharos.mdp.expanded import ExpandedMDP, executed_actions, nodes_of_outcomes, outcomes_of
-    from pharos.mdp.matrices import Matrices
-    from pharos.mdp.outcome_table import OutcomeTable
-    from pharos.mdp.part import Part
+    from pharos.mdp.outcome_table import Matrices, OutcomeTable
     from pharos.mdp.rewards import Rewards
     from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass, mass_of
     from pharos.mdp.space_rewards import (
@@ -36,7 +34,7 @@ if TYPE_CHECKING:
         rewards_of_staying,
     )
     from pharos.mdp.table import Lazy, Table
-    from pharos.mdp.tabular import TabularMDP
+    from pharos.mdp.tabular import Part, TabularMDP
 
 __all__ = [
     "Chance",

@@ -6,9 +6,9 @@ classes that their states lead to, until nothing splits (Moore 1956; Kanellakis 
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pharos.errors import ParameterError
 from pharos.mdp.arguments import require_mdp
@@ -40,7 +40,7 @@ class Minimization:
 
 
 @require_mdp
-def minimize(mdp: TabularMDP, observations: Any = None) -> Minimization:
+def minimize(mdp: TabularMDP, observations: npt.ArrayLike | None = None) -> Minimization:
     """Return the smallest MDP that cannot be told from this one.
 
     V(s) = V(class of s) for every policy that depends on classes, under sticky and random actions too, because both act
@@ -121,7 +121,7 @@ def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -
     count = len(representatives)
     initial = np.zeros(count)
     np.add.at(initial, classes[mdp.start_states], mdp.start_probabilities)
-    start: Any = int(initial.argmax()) if np.count_nonzero(initial) == 1 else initial / initial.sum()
+    start = int(initial.argmax()) if np.count_nonzero(initial) == 1 else initial / initial.sum()
     return replace(
         mdp,
         dynamics=mdp.dynamics.merged(classes, representatives),

@@ -17,6 +17,8 @@ from pharos.errors import ParameterError, UnknownName
 from pharos.mdp.arguments import require_mdp
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from pharos.mdp.tabular import TabularMDP
 
 
@@ -52,7 +54,7 @@ class Chance:
         _check_probability("sticky_actions", p)
         return Chance((1 - p) * self.chosen, p * self.chosen + self.previous, self.uniform, self.first_chosen)
 
-    # What it is -----------------------------------------------------------------------------------------------------
+    # What it is -------------------------------------------------------------------------------------------------------
 
     @property
     def first_uniform(self) -> float:
@@ -96,7 +98,7 @@ class Chance:
         """W: the previous actions that values and distributions distinguish, A under sticky actions, else 1."""
         return num_actions if self.is_sticky else 1
 
-    # What it does ---------------------------------------------------------------------------------------------------
+    # What it does -----------------------------------------------------------------------------------------------------
 
     def choice(self, q: np.ndarray, value: np.ndarray) -> np.ndarray:
         """(N, W, ...): the value of what is executed, given the value of what is chosen; W previous actions.
@@ -282,7 +284,7 @@ def sticky_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
 
 
 @require_mdp
-def lazy_actions(mdp: "TabularMDP", p: float, *, staying: Any = None) -> "TabularMDP":
+def lazy_actions(mdp: "TabularMDP", p: float, *, staying: "npt.ArrayLike | None" = None) -> "TabularMDP":
     """The MDP in which, with probability p, the executed action has no effect: the state stays what it is.
 
         q(s, a) = (1 - p) [r(s, a) + gamma E V(next)] + p [r(s, a, s) + gamma V(s)]

@@ -18,7 +18,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from pharos.errors import ParameterError
 from pharos.kernels import bellman, graph, occupancy, outcomes
 from pharos.mdp.chance import Chance
 from pharos.mdp.rewards import Rewards
-from pharos.mdp.selection import Extreme, PolicyTable, Selection
+from pharos.mdp.selection import Extreme, PolicyTable, Selection, States
 from pharos.system.memory import pieces_from_the_end, rows_with_room
 from pharos.system.packed_indices import Indices, room_for_indices
 
@@ -50,7 +50,7 @@ class BellmanEquation(NamedTuple):
     chance: Chance
     select: Selection
 
-    def value(self, q: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+    def value(self, q: np.ndarray, states: States = slice(None)) -> np.ndarray:
         """(N, W), from the values of executing each action in some states (N, A)."""
         return self.chance.choice(q, self.select.value(q, states))
 
@@ -127,10 +127,10 @@ class Dynamics(ABC):
     laziness: float = 0.0
     workers: int | None = None
 
-    # What each representation says of itself ------------------------------------------------------------------------
+    # What each representation says of itself --------------------------------------------------------------------------
 
     @abstractmethod
-    def expected(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+    def expected(self, x: np.ndarray, states: States = slice(None)) -> np.ndarray:
         """(N, A, ...): E x(next) of executing each action in some states (indices or a slice).
 
         Args:
@@ -140,11 +140,11 @@ class Dynamics(ABC):
 
     @property
     @abstractmethod
-    def for_kernels(self) -> Any:
+    def for_kernels(self) -> object:
         """The argument `transitions` of kernels, see kernels/outcomes.py."""
 
     @property
-    def for_sweeps(self) -> Any:
+    def for_sweeps(self) -> object:
         """The same for the loops in which solvers spend their time: what the compiler knows more of."""
         return self.for_kernels
 
@@ -170,7 +170,7 @@ class Dynamics(ABC):
 
     @abstractmethod
     def part(self, start: int, stop: int) -> "tuple[Dynamics, np.ndarray]":
-        """The states [start, stop) alone, and the states outside that they may lead to; numbers as part.py says."""
+        """The states [start, stop) alone, and the states outside that they may lead to; numbers as `Part` says."""
 
     def deterministic_table(self) -> Indices | None:
         """(S, A) next states, -1 for the end, where each execution has one outcome; else None."""
@@ -181,7 +181,7 @@ class Dynamics(ABC):
         """Whether an action that has an effect may have several outcomes."""
         return not self.is_deterministic
 
-    # What follows from it -------------------------------------------------------------------------------------------
+    # What follows from it ---------------------------------------------------------------------------------------------
 
     def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray, runs: np.ndarray | None = None) -> None:
         """out = T x; x and out are not the same. Between the states and the end there may be others, of a part.
@@ -273,15 +273,15 @@ class Dynamics(ABC):
         following = self.entries_of(states)[1]
         return np.unique(np.where(following < 0, self.num_states, following))
 
-    def largest(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+    def largest(self, x: np.ndarray, states: States = slice(None)) -> np.ndarray:
         """(N, A): the largest of x (S + 1,) over what executing an action may lead to."""
         return self._extreme(x, states, 1.0)
 
-    def smallest(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+    def smallest(self, x: np.ndarray, states: States = slice(None)) -> np.ndarray:
         """(N, A): the smallest of x (S + 1,) over what executing an action may lead to."""
         return self._extreme(x, states, -1.0)
 
-    def _extreme(self, x: np.ndarray, states: Any, sign: float) -> np.ndarray:
+    def _extreme(self, x: np.ndarray, states: States, sign: float) -> np.ndarray:
         rows = np.arange(self.num_states)[states]
         out = np.empty((len(rows), self.num_actions))
         outcomes.largest(self.for_kernels, np.ascontiguousarray(x, np.float64), rows, sign, out)
@@ -408,7 +408,7 @@ class Dynamics(ABC):
 
 
 def swept(
-    transitions: Any,
+    transitions: object,
     num_actions: int,
     equation: BellmanEquation,
     x: np.ndarray,

@@ -7,11 +7,12 @@ float64.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pharos.errors import ParameterError
+from pharos.mdp.arguments import as_array
 from pharos.system.memory import large_zeros
 
 _BLOCK = 1 << 16
@@ -99,7 +100,7 @@ class RangedRewards(Rewards):
     def shape(self) -> tuple[int, int]:
         return vars(self)["_shape"]
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> np.ndarray:
         if name not in ("table", "palette"):
             raise AttributeError(name)
         if vars(self)["whole"] is None:
@@ -159,3 +160,38 @@ class RewardsCollector:
             return Rewards(self._values, np.empty(0))
         codes = self._codes if self._codes is not None else np.zeros(self.shape, np.uint8)
         return Rewards(codes, self._palette if len(self._palette) else np.zeros(1))
+
+
+# Given by users -------------------------------------------------------------------------------------------------------
+
+
+def rewards_of_shape(rewards: npt.ArrayLike, shape: tuple[int, ...]) -> Rewards:
+    """Rewards (S, A) of this shape; ParameterError where they have another, or one is not finite."""
+    array = as_array(rewards, "rewards", np.float64)
+    if array.shape != shape:
+        raise ParameterError(f"rewards have shape {array.shape}; expected {shape}, one for each state and action")
+    return Rewards.from_array(array)
+
+
+def expected_over_outcomes(rewards: npt.ArrayLike, probabilities: np.ndarray) -> np.ndarray:
+    """(S, A) expected rewards: those given, or the mean of those of the outcomes, (S, A, K).
+
+    Raises:
+        ParameterError: they have neither shape, or one of a possible outcome is not finite.
+    """
+    array, shape = as_array(rewards, "rewards", np.float64), probabilities.shape
+    if array.shape == shape[:2]:
+        return array
+    if array.shape != shape:
+        raise ParameterError(
+            f"rewards have shape {array.shape}; expected {shape[:2]}, one for each state and action, or {shape}, one "
+            "for each outcome"
+        )
+    possible = probabilities > 0
+    wrong = possible & ~np.isfinite(array)
+    if wrong.any():
+        s, a, k = map(int, np.argwhere(wrong)[0])
+        raise ParameterError(
+            f"the reward of state {s}, action {a}, outcome {k} is {array[s, a, k]}; expected a finite number"
+        )
+    return (probabilities * np.where(possible, array, 0.0)).sum(axis=2)

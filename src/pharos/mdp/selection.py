@@ -5,7 +5,7 @@ The one thing in which the Bellman equations of optimal values, worst values and
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -13,6 +13,10 @@ from pharos.errors import ParameterError
 
 if TYPE_CHECKING:
     from pharos.mdp.tabular import TabularMDP
+
+
+States = slice | np.ndarray
+"""Which states: a range, or their numbers (N,)."""
 
 
 class Selection(Protocol):
@@ -32,10 +36,10 @@ class Selection(Protocol):
 
     def operations(self, num_actions: int) -> int: ...
 
-    def value(self, q: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+    def value(self, q: np.ndarray, states: States = slice(None)) -> np.ndarray:
         """(N, 1, ...), or (N, A, ...) where it depends on the previous action: from q (N, A, ...) of some states."""
 
-    def first_value(self, q: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+    def first_value(self, q: np.ndarray, states: States = slice(None)) -> np.ndarray:
         """(N, 1, ...): without a previous action."""
 
     def policy(self, q: np.ndarray) -> "PolicyTable":
@@ -53,7 +57,7 @@ class Extreme:
     def operations(self, num_actions: int) -> int:
         return 0
 
-    def value(self, q: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+    def value(self, q: np.ndarray, states: States = slice(None)) -> np.ndarray:
         return q.max(axis=1, keepdims=True) if self.sign > 0 else q.min(axis=1, keepdims=True)
 
     first_value = value
@@ -88,7 +92,7 @@ class PolicyTable:
         return np.eye(self.num_actions)[self.actions][:, None]
 
     @staticmethod
-    def of(mdp: "TabularMDP", policy: Any = None) -> "PolicyTable":
+    def of(mdp: "TabularMDP", policy: object = None) -> "PolicyTable":
         """From what users write.
 
         Args:
@@ -144,10 +148,10 @@ class PolicyTable:
     def operations(self, num_actions: int) -> int:
         return (num_actions + 1) * (1 if self.actions is not None else 2)  # the sum of a row and a division by it
 
-    def value(self, q: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+    def value(self, q: np.ndarray, states: States = slice(None)) -> np.ndarray:
         return np.einsum("sba,sa...->sb...", self.later[states], q)
 
-    def first_value(self, q: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+    def first_value(self, q: np.ndarray, states: States = slice(None)) -> np.ndarray:
         return np.einsum("sba,sa...->sb...", self.first[states], q)
 
     def of_states(self, states: slice) -> "PolicyTable":

@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from pharos.errors import ParameterError, StateSpaceError
 from pharos.system.workers import usable_workers
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from pharos.mdp.rewards import Rewards
     from pharos.mdp.tabular import TabularMDP
     from pharos.state_space import StateSpace
@@ -19,7 +21,9 @@ if TYPE_CHECKING:
 _ROWS = 1 << 16
 
 
-def rewards_of_space(space: "StateSpace", rewards: Any = None, *, workers: int | None = None) -> "Rewards":
+def rewards_of_space(
+    space: "StateSpace", rewards: "npt.ArrayLike | Callable[..., float] | None" = None, *, workers: int | None = None
+) -> "Rewards":
     """The rewards of all transitions of a state space.
 
     Args:

@@ -4,11 +4,11 @@ Dynamics in which now and then nothing happens: nothing is copied, neither succe
 """
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from pharos.mdp.dynamics import Dynamics, Order, Outcomes, as_indices, split
+from pharos.mdp.selection import States
 from pharos.system.packed_indices import Indices, PackedIndices, blocks_of, holds_end, rows_of
 
 
@@ -42,7 +42,7 @@ class Table(Dynamics):
     def arrays(self) -> dict[str, np.ndarray]:
         return {"next_states": np.asarray(self.next_states)}
 
-    def expected(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+    def expected(self, x: np.ndarray, states: States = slice(None)) -> np.ndarray:
         if isinstance(self.next_states, PackedIndices) and isinstance(states, slice) and states == slice(None):
             rows = self.next_states
             out = np.empty((*rows.shape, *x.shape[2:]), x.dtype)
@@ -116,11 +116,11 @@ class Lazy(Dynamics):
         self.mass = max(1.0, tables.mass) * (1 + (self.operations + 2) * _UNIT)
 
     @property
-    def for_kernels(self) -> Any:
+    def for_kernels(self) -> object:
         return self.tables.for_kernels, self.laziness
 
     @property
-    def for_sweeps(self) -> Any:
+    def for_sweeps(self) -> object:
         return self.tables.for_sweeps, self.laziness
 
     @property
@@ -134,7 +134,7 @@ class Lazy(Dynamics):
     def arrays(self) -> dict[str, np.ndarray]:
         return {**self.tables.arrays(), "laziness": np.array(self.laziness)}
 
-    def expected(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+    def expected(self, x: np.ndarray, states: States = slice(None)) -> np.ndarray:
         own = x[np.arange(self.num_states)[states]]
         return (1.0 - self.laziness) * self.tables.expected(x, states) + self.laziness * (
             own[:, None] if x.ndim == 1 else own

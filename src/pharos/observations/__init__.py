@@ -6,11 +6,11 @@ states. Images are loaded when they are first asked for.
 
 from typing import TYPE_CHECKING
 
-from pharos.observations.blocks import in_blocks
-from pharos.observations.context import NO_ACTION, ObservationInContext
+from pharos.observations.context import NO_ACTION, ObservationInContext, Seen
 from pharos.observations.observation import (
     FunctionObservation,
     Observation,
+    in_blocks,
     names,
     observe,
     register,
@@ -21,10 +21,9 @@ from pharos.observations.vector import Index, OneHot, Vector
 from pharos.system import lazy
 
 if TYPE_CHECKING:
-    from pharos.observations.complex_image import ComplexImage
-    from pharos.observations.hash import Hash
+    from pharos.observations.images import RENDERERS, ComplexImage, SimpleImage, render, renderers
     from pharos.observations.memoryless import MemorylessLoss, memoryless_loss
-    from pharos.observations.networks import Network, default_network
+    from pharos.observations.networks import Network, default_network, network_inputs, ntk, tangent_kernel
     from pharos.observations.observation import OwnObservation, imported, observation_of, own_observation
     from pharos.observations.observation_aliasing import (
         Aliasing,
@@ -33,10 +32,8 @@ if TYPE_CHECKING:
         history_aliasing,
         observation_classes,
     )
-    from pharos.observations.rendered import RENDERERS, render, renderers
     from pharos.observations.represented import empirical_ntk, representation
-    from pharos.observations.simple_image import SimpleImage
-    from pharos.observations.tangent_kernels import network_inputs, ntk, tangent_kernel
+    from pharos.observations.vector import Hash
 
 __all__ = [
     "Network",
@@ -52,8 +49,8 @@ __all__ = [
 ]
 _shared = """
     Aliasing ComplexImage FunctionObservation Hash Index MemorylessLoss NO_ACTION ObservationInContext OneHot
-    OwnObservation RENDERERS SimpleImage Vector counted default_network history_aliasing imported in_blocks names
-    network_inputs observation_of own_observation registered render renderers tangent_kernel title
+    OwnObservation RENDERERS Seen SimpleImage Vector counted default_network history_aliasing imported in_blocks
+    names network_inputs observation_of own_observation registered render renderers tangent_kernel title
 """
 
 __getattr__ = lazy.attributes(__name__)

@@ -1,13 +1,12 @@
 """An observation with what a pure function of the state cannot see: the previous action, the remaining time."""
 
-from typing import Any
-
 import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.observations.observation import Observation
 from pharos.observations.vector import Vector
 
+Seen = np.ndarray | dict[str, np.ndarray]  # one observation or a batch of them; a dict where there are several parts
 NO_ACTION = -1  # the previous action on the first step of an episode
 
 
@@ -27,6 +26,7 @@ class ObservationInContext:
         names: of the entries of a vector; None for others.
         has_more: whether frames or coins are wanted.
         is_alone: whether neither the previous action nor the remaining time is wanted.
+        vector: the observation, where it is one; is_vector: whether it is.
         is_plain: whether nothing at all is: a function of the state.
     Raises:
         ParameterError: the remaining time is wanted where there is no time limit.
@@ -43,7 +43,8 @@ class ObservationInContext:
         self.has_more = observation.frames > 1 or observation.irrelevant > 0
         self.is_alone = not previous_action and not remaining_time
         self.is_plain = self.is_alone and not self.has_more
-        self.is_vector = isinstance(observation, Vector)
+        self.vector = observation if isinstance(observation, Vector) else None
+        self.is_vector = self.vector is not None
         self._previous_action = previous_action
         self._remaining_time = remaining_time
         self._limit = limit
@@ -74,7 +75,7 @@ class ObservationInContext:
         *,
         seen: np.ndarray | None = None,
         coins: np.ndarray | None = None,
-    ) -> Any:
+    ) -> Seen:
         """States (N, D), previous actions (N,), elapsed steps (N,) -> a batch of observations (a dict of batches).
 
         Args:
@@ -83,12 +84,11 @@ class ObservationInContext:
         """
         if self.is_plain:
             return self.observation(states)
-        if self.is_vector:
+        if self.vector is not None:
             from pharos.kernels.observation_kernels import normalize
 
-            observation: Any = self.observation
             out = np.zeros((len(states), *self.space.shape), np.float32)  # type: ignore[misc]
-            normalize(states, observation.low, observation.scale, out)
+            normalize(states, self.vector.low, self.vector.scale, out)
             column = states.shape[1]
             if coins is not None:
                 out[:, column : column + coins.shape[1]] = coins
@@ -97,19 +97,19 @@ class ObservationInContext:
         seen = self.observation(states) if seen is None else seen
         if self.is_alone:
             return seen
-        batch: dict[str, Any] = {"observation": seen}
+        batch = {"observation": seen}
         if self._previous_action:
             batch["previous_action"] = np.where(previous == NO_ACTION, self._num_actions, previous).astype(np.int64)
         if self._remaining_time:
             batch["remaining_time"] = self._remaining(elapsed).astype(np.float32)[:, None]
         return batch
 
-    def one(self, state: np.ndarray, previous: int, elapsed: int) -> Any:
+    def one(self, state: np.ndarray, previous: int, elapsed: int) -> Seen:
         """The observation of one state (D,)."""
         if self.is_plain:
             return self.observation.one(state)
         batch = self(state[None], np.array([previous]), np.array([elapsed]))
-        return batch[0] if self.is_vector or self.is_alone else {name: values[0] for name, values in batch.items()}
+        return {name: values[0] for name, values in batch.items()} if isinstance(batch, dict) else batch[0]
 
     def _write_context(self, out: np.ndarray, column: int, previous: np.ndarray, elapsed: np.ndarray) -> None:
         if self._previous_action:

@@ -8,7 +8,10 @@ The name is that of an entry that the module registers, of a pair (function, Gym
 
 import importlib
 import inspect
-from collections.abc import Callable, Mapping
+import itertools
+import os
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -32,7 +35,7 @@ Function = Callable[[Environment, np.ndarray], np.ndarray]
 class Observation:
     """A function of the state for one environment; called with a batch of states it gives a batch of observations.
 
-    Two options tell an agent something else besides: `frames`, pictures of the states before (drawn.py), and
+    Two options tell an agent something else besides: `frames`, pictures of the states before (images.py), and
     `irrelevant`, coins that are thrown anew at each step (context.py). Who steps an environment brings them along.
 
     Attributes:
@@ -43,6 +46,7 @@ class Observation:
         frames: k, where the last k states are seen; else 1.
         irrelevant: how many entries of noise follow a vector.
         is_flat: whether a compiled step may draw it: a pixel is a cell, and each layer has a plane of its own.
+        shades: (L, 256) uint8, of an image: the shade of every value on the plane of every layer.
     """
 
     name: str
@@ -52,14 +56,29 @@ class Observation:
     is_flat: bool = False
     frames: int = 1
     irrelevant: int = 0
+    shades: np.ndarray
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         """(N, D) int64 states -> (N, *space.shape) of space.dtype, a fresh array."""
         raise NotImplementedError
 
-    def one(self, state: np.ndarray) -> Any:
+    def one(self, state: np.ndarray) -> np.ndarray:
         """The observation of one state (D,): a fresh array, or an integer where the space is Discrete."""
         return self(state[None])[0]
+
+    def frame(self, states: np.ndarray) -> np.ndarray:
+        """(N, *shape of one frame) of states (N, D), of an observation of several frames."""
+        raise NotImplementedError(f"{self} has no frames")
+
+    def stacked(self, frames: np.ndarray) -> np.ndarray:
+        """(N, *space.shape) of N histories of k frames (N, k, ...), the oldest first; a fresh array."""
+        raise NotImplementedError(f"{self} has no frames")
+
+    def of_histories(self, histories: np.ndarray) -> np.ndarray:
+        """(N, *space.shape) of N times k states (N, k, D), the oldest first."""
+        count, k, width = histories.shape
+        frames = self.frame(histories.reshape(count * k, width))
+        return self.stacked(frames.reshape(count, k, *frames.shape[1:]))
 
     def __repr__(self) -> str:
         return f"<observation {self.name!r} of {self.env}: {self.space}>"
@@ -76,18 +95,19 @@ class FunctionObservation(Observation):
             value lies outside the space.
     """
 
-    def __init__(self, env: Environment, function: Function, space: Any, *, name: str | None = None):
+    def __init__(self, env: Environment, function: Function, space: object, *, name: str | None = None):
         from gymnasium import spaces
 
         self.name = name or str(getattr(function, "__name__", "function"))
         self.env = env
         self.function = function
-        self.space = space(env) if callable(space) else space
-        if not isinstance(self.space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        one = space(env) if callable(space) else space
+        if not isinstance(one, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
             raise ParameterError(
-                f"observation {self.name!r}: its space is {self.space!r}; expected a Box, Discrete, MultiDiscrete or "
+                f"observation {self.name!r}: its space is {one!r}; expected a Box, Discrete, MultiDiscrete or "
                 f"MultiBinary of Gymnasium, or a function that gives one for env"
             )
+        self.space = one
         starts = np.array([state for state, _ in env.initial_states()], np.int64)
         for state, observation in zip(starts, self(starts), strict=True):
             if not self.space.contains(observation):
@@ -115,15 +135,15 @@ class FunctionObservation(Observation):
 # Name of one of pharos' own -> its file and class, which is loaded when it is first asked for
 _BUILT_IN = {
     "vector": "vector:Vector",
-    "simple_image": "simple_image:SimpleImage",
-    "complex_image": "complex_image:ComplexImage",
+    "simple_image": "images:SimpleImage",
+    "complex_image": "images:ComplexImage",
     "one_hot": "vector:OneHot",
     "index": "vector:Index",
-    "hash": "hash:Hash",
-    "mixed": "hash:Mixed",
-    "recorded": "recorded:Recorded",
+    "hash": "vector:Hash",
+    "mixed": "vector:Mixed",
+    "recorded": "vector:Recorded",
 }
-_registered: dict[str, tuple[Function, Any]] = {}
+_registered: dict[str, tuple[Function, object]] = {}
 
 # Options that change what an agent is told, not how
 TELLING = ("motion", "hide", "seen_first", "frames", "irrelevant")
@@ -146,7 +166,7 @@ def title(name: str, options: Mapping[str, Any], *, whole: bool = False) -> str:
     return f"{name}({', '.join(words)})".removesuffix("()")
 
 
-def _words(value: Any) -> str:
+def _words(value: str | bool | int | Iterable[object]) -> str:
     return str(value) if isinstance(value, str | bool | int) else "+".join(map(str, value))
 
 
@@ -165,7 +185,7 @@ def register(name: str, function: Function, space: object) -> None:
     _registered[name] = (function, space)
 
 
-def registered(name: str) -> tuple[Function, Any] | None:
+def registered(name: str) -> tuple[Function, object] | None:
     """The (function, space) that a user registered under this name."""
     return _registered.get(name)
 
@@ -240,11 +260,8 @@ def _built_in(name: str) -> Callable[..., Observation]:
     return getattr(importlib.import_module(f"pharos.observations.{file}"), class_name)
 
 
-def _own(observation: Any) -> Any:
+def _own(observation: object) -> "OwnObservation | None":
     """The user's own observation, where that is what `observation` names."""
-    if isinstance(observation, str) and not is_reference(observation):
-        return None
-
     if isinstance(observation, OwnObservation):
         return observation
     return imported(observation) if is_reference(observation) else None
@@ -299,7 +316,7 @@ def observation_of(source: Source, *, trust: bool = False, strict: bool = False)
     return _observation(source, sources.resolve(source, trust=trust, strict=strict))
 
 
-def own_observation(observation: Any, folder: str | Path | None = None) -> OwnObservation | None:
+def own_observation(observation: object, folder: str | Path | None = None) -> OwnObservation | None:
     """The user's own observation of this name, imported or registered before; None for all others."""
     if isinstance(observation, OwnObservation):
         return observation
@@ -329,5 +346,53 @@ def _observation(source: Source, value: object) -> OwnObservation:
     return OwnObservation(name, partial(_of_function, name, *entry), source)
 
 
-def _of_function(name: str, function: Any, space: Any, env: Environment) -> Observation:
+def _of_function(name: str, function: Function, space: object, env: Environment) -> Observation:
     return FunctionObservation(env, function, space, name=name)
+
+
+def hidden_names(
+    hide: str | Sequence[str], what: str, choices: Collection[str], also: Collection[str] = (), option: str = "hide"
+) -> set[str]:
+    """The names that `hide` has, a sequence or a text with commas.
+
+    Args:
+        what: whose they are, such as "vector of breakout".
+        choices: what can be hidden, as a message lists it. also: further names.
+        option: in whose value they stand.
+    Raises:
+        ParameterError: one of them cannot be hidden, or they are no names; the message says what can.
+    """
+    names = [name.strip() for name in hide.split(",") if name.strip()] if isinstance(hide, str) else hide
+    if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        raise ParameterError(f"{what}: {option} is {hide!r}; expected names, some of {', '.join(choices)}")
+    for name in names:
+        if name not in choices and name not in also:
+            raise ParameterError(f"{what}: there is no {name!r} to hide; expected some of {', '.join(choices)}")
+    return set(names)
+
+
+_pool: tuple[int, ThreadPoolExecutor] | None = None  # of this process: threads do not survive a fork
+
+
+def in_blocks(run: Callable[[int, int], None], number: int, block: int) -> None:
+    """run(first, last) over 0 .. number - 1; on all processors where there are at least two blocks."""
+    if number < 2 * block:
+        run(0, number)
+        return
+    from pharos.system.workers import usable_workers
+
+    workers = usable_workers(None)
+    if workers < 2:
+        run(0, number)
+        return
+    parts = min(4 * workers, number // block)
+    edges = [number * part // parts for part in range(parts + 1)]
+    for future in [_threads(workers).submit(run, *edge) for edge in itertools.pairwise(edges)]:
+        future.result()
+
+
+def _threads(workers: int) -> ThreadPoolExecutor:
+    global _pool
+    if _pool is None or _pool[0] != os.getpid():
+        _pool = os.getpid(), ThreadPoolExecutor(workers, thread_name_prefix="pharos-observations")
+    return _pool[1]

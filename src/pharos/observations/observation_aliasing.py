@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -82,7 +82,7 @@ def observation_classes(
 
 def history_aliasing(
     space: "StateSpace",
-    observation: Any,
+    observation: Observation,
     *,
     most: int = MOST_HISTORIES,
     progress: Progress | None = None,

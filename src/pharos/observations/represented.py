@@ -11,13 +11,14 @@ import numpy as np
 
 from pharos.errors import MissingExtra, ParameterError, PharosError
 from pharos.hardness import Representation
-from pharos.observations.networks import Network, default_network
+from pharos.observations.networks import Network, check_memory, default_network, network_inputs, tangent_kernel
 from pharos.observations.observation import observe
 from pharos.observations.observation_aliasing import observation_classes
-from pharos.observations.tangent_kernels import check_memory, network_inputs, tangent_kernel
 from pharos.system import sources
 
 if TYPE_CHECKING:
+    import torch
+
     from pharos.state_space import StateSpace
 
 NETWORKS = 20  # random ones, where there is no closed form
@@ -113,7 +114,7 @@ def _own_network(network: object, shape: tuple[int, ...]) -> tuple[Callable[...,
     return kernel, {"network": name, "initialisation": "its own", "networks": NETWORKS, "code": checksum}
 
 
-def _digest(inputs: Any, num_states: int) -> str:
+def _digest(inputs: Callable[[np.ndarray], np.ndarray], num_states: int) -> str:
     """Digest of the network's input in up to SAMPLE states all over the space."""
     import xxhash
 
@@ -158,8 +159,8 @@ def empirical_ntk(
             network = make()
             if not isinstance(network, torch.nn.Module):
                 raise ParameterError(f"make returned {network!r}; expected a torch.nn.Module")
-            rows = _gradients(torch, network, inputs)
-            facing = rows if columns is None else _gradients(torch, network, columns)
+            rows = _gradients(network, inputs)
+            facing = rows if columns is None else _gradients(network, columns)
             total += (rows @ facing.T).double().numpy()
     if not np.isfinite(total).all():
         raise ParameterError("gradients of the network are not finite; expected finite parameters and inputs")
@@ -168,11 +169,13 @@ def empirical_ntk(
     return (total / networks).astype(np.float32)
 
 
-def _gradients(torch: Any, network: Any, inputs: Any) -> Any:
+def _gradients(network: "torch.nn.Module", inputs: "torch.Tensor") -> "torch.Tensor":
     """(N, P): of the first output by all parameters."""
+    import torch
+
     parameters = {name: value.detach() for name, value in network.named_parameters()}
 
-    def output(values: Any, one: Any) -> Any:
+    def output(values: dict[str, torch.Tensor], one: torch.Tensor) -> torch.Tensor:
         outputs = torch.func.functional_call(network, values, (one[None],))
         if outputs.ndim != 2:
             raise ParameterError(f"outputs of one input have shape {tuple(outputs.shape)}; expected (1, A)")

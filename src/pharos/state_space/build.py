@@ -10,17 +10,17 @@ import hashlib
 import json
 import os
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceLocked, StateSpaceMismatch
 from pharos.state_space.files import lock
-from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, read_manifest
-from pharos.state_space.plan import Plan
+from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, Plan, read_manifest
 from pharos.state_space.progress import Progress, reporter
-from pharos.state_space.shards import SHARDS, check_files
 from pharos.state_space.store import StateSpace, load
+from pharos.state_space.stored import SHARDS, check_files
 from pharos.system import memory as machine
 from pharos.system import paths, storage
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 OUR_FILES = (*ARRAYS, *PARTS.values(), SHARDS, MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
 CHECKPOINT_SECONDS = 15.0
+Hold = Callable[[Path], contextlib.AbstractContextManager[object]]  # of a folder, for one builder
 
 
 def build(
@@ -100,7 +101,7 @@ def build(
 
 
 def _build(
-    plan: Plan, path: Path, rank: "Rank | None", options: "Options", progress: Progress | bool | None, hold: Any
+    plan: Plan, path: Path, rank: "Rank | None", options: "Options", progress: Progress | bool | None, hold: Hold
 ) -> bool:
     """Make the folder hold the finished state space; returns whether it did before."""
     from pharos.state_space.outcome_journal import remove_parts
@@ -125,7 +126,7 @@ def _build(
     return False
 
 
-def _waiting(path: Path) -> Any:
+def _waiting(path: Path) -> contextlib.ExitStack:
     def tell(text: str) -> None:
         warnings.warn(text, RuntimeWarning, stacklevel=4)
 

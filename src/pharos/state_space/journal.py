@@ -17,7 +17,6 @@ import numpy as np
 
 from pharos.errors import DiskFull
 from pharos.rules import pack
-from pharos.state_space.checks import check_rules
 from pharos.state_space.files import GrowingFile, write_manifest
 from pharos.state_space.manifest import (
     ARRAYS,
@@ -28,9 +27,10 @@ from pharos.state_space.manifest import (
     SUCCESSORS,
     SUCCESSORS40,
     TERMINAL,
+    Plan,
     successors_name,
 )
-from pharos.state_space.plan import Plan
+from pharos.state_space.stored import check_rules
 from pharos.state_space.table import Block
 from pharos.system.packed_indices import as_stored, dtype_of, from_stored
 
@@ -140,7 +140,7 @@ class Journal:
         words = self.plan.layout.num_words
         out[:] = np.fromfile(self.path / STATES, "<u8", len(out) * words, offset=8 * words * start).reshape(-1, words)
 
-    # Appending -------------------------------------------------------------------------------------------------------
+    # Appending --------------------------------------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
@@ -191,7 +191,7 @@ class Journal:
         file.close()
         file.path.unlink()
 
-    # Committing ------------------------------------------------------------------------------------------------------
+    # Committing -------------------------------------------------------------------------------------------------------
 
     def checkpoint(self, *, complete: bool) -> None:
         """Commit everything appended."""

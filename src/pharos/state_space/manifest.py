@@ -1,12 +1,22 @@
-"""The manifest of a state space: reading it, and checking what it says before anything is made of it."""
+"""The manifest of a state space: reading it, and checking what it says before anything is made of it.
+
+`Plan` is what a manifest needs to know of an environment.
+"""
 
 import hashlib
 import json
 import math
+import re
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from pharos.environments import Environment, State, start_distribution
 from pharos.errors import StateSpaceCorrupted, StateSpaceError, StateSpaceMismatch
+from pharos.rules import Layout, fingerprint_of_rules, layout_of
 from pharos.system import storage
 from pharos.system.packed_indices import INT40
 
@@ -253,3 +263,69 @@ def _whole(value: object, name: str, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 2**63:
         raise ValueError(f"{name} is {repr(value)[:200]}; expected a whole number of at least {least}")
     return value
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a state space needs to know of an environment, each computed once.
+
+    Attributes:
+        env: the environment.
+        layout: where its components sit in packed states.
+        starts: its start states and their probabilities.
+        identity: what makes a state space its state space: kept in the manifest and hashed into the cache's folder
+            names.
+        fingerprint: of its rules.
+    """
+
+    env: Environment
+
+    @cached_property
+    def layout(self) -> Layout:
+        return layout_of(self.env.components)
+
+    @cached_property
+    def starts(self) -> tuple[list[State], np.ndarray]:
+        return start_distribution(self.env)
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        env, layout = self.env, self.layout
+        return {
+            "environment": env.name,
+            "class": f"{_module_of(type(env))}:{type(env).__qualname__}",
+            "rules_version": env.version,
+            "parameters": json.loads(json.dumps(env.parameters)),
+            "actions": list(env.actions),
+            **({"outcomes": int(env.outcomes)} if env.has_chance else {}),
+            "layout": {
+                "names": list(env.components.names),
+                "low": env.components.low.tolist(),
+                "size": env.components.size.tolist(),
+                "bits": [int(mask).bit_length() for mask in layout.mask],
+                "word": layout.word.tolist(),
+                "shift": layout.shift.tolist(),
+                "num_words": layout.num_words,
+            },
+            "start": [[list(state), float(p)] for state, p in zip(*self.starts, strict=True)],
+        }
+
+    @cached_property
+    def branches(self) -> int:
+        """How many successors a state may have: the number of actions, times that of outcomes."""
+        return self.env.num_actions * int(self.env.outcomes)
+
+    @property
+    def format_version(self) -> int:
+        """Of the folder."""
+        return OUTCOMES_VERSION if self.env.has_chance else FORMAT_VERSION
+
+    @cached_property
+    def fingerprint(self) -> str:
+        chance = ("probability",) * self.env.has_chance
+        return fingerprint_of_rules(self.env, ("transition", "is_terminal", *chance))
+
+
+def _module_of(cls: type) -> str:
+    """The module of a class, as manifests name it: built-in classes without the folder of their file."""
+    return re.sub(r"^(pharos\.environments)\.(worlds|mini_grid)\b", r"\1", cls.__module__)

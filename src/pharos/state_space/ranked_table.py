@@ -34,7 +34,7 @@ from pharos.kernels import hash_table
 from pharos.ranks import Rank, mpi_rank
 from pharos.rules import rules_of
 from pharos.state_space.journal import Journal, Position
-from pharos.state_space.plan import Plan
+from pharos.state_space.manifest import Plan
 from pharos.state_space.progress import Progress
 from pharos.state_space.search import Options, Search
 from pharos.state_space.table import Block, MemoryTable
@@ -121,7 +121,7 @@ class RankedTable:
         self.owner.release()
         self.rules.close()
 
-    # Rank 0 ----------------------------------------------------------------------------------------------------------
+    # Rank 0 -----------------------------------------------------------------------------------------------------------
 
     def take(self, states: np.ndarray) -> None:
         """Tell the owners of the states that are numbered already; state i has number i."""
@@ -149,7 +149,7 @@ class RankedTable:
     def _say(self, *header: int) -> None:
         self.rank.broadcast(np.array(header, np.int64), _HEADER)
 
-    # The others ------------------------------------------------------------------------------------------------------
+    # The others -------------------------------------------------------------------------------------------------------
 
     def answer(self) -> None:
         """Do what rank 0 says, until the end."""
@@ -166,7 +166,7 @@ class RankedTable:
             for array in (*block, new):
                 self.rank.gather(array)
 
-    # All -------------------------------------------------------------------------------------------------------------
+    # All --------------------------------------------------------------------------------------------------------------
 
     def _take(self, states: list[np.ndarray], numbers: list[np.ndarray]) -> None:
         for keys, number in zip(self.rank.exchange(states), self.rank.exchange(numbers), strict=True):

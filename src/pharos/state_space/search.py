@@ -18,8 +18,8 @@ from pharos.environments import Environment
 from pharos.errors import StateSpaceTooLarge
 from pharos.rules import rules_of
 from pharos.state_space.journal import Journal, Position
+from pharos.state_space.manifest import Plan
 from pharos.state_space.outcome_journal import OutcomeJournal
-from pharos.state_space.plan import Plan
 from pharos.state_space.progress import BuildProgress, Progress
 from pharos.state_space.table import Block, MemoryTable, SpilledTable
 from pharos.system import compiling
@@ -137,7 +137,7 @@ class Search:
         else:
             self._spill(stored)
 
-    # The table in memory ---------------------------------------------------------------------------------------------
+    # The table in memory ----------------------------------------------------------------------------------------------
 
     def _expand_chunk(self, pool: ThreadPoolExecutor) -> None:
         """Expand up to a chunk of states, then append their rows to the files."""
@@ -281,7 +281,7 @@ class Search:
         if self.in_memory:
             self._grow_table(pool)
 
-    # The table on disk -----------------------------------------------------------------------------------------------
+    # The table on disk ------------------------------------------------------------------------------------------------
 
     def _spill(self, stored: np.ndarray | None = None) -> None:
         """Go on with the table on disk, filled from the one in memory, or from the states of the last checkpoint."""
@@ -352,7 +352,7 @@ class Search:
         states[in_file:] = spilled.states[start + in_file - spilled.appended : stop - spilled.appended]
         return states
 
-    # Limits and reports ----------------------------------------------------------------------------------------------
+    # Limits and reports -----------------------------------------------------------------------------------------------
 
     def _check_size(self) -> None:
         check_size(self.env, self.position.count, self.position.count - self.position.first, self.options.max_states)

@@ -20,23 +20,30 @@ from pharos.errors import (
     StateSpaceMismatch,
 )
 from pharos.rules import Layout, pack, rules_of, unpack
-from pharos.state_space.checks import check_environment, check_rules, check_states, check_successors, states_to_check
 from pharos.state_space.manifest import (
     AGAIN,
     CHECKSUM_BYTES,
     MANIFEST,
     STATES,
     TERMINAL,
+    Plan,
     has_chance,
     read_manifest,
     successors_name,
 )
-from pharos.state_space.plan import Plan
-from pharos.state_space.shards import blocks_of, check_files, mapped, parts_of
-from pharos.state_space.stored_outcomes import (
+from pharos.state_space.stored import (
+    blocks_of,
+    check_environment,
+    check_files,
     check_outcome_rules,
     check_outcomes,
+    check_rules,
+    check_states,
+    check_successors,
+    mapped,
     outcomes_to_check,
+    parts_of,
+    states_to_check,
     stored_outcomes,
 )
 from pharos.system.outcome_rows import OutcomeRows
@@ -189,7 +196,7 @@ class StateSpace:
         """Names of the D components of a state."""
         return tuple(self.manifest["layout"]["names"])
 
-    def states(self, indices: Any = slice(None)) -> np.ndarray:
+    def states(self, indices: "slice | Sequence[int] | np.ndarray" = slice(None)) -> np.ndarray:
         """(N, D) int64, the states with these indices (an array of integers or a slice)."""
         return unpack(self.layout, np.atleast_2d(self.packed_states[indices]))
 
@@ -241,7 +248,13 @@ class StateSpace:
         fill(table, self.packed_states, self.num_states)
         return table
 
-    def mdp(self, gamma: float = 0.99, rewards: Any = None, *, by_range: bool = False) -> "TabularMDP":
+    def mdp(
+        self,
+        gamma: float = 0.99,
+        rewards: Any = None,
+        *,
+        by_range: bool = False,
+    ) -> "TabularMDP":
         """The tabular MDP on these states.
 
         Args:

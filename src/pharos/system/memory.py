@@ -34,7 +34,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-R = TypeVar("R", bound=np.ndarray | PackedIndices)
+R = TypeVar("R")
 LEAST_MEMORY = 1 << 24  # bytes that a build needs
 _PROC, _GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 

@@ -38,10 +38,10 @@ class OutcomeRows:
         self,
         successors: Indices,
         *,
-        offsets: np.ndarray | None = None,
-        codes: np.ndarray | None = None,
-        palette: np.ndarray | None = None,
-        probabilities: np.ndarray | None = None,
+        offsets: Indices | None = None,
+        codes: Indices | None = None,
+        palette: Indices | None = None,
+        probabilities: Indices | None = None,
     ):
         """From arrays as files hold them: nothing is copied, so they may be memory maps.
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeGuard
 
 from pharos.errors import FileFormatError, ParameterError, UntrustedCode
 from pharos.system.records import read
@@ -74,7 +74,7 @@ class Source:
         return f"{self.name} ({self.file})"
 
 
-def is_reference(name: object) -> bool:
+def is_reference(name: object) -> TypeGuard[str]:
     """Whether a name is that of the user's own code, `module:Name` or `file.py:Name`."""
     return isinstance(name, str) and ":" in name
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from pharos.environments.look import Layer, Look
+from pharos.environments.base import Layer, Look
 
-Mask = Callable[[np.ndarray, np.ndarray], Any]
+Mask = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 # In the order of `mini_grid_layouts.COLORS`: blue, green, grey, purple, red, yellow
 PALETTE = ((72, 104, 240), (64, 190, 84), (150, 152, 160), (164, 92, 224), (228, 70, 66), (240, 208, 62))
@@ -52,7 +52,7 @@ def wall(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
 def lava(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
     """Three dark waves."""
 
-    def waves(x: np.ndarray, y: np.ndarray) -> Any:
+    def waves(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return abs((3 * y + 0.18 * np.sin(4 * np.pi * x)) % 1 - 0.5) < 0.12
 
     return painted(cell, (box(0, 1, 0, 1), color), (waves, color * 0.45))

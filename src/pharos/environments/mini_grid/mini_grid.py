@@ -3,6 +3,7 @@
 Source: Chevalier-Boisvert et al. (2023), "Minigrid & Miniworld"; the package minigrid 3.2.0.
 """
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,26 +11,117 @@ from typing import Any
 import numpy as np
 
 from pharos.environments.base import Environment
-from pharos.environments.mini_grid.canvas import Layout
-from pharos.environments.mini_grid.layouts import KINDS
-from pharos.environments.mini_grid.level import (
-    BLOCKED,
-    BOX,
-    CLOSED,
-    DOOR,
-    FREE,
-    KEY,
-    LOCKED,
-    LOST,
-    OPEN,
-    WON,
-    Level,
-    level_of,
-    rows_of,
-)
+from pharos.environments.mini_grid.layouts import COLORS, FLOOR, GOAL, KINDS, LAVA, PLAYER, WALL, Layout
 from pharos.environments.mini_grid.look import LAYERS, LOOK
 from pharos.environments.parameters import one_of, parameter, store
 from pharos.errors import ParameterError
+
+OPEN, CLOSED, LOCKED = range(3)  # doors
+KEY, BALL, BOX = range(3)  # things
+FREE, WON, LOST, BLOCKED, DOOR = range(5)  # cells; DOOR + i has door number i
+DOOR_LETTERS, THING_LETTERS = "ODL", "KAB"
+CELLS = {FLOOR: FREE, WALL: BLOCKED, GOAL: WON, LAVA: LOST}
+
+
+@dataclass(frozen=True)
+class Level:
+    """A layout as numbers: what its text says of cells, doors, things and the player; checked.
+
+    Attributes:
+        start: (row, column, direction) of the player.
+        cells: (rows, columns) int64: FREE, WON, LOST, BLOCKED, or DOOR + the number of a door.
+        door_conditions, door_colors: of each door at the start; numbers of `COLORS`.
+        things: (n, 4) int64: row, column, KEY, BALL or BOX, and colour of each.
+        target_door, target_thing: what pays; -1: none.
+    """
+
+    start: tuple[int, int, int]
+    cells: np.ndarray
+    door_conditions: np.ndarray
+    door_colors: np.ndarray
+    things: np.ndarray
+    target_door: int
+    target_thing: int
+
+
+def level_of(layout: Layout) -> Level:
+    """The numbers of a layout; ParameterError where its text is none, or the player can walk out of the grid."""
+    rows = [re.findall("..", row) for row in layout.rows]
+    cells = np.full((len(rows), len(rows[0])), FREE, np.int64)
+    starts: list[tuple[int, int, int]] = []
+    doors: list[str] = []
+    things: list[tuple[int, int, int, int, str]] = []
+    for row, texts in enumerate(rows):
+        for column, text in enumerate(texts):
+            if text in CELLS:
+                cells[row, column] = CELLS[text]
+            elif text in PLAYER:
+                starts.append((row, column, PLAYER.index(text)))
+            elif text[0] in DOOR_LETTERS and text[1] in COLORS:
+                cells[row, column] = DOOR + len(doors)
+                doors.append(text)
+            elif text[0] in THING_LETTERS and text[1] in COLORS:
+                things.append((row, column, THING_LETTERS.index(text[0]), COLORS.index(text[1]), text))
+            else:
+                raise ParameterError(
+                    f"MiniGrid: level has {text!r} at row {row}, column {column}; expected .. ## GG ~~ >> vv << ^^, or "
+                    f"one of {' '.join(DOOR_LETTERS + THING_LETTERS)} and one of {' '.join(COLORS)}"
+                )
+    if len(starts) != 1:
+        raise ParameterError(f"MiniGrid: level has {len(starts)} players; expected one of {' '.join(PLAYER)}")
+    door, thing = _target(layout.target, doors, [text for *_, text in things])
+    if door < 0 and thing < 0 and not (cells == WON).any():
+        raise ParameterError("MiniGrid: level has neither a goal GG nor a target; expected one of them")
+    _check_walls(cells, starts[0][:2])
+    return Level(
+        start=starts[0],
+        cells=cells,
+        door_conditions=np.array([DOOR_LETTERS.index(text[0]) for text in doors], np.int64),
+        door_colors=np.array([COLORS.index(text[1]) for text in doors], np.int64),
+        things=np.array([numbers[:4] for numbers in things], np.int64).reshape(-1, 4),
+        target_door=door,
+        target_thing=thing,
+    )
+
+
+def rows_of(text: object) -> tuple[str, ...]:
+    """The rows of a level as text, in capitals but for the player; ParameterError where they are of unequal length."""
+    rows = tuple(text.upper().replace("VV", "vv").replace("/", " ").split()) if isinstance(text, str) else ()
+    if not rows or len(set(map(len, rows))) > 1 or len(rows[0]) % 2 or len(rows[0]) < 6 or len(rows) < 3:
+        raise ParameterError(
+            f'MiniGrid: level={text!r}; expected at least 3 rows, separated by "/", of equally many cells, at least 3, '
+            f"of two characters each"
+        )
+    return rows
+
+
+def _target(target: str | None, doors: list[str], things: list[str]) -> tuple[int, int]:
+    """(door, thing) that is the target; -1: none."""
+    if target is None:
+        return -1, -1
+    matches = [(i, -1) for i, text in enumerate(doors) if text == target and text[0] != "O"]
+    matches += [(-1, i) for i, text in enumerate(things) if text == target]
+    if len(matches) != 1:
+        names = sorted({*things, *(text for text in doors if text[0] != "O")})
+        raise ParameterError(
+            f"MiniGrid: target={target!r} is {len(matches)} of the closed doors and things of the level; "
+            f"expected one of {', '.join(names) or 'none'} that is there once"
+        )
+    return matches[0]
+
+
+def _check_walls(cells: np.ndarray, start: tuple[int, int]) -> None:
+    """ParameterError where the player can come to the border of the grid, through doors of any condition."""
+    region, frontier = {start}, [start]
+    while frontier:
+        row, column = frontier.pop()
+        if not (0 < row < len(cells) - 1 and 0 < column < cells.shape[1] - 1):
+            raise ParameterError(f"MiniGrid: level has a way out at row {row}, column {column}; close it with ##")
+        for cell in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
+            if cell not in region and cells[cell] != BLOCKED:
+                region.add(cell)
+                frontier.append(cell)
+
 
 ROW, COLUMN, DIRECTION, DOORS = range(4)  # the condition of each door, then row and column of each thing
 LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE = range(6)
@@ -93,7 +185,7 @@ class MiniGrid(Environment):
         rooms: how many, in multi_room; None stands for 6.
         crossings: obstacles to cross, in lava_crossing and simple_crossing; None stands for 1.
         strip: the row of the second strip of lava, in dist_shift; None stands for 2.
-        level: a layout of one's own, in place of the above: two characters a cell (see canvas.py), rows
+        level: a layout of one's own, in place of the above: two characters a cell (see layouts.py), rows
             separated by "/" or line ends, with walls around.
         target: of a level: what to pick up, such as "BR" for the red box, or which door to open, such as "LY"; None:
             only goals.
@@ -165,7 +257,7 @@ class MiniGrid(Environment):
             )
         return value
 
-    # The layout, as text and as numbers -----------------------------------------------------------------------------
+    # The layout, as text and as numbers -------------------------------------------------------------------------------
 
     @cached_property
     def layout(self) -> Layout:
@@ -225,7 +317,7 @@ class MiniGrid(Environment):
         arguments = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items() if value is not None)
         return f"MiniGrid({arguments})"
 
-    # The rules ------------------------------------------------------------------------------------------------------
+    # The rules --------------------------------------------------------------------------------------------------------
 
     def variables(self):
         height, width = self.cells.shape

@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Look
+from pharos.environments.base import Environment, Look
 from pharos.environments.mini_grid.look import LAYERS
 from pharos.environments.parameters import parameter
 

@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Layer, Look, Scenery
+from pharos.environments.base import Environment, Layer, Look, Scenery
 from pharos.environments.parameters import parameter
-from pharos.environments.worlds.hyperparameters import ARCADE
+from pharos.environments.worlds import ARCADE
 
 BALL_ROW, BALL_COLUMN, BALL_RIGHT, BALL_DOWN, PADDLE, BRICKS = range(6)  # bricks follow, row by row
 LEFT, STAY, RIGHT = range(3)

@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Layer, Look
+from pharos.environments.base import Environment, Layer, Look
 from pharos.environments.parameters import parameter
 
 BALL_ROW, BALL_COLUMN, PADDLE = range(3)

@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Layer, Look
+from pharos.environments.base import Environment, Layer, Look
 from pharos.environments.parameters import parameter
 
 ROW, COLUMN = range(2)
@@ -44,7 +42,7 @@ class DeepSea(Environment):
 
     size: int = parameter(10, low=2, high=1000)
     stochastic: bool = parameter(False)
-    mapping_seed: Any = parameter(None, kind=int, low=0, high=2**32 - 1)
+    mapping_seed: int | None = parameter(None, kind=int, low=0, high=2**32 - 1)
     move_cost: float = parameter(0.01, low=0.0)
     left_reward: float = parameter(0.0)
     p_rand: float = parameter(0.0, low=0.0, high=0.9999)

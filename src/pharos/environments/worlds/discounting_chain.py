@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Layer, Look
+from pharos.environments.base import Environment, Layer, Look
 from pharos.environments.parameters import integers, parameter
 from pharos.errors import ParameterError
 
@@ -31,7 +29,7 @@ class DiscountingChain(Environment):
         bonus: at least 0.
     """
 
-    delays: Any = parameter((1, 3, 10, 30, 100), kind=integers("at least 1", lambda delay: delay >= 1))
+    delays: tuple[int, ...] = parameter((1, 3, 10, 30, 100), kind=integers("at least 1", lambda delay: delay >= 1))
     mapping_seed: int = parameter(0, low=0)
     bonus: float = parameter(0.1, low=0.0)
 

@@ -1,10 +1,8 @@
 """Colosseum's DeepSea: deep sea where a dive follows another one, and every choice of left pays a little."""
 
 from dataclasses import dataclass
-from typing import Any
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Look
+from pharos.environments.base import Environment, Look
 from pharos.environments.parameters import parameter, store
 from pharos.environments.worlds.deep_sea import DeepSea
 
@@ -33,7 +31,7 @@ class EndlessSea(DeepSea):
     """
 
     move_cost: float = parameter(0.0, low=0.0)
-    left_reward: Any = parameter(None, kind=float)
+    left_reward: float = parameter(None, kind=float)
 
     name = "endless_sea"
     version = 1

@@ -2,14 +2,12 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Layer, Look, Scenery
+from pharos.environments.base import Environment, Layer, Look, Scenery
 from pharos.environments.parameters import integers, parameter, store
-from pharos.environments.worlds.hyperparameters import ARCADE
+from pharos.environments.worlds import ARCADE
 
 PLAYER_ROW, PLAYER_TIMER, CARS = range(3)  # positions of the cars follow, then their timers
 STAY, UP, DOWN = range(3)
@@ -108,8 +106,10 @@ class Freeway(Environment):
     num_cars: int = parameter(16, low=1)
     lane_length: int = parameter(7, low=2)
     player_speed: int = parameter(1, low=1)
-    car_speeds: Any = parameter(None, kind=integers("at least 1", lambda period: period >= 1))
-    directions: Any = parameter(None, kind=integers("1 (right) or -1 (left)", lambda direction: direction in (1, -1)))
+    car_speeds: tuple[int, ...] = parameter(None, kind=integers("at least 1", lambda period: period >= 1))
+    directions: tuple[int, ...] = parameter(
+        None, kind=integers("1 (right) or -1 (left)", lambda direction: direction in (1, -1))
+    )
     restart_on_hit: bool = parameter(True)
     hit_penalty: float = parameter(1.0, low=0.0)
 

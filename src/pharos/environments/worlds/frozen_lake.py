@@ -5,8 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Layer, Look
+from pharos.environments.base import Environment, Layer, Look
 from pharos.environments.parameters import parameter, store
 from pharos.errors import ParameterError
 

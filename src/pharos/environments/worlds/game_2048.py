@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Any
 
 import numpy as np
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Layer, Look
+from pharos.environments.base import Environment, Layer, Look
 from pharos.environments.parameters import one_of, parameter
 from pharos.errors import ParameterError
 
@@ -55,7 +53,7 @@ class Game2048(Environment):
     rows: int = parameter(3, low=1)
     columns: int = parameter(3, low=1)
     target: int | None = parameter(None, kind=int, low=8)
-    objective: Any = parameter("score", kind=one_of("score", "target"))
+    objective: str = parameter("score", kind=one_of("score", "target"))
     canonical: bool = parameter(True)
 
     name = "game_2048"

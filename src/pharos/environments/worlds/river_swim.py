@@ -1,10 +1,8 @@
 """River swim: a small reward downstream, a large one far up against the current. Source: Strehl and Littman (2008)."""
 
 from dataclasses import dataclass
-from typing import Any
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Layer, Look
+from pharos.environments.base import Environment, Layer, Look
 from pharos.environments.parameters import integers, parameter
 from pharos.errors import ParameterError
 
@@ -44,11 +42,11 @@ class RiverSwim(Environment):
     length: int = parameter(6, low=2, high=1_000_000)
     forward: float = parameter(0.3, low=0.0, high=1.0)
     backward: float = parameter(0.1, low=0.0, high=1.0)
-    forward_at_ends: Any = parameter(None, kind=float, low=0.0, high=1.0)
+    forward_at_ends: float | None = parameter(None, kind=float, low=0.0, high=1.0)
     left_reward: float = parameter(5.0)
     right_reward: float = parameter(10000.0)
     pays_for_action: bool = parameter(False)
-    starts: Any = parameter((1, 2), kind=integers("a place, counted from 0", lambda place: place >= 0))
+    starts: tuple[int, ...] = parameter((1, 2), kind=integers("a place, counted from 0", lambda place: place >= 0))
     p_lazy: float = parameter(0.0, low=0.0, high=0.9999)
     p_rand: float = parameter(0.0, low=0.0, high=0.9999)
 

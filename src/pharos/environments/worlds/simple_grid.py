@@ -2,13 +2,11 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Layer, Look
-from pharos.environments.parameters import CELL, VALUED_CELLS, parameter, store
+from pharos.environments.base import Environment, Layer, Look
+from pharos.environments.parameters import CELL, VALUED_CELLS, Cell, parameter, store
 from pharos.errors import ParameterError
 
 ROW, COLUMN = range(2)
@@ -42,9 +40,9 @@ class SimpleGrid(Environment):
 
     height: int = parameter(4, low=1)
     width: int = parameter(4, low=1)
-    goal: Any = parameter(None, kind=CELL)
-    rewards: Any = parameter((), kind=VALUED_CELLS)
-    penalties: Any = parameter((), kind=VALUED_CELLS)
+    goal: Cell = parameter(None, kind=CELL)
+    rewards: tuple[tuple[Cell, float], ...] = parameter((), kind=VALUED_CELLS)
+    penalties: tuple[tuple[Cell, float], ...] = parameter((), kind=VALUED_CELLS)
 
     name = "simple_grid"
     actions = ("up", "right", "down", "left")

@@ -2,12 +2,10 @@
 
 import colorsys
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Color, Layer, Look
+from pharos.environments.base import Color, Environment, Layer, Look
 from pharos.environments.parameters import integers, parameter, store
 from pharos.errors import ParameterError
 
@@ -53,7 +51,7 @@ class SlidingTiles(Environment):
 
     rows: int = parameter(3, low=2)
     columns: int = parameter(3, low=2)
-    start: Any = parameter(None, kind=integers("a tile, or 0 for the blank", lambda tile: tile >= 0))
+    start: tuple[int, ...] = parameter(None, kind=integers("a tile, or 0 for the blank", lambda tile: tile >= 0))
     seed: int | None = parameter(None, kind=int, low=0)
 
     name = "sliding_tiles"

@@ -2,13 +2,11 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from pharos.environments.base import Environment
-from pharos.environments.look import Layer, Look
-from pharos.environments.parameters import CELLS, parameter, store
+from pharos.environments.base import Environment, Layer, Look
+from pharos.environments.parameters import CELLS, Cell, parameter, store
 from pharos.errors import ParameterError
 
 ROW, COLUMN, PASSENGER, DESTINATION, UNDECIDED = range(5)
@@ -59,8 +57,8 @@ class Taxi(Environment):
     """
 
     size: int = parameter(5, low=2)
-    landmarks: Any = parameter(None, kind=CELLS)
-    walls: Any = parameter(None, kind=CELLS)
+    landmarks: tuple[Cell, ...] = parameter(None, kind=CELLS)
+    walls: tuple[Cell, ...] = parameter(None, kind=CELLS)
     rainy: bool = parameter(False)
     fickle: bool = parameter(False)
     rainy_probability: float = parameter(0.8, low=0.0, high=1.0)
