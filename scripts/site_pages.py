@@ -10,6 +10,7 @@ import inspect
 import io
 import itertools
 import json
+import math
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -337,7 +338,8 @@ def board(suite: benchmark.Suite, agents: Sequence[benchmark.AgentResults]) -> s
     axes = [ladder.axis for ladder in suite.ladders]
     heads = ["agent", "core", *(f"{ladder.axis} ({ladder.unit})" for ladder in suite.ladders), "seeds"]
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-    for each in sorted(agents, key=lambda each: -scores[each.agent].core.value):
+    cores = {name: own.core.value for name, own in scores.items()}
+    for each in sorted(agents, key=lambda each: (math.isnan(cores[each.agent]), -cores[each.agent])):
         own = scores[each.agent]
         frontiers = [frontier_text(own.axes[axis].frontier) if axis in own.axes else "–" for axis in axes]
         lines.append("| " + " | ".join([each.agent, number(own.core), *frontiers, str(len(each.seeds))]) + " |")

@@ -106,6 +106,16 @@ def test_the_sentence_says_frontiers_in_units_beside_those_of_baselines(contents
     assert "scales to beyond 3 log10 states (DQN beyond 3, PPO 1.83)" in text
 
 
+def test_ladders_without_a_core_have_a_page():
+    ladders = {name: regret for name, regret in MINE.items() if name not in ("easy", "hard", "odd")}
+    own, other = results("mine.py:learn", ladders), results("dqn", DQN)
+    text = Elements(page(contents_of(own, beside=[other], suite=SUITE))).text
+    assert "The core was not run." in text and "explores to 9 bits" in text and "nan" not in text.lower()
+    assert "Learning curve" not in text and "Core tasks" not in text
+    text = Elements(page(contents_of(other, beside=[own], suite=SUITE))).text
+    assert "Learning curve" in text and "nan" not in text.lower()
+
+
 def test_weaknesses_are_those_whose_difference_excludes_zero(contents):
     text = Elements(page(contents)).text
     worse, better, undecided = re.split("Worse|Better|Not shown to differ", text.split("in words")[1])[1:4]

@@ -243,7 +243,7 @@ def learning_sentence(contents: Contents) -> str:
 def unclipped_regret(contents: Contents) -> str:
     """The mean regret on the core without clipping, in words, where runs far below random play make it differ."""
     own = contents.agent.score
-    if own.optimality_gap.value <= 1 - own.core.value + 0.1:
+    if not own.optimality_gap.value > 1 - own.core.value + 0.1:
         return ""
     runs, core = run_regrets(contents.agent.results), {task.name for task in contents.suite.core}
     regrets = {name: np.maximum(own, 0.0).mean() for name, own in runs.items() if name in core}
@@ -268,6 +268,8 @@ def seeds_text(results: AgentResults) -> str:
 def number(interval: Interval, form: str = ".2f") -> str:
     """A score with its interval, which one seed does not have: `0.70 (0.68 to 0.72)`."""
     value, low, high = (f"{round(each, 2) + 0.0:{form}}" for each in (interval.value, interval.low, interval.high))
+    if math.isnan(interval.value):
+        return "–"
     return value if math.isnan(interval.low) else f"{value} ({low} to {high})"
 
 

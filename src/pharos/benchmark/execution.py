@@ -51,7 +51,7 @@ class Outcome:
 
     @cached_property
     def scores(self) -> BenchmarkScore:
-        """All scores. ParameterError: no task of the core has results."""
+        """All scores."""
         return score(self.results, self.suite)
 
     @property

@@ -5,6 +5,7 @@ theory the page has two things: the dashed line on each ladder, and residuals, t
 and the agent does not. The page is a tree of elements, so that every text in it is escaped.
 """
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -103,11 +104,13 @@ def _lead(contents: Contents) -> list[Element]:
     own = contents.agent.score
     lines = [element("p", sentence(contents), class_="lead")]
     core = f"Core score {number(own.core)} on {many(contents.num_run(contents.suite.core), 'task')}"
-    core += "".join(f"; {each.name} {each.score.core.value:.2f}" for each in contents.beside) + ". "
+    have_core = [each for each in contents.beside if not math.isnan(each.score.core.value)]
+    core += "".join(f"; {each.name} {each.score.core.value:.2f}" for each in have_core) + ". "
     rest = {"Final score": own.final, "interquartile mean": own.iqm}
     parts = [*(f"{name} {number(interval)}" for name, interval in rest.items()), unclipped_regret(contents)]
     scale = "A score is 1 for the oracle and 0 for random play. Intervals are of 95 %, over seeds."
-    lines.append(element("p", f"{core if own.axes else ''}{', '.join(filter(None, parts))}. {scale}"))
+    said = f"{core if own.axes else ''}{', '.join(filter(None, parts))}."
+    lines.append(element("p", f"{'The core was not run.' if math.isnan(own.core.value) else said} {scale}"))
     if own.preliminary:
         seeds = many(len(contents.agent.results.seeds), "seed")
         missing = f", and {many(len(own.missing), 'task')} without results" if own.missing else ""
@@ -120,8 +123,8 @@ def _lead(contents: Contents) -> list[Element]:
 
 def _axes(contents: Contents) -> Element:
     agents = dict(enumerate(contents.agents))
-    cores = {k: (each.name, each.score.core) for k, each in agents.items()}
-    figures = [_figure("core", bars(cores, "core: scores of agents"))]
+    cores = {k: (each.name, each.score.core) for k, each in agents.items() if not math.isnan(each.score.core.value)}
+    figures = [_figure("core", bars(cores, "core: scores of agents"))] if cores else []
     axes = list(contents.agent.score.axes)
     for axis in axes:
         rows = {k: (each.name, each.score.axes[axis].score) for k, each in agents.items() if axis in each.score.axes}
@@ -135,8 +138,10 @@ def _axes(contents: Contents) -> Element:
     return _section(title, f"Mean over {means}; lines are intervals.", *parts)
 
 
-def _learning(contents: Contents) -> Element:
+def _learning(contents: Contents) -> Element | None:
     names = [task.name for task in contents.suite.core if task.name in contents.agent.results.curves]
+    if not names:
+        return None
     lines = [learning_curve(each, names) for each in contents.agents]
     without = [each.name for each, own in zip(contents.agents, lines, strict=True) if not own]
     text = f"Normalised regret of the policy at each evaluation, mean over {many(len(names), 'core task')}. "

@@ -64,6 +64,10 @@ class Interval:
     __str__ = text
 
 
+NOT_RUN = Interval(math.nan)
+"""Scores of a core of which no task was run."""
+
+
 def _digits(number: float) -> str:
     return f"{number:.3f}" if abs(number) < 1.0005 else f"{number:.3g}"
 
@@ -89,7 +93,7 @@ class BenchmarkScore:
     """All scores of an agent on a suite.
 
     Attributes:
-        core: mean over the tasks of the core of the mean score over the run.
+        core: mean over the tasks of the core of the mean score over the run; NaN where none was run, as the next three.
         final: the same of the last evaluation alone.
         iqm: mean of the middle half of all runs of all core tasks, pooled as in Agarwal et al. (2021).
         optimality_gap: mean over core runs of max(0, regret): 1 - core, but runs below random count in full.
@@ -114,22 +118,22 @@ def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
     """Return the scores of an agent's results on a suite; oracle scores 1 and uniform play 0.
 
     Raises:
-        ParameterError: the results are those of another suite, or none is of a core task.
+        ParameterError: the results are those of another suite.
     Cost: milliseconds.
     """
     check_suite(results, suite)
     runs, finals, regrets = run_scores(results), run_scores(results, last=True), run_regrets(results)
     core = sorted(task.name for task in suite.core if task.name in runs)
-    if not core:
-        raise ParameterError(f"results of {results.agent}: no run of a core task of {suite.name}; run its core first")
     names = sorted(task.name for task in suite.tasks if task.name in runs)
     missing = tuple(task.name for task in suite.tasks if task.name not in runs)
     regret_intervals = {name: mean_interval([regrets[name]]) for name in names}
     return BenchmarkScore(
-        core=mean_interval([runs[name] for name in core], (0.0, 1.0)),
-        final=mean_interval([finals[name] for name in core], (0.0, 1.0)),
-        iqm=interquartile_interval([runs[name] for name in core]),
-        optimality_gap=mean_interval([np.maximum(regrets[name], 0.0) for name in core], (0.0, math.inf)),
+        core=mean_interval([runs[name] for name in core], (0.0, 1.0)) if core else NOT_RUN,
+        final=mean_interval([finals[name] for name in core], (0.0, 1.0)) if core else NOT_RUN,
+        iqm=interquartile_interval([runs[name] for name in core]) if core else NOT_RUN,
+        optimality_gap=mean_interval([np.maximum(regrets[name], 0.0) for name in core], (0.0, math.inf))
+        if core
+        else NOT_RUN,
         axes={ladder.axis: axis for ladder in suite.ladders if (axis := axis_score(ladder, runs)) is not None},
         tasks={name: mean_interval([runs[name]], (0.0, 1.0)) for name in names},
         preliminary=len(results.seeds) < ENOUGH_SEEDS or bool(missing),

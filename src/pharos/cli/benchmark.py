@@ -101,6 +101,7 @@ def run(
     ]
     if any(task.name in results.curves for task in loaded.core):
         facts += [("score of the core", f"{outcome.score}{', preliminary' if outcome.scores.preliminary else ''}")]
+    if results.curves:
         facts += [(f"frontier of {axis}", f"{each.frontier} {each.unit}") for axis, each in outcome.axes.items()]
     facts.append(("results", out))
     answer = {
