@@ -1,6 +1,6 @@
 """The baselines that are shipped with a suite: results files of some agents, each with one setting.
 
-Ten seeds of batched agents, 2 s of one core a run; five of A2C, 5 s; three of those of sb3-contrib, 25 s.
+Ten seeds of named agents (A2C five), 2 to 6 s of one core a run; three of those of sb3-contrib, 26 s and more.
 
 python benchmarks/benchmark_baselines.py --out DIR                  all of them; what is finished in DIR stays
 python benchmarks/benchmark_baselines.py --out DIR --only dqn       one of them
@@ -23,8 +23,8 @@ from pharos.errors import AllRunsFailed
 FEWER_SEEDS = {"a2c": 5, "qrdqn": 3, "recurrent_ppo": 3}
 LEFT_OUT = {
     "q_learning": ("memory",),  # its table has a row for each state, whatever is seen
-    "qrdqn": ("exploration", "estimation", "credit", "memory"),  # 35 s a run: the ladders were not run yet
-    "recurrent_ppo": ("core",),  # nor the core: minutes a run where chance makes many histories
+    "qrdqn": ("exploration", "estimation", "credit", "memory"),  # not run yet
+    "recurrent_ppo": ("core",),  # minutes a run where chance makes many histories
 }
 
 

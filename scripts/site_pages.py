@@ -10,7 +10,6 @@ import inspect
 import io
 import itertools
 import json
-import math
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -338,8 +337,7 @@ def board(suite: benchmark.Suite, agents: Sequence[benchmark.AgentResults]) -> s
     axes = [ladder.axis for ladder in suite.ladders]
     heads = ["agent", "core", *(f"{ladder.axis} ({ladder.unit})" for ladder in suite.ladders), "seeds"]
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-    cores = {name: own.core.value for name, own in scores.items()}
-    for each in sorted(agents, key=lambda each: (math.isnan(cores[each.agent]), -cores[each.agent])):
+    for each in sorted(agents, key=lambda each: scores[each.agent].rank):
         own = scores[each.agent]
         frontiers = [frontier_text(own.axes[axis].frontier) if axis in own.axes else "–" for axis in axes]
         lines.append("| " + " | ".join([each.agent, number(own.core), *frontiers, str(len(each.seeds))]) + " |")

@@ -5,7 +5,6 @@ audit for this very file, beside it: FILE.audit.json. Scores are computed from t
 lists; in the first, three of them were repeated.
 """
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -116,7 +115,7 @@ def _rows(
         for verdict, audit, its in verdicts
         if its is suite and (audit is not None and audit.holds) == (kind == AUDITED)
     ]
-    listed.sort(key=lambda each: (math.isnan(each[0].core.value), -each[0].core.value, each[1].sha256))
+    listed.sort(key=lambda each: (each[0].rank, each[1].sha256))
     rows = []
     for rank, (scores, verdict, audit) in enumerate(listed, 1):
         results, submission = verdict.submission.results, verdict.submission

@@ -252,8 +252,8 @@ def _judged(differences: Mapping[str, Difference]) -> dict[str, Difference]:
     judged = {}
     adjusted = holm([each.p_value for each in differences.values()])
     for (name, each), p in zip(differences.items(), adjusted, strict=True):
-        verdict = UNDECIDED if p >= SIGNIFICANCE else BETTER if each.interval.value > 0 else WORSE
-        verdict = UNKNOWN if math.isnan(p) else verdict
+        shown = BETTER if each.interval.value > 0 else WORSE
+        verdict = UNKNOWN if math.isnan(p) else shown if p < SIGNIFICANCE else UNDECIDED
         judged[name] = replace(each, adjusted=p, verdict=verdict)
     return judged
 

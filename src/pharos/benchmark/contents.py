@@ -246,7 +246,7 @@ def unclipped_regret(contents: Contents) -> str:
     if not own.optimality_gap.value > 1 - own.core.value + 0.1:
         return ""
     runs, core = run_regrets(contents.agent.results), {task.name for task in contents.suite.core}
-    regrets = {name: np.maximum(own, 0.0).mean() for name, own in runs.items() if name in core}
+    regrets = {name: np.maximum(each, 0.0).mean() for name, each in runs.items() if name in core}
     worst = max(regrets, key=regrets.__getitem__)
     share = "most of it" if regrets[worst] > sum(regrets.values()) / 2 else "the largest part"
     return f"mean regret {own.optimality_gap.value:.2f}, not clipped ({share} from {worst})"

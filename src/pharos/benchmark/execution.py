@@ -205,6 +205,6 @@ def _collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any]
         reason, _ = Counter(missing.values()).most_common(1)[0]
         raise AllRunsFailed(folder, {reason: reason}, outcome)
     results.write(folder / FILE)
-    if any(task.name in whole for task in suite.core):
+    if outcome.scores.has_core:
         storage.replace_json(folder / SCORE, {"agent": results.agent, "suite": suite.name, **asdict(outcome.scores)})
     return outcome

@@ -5,7 +5,6 @@ theory the page has two things: the dashed line on each ladder, and residuals, t
 and the agent does not. The page is a tree of elements, so that every text in it is escaped.
 """
 
-import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -104,13 +103,12 @@ def _lead(contents: Contents) -> list[Element]:
     own = contents.agent.score
     lines = [element("p", sentence(contents), class_="lead")]
     core = f"Core score {number(own.core)} on {many(contents.num_run(contents.suite.core), 'task')}"
-    have_core = [each for each in contents.beside if not math.isnan(each.score.core.value)]
-    core += "".join(f"; {each.name} {each.score.core.value:.2f}" for each in have_core) + ". "
+    core += "".join(f"; {each.name} {each.score.core.value:.2f}" for each in contents.beside if each.score.has_core)
     rest = {"Final score": own.final, "interquartile mean": own.iqm}
     parts = [*(f"{name} {number(interval)}" for name, interval in rest.items()), unclipped_regret(contents)]
     scale = "A score is 1 for the oracle and 0 for random play. Intervals are of 95 %, over seeds."
-    said = f"{core if own.axes else ''}{', '.join(filter(None, parts))}."
-    lines.append(element("p", f"{'The core was not run.' if math.isnan(own.core.value) else said} {scale}"))
+    said = f"{f'{core}. ' if own.axes else ''}{', '.join(filter(None, parts))}."
+    lines.append(element("p", f"{said if own.has_core else 'The core was not run.'} {scale}"))
     if own.preliminary:
         seeds = many(len(contents.agent.results.seeds), "seed")
         missing = f", and {many(len(own.missing), 'task')} without results" if own.missing else ""
@@ -123,7 +121,7 @@ def _lead(contents: Contents) -> list[Element]:
 
 def _axes(contents: Contents) -> Element:
     agents = dict(enumerate(contents.agents))
-    cores = {k: (each.name, each.score.core) for k, each in agents.items() if not math.isnan(each.score.core.value)}
+    cores = {k: (each.name, each.score.core) for k, each in agents.items() if each.score.has_core}
     figures = [_figure("core", bars(cores, "core: scores of agents"))] if cores else []
     axes = list(contents.agent.score.axes)
     for axis in axes:

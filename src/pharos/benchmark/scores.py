@@ -64,10 +64,6 @@ class Interval:
     __str__ = text
 
 
-NOT_RUN = Interval(math.nan)
-"""Scores of a core of which no task was run."""
-
-
 def _digits(number: float) -> str:
     return f"{number:.3f}" if abs(number) < 1.0005 else f"{number:.3g}"
 
@@ -113,6 +109,16 @@ class BenchmarkScore:
     below_random: tuple[str, ...]
     missing: tuple[str, ...] = field(default=())
 
+    @property
+    def has_core(self) -> bool:
+        """Whether a task of the core was run."""
+        return not math.isnan(self.core.value)
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Key by which boards sort: the best core first, those without one last."""
+        return not self.has_core, -self.core.value
+
 
 def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
     """Return the scores of an agent's results on a suite; oracle scores 1 and uniform play 0.
@@ -128,12 +134,10 @@ def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
     missing = tuple(task.name for task in suite.tasks if task.name not in runs)
     regret_intervals = {name: mean_interval([regrets[name]]) for name in names}
     return BenchmarkScore(
-        core=mean_interval([runs[name] for name in core], (0.0, 1.0)) if core else NOT_RUN,
-        final=mean_interval([finals[name] for name in core], (0.0, 1.0)) if core else NOT_RUN,
-        iqm=interquartile_interval([runs[name] for name in core]) if core else NOT_RUN,
-        optimality_gap=mean_interval([np.maximum(regrets[name], 0.0) for name in core], (0.0, math.inf))
-        if core
-        else NOT_RUN,
+        core=mean_interval([runs[name] for name in core], (0.0, 1.0)),
+        final=mean_interval([finals[name] for name in core], (0.0, 1.0)),
+        iqm=interquartile_interval([runs[name] for name in core]),
+        optimality_gap=mean_interval([np.maximum(regrets[name], 0.0) for name in core], (0.0, math.inf)),
         axes={ladder.axis: axis for ladder in suite.ladders if (axis := axis_score(ladder, runs)) is not None},
         tasks={name: mean_interval([runs[name]], (0.0, 1.0)) for name in names},
         preliminary=len(results.seeds) < ENOUGH_SEEDS or bool(missing),
@@ -225,7 +229,9 @@ def interval_around(
 
 
 def mean_interval(strata: Sequence[np.ndarray], bounds: tuple[float, float] = (-math.inf, math.inf)) -> Interval:
-    """Return the mean over tasks of the mean over runs, with Student's interval."""
+    """Return the mean over tasks of the mean over runs, with Student's interval; NaN without tasks."""
+    if not strata:
+        return Interval(math.nan)
     value = float(np.mean([own.mean() for own in strata]))
     return interval_around(value, *standard_error(strata, [1.0 / len(strata)] * len(strata)), bounds)
 
@@ -234,7 +240,10 @@ def interquartile_interval(strata: Sequence[np.ndarray]) -> Interval:
     """Return the interquartile mean of all runs of all tasks pooled, with Student's interval.
 
     The standard error is that of twice the mean of runs winsorised at the pooled quartiles, over seeds within tasks.
+    NaN without tasks.
     """
+    if not strata:
+        return Interval(math.nan)
     pooled = np.sort(np.concatenate(strata))
     cut = len(pooled) // 4
     value = float(pooled[cut : len(pooled) - cut].mean())

@@ -99,10 +99,9 @@ def run(
         ("missing", "; ".join(missing) or "none"),
         ("regret", f"{results.mean():.4g} of uniform play, mean of all runs" if results.curves else "none"),
     ]
-    if any(task.name in results.curves for task in loaded.core):
+    if outcome.scores.has_core:
         facts += [("score of the core", f"{outcome.score}{', preliminary' if outcome.scores.preliminary else ''}")]
-    if results.curves:
-        facts += [(f"frontier of {axis}", f"{each.frontier} {each.unit}") for axis, each in outcome.axes.items()]
+    facts += [(f"frontier of {axis}", f"{each.frontier} {each.unit}") for axis, each in outcome.axes.items()]
     facts.append(("results", out))
     answer = {
         "agent": results.agent,

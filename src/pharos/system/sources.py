@@ -109,10 +109,10 @@ def find(name: str, folder: str | Path | None = None) -> Source:
 
 
 def load(source: Source) -> Any:
-    """Import what a source names. A file is executed again only where it has changed.
+    """Import what a source names; None where it has no such name. A file is executed again only where it has changed.
 
     Raises:
-        ParameterError: it cannot be imported, or has no such name.
+        ParameterError: it cannot be imported.
     """
     try:
         module = _module_of_file(source) if source.module is None else _module_called(source)
