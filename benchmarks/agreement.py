@@ -1,8 +1,8 @@
 """Do the batched engine and Stable-Baselines3 learn alike? The same cells with many seeds of both, and two tests.
 
-    python benchmarks/agreement.py --out build/agreement [--seeds 30] [--batched-seeds 90] [--steps 10000]
-        [--evaluations 20] [--workers 2]
-    python benchmarks/agreement.py --out build/agreement --report         # the table of what is finished
+    python benchmarks/agreement.py --out build/agreement --pilot     # how many runs each setting needs
+    python benchmarks/agreement.py --out build/agreement [--workers 2]
+    python benchmarks/agreement.py --out build/agreement --report    # the table of what is finished
 
 Trains every cell (instance, chance, observation, agent) with both engines: two studies, in OUT/sb3 and OUT/batched. It
 may be interrupted at any time; the same command goes on from there. What is compared is the normalised cumulative
@@ -11,12 +11,14 @@ regret of runs. For each cell:
     equivalence    two one-sided Welch tests that the means differ by less than MARGIN; p_tost is the larger p
     distribution   Kolmogorov-Smirnov's two-sample test; p_ks_holm is corrected over the cells by Holm's method
 
-Writes docs/agreement.csv and prints the table. Runs of the batched engine are cheap, so there are more of them: a mean
-of 30 runs with a deviation of 0.07 is known to 0.013, and the difference cannot be bounded better than that.
+How many runs: if the means are equal and runs deviate by s, n of Stable-Baselines3 and 2 n of the batched engine show
+it with the chance POWER where n = (z(0.95) + z((1 + POWER) / 2))^2 * 1.5 * s^2 / MARGIN^2. The pilot trains 32 runs of
+the batched engine alone for each candidate, so that a setting is chosen before any difference is seen; RESERVE is for
+the error of its deviations. Runs of the comparison have other seeds than those of the pilot.
 
-Cost: on one busy core 306 (vector) and 185 (image) steps/s of Stable-Baselines3's DQN, 1,200 and 860 of its PPO: 10,000
-steps, 30 seeds, 16 cells take about 2.5 hours on two such cores, an idle machine a third of that; the batched engine a
-sixth of it.
+Writes docs/agreement.csv, and prints the table.
+
+Cost: the pilot 12 minutes, the batched runs 10, those of Stable-Baselines3 about an hour of one core.
 """
 
 import argparse
@@ -28,52 +30,99 @@ from scipy import stats
 
 from pharos import study
 
-MARGIN = 0.03
+MARGIN, POWER, RESERVE = 0.03, 0.8, 1.2
+PILOT = 32
 CELL = ["environment", "instance", "chance", "observation", "agent"]
+LAKE = {"name": "frozen_lake", "parameters": {"map": "SFF/FFH/FFG"}}
+GRID = {"name": "simple_grid", "parameters": {"height": 3, "width": 3, "rewards": "2,0:0.1"}}
 BREAKOUT = {"name": "breakout", "parameters": {"height": 7, "columns": 5, "brick_rows": 1}}
-FREEWAY = {
-    "name": "freeway",
-    "parameters": {"num_cars": 3, "lane_length": 5, "car_speeds": [1, 2, 3], "directions": [1, -1, 1]},
-}
-# (environments, kinds of chance, observations): 8 cells for each agent
+
+
+def freeway(cars, length):
+    """A small Freeway."""
+    speeds, directions = [1, 2, 3][:cars], [1, -1, 1][:cars]
+    parameters = {"num_cars": cars, "lane_length": length, "car_speeds": speeds, "directions": directions}
+    return {"name": "freeway", "parameters": parameters}
+
+
+RANDOM, STICKY = {"random": 0.1}, {"sticky": 0.25}
+LAKES, GRIDS = [LAKE, "frozen_lake/4x4"], [GRID, "simple_grid/4x4-decoy"]
+FREEWAYS = [freeway(1, 3), freeway(2, 3), freeway(3, 5)]
+# agent, environment, chance, observation, steps, runs of Stable-Baselines3: 8 cells for each agent
 CELLS = (
-    (["frozen_lake/4x4"], ["plain", {"random": 0.1}], ["vector"]),
-    (["simple_grid/4x4-decoy"], [{"sticky": 0.25}], ["vector"]),
-    (["simple_grid/4x4-decoy"], ["plain"], ["simple_image"]),
-    ([BREAKOUT], ["plain"], ["vector", "simple_image"]),
-    ([FREEWAY], [{"sticky": 0.25}], ["vector"]),
-    ([FREEWAY], ["plain"], ["simple_image"]),
+    ("dqn", LAKE, "plain", "vector", 5000, 108),
+    ("dqn", LAKE, RANDOM, "vector", 5000, 55),
+    ("dqn", GRID, STICKY, "vector", 2500, 152),
+    ("dqn", GRID, "plain", "simple_image", 2500, 109),
+    ("dqn", BREAKOUT, "plain", "vector", 2500, 30),
+    ("dqn", BREAKOUT, "plain", "simple_image", 2500, 30),
+    ("dqn", freeway(1, 3), STICKY, "vector", 2500, 208),
+    ("dqn", freeway(3, 5), "plain", "simple_image", 2500, 78),
+    ("ppo", "frozen_lake/4x4", "plain", "vector", 2500, 30),
+    ("ppo", "frozen_lake/4x4", RANDOM, "vector", 2500, 30),
+    ("ppo", "simple_grid/4x4-decoy", STICKY, "vector", 2500, 30),
+    ("ppo", "simple_grid/4x4-decoy", "plain", "simple_image", 2500, 62),
+    ("ppo", BREAKOUT, "plain", "vector", 2500, 30),
+    ("ppo", BREAKOUT, "plain", "simple_image", 2500, 30),
+    ("ppo", freeway(1, 3), STICKY, "vector", 2500, 30),
+    ("ppo", freeway(1, 3), "plain", "simple_image", 2500, 30),
+)
+# agent, environments, chance, observation, steps: where runs of 2,500 steps of the larger world were too noisy
+CANDIDATES = (
+    ("dqn", LAKES, "plain", "vector", (2500, 5000, 10_000)),
+    ("dqn", LAKES, RANDOM, "vector", (2500, 5000, 10_000)),
+    ("dqn", GRIDS, STICKY, "vector", (2500, 5000, 10_000)),
+    ("dqn", GRIDS, "plain", "simple_image", (2500, 5000)),
+    ("dqn", FREEWAYS, STICKY, "vector", (2500, 5000, 10_000)),
+    ("dqn", [FREEWAYS[0], FREEWAYS[2]], "plain", "simple_image", (2500, 5000)),
+    ("ppo", GRIDS, "plain", "simple_image", (2500, 5000)),
+    ("ppo", FREEWAYS, STICKY, "vector", (2500, 5000, 10_000)),
+    ("ppo", FREEWAYS, "plain", "simple_image", (2500, 5000, 10_000)),
 )
 SMALL = {
     "dqn": {"learning_starts": 500, "buffer_size": 10_000, "target_update_interval": 250, "exploration_fraction": 0.4},
-    "ppo": {},
+    "ppo": {"n_envs": 4},
 }
 
 
-def specification(engine, seeds, steps, evaluations=20):
-    """The study of one engine."""
+def specification(engine, cells):
+    """The study of one engine: of each cell agent, environments, chance, observation, steps and seeds."""
     blocks = [
         {
             "environments": environments,
-            "chance": chance,
-            "observations": observations,
+            "chance": [chance],
+            "observations": [observation],
             "agents": [agent],
-            "hyperparameters": {agent: {**given, **({"n_envs": 4} if agent == "ppo" else {})}},
+            "hyperparameters": {agent: SMALL[agent]},
             "horizon": 100,
-        }
-        for agent, given in SMALL.items()
-        for environments, chance, observations in CELLS
-    ]
-    return study.specification(
-        {
-            "name": f"agreement-{engine}",
-            "engine": engine,
             "steps": steps,
-            "evaluations": evaluations,
             "seeds": seeds,
-            "blocks": blocks,
         }
-    )
+        for agent, environments, chance, observation, steps, seeds in cells
+    ]
+    name = f"agreement-{engine}"
+    return study.specification({"name": name, "engine": engine, "evaluations": 10, "seeds": 1, "blocks": blocks})
+
+
+def runs_needed(deviation):
+    """How many runs of Stable-Baselines3, beside twice as many batched ones, show equal means to be within MARGIN."""
+    quantiles = stats.norm.ppf(0.95) + stats.norm.ppf((1 + POWER) / 2)
+    return max(30, int(np.ceil(RESERVE * 1.5 * (quantiles * deviation / MARGIN) ** 2)))
+
+
+def pilot(folder, workers):
+    """Print mean and deviation of each candidate, and how many runs and steps of Stable-Baselines3 it needs."""
+    cells = [(*rest, steps, PILOT) for *rest, lengths in CANDIDATES for steps in lengths]
+    spec = specification("batched", cells)
+    print(study.run(spec, folder, workers=workers))
+    runs = study.table(spec, folder)
+    print("| agent | cell | steps | mean | deviation | runs of SB3 | their steps |\n|---|---|---|---|---|---|---|")
+    for key, part in runs.groupby([*CELL, "steps"], sort=False):
+        _, instance, chance, observation, agent, steps = key
+        regret = part["normalized_regret"]
+        needed = runs_needed(regret.std())
+        cell = f"{agent} | {instance}, {chance}, {observation} | {steps:,}"
+        print(f"| {cell} | {regret.mean():.3f} | {regret.std():.3f} | {needed} | {needed * steps:,} |")
 
 
 def compared(sb3, batched):
@@ -148,26 +197,27 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("build/agreement"))
     parser.add_argument("--table", type=Path, default=Path("docs/agreement.csv"))
-    parser.add_argument("--seeds", type=int, default=30)
-    parser.add_argument("--batched-seeds", type=int, default=90)
-    parser.add_argument("--steps", type=int, default=10_000)
-    parser.add_argument("--evaluations", type=int, default=20)
+    parser.add_argument("--pilot", action="store_true", help="the candidates, with the batched engine alone")
     parser.add_argument("--workers", type=int)
     parser.add_argument("--report", action="store_true", help="only the table of what is finished")
     arguments = parser.parse_args()
+    if arguments.pilot:
+        return pilot(arguments.out / "pilot", arguments.workers)
     specifications = {
-        engine: specification(engine, seeds, arguments.steps, arguments.evaluations)
-        for engine, seeds in (("batched", arguments.batched_seeds), ("sb3", arguments.seeds))
+        engine: specification(
+            engine,
+            [(agent, [world], *rest, list(range(PILOT, PILOT + times * runs))) for agent, world, *rest, runs in CELLS],
+        )
+        for engine, times in (("batched", 2), ("sb3", 1))
     }
     if not arguments.report:
         for engine, spec in specifications.items():
-            end = study.run(spec, arguments.out / engine, workers=arguments.workers, foretold=print)
-            print(end)
+            print(study.run(spec, arguments.out / engine, workers=arguments.workers))
     tables = {engine: study.table(spec, arguments.out / engine) for engine, spec in specifications.items()}
     table = compared(tables["sb3"], tables["batched"])
     if table.empty:
         print("no cell has two finished runs of both engines")
-        return
+        return None
     table.to_csv(arguments.table, index=False, float_format="%.6g")
     printed(table)
 
