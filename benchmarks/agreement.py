@@ -104,6 +104,17 @@ def specification(engine, cells):
     return study.specification({"name": name, "engine": engine, "evaluations": 10, "seeds": 1, "blocks": blocks})
 
 
+def compared_studies():
+    """The studies of both engines, with twice as many batched runs; seeds are not those of the pilot."""
+    return {
+        engine: specification(
+            engine,
+            [(agent, [world], *rest, list(range(PILOT, PILOT + times * runs))) for agent, world, *rest, runs in CELLS],
+        )
+        for engine, times in (("batched", 2), ("sb3", 1))
+    }
+
+
 def runs_needed(deviation):
     """How many runs of Stable-Baselines3, beside twice as many batched ones, show equal means to be within MARGIN."""
     quantiles = stats.norm.ppf(0.95) + stats.norm.ppf((1 + POWER) / 2)
@@ -203,13 +214,7 @@ def main():
     arguments = parser.parse_args()
     if arguments.pilot:
         return pilot(arguments.out / "pilot", arguments.workers)
-    specifications = {
-        engine: specification(
-            engine,
-            [(agent, [world], *rest, list(range(PILOT, PILOT + times * runs))) for agent, world, *rest, runs in CELLS],
-        )
-        for engine, times in (("batched", 2), ("sb3", 1))
-    }
+    specifications = compared_studies()
     if not arguments.report:
         for engine, spec in specifications.items():
             print(study.run(spec, arguments.out / engine, workers=arguments.workers))

@@ -44,8 +44,19 @@ def test_runs_that_are_all_alike_are_equivalent_and_cells_of_one_engine_are_left
 
 
 def test_both_studies_have_the_same_cells(agreement):
-    both = [agreement.specification(engine, 2, 100).runs for engine in ("sb3", "batched")]
+    studies = agreement.compared_studies()
+    both = [studies[engine].runs for engine in ("sb3", "batched")]
     cells = [{(run.instance, run.chance, run.configuration.observation, run.configuration.agent) for run in each}
              for each in both]  # fmt: skip
     assert cells[0] == cells[1] and len(cells[0]) == 16
     assert {run.engine for run in both[1]} == {"batched"} and not {a.id for a in both[0]} & {b.id for b in both[1]}
+
+
+def test_as_many_runs_as_needed_show_equal_means_with_the_power_that_is_said(agreement):
+    deviation, generator = 0.1, np.random.default_rng(0)
+    runs_sb3 = round(agreement.runs_needed(deviation) / agreement.RESERVE)
+    shown = 0
+    for _ in range(400):
+        theirs, ours = (generator.normal(0.5, deviation, n) for n in (runs_sb3, 2 * runs_sb3))
+        shown += agreement.compared(runs(theirs, "i"), runs(ours, "i"))["p_tost"].item() < 0.05
+    assert shown / 400 == pytest.approx(agreement.POWER, abs=0.06)
