@@ -103,6 +103,12 @@ def test_the_values_are_those_of_the_task_by_other_means():
     assert result.result["final_value"] == pytest.approx(pharos.evaluate_policy(mdp, policy).value_at_start, abs=1e-6)
 
 
+def test_a_result_says_in_one_line_how_the_run_ended():
+    result = train("q_learning", "frozen_lake/4x4", steps=500)
+    line = f"TrainingResult(q_learning on frozen_lake, steps=500, final_value={result.result['final_value']}, "
+    assert repr(result).startswith(line) and "normalized_regret=" in repr(result) and len(repr(result)) < 200
+
+
 class Killed(BaseException):
     pass
 

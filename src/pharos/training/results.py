@@ -363,6 +363,12 @@ class TrainingResult:
     folder: Path | None
     seconds: float
 
+    def __repr__(self) -> str:
+        config, result = self.config, self.result
+        numbers = (f"{name}={result[name]}" for name in ("final_value", "value_optimal", "normalized_regret"))
+        place = f"{config['agent']} on {config['environment']}, steps={config['steps']}"
+        return f"TrainingResult({place}, {', '.join(numbers)}, seconds={self.seconds:.2f})"
+
 
 class Record:
     """The file run.json, where there is a folder for results."""
