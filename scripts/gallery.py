@@ -145,29 +145,29 @@ def shown(env, state):
 HEAD = """# Gallery
 
 Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at its
-natural size and at 84 x 84 pixels, and the planes of the simple image, one for each layer. What agents learnt, at play
-beside the optimal policy and a random one: [large-runs.md](large-runs.md).
+natural size and at 84 x 84 pixels, and the planes of the simple image, one for each layer, after some steps of the
+optimal policy; then that policy at play. What agents learnt: [large-runs.md](large-runs.md).
 """
 
 
 def section(cls):
     """The section of a class, its pictures written."""
-    lines = [f"## {cls}", ""]
+    lines = [f"## {cls}"]
     for name, steps in INSTANCES[cls]:
         env, policy = optimal(name)
         state = drawing.episode(env, policy, env.initial_states()[0][0], steps=steps)[-1][0]
         file = file_of(name, ".png")
         drawing.save_png(file, shown(env, state))
         states = pharos.build(env).num_states
-        about = f"`{name}`, {states:,} states, after {many(steps, 'step')} of the optimal policy:"
-        lines += [f"{about} ![{name}](gallery/{file.name})", ""]
+        about = f"- `{name}`, {states:,} states, after {many(steps, 'step')}:"
+        lines += [f"{about} ![{name}](gallery/{file.name})"]
     for name in PLAYED[cls].split(", "):
         env, policy = (unturned if cls == "game_2048" else optimal)(name)
         pictures = [render(env, state, "complex_image", size="natural") for state in played(env, policy, cls)]
         file = file_of(name, ".gif")
         drawing.save_gif(file, pictures, frames_per_second=FRAMES_PER_SECOND.get(cls, 12), at_least=160)
-        lines += [f"The optimal policy of `{name}`: ![{name}](gallery/{file.name})", ""]
-    return "\n".join(lines)
+        lines += [f"- The optimal policy of `{name}`: ![{name}](gallery/{file.name})"]
+    return "\n".join(lines) + "\n"
 
 
 def played(env, policy, cls):

@@ -289,13 +289,14 @@ def instances(cls, stored: Mapping[str, dict]) -> list[str]:
 
 def observations(section: str) -> str:
     """The pictures of the gallery: what people and agents see."""
-    text = re.sub(r"^The optimal policy of .*\n", "", section, flags=re.MULTILINE)
+    text = re.sub(r"^- The optimal policy of .*\n", "", section, flags=re.MULTILINE)
     text = text.strip().replace("](gallery/", "](../gallery/")
     if not text.strip():
         return "The observations of every class: [observations](../observations.md)."
     about = (
         "From the left: the drawing for people, the complex image at its natural size and at 84 x 84 pixels, and the "
-        "planes of the simple image, one for each layer, named in their order. [More](../observations.md).\n\n"
+        "planes of the simple image, one for each layer, named in their order, after some steps of the optimal policy. "
+        "[More](../observations.md).\n\n"
     )
     return about + text
 

@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 ROOT = Path(__file__).parents[1]
 LOOSE = "(files of no package)"
 MANY_PARAMETERS = 7
+RECORDS = ("decisions", "evidence", "studies")  # folders of docs
 SILENT = {
     *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT),
     *(tokenize.ENCODING, tokenize.ENDMARKER),
@@ -115,9 +116,10 @@ def imported_by(tree: ast.Module, paths: dict[str, Path]) -> Iterator[str]:
 
 
 def pages_for_users(root: Path) -> list[Path]:
+    """Return the pages of the site but its records: decisions, what was measured, designs of studies."""
     docs = root / "docs"
     inside = {path: path.relative_to(docs).parts[0] for path in sorted(docs.rglob("*.md"))}
-    return [path for path, folder in inside.items() if folder not in ("decisions", "evidence")]
+    return [path for path, folder in inside.items() if folder not in RECORDS]
 
 
 def rows(root: Path) -> dict[str, str]:
