@@ -27,7 +27,7 @@ def test_the_page_describes_no_measure_that_is_not_there():
 
 
 def test_witnesses_are_files_of_tests():
-    named = re.findall(r"`(tests/[\w/]+\.py)`", PAGE)
-    assert named
+    named = re.findall(r"`(test_\w+\.py)`", PAGE)
+    assert len(named) >= len(BUILT_IN) / 2
     for name in named:
-        assert "def test_" in (ROOT / name).read_text(), name
+        assert "def test_" in (ROOT / "tests/hardness" / name).read_text(), name
