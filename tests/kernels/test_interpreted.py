@@ -16,6 +16,7 @@ from numba.core.registry import CPUDispatcher
 
 import pharos
 from pharos import hardness, kernels, solvers
+from pharos.rules.interpreted import InterpretedExploration
 from pharos.system import compiling
 
 TESTS = Path(__file__).parents[1]
@@ -74,6 +75,7 @@ def test_interpreted_kernels_give_the_bits_of_compiled_ones(tmp_path):
     code = f"""
 import pickle, sys
 from pathlib import Path
+from pharos.rules.interpreted import InterpretedExploration
 from pharos.system import compiling
 compiling.SMALL = 1 << 24
 import test_interpreted
@@ -111,3 +113,22 @@ def test_much_work_is_compiled(monkeypatch):
     monkeypatch.setattr(compiling, "SMALL", 100)
     x = np.full(30, 0.1)
     assert [(total(x), bool(total.signatures)) for _ in range(4)] == [(sum(x), False)] * 3 + [(sum(x), True)]
+
+
+def test_rules_that_are_compiled_already_are_hardly_interpreted_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(compiling, "SMALL", 1 << 14)
+    env = pharos.make("breakout", height=7, columns=5, brick_rows=1)
+    pharos.build(env, tmp_path / "first", progress=False)
+    asked = []
+    expand = InterpretedExploration.expand_and_find
+
+    def counted(self, states, start, stop, *rest):
+        asked.append(stop - start)
+        expand(self, states, start, stop, *rest)
+
+    monkeypatch.setattr(InterpretedExploration, "expand_and_find", counted)
+    pharos.build(env, tmp_path / "second", progress=False)
+    assert not asked
+    monkeypatch.setattr("pharos.rules.rules.explored", set())  # as in another process, which finds them on disk
+    space = pharos.build(env, tmp_path / "third", progress=False)
+    assert 0 < sum(asked) < compiling.SMALL // 16 // space.num_actions < space.num_states

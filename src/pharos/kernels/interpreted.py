@@ -5,6 +5,7 @@ compiled, Python runs its text, and that of what it calls: the same operations o
 (NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64; few entries do not come that far.)
 """
 
+import os
 from collections.abc import Callable
 from functools import cache
 from types import FunctionType
@@ -16,6 +17,9 @@ import numpy as np
 from numba.core.registry import CPUDispatcher
 
 from pharos.system import compiling
+
+LOADING = 4
+"""By how much fewer entries are worth loading a kernel that is compiled on disk (benchmarks/startup.py)."""
 
 Intrinsic = TypeVar("Intrinsic", bound=Callable)
 
@@ -44,7 +48,8 @@ def in_python(meaning: Callable) -> Callable:
 
 
 def interpreted_first(*counted: str) -> Callable:
-    """Decorator of a kernel: interpreted until its calls have counted `compiling.SMALL` entries.
+    """Decorator of a kernel: interpreted until its calls have counted `compiling.SMALL` entries, or so many fewer as
+    loading takes less than compiling.
 
     Args:
         counted: arguments whose entries count, a whole number as so many; none: all arrays. The work of a call must not
@@ -61,7 +66,8 @@ def interpreted_first(*counted: str) -> Callable:
             nonlocal count
             read = [arguments[i] for i in places] or [each for each in arguments if not isinstance(each, int)]
             count += sum(map(_entries, read))
-            return quiet if count < compiling.SMALL else compiled(*arguments)
+            is_small = count < compiling.SMALL // LOADING or (count < compiling.SMALL and not _is_kept(kernel))
+            return quiet if is_small else compiled(*arguments)
 
         def quiet(*arguments: object) -> object:
             with np.errstate(all="ignore"):  # hashes wrap around, and 1 / 0 is infinite
@@ -71,6 +77,12 @@ def interpreted_first(*counted: str) -> Callable:
         return kernel
 
     return decorate
+
+
+def _is_kept(kernel: CPUDispatcher) -> bool:
+    """Whether Numba has files of the compiled kernel."""
+    file = getattr(kernel._cache, "_cache_file", None)
+    return file is not None and os.path.exists(file._index_path)
 
 
 def _as_python(result: object) -> object:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import RuleError
-from pharos.rules.compiler import Function, compiler_of, numeric_attributes, type_text
+from pharos.rules.compiler import Function, KernelCache, compiler_of, numeric_attributes, type_text
 from pharos.rules.layout import Layout
 from pharos.system.packed_indices import Indices, PackedIndices
 
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 Rows = np.ndarray | tuple[np.ndarray, np.ndarray]  # terminal, or (terminal, probabilities)
 COUNTED = np.empty(0, np.int64)
 """No ranks of outcomes: those of a state and action are all its possible ones, in their order."""
+
+explored: set[type[Environment]] = set()
+"""Classes by whose rules this process explores compiled."""
 
 _SUSPECTS = 16  # states of which a kernel cannot say in which one a rule failed
 
@@ -61,6 +64,12 @@ class _Compiled:
         self.kernels = exploration_kernels(_class_of(env), names, layout.num_words, env.num_actions, self.outcomes)
 
 
+def is_kept(env: Environment, layout: Layout) -> bool:
+    """Whether exploration by the rules of the class was compiled before and kept on disk."""
+    cache = getattr(_Compiled(env, layout).kernels.explore, "_cache", None)
+    return isinstance(cache, KernelCache) and cache.holds_any()
+
+
 class CompiledExploration(_Compiled):
     """See `rules.Exploration`. Threads may share the work: the kernels release Python's lock."""
 
@@ -68,6 +77,7 @@ class CompiledExploration(_Compiled):
 
     def __init__(self, env: Environment, layout: Layout):
         super().__init__(env, layout)
+        explored.add(_class_of(env))
         self._is_plain = self.outcomes == 1 and not env.has_age
         branches = env.num_actions * self.outcomes
         states = np.empty((1, layout.num_words), np.uint64)

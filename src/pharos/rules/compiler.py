@@ -291,6 +291,10 @@ class KernelCache(NullCache):
     def cache_path(self) -> str:
         return str(self.path.parent)
 
+    def holds_any(self) -> bool:
+        """Whether the kernel was compiled and kept, for whatever signature."""
+        return any(self.path.parent.glob(f"{self.path.name}.*.nbc"))
+
     def load_overload(self, sig: object, target_context: TargetContext) -> CompileResult | None:
         """The compiled kernel; None where there is none, or a damaged one, which is deleted."""
         target_context.refresh()

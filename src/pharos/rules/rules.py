@@ -28,6 +28,8 @@ from pharos.rules.compiled import (
     CompiledMotion,
     CompiledRewards,
     CompiledStepping,
+    explored,
+    is_kept,
     signature_of,
 )
 from pharos.rules.compiler import reason_of
@@ -203,6 +205,19 @@ class Rules:
         from pharos.rules.interpreted import InterpretedExploration
 
         return InterpretedExploration(self.env, self.layout)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether this process explores by rules of the class compiled."""
+        return type(self.env) in explored
+
+    @cached_property
+    def is_kept(self) -> bool:
+        """Whether compiled exploration is at hand sooner than many states are interpreted."""
+        try:
+            return is_kept(self.env, self.layout)
+        except Exception:  # what Numba does not compile is told where it is compiled
+            return False
 
     def rewards_of(self, num_states: int) -> Rewards:
         """For so many states in all: those of a few are interpreted."""

@@ -78,8 +78,9 @@ class Search:
         self.workers = usable_workers(options.workers)
         self._rules = rules_of(plan.env, workers=self.workers)
         self.rules, self.threads = self._rules.first_exploration, 1
-        # the first chunk is all of a small space
-        self.chunk = min(CHUNK, compiling.SMALL // 4 // self.branches // 8 * 8)
+        # the first ones are all of a small space
+        self._interpreted = 0 if self._rules.is_ready else compiling.SMALL // 4 // self.branches // 8 * 8
+        self.chunk = max(8, min(CHUNK, self._interpreted // 64 * 8))
         self.position = Position()
         margin = 32 * self.branches + len(self.plan.starts[0])
         self.table = MemoryTable(self.num_words, margin, options.memory)
@@ -98,7 +99,7 @@ class Search:
                 if self.in_memory:
                     self._grow_table(pool)
                 while self.position.first < self.position.count:
-                    if self.position.first or not self.chunk or not self.in_memory:
+                    if self._is_large():
                         self._compile()
                     if self.in_memory:
                         self._expand_chunk(pool)
@@ -116,6 +117,11 @@ class Search:
             self.spilled = None
             self.table.release()
         self._report(finished=True)
+
+    def _is_large(self) -> bool:
+        """Whether compiled rules are worth their time: at once where they are at hand, but for the first chunk."""
+        first = self.position.first
+        return not self.in_memory or first >= self._interpreted or (first > 0 and self._rules.is_kept)
 
     def _compile(self) -> None:
         """Go on with compiled rules, by larger chunks."""
