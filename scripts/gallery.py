@@ -146,7 +146,7 @@ HEAD = """# Gallery
 
 Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at its
 natural size and at 84 x 84 pixels, and the planes of the simple image, one for each layer, after some steps of the
-optimal policy; then that policy at play. What agents learnt: [large-runs.md](large-runs.md).
+optimal policy; then that policy at play. What agents learnt: [evidence](evidence/agents.md).
 """
 
 
