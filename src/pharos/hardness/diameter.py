@@ -31,7 +31,7 @@ from pharos.hardness.interval import Budget, BudgetClock, Interval, Progress, co
 from pharos.hardness.stochastic_diameter import stochastic_diameter, stochastic_start_eccentricity
 from pharos.hardness.sum_sweep import Graph, SumSweep
 from pharos.kernels import graph as kernels
-from pharos.mdp import ExpandedMDP, TabularMDP, require_mdp
+from pharos.mdp import ExpandedMDP, TabularMDP, require_mdp, whole_number
 from pharos.system import storage
 from pharos.system.memory import available_memory, kept_array, large_zeros, ranges_from_the_end
 from pharos.system.wording import many
@@ -208,9 +208,8 @@ def colosseum_diameter(mdp: TabularMDP, *, horizon: int | None = None) -> float:
     Cost: a few backward passes of H steps for each state; O(H S^2 A) time for each pass with sparse rows.
     Source: Conserva and Rauber (2022), "Hardness in Markov decision processes: theory and practice", and its code.
     """
-    horizon = mdp.horizon if horizon is None else horizon
-    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
-        raise ParameterError(f"horizon is {horizon!r}; expected an integer of at least 1, here or in the MDP")
+    expected = "an integer of at least 1, here or in the MDP"
+    steps = whole_number(mdp.horizon if horizon is None else horizon, "horizon", expected)
     choices = ExpandedMDP.of(mdp, False)
     size, num_actions = len(choices.underlying), choices.num_actions
     rho = np.zeros(size)
@@ -220,7 +219,7 @@ def colosseum_diameter(mdp: TabularMDP, *, horizon: int | None = None) -> float:
     for low in range(0, choices.num_targets, _TARGETS):
         targets = np.arange(low, min(low + _TARGETS, choices.num_targets))
         goal = choices.underlying[:, None] == targets
-        around = _Episodes(choices.matrix, num_actions, goal, rho, int(horizon))
+        around = _Episodes(choices.matrix, num_actions, goal, rho, steps)
         largest = max(largest, 1 + float(around.times_from_start().max()))
     return largest
 

@@ -23,11 +23,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
+from pharos.errors import PrecisionError, UndefinedMeasure
 from pharos.hardness.gaps import optimal_solution, solved
 from pharos.hardness.gorp import gorp_bound
-from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, expected_rewards, single_outcomes, steps_of
-from pharos.mdp import ExpandedMDP, TabularMDP, require_mdp
+from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
+from pharos.mdp import STEPS, ExpandedMDP, TabularMDP, require_mdp, whole_number
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
 from pharos.system import memory
 
@@ -248,7 +248,7 @@ class SmallHorizon(FiniteHorizonValues):
         if spread:
             after = np.zeros_like(self.variance)
             for t in range(self.steps - 1):
-                after[t] = self.following_max(self.variance[t + 1].max(axis=1))
+                after[t] = self.choices.largest(self.variance[t + 1].max(axis=1))
             self.variance = after
 
     def look_at_rewards(self) -> None:
@@ -451,9 +451,7 @@ def stationary_effective_horizon(
         raise UndefinedMeasure(
             "stationary_effective_horizon is defined for gamma < 1; see effective_horizon for episodes"
         )
-    limit = steps if steps is not None else mdp.horizon or math.ceil(1 / (1 - mdp.gamma))
-    if isinstance(limit, bool) or not isinstance(limit, int | np.integer) or limit < 1:
-        raise ParameterError(f"steps is {limit!r}; expected a whole number of steps, at least 1")
+    limit = mdp.horizon or math.ceil(1 / (1 - mdp.gamma)) if steps is None else whole_number(steps, "steps", STEPS)
     endless = mdp if mdp.horizon is None else mdp.with_horizon(None)
     tell = progress or (lambda line: None)
     nodes = _Nodes(endless, solution, tolerance, tell)
@@ -466,10 +464,10 @@ def stationary_effective_horizon(
         )
     slack = max(1e-12, 2 * floor)
     nodes.compare(tie, slack)
-    ahead, _ = look_ahead(nodes, int(limit), mdp.num_actions, tell=tell)
+    ahead, _ = look_ahead(nodes, limit, mdp.num_actions, tell=tell)
     conventions = {
         "gamma": mdp.gamma,
-        "steps": int(limit),
+        "steps": limit,
         "exploration": "uniform",
         "tie_tolerance": tie,
         "slack": slack,
@@ -478,40 +476,29 @@ def stationary_effective_horizon(
     return StationaryHorizon(**vars(ahead), conventions=conventions)
 
 
-class _StoredQ:
-    """Action values that are kept as a table (N, A)."""
-
-    def __init__(self, table: np.ndarray):
-        self.table = table
-
-    @cached_property
-    def best(self) -> np.ndarray:
-        """(N,): max over a."""
-        return self.table.max(axis=1)
-
-    def at(self, nodes: np.ndarray) -> np.ndarray:
-        """(n, A), of some nodes."""
-        return self.table[nodes]
-
-
-class _LookaheadQ:
-    """Action values r + gamma value(next), where each action leads to one node: computed where they are asked for."""
+class _ActionValues:
+    """r + gamma E value(next) of nodes; where each action leads to one node, computed where they are asked for."""
 
     def __init__(self, nodes: "_Nodes", value: np.ndarray):
-        self.nodes, self.value = nodes, value
+        self.nodes, self.value, self.table = nodes, value, np.empty(0)
+        if nodes.table is None:
+            self.table = nodes.rewards + nodes.gamma * nodes.choices.expected(value)
 
     @cached_property
     def best(self) -> np.ndarray:
         """(N,): max over a."""
         from pharos.kernels import horizon
 
-        result = np.empty(self.nodes.num_nodes)
+        if self.nodes.table is None:
+            return np.asarray(self.table.max(axis=1))
+        result = np.empty(len(self.value))
         horizon.lookahead(self.nodes.table, self.nodes.rewards, self.nodes.gamma, self.value, result)
         return result
 
     def at(self, nodes: np.ndarray) -> np.ndarray:
         """(n, A), of some nodes."""
-        assert self.nodes.table is not None
+        if self.nodes.table is None:
+            return self.table[nodes]
         return self.nodes.rewards[nodes] + self.nodes.gamma * self.value[self.nodes.table[nodes]]
 
 
@@ -520,22 +507,16 @@ class _Nodes:
 
     Attributes:
         rewards, best, worst, explored: (N, A) of choosing an action. error: the largest error of any of them.
-        table: (N, A), the only node that an action leads to, where that is so everywhere; else None, and matrix (N A,
-            N) says.
+        choices: the MDP written out. table: (N, A), the only node that an action leads to; None where some lead to
+            several.
     """
 
     def __init__(self, mdp: TabularMDP, solution: Solution | None, tolerance: float, tell: Callable[[str], None]):
         self.gamma, self.num_actions = mdp.gamma, mdp.num_actions
-        self.table: np.ndarray | None
-        if mdp.is_deterministic:
-            choices, self.table = _states_and_the_end(mdp)
-        else:
-            choices = ExpandedMDP.of(mdp, restart=False).reachable()
-            self.table = single_outcomes(choices.matrix, len(choices.underlying), mdp.num_actions)
-        self.num_nodes = len(choices.underlying)
-        self.matrix = choices.matrix
+        choices = _states_and_the_end(mdp) if mdp.is_deterministic else ExpandedMDP.of(mdp, restart=False).reachable()
+        self.choices, self.table, self.num_nodes = choices, choices.table, len(choices.underlying)
         self.starts = np.array(sorted(node for node, _ in choices.starts))
-        self.rewards = expected_rewards(mdp, choices)
+        self.rewards = choices.rewards(mdp)
         tell("values of optimal play")
         best = optimal_solution(mdp, solution) if solution is not None else solved(value_iteration, mdp, tolerance)
         tell("values of the worst play")
@@ -544,14 +525,13 @@ class _Nodes:
         explored = solved(uniform_value, mdp, tolerance)
         self.error = mdp.gamma * max(best.error_bound, worst.error_bound, explored.error_bound)
         everywhere = np.arange(self.num_nodes)
-        self.best, self.worst, self.explored = (
-            self.backup(_on_nodes(each, choices, mdp)).at(everywhere) for each in (best, worst, explored)
-        )
+        values = [_ActionValues(self, _on_nodes(each, choices, mdp)) for each in (best, worst, explored)]
+        self.best, self.worst, self.explored = (each.at(everywhere) for each in values)
+        self.values = values[-1]
 
     def compare(self, tie: float, slack: float) -> None:
         """Begin with Q^1 of uniform play; what is within `tie` of the best is optimal, within `slack` equal."""
         self.slack, self.optimal = slack, self.best >= self.best.max(axis=1, keepdims=True) - tie
-        self.values: _StoredQ | _LookaheadQ = _StoredQ(self.explored)
         self.spread = ((self.explored - self.worst) * (self.best - self.worst)).max(axis=1)
 
     def samples(self, log: float) -> tuple[int, float, float] | None:
@@ -580,29 +560,22 @@ class _Nodes:
         return self.closure(greedy) is not None
 
     def advance(self, spread: bool = True) -> None:
-        self.values = self.backup(self.values.best)
+        self.values = _ActionValues(self, self.values.best)
         if spread:
             self.spread = self.gamma**2 * self.following_max(self.spread)
 
     def look_at_rewards(self) -> None:
-        self.values = _StoredQ(self.rewards)
-
-    def backup(self, value: np.ndarray) -> _StoredQ | _LookaheadQ:
-        """r + gamma E value(next)."""
-        if self.table is not None:
-            return _LookaheadQ(self, value)
-        return _StoredQ(self.rewards + self.gamma * (self.matrix @ value).reshape(self.num_nodes, self.num_actions))
+        self.values = _ActionValues(self, np.zeros(self.num_nodes))
 
     def following_max(self, values: np.ndarray) -> np.ndarray:
         """(N,): the largest of values (N,) >= 0 over the nodes that some action may lead to."""
-        if self.table is not None:
-            from pharos.kernels import horizon
+        from pharos.kernels import horizon
 
-            result = np.empty(self.num_nodes)
-            horizon.largest(self.table, values, result)
-            return result
-        each = np.maximum.reduceat(values[self.matrix.indices], self.matrix.indptr[:-1])
-        return each.reshape(self.rewards.shape).max(axis=1)
+        if self.table is None:
+            return np.asarray(self.choices.largest(values).max(axis=1))
+        result = np.empty(self.num_nodes)
+        horizon.largest(self.table, values, result)
+        return result
 
     def closure(self, actions: Callable[[np.ndarray], np.ndarray | None]) -> np.ndarray | None:
         """The nodes that can be met from the start by some actions; None where `actions` answers None.
@@ -616,18 +589,14 @@ class _Nodes:
             allowed = actions(nodes)
             if allowed is None:
                 return None
-            rows, chosen = np.nonzero(allowed)
-            if self.table is not None:
-                following = self.table[nodes[rows], chosen]
-            else:
-                following = self.matrix[nodes[rows] * self.num_actions + chosen].indices
+            following = self.choices.following(nodes, allowed)
             nodes = np.unique(following[~is_reached[following]])
             is_reached[nodes] = True
         return np.flatnonzero(is_reached)
 
 
-def _states_and_the_end(mdp: TabularMDP) -> tuple[ExpandedMDP, np.ndarray]:
-    """The states without chance, then the implicit end; and where each action leads.
+def _states_and_the_end(mdp: TabularMDP) -> ExpandedMDP:
+    """The states without chance, then the implicit end, by the table of where each action leads.
 
     What has ended stays where it is.
     """
@@ -641,15 +610,11 @@ def _states_and_the_end(mdp: TabularMDP) -> tuple[ExpandedMDP, np.ndarray]:
     table[terminal] = terminal[:, None]
     starts = [(int(s), float(p)) for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True) if p > 0]
     none = np.zeros(size + 1, np.bool_)
-    return ExpandedMDP(None, np.arange(size + 1), np.full(size + 1, -1), starts, mdp.num_actions, size + 1, none), table
+    choices = ExpandedMDP(None, np.arange(size + 1), np.full(size + 1, -1), starts, mdp.num_actions, size + 1, none)
+    choices.table = table
+    return choices
 
 
 def _on_nodes(solution: Solution, choices: ExpandedMDP, mdp: TabularMDP) -> np.ndarray:
     """(N,): V of the nodes; 0 at the end. Of starts without a previous action any number, as nothing leads there."""
-    inside = choices.underlying < mdp.num_states
-    v = solution.v
-    if v.ndim == 2:
-        result = v[np.where(inside, choices.underlying, 0), np.clip(choices.previous, 0, mdp.num_actions - 1)]
-    else:
-        result = v[np.where(inside, choices.underlying, 0)]
-    return np.where(inside, result, 0.0)
+    return solution.x[np.minimum(choices.underlying, mdp.num_states), np.clip(choices.previous, 0, mdp.width - 1)]

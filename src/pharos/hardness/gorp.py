@@ -16,7 +16,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
-from pharos.mdp import TabularMDP, require_mdp
+from pharos.mdp import TabularMDP, require_mdp, whole_number
 from pharos.system.wording import many
 
 METHODS = ("binomial", "bernstein", "exact")
@@ -94,8 +94,7 @@ def gorp_bound(
     """
     steps, names = steps_of("gorp_bound", mdp, horizon), tuple(methods)
     check_returns("gorp_bound", mdp, steps)
-    if isinstance(max_k, bool) or not isinstance(max_k, int | np.integer) or max_k < 1:
-        raise ParameterError(f"max_k is {max_k!r}; expected a whole number, at least 1")
+    ks = list(range(1, whole_number(max_k, "max_k") + 1))
     for name in names:
         if name not in METHODS:
             raise ParameterError(f"unknown method {name!r}; expected some of {', '.join(METHODS)}")
@@ -106,7 +105,7 @@ def gorp_bound(
     ms: list[int | None] = []
     values: list[float] = []
     failures: list[float] = []
-    for k in range(1, int(max_k) + 1):
+    for k in ks:
         samples, failure = search.samples(k)
         ms.append(samples)
         failures.append(failure)
@@ -116,7 +115,7 @@ def gorp_bound(
             values.append(k + (math.log(samples) / math.log(mdp.num_actions) if mdp.num_actions > 1 else 0.0))
     return GorpBound(
         min(values),
-        list(range(1, int(max_k) + 1)),
+        ks,
         ms,
         values,
         failures,
@@ -184,8 +183,7 @@ def run_gorp(
     """
     steps = steps_of("run_gorp", mdp, horizon)
     for name, value in (("k", k), ("m", m), ("runs", runs)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise ParameterError(f"{name} is {value!r}; expected a whole number, at least 1")
+        whole_number(value, name)
     _needs_one_outcome("run_gorp", mdp)
     tree = FiniteHorizonValues(mdp, steps)
     if len(tree.starts) != 1:

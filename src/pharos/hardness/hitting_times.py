@@ -209,7 +209,8 @@ class HittingTimes:
 
     def bounds(self, j: np.ndarray, count: int) -> Bounds:
         """Bounds by the residuals of J; the greedy policy stands in `policy` then. `least` is the best lower one."""
-        above, below, largest = hitting.residuals(*self.arrays, self.goal, self.order, count, j, self.policy)
+        arrays = (*self.arrays, self.goal, self.order, count, j, None, self.policy, None, None)
+        above, below, largest = hitting.residuals(*arrays)
         bounds = certified(above, below, largest)
         self.least = max(self.least, bounds.lower)
         return bounds
@@ -219,7 +220,7 @@ class HittingTimes:
         move."""
         for number in range(sweeps):
             if self.swept < PLAIN_SWEEPS:
-                change = hitting.sweep_in_place(*self.arrays, self.goal, self.order, count, j)
+                change = hitting.sweep_in_place(*self.arrays, self.goal, self.order, count, j, None)[0]
             else:
                 change = self._sweep_with_mode(j, count)
             self.swept += 1
@@ -237,7 +238,7 @@ class HittingTimes:
             self.mode = np.zeros(len(j))
             self.mode[self.order[:count]] = ~self.goal[self.order[:count]]
         arrays = (*self.arrays, self.goal, self.order, count, j, self.mode)
-        change, ff, fg, gg = hitting.sweep_with_mode(*arrays)
+        change, ff, fg, gg = hitting.sweep_in_place(*arrays)
         if self.swept % LOOK != LOOK - 1 or not (gg > 0 and math.isfinite(ff) and change > 0):
             return float(change)
         nodes = self.order[:count]
@@ -399,7 +400,7 @@ class HittingTimes:
         in `policy`."""
         residual, error = np.zeros_like(high), np.zeros_like(high)
         arrays = (high, low, self.policy, residual, error)
-        return residual, error, hitting.residuals_of_pairs(*self.arrays, self.goal, self.order, count, *arrays)
+        return residual, error, hitting.residuals(*self.arrays, self.goal, self.order, count, *arrays)[:2]
 
 
 # Hitting equations ----------------------------------------------------------------------------------------------------

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import xxhash
 
-from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
+from pharos.errors import PrecisionError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of
 from pharos.hardness.registry import Measure, Problem, chosen
 from pharos.hardness.representation import Representation, Rollouts, Schedule
 from pharos.hardness.sampled_regret import Sampling
-from pharos.mdp import TabularMDP, require_mdp
+from pharos.mdp import TabularMDP, check_horizon, require_mdp
 from pharos.system import storage
 from pharos.system.compiling import Stopwatch
 from pharos.system.wording import latex_text
@@ -161,11 +161,7 @@ def report(  # noqa: PLR0913
     """
     watch = Stopwatch()
     horizon = mdp.horizon if horizon is None else horizon
-    is_number = isinstance(horizon, int | np.integer) and not isinstance(horizon, bool)
-    if horizon is not None and not (is_number and 1 <= horizon < 2**31):
-        raise ParameterError(
-            f"horizon is {horizon!r}; expected a whole number of steps, at least 1 and below 2^31, or None"
-        )
+    check_horizon(horizon)
     wanted = chosen(measures, representation is not None)
     schedule = schedule or Schedule()
     options = (representation, schedule, rollouts, sampling, None if folder is None else Path(folder))

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.visitation import Walk
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, whole_number
 from pharos.solvers import Solution, evaluate_policy, regret_scale, uniform_value, value_iteration
 
 MOST_EXACT = 4096
@@ -325,9 +325,7 @@ class Schedule:
 
     def __post_init__(self) -> None:
         for name in ("steps", "period", "gradient_steps"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-                raise ParameterError(f"schedule: {name} is {value!r}; expected a whole number, at least 1")
+            whole_number(getattr(self, name), f"schedule: {name}")
         if not self.learning_starts >= 0:
             raise ParameterError(f"schedule: learning_starts is {self.learning_starts!r}; expected at least 0")
         for name in ("exploration_initial_eps", "exploration_final_eps", "exploration_fraction", "gamma"):
@@ -365,9 +363,7 @@ class Rollouts:
 
     def __post_init__(self) -> None:
         for name in ("steps", "gradient_steps"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-                raise ParameterError(f"rollouts: {name} is {value!r}; expected a whole number, at least 1")
+            whole_number(getattr(self, name), f"rollouts: {name}")
         if not 0 <= self.gae_lambda <= 1:
             raise ParameterError(f"rollouts: gae_lambda is {self.gae_lambda!r}; expected a number in [0, 1]")
         if self.clip_range is not None and not self.clip_range > 0:

@@ -29,7 +29,7 @@ from pharos.hardness.representation import (
     greedy_policy,
 )
 from pharos.hardness.visitation import drawn, standard_occupancy
-from pharos.mdp import TabularMDP, paid_outcomes, require_mdp
+from pharos.mdp import TabularMDP, paid_outcomes, require_mdp, whole_number
 from pharos.solvers import Solution
 
 LOOKS = 30
@@ -56,13 +56,10 @@ class Sampling:
 
     def __post_init__(self) -> None:
         for name in ("walks", "batch_size", "buffer_size"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-                raise ParameterError(f"sampling: {name} is {value!r}; expected a whole number, at least 1")
+            whole_number(getattr(self, name), f"sampling: {name}")
         if not (math.isfinite(self.reward_noise) and self.reward_noise >= 0):
             raise ParameterError(f"sampling: reward_noise is {self.reward_noise!r}; expected at least 0")
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int | np.integer) or self.seed < 0:
-            raise ParameterError(f"sampling: seed is {self.seed!r}; expected a whole number, at least 0")
+        whole_number(self.seed, "sampling: seed", "a whole number, at least 0", least=0)
 
 
 @dataclass(frozen=True, eq=False)

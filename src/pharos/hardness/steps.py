@@ -6,19 +6,14 @@ executed action) and the starts without one. Source: Laidlaw, Russell and Dragan
 `return_distribution`: the distribution of the return of a policy over such an episode.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import scipy  # whose `sparse` is loaded where it is used
 
-from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
-from pharos.mdp import ExpandedMDP, PolicyTable, TabularMDP, require_mdp
+from pharos.errors import PrecisionError, UndefinedMeasure
+from pharos.mdp import STEPS, ExpandedMDP, PolicyTable, TabularMDP, mean_of_actions, require_mdp, whole_number
 from pharos.solvers import TablePolicy
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
 
 # In units of return: an action is optimal if its value is within this of the best (theirs).
 TIE = 1e-4
@@ -33,9 +28,7 @@ def steps_of(name: str, mdp: TabularMDP, horizon: int | None) -> int:
     steps = mdp.horizon if horizon is None else horizon
     if steps is None:
         raise UndefinedMeasure(f"{name} is defined for episodes of T steps: give a horizon")
-    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
-        raise ParameterError(f"horizon is {steps!r}; expected a whole number of steps, at least 1")
-    return int(steps)
+    return whole_number(steps, "horizon", STEPS)
 
 
 def check_returns(name: str, mdp: TabularMDP, steps: int) -> None:
@@ -51,7 +44,7 @@ class FiniteHorizonValues:
     """Values at every step t = 1, ..., T (index t - 1) of optimal, worst and exploring play, on the nodes of an MDP.
 
     Attributes:
-        matrix: (N A, N) probabilities; rewards (N, A).
+        choices: the MDP written out; rewards (N, A); table (N, A) where each choice has one outcome, else None.
         best, worst, explored: (T, N, A) action values; explored_value (T, N), clipped to [worst, best].
         optimal: (T, N, A) bool.
         met: (T, N) bool, whether a node can be met at step t.
@@ -66,14 +59,9 @@ class FiniteHorizonValues:
                 f"GiB, more than {MEMORY / 2**30:.0f}; a smaller horizon or instance would define it"
             )
         choices = ExpandedMDP.of(mdp, restart=False)
-        self.matrix, self.num_actions, self.steps = choices.matrix, mdp.num_actions, steps
-        self.underlying, self.num_nodes = choices.underlying, len(choices.underlying)
-        self.starts = choices.starts
-        self.rewards = expected_rewards(mdp, choices)
-        self.table = single_outcomes(self.matrix, self.num_nodes, self.num_actions)
-        self.support = scipy.sparse.csr_matrix(
-            (np.ones(self.matrix.nnz, np.float32), self.matrix.indices, self.matrix.indptr), shape=self.matrix.shape
-        )
+        self.choices, self.num_actions, self.steps = choices, mdp.num_actions, steps
+        self.num_nodes, self.starts, self.table = len(choices.underlying), choices.starts, choices.table
+        self.rewards = choices.rewards(mdp)
         shape = (steps, self.num_nodes, self.num_actions)
         self.best, self.worst, self.explored = (np.empty(shape) for _ in range(3))
         self.explored_value = np.empty(shape[:2])
@@ -107,23 +95,13 @@ class FiniteHorizonValues:
 
     def backup(self, value: np.ndarray) -> np.ndarray:
         """(N, A): r + E value(next)."""
-        if self.table is not None:
-            return self.rewards + value[self.table]
-        return self.rewards + (self.matrix @ value).reshape(self.num_nodes, self.num_actions)
+        return self.rewards + self.choices.expected(value)
 
     def following(self, met: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """(N,) bool: nodes that some of these actions (N, A) lead to from the nodes that are met."""
-        chosen = np.flatnonzero((met[:, None] & actions).ravel())
-        result = np.zeros(self.num_nodes, np.bool_)
-        result[self.matrix[chosen].indices] = True
+        result, nodes = np.zeros(self.num_nodes, np.bool_), np.flatnonzero(met)
+        result[self.choices.following(nodes, actions[nodes])] = True
         return result
-
-    def following_max(self, values: np.ndarray) -> np.ndarray:
-        """(N, A): the largest of values (N,) >= 0 over the nodes that an action may lead to."""
-        if self.table is not None:
-            return values[self.table]
-        largest = np.maximum.reduceat(values[self.matrix.indices], self.matrix.indptr[:-1])
-        return largest.reshape(self.num_nodes, self.num_actions)
 
     def at_start(self, values: np.ndarray) -> float:
         """The expectation over start nodes."""
@@ -136,31 +114,6 @@ class FiniteHorizonValues:
         for t in range(self.steps - 1):
             result[t] = self.backup(values[t + 1].max(axis=1))
         return result
-
-
-def mean_of_actions(values: np.ndarray) -> np.ndarray:
-    """Mean over actions, added up in their order."""
-    total = values[:, 0].copy()
-    for action in range(1, values.shape[1]):
-        total += values[:, action]
-    return total / values.shape[1]
-
-
-def single_outcomes(matrix: "csr_matrix", nodes: int, num_actions: int) -> np.ndarray | None:
-    """(N, A) next nodes where every choice has one outcome; else None."""
-    if matrix.nnz == nodes * num_actions and (np.diff(matrix.indptr) == 1).all() and (matrix.data == 1.0).all():
-        return matrix.indices.reshape(nodes, num_actions).astype(np.int64)
-    return None
-
-
-def expected_rewards(mdp: TabularMDP, choices: ExpandedMDP) -> np.ndarray:
-    """(N, A): the expected reward of choosing an action in a node."""
-    num_actions = mdp.num_actions
-    paid = np.vstack([mdp.rewards, np.zeros((1, num_actions))])
-    paid[:-1][np.asarray(mdp.terminal)] = 0.0
-    executed = paid[np.minimum(choices.underlying, mdp.num_states)]
-    mean = mean_of_actions(executed)[:, None]
-    return mdp.chance.chosen_values(executed, choices.previous, mean)
 
 
 # Returns of an episode ------------------------------------------------------------------------------------------------
@@ -229,8 +182,7 @@ def return_distribution(
     Source: Bellemare, Dabney and Rowland (2023), "Distributional reinforcement learning", chapter 2.
     """
     steps = steps_of("return_distribution", mdp, horizon)
-    for support, values, first in _backward(mdp, policy, steps):
-        returns, last = support, first if first is not None else values
+    returns, last = _backward(mdp, policy, steps)
     mass = np.zeros(len(returns))
     for state, probability in zip(mdp.start_states, mdp.start_probabilities, strict=True):
         mass += probability * last[state, 0]
@@ -239,22 +191,14 @@ def return_distribution(
     return ReturnDistribution(returns[is_possible], mass[is_possible], conventions)
 
 
-def _backward(
-    mdp: TabularMDP, policy: TablePolicy | None, steps: int
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
-    """For t = T - 1, ..., 0: the possible returns (K,), and their probabilities.
-
-    These are (S + 1, W, K), from t on, W being A previous actions or 1.
-
-    Under sticky actions also (S + 1, 1, K), as if no action had been executed before, for the last of them.
-    """
+def _backward(mdp: TabularMDP, policy: TablePolicy | None, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """((K,) possible returns, (S + 1, 1, K) their probabilities from each state on, without a previous action)."""
     states, num_actions, chance = mdp.num_states, mdp.num_actions, mdp.chance
     table = PolicyTable.of(mdp, policy)
     rewards = np.where(np.asarray(mdp.terminal)[:, None], 0.0, mdp.rewards)
     paid, which = np.unique(rewards, return_inverse=True)
     which = which.reshape(rewards.shape)
-    width = mdp.width
-    support, values = np.zeros(1), np.ones((states + 1, width, 1))
+    support, values = np.zeros(1), np.ones((states + 1, mdp.width, 1))
     for t in range(steps - 1, -1, -1):
         sums = np.sort(np.append((paid[:, None] + support).ravel(), 0.0))  # what has ended has return 0
         following = sums[np.concatenate([[True], np.diff(sums) > SAME])]
@@ -271,15 +215,13 @@ def _backward(
             block = np.zeros((len(s), len(following)))
             block[:, np.maximum(place, 0)] = after[s, a]
             executed[s, a] = block
-        now = np.zeros((states + 1, width, len(following)))
-        origin = int(np.abs(following).argmin())
-        now[states, :, origin] = 1.0
-        now[:states] = chance.choice(executed, table.value(executed))
-        first = None
         if mdp.is_sticky and t == 0:
-            first = np.zeros((states + 1, 1, len(following)))
-            first[:states] = chance.first.choice(executed, table.first_value(executed))
-            first[states, 0, origin] = 1.0
-        live = (now > 0).any(axis=(0, 1)) | (False if first is None else (first > 0).any(axis=(0, 1)))
+            chosen = chance.first.choice(executed, table.first_value(executed))
+        else:
+            chosen = chance.choice(executed, table.value(executed))
+        now = np.zeros((states + 1, *chosen.shape[1:]))
+        now[states, :, int(np.abs(following).argmin())] = 1.0
+        now[:states] = chosen
+        live = (now > 0).any(axis=(0, 1))
         support, values = following[live], now[..., live]
-        yield support, values, None if first is None else first[..., live]
+    return support, values

@@ -118,19 +118,20 @@ class HubBounds:
             (np.zeros(size, np.uint8), np.empty(NEARBY, np.int64), np.empty(size, dtype)) for _ in range(self._threads)
         ]
 
-        def all_nodes(kernel, *arguments):  # type: ignore[no-untyped-def]
+        def all_nodes(start: np.ndarray | None, way: np.ndarray | None) -> None:
             def part(thread: int) -> None:
                 low, high = edges[thread], edges[thread + 1]
-                kernel(low, high, self._outcomes, owner, into, square, steps, *arguments, NEARBY, *room[thread])
+                arrays = (self._outcomes, owner, into, square, steps, start, way, NEARBY, *room[thread])
+                hitting.ways_back(low, high, *arrays)
 
             list(pool.map(part, range(self._threads)))
 
-        all_nodes(hitting.steps_back)
+        all_nodes(None, None)
         length = np.empty(len(node), np.int64)
         self._rho = hitting.keep_near(*self._fixed, square, steps, LIMIT, length)
         start = np.cumsum(length) - length
         way = np.empty(int(length.sum()), dtype)
-        all_nodes(hitting.ways_back, start, way)
+        all_nodes(start, way)
         self._ways = (square, steps, start, way)
 
     def _solve(self, own: float, times: np.ndarray) -> np.ndarray:

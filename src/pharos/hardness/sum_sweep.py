@@ -79,11 +79,11 @@ class Graph:
 
     def search_forward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
         """distance[v] = d(source, v); (nodes found, largest distance, sum of distances)."""
-        return kernels.search_forward(self.next_states, self.ends, self.start, source, distance, self.queue)
+        return kernels.search((self.next_states, self.ends), None, self.start, source, distance, self.queue)
 
     def search_backward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
         """distance[v] = d(v, source); (nodes found, largest distance, sum of distances)."""
-        return kernels.search_backward(*self.backward, self.start, source, distance, self.queue)
+        return kernels.search(None, self.backward, self.start, source, distance, self.queue)
 
 
 def _leads_to_end(table: Indices, terminal: np.ndarray) -> bool:
@@ -379,12 +379,8 @@ class SumSweep:
         largest = np.empty(len(sources), np.int64)
         origins, front, coming = (np.zeros((graph.num_nodes, words), np.uint64) for _ in range(3))
         scratch = (origins, front, coming, graph.queue, np.empty_like(graph.queue))
-        if outward:
-            _, reads = many_searches.search_forward_from_many(
-                graph.next_states, graph.ends, graph.start, sources, *scratch, largest
-            )
-        else:
-            _, reads = many_searches.search_backward_from_many(*graph.backward, graph.start, sources, *scratch, largest)
+        table, reverse = ((graph.next_states, graph.ends), None) if outward else (None, graph.backward)
+        _, reads = many_searches.search_from_many(table, reverse, graph.start, sources, *scratch, largest)
         upper[nodes] = lower[nodes] = largest
         self.best = max(self.best, int(largest.max()))
         self.spending.searches += len(sources)
@@ -510,9 +506,8 @@ def _infinite_diameter(graph: Graph, spending: BudgetClock, conventions: dict[st
         sources = np.arange(done, min(done + 64 * words, size), dtype=graph.dtype)
         origins[:] = 0
         largest = np.empty(len(sources), np.int64)
-        pairs, _ = many_searches.search_forward_from_many(
-            graph.next_states, graph.ends, graph.start, sources, *scratch, largest
-        )
+        table = (graph.next_states, graph.ends)
+        pairs, _ = many_searches.search_from_many(table, None, graph.start, sources, *scratch, largest)
         reached += int(pairs)
         finite = max(finite, int(largest.max()))
         done += len(sources)

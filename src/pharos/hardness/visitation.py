@@ -22,8 +22,19 @@ import scipy  # whose `sparse` is loaded where it is used
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.gaps import optimal_solution
 from pharos.hardness.interval import Interval
+from pharos.hardness.steps import steps_of
 from pharos.kernels import occupancy as kernels
-from pharos.mdp import Chance, ExpandedMDP, PolicyStep, PolicyTable, TabularMDP, chosen_mass, require_mdp
+from pharos.mdp import (
+    STEPS,
+    Chance,
+    ExpandedMDP,
+    PolicyStep,
+    PolicyTable,
+    TabularMDP,
+    chosen_mass,
+    require_mdp,
+    whole_number,
+)
 from pharos.solvers import Solution, TablePolicy, value_iteration
 from pharos.system.compiling import Stopwatch
 
@@ -227,14 +238,12 @@ class Walk:
     """
 
     def __init__(self, mdp: TabularMDP, policy: TablePolicy | None, horizon: int | None):
-        steps = mdp.horizon if horizon is None else horizon
-        if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1):
-            raise ParameterError(f"horizon is {steps!r}; expected a whole number of steps, at least 1")
+        steps = mdp.horizon if horizon is None else whole_number(horizon, "horizon", STEPS)
         if steps is None and mdp.gamma == 1.0:
             raise UndefinedMeasure(
                 f"{mdp}: visits may be infinite, as gamma is 1 and there is no horizon; give one, or gamma < 1"
             )
-        self.mdp, self.horizon = mdp, None if steps is None else int(steps)
+        self.mdp, self.horizon = mdp, steps
         self.live = ~np.asarray(mdp.terminal)
         table = PolicyTable.of(mdp, policy)
         self.first = PolicyStep(self.live, table.first, mdp.chance.first)
@@ -402,11 +411,7 @@ def exploration_time(mdp: TabularMDP, *, horizon: int | None = None) -> Explorat
     Cost: O(S A) a step.
     Source: pharos; goal-finding by random walk, as in Koenig and Simmons (1996).
     """
-    steps = mdp.horizon if horizon is None else horizon
-    if steps is None:
-        raise UndefinedMeasure("exploration_time is defined for episodes of T steps: give a horizon")
-    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
-        raise ParameterError(f"horizon is {steps!r}; expected a whole number of steps, at least 1")
+    steps = steps_of("exploration_time", mdp, horizon)
     rewards, live = mdp.rewards, ~np.asarray(mdp.terminal)
     threshold = LARGE * float(rewards.max(initial=0.0))
     if not threshold > 0:
@@ -416,7 +421,7 @@ def exploration_time(mdp: TabularMDP, *, horizon: int | None = None) -> Explorat
     np.add.at(mass[:, 0], mdp.start_states, mdp.start_probabilities)
     met = length = 0.0
     chance = mdp.chance.first
-    for _ in range(int(steps)):
+    for _ in range(steps):
         mass[~live] = 0.0
         total = mass.sum(axis=1, keepdims=True)
         length += float(total.sum())
@@ -429,8 +434,8 @@ def exploration_time(mdp: TabularMDP, *, horizon: int | None = None) -> Explorat
         chance = mdp.chance
     met = min(met, 1.0)
     if met <= 0.0:
-        return ExplorationTime(float("inf"), float("inf"), 0.0, threshold, int(steps))
-    return ExplorationTime(length / met, 1 / met, met, threshold, int(steps))
+        return ExplorationTime(math.inf, math.inf, 0.0, threshold, steps)
+    return ExplorationTime(length / met, 1 / met, met, threshold, steps)
 
 
 # Covering -------------------------------------------------------------------------------------------------------------
@@ -486,19 +491,15 @@ def covering(mdp: TabularMDP, *, horizon: int | None = None) -> Covering:
         states of `breakout/12x8x1` take 1.4 s.
     Source: Laidlaw, Russell and Dragan (2023), section 3 and appendix; the bound: Even-Dar and Mansour (2003).
     """
-    steps = mdp.horizon if horizon is None else horizon
-    if steps is None:
-        raise UndefinedMeasure("covering is defined for episodes of T steps: give a horizon")
-    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
-        raise ParameterError(f"horizon is {steps!r}; expected a whole number of steps, at least 1")
-    largest, total = _occupied(mdp, int(steps))
+    steps = steps_of("covering", mdp, horizon)
+    largest, total = _occupied(mdp, steps)
     states = len(total)
     if not states:
         raise UndefinedMeasure("covering: every start state is terminal, so that nothing is played")
     omega_max = float(largest.min()) / mdp.num_actions
     omega_sum = float(total.min()) / mdp.num_actions
     length = math.log(2 * states * mdp.num_actions) / omega_max
-    return Covering(omega_max, omega_sum, length, states, {"horizon": int(steps), "exploration": "uniform"})
+    return Covering(omega_max, omega_sum, length, states, {"horizon": steps, "exploration": "uniform"})
 
 
 def _occupied(mdp: TabularMDP, steps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -26,9 +26,17 @@ from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 
 @interpreted_first()
 @njit(cache=True, nogil=True)
-def search_forward(next_states, ends, start, source, distance, queue):
-    """distance[v] = steps from `source` to v. Returns (nodes found, largest distance, sum of distances)."""
-    num_states, num_actions = next_states.shape
+def search(table, reverse, start, source, distance, queue):
+    """distance[v] = steps from `source` to v, by the table (next_states, ends); or, where that is None, from v to
+    `source`, by reverse: (first, previous) of `reversed_graph`, and the nodes that lead to `start`.
+
+    Returns (nodes found, largest distance, sum of distances).
+    """
+    if reverse is not None:
+        first, previous, restarting = reverse
+    if table is not None:
+        next_states, ends = table
+        num_states, num_actions = next_states.shape
     distance[:] = -1
     distance[source] = 0
     queue[0] = source
@@ -39,88 +47,61 @@ def search_forward(next_states, ends, start, source, distance, queue):
         head += 1
         total += distance[u]
         d = distance[u] + 1
-        if u == num_states or ends[u]:
-            if start >= 0 and distance[start] < 0:
-                distance[start] = d
-                queue[tail] = start
-                tail += 1
-            continue
-        for a in range(num_actions):
-            v = next_states[u, a]
-            if v < 0:
-                v = num_states
-            if distance[v] < 0:
-                distance[v] = d
-                queue[tail] = v
-                tail += 1
-    return tail, distance[queue[tail - 1]], total
-
-
-@interpreted_first()
-@njit(cache=True, nogil=True)
-def search_backward(first, previous, restarting, start, source, distance, queue):
-    """distance[v] = steps from v to `source`. Returns (nodes found, largest distance, sum of distances).
-
-    first (N + 1,), previous: the reversed graph (`reversed_graph`); restarting: the nodes that lead to `start`.
-    """
-    distance[:] = -1
-    distance[source] = 0
-    queue[0] = source
-    head, tail = 0, 1
-    total = 0
-    while head < tail:
-        v = queue[head]
-        head += 1
-        total += distance[v]
-        d = distance[v] + 1
-        for i in range(first[v], first[v + 1]):
-            u = previous[i]
-            if distance[u] < 0:
-                distance[u] = d
-                queue[tail] = u
-                tail += 1
-        if v == start:
-            for i in range(len(restarting)):
-                u = restarting[i]
-                if distance[u] < 0:
-                    distance[u] = d
-                    queue[tail] = u
+        if reverse is not None:
+            for i in range(first[u], first[u + 1]):
+                v = previous[i]
+                if distance[v] < 0:
+                    distance[v] = d
+                    queue[tail] = v
+                    tail += 1
+            if u == start:
+                for i in range(len(restarting)):
+                    v = restarting[i]
+                    if distance[v] < 0:
+                        distance[v] = d
+                        queue[tail] = v
+                        tail += 1
+        if table is not None:
+            if u == num_states or ends[u]:
+                if start >= 0 and distance[start] < 0:
+                    distance[start] = d
+                    queue[tail] = start
+                    tail += 1
+                continue
+            for a in range(num_actions):
+                v = next_states[u, a]
+                if v < 0:
+                    v = num_states
+                if distance[v] < 0:
+                    distance[v] = d
+                    queue[tail] = v
                     tail += 1
     return tail, distance[queue[tail - 1]], total
 
 
 @interpreted_first()
 @njit(cache=True, nogil=True)
-def count_predecessors(next_states, ends, first):
-    """first[v + 1] = distinct predecessors of v other than v, by rows that are followed. `first` is zero before."""
-    num_states, num_actions = next_states.shape
-    for u in range(num_states):
-        if ends[u]:
-            continue
-        for a in range(num_actions):
-            if _is_new_edge(next_states, u, a):
-                v = next_states[u, a]
-                first[(num_states if v < 0 else v) + 1] += 1
-
-
-@interpreted_first()
-@njit(cache=True, nogil=True)
 def fill_predecessors(next_states, ends, first, previous):
-    """previous[first[v] : first[v + 1]] = predecessors of v. `first` comes shifted by one place and leaves in place."""
+    """previous[first[v] : first[v + 1]] = distinct predecessors of v other than v, by rows that are followed.
+
+    `first` comes shifted by one place and leaves in place. Where `previous` is None, it is zero before, and becomes how
+    many there are, again one place ahead.
+    """
     num_states, num_actions = next_states.shape
     for u in range(num_states):
         if ends[u]:
             continue
         for a in range(num_actions):
-            if _is_new_edge(next_states, u, a):
+            if is_new_edge(next_states, u, a):
                 v = next_states[u, a]
                 w = (num_states if v < 0 else v) + 1
-                previous[first[w]] = u
+                if previous is not None:
+                    previous[first[w]] = u
                 first[w] += 1
 
 
 @njit(cache=True, nogil=True)
-def _is_new_edge(next_states, u, a):
+def is_new_edge(next_states, u, a):
     """Whether action a leads from u to another node, to which no action before it leads."""
     v = next_states[u, a]
     if v == u:
@@ -138,7 +119,7 @@ def reversed_graph(next_states, ends, num_nodes):
     """
     small = next_states.size < 2**31
     counts = np.zeros(num_nodes + 2, np.int32 if small else np.int64)
-    count_predecessors(next_states, ends, counts[1:])
+    fill_predecessors(next_states, ends, counts[1:], None)
     first = np.cumsum(counts, dtype=counts.dtype)  # first[v + 1] is where v begins: the fill moves it to where v ends
     previous = np.empty(first[-1], next_states.dtype)
     fill_predecessors(next_states, ends, first[:-1], previous)

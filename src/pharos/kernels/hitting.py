@@ -45,43 +45,11 @@ def backward_order(first, previous, goal, order, distance):
 
 
 @njit(cache=True, nogil=True)
-def sweep_in_place(rows, common, alike, goal, order, count, j):
-    """j(n) = 1 + min_a sum p j, in place in the order given; the largest change. j is 0 at the goal.
+def sweep_in_place(rows, common, alike, goal, order, count, j, mode):
+    """j(n) = 1 + min_a sum p j, in place in the order given; j is 0 at the goal. And mode(n) = sum p mode under the
+    actions that are best for j, unless mode is None.
 
     What all actions of a node have in common is in its row of `common`, the rest in `rows` of each action.
-    """
-    first, node, weight = rows
-    always, always_node, always_weight = common
-    num_actions = (len(first) - 1) // len(goal)
-    change, of_alike = 0.0, -1.0
-    for i in range(count):
-        n = order[i]
-        if goal[n]:
-            continue
-        if alike[n] and of_alike >= 0:
-            change = max(change, abs(of_alike - j[n]))
-            j[n] = of_alike
-            continue
-        best = np.inf
-        for row in range(n * num_actions, (n + 1) * num_actions):
-            total = 0.0
-            for k in range(first[row], first[row + 1]):
-                total += weight[k] * j[node[k]]
-            best = min(best, total)
-        best += 1.0
-        for k in range(always[n], always[n + 1]):
-            best += always_weight[k] * j[always_node[k]]
-        change = max(change, abs(best - j[n]))
-        j[n] = best
-        if alike[n]:
-            of_alike = best
-    return change
-
-
-@njit(cache=True, nogil=True)
-def sweep_with_mode(rows, common, alike, goal, order, count, j, mode):
-    """As `sweep_in_place`, and mode(n) = sum p mode under the actions that are best for j, in place as well.
-
     Returns (largest change of j, sum f f, sum f g, sum g g): f, what j has gained, g, what mode has lost in the sweep.
     """
     first, node, weight = rows
@@ -95,7 +63,9 @@ def sweep_with_mode(rows, common, alike, goal, order, count, j, mode):
             continue
         if alike[n] and of_alike >= 0:
             change = max(change, abs(of_alike - j[n]))
-            j[n], mode[n] = of_alike, mode_of_alike
+            j[n] = of_alike
+            if mode is not None:
+                mode[n] = mode_of_alike
             continue
         best, choice = np.inf, n * num_actions
         for row in range(n * num_actions, (n + 1) * num_actions):
@@ -106,30 +76,38 @@ def sweep_with_mode(rows, common, alike, goal, order, count, j, mode):
                 best, choice = total, row
         best += 1.0
         left = 0.0
-        for k in range(first[choice], first[choice + 1]):
-            left += weight[k] * mode[node[k]]
+        if mode is not None:
+            for k in range(first[choice], first[choice + 1]):
+                left += weight[k] * mode[node[k]]
         for k in range(always[n], always[n + 1]):
             best += always_weight[k] * j[always_node[k]]
-            left += always_weight[k] * mode[always_node[k]]
-        f, g = best - j[n], mode[n] - left
+            if mode is not None:
+                left += always_weight[k] * mode[always_node[k]]
+        f = best - j[n]
         change = max(change, abs(f))
-        ff += f * f
-        fg += f * g
-        gg += g * g
-        j[n], mode[n] = best, left
+        j[n] = best
         if alike[n]:
-            of_alike, mode_of_alike = best, left
+            of_alike = best
+        if mode is not None:
+            g = mode[n] - left
+            ff += f * f
+            fg += f * g
+            gg += g * g
+            mode[n] = left
+            if alike[n]:
+                mode_of_alike = left
     return change, ff, fg, gg
 
 
 @njit(cache=True, nogil=True)
-def residuals(rows, common, alike, goal, order, count, j, policy):
+def residuals(rows, common, alike, goal, order, count, high, low, policy, residual, error):
     """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; policy[n] = the action that
-    attains T j.
+    attains T j. j = high; or j = high + low, two floats a node, so that j may be 1e16 times its differences.
 
     T j(n) - j(n) = 1 + min_a sum_m p(m | n, a) (j(m) - j(n)): written with differences, no rounding error grows with j
-    itself.
-    Both bounds count all rounding: `operations` says how many units in the last place one sum may be off.
+    itself. Both bounds count all rounding: `operations` says how many units in the last place one sum may be off. The
+    error of a difference of two pairs is a unit of the difference and eight units of a unit of the numbers.
+    residual, error (N,): T j - j, and by how much it may be off; None where low is.
     """
     first, node, weight = rows
     always, always_node, always_weight = common
@@ -139,87 +117,46 @@ def residuals(rows, common, alike, goal, order, count, j, policy):
         n = order[i]
         if goal[n]:
             continue
-        here = j[n]
         if alike[n]:
-            if first_alike >= 0 and here == j[first_alike]:
+            if first_alike >= 0 and high[n] == high[first_alike] and (low is None or low[n] == low[first_alike]):
                 policy[n] = policy[first_alike]
+                if low is not None:
+                    residual[n], error[n] = residual[first_alike], error[first_alike]
                 continue
             first_alike = n
-        shared, size = 0.0, 1.0
-        for k in range(always[n], always[n + 1]):
-            step = always_weight[k] * (j[always_node[k]] - here)
-            shared += step
-            size += abs(step)
-        shared += 1.0
-        best, least, most, choice = np.inf, np.inf, np.inf, 0
-        for a in range(num_actions):
-            row = n * num_actions + a
-            total, own = 0.0, size
-            for k in range(first[row], first[row + 1]):
-                step = weight[k] * (j[node[k]] - here)
-                total += step
-                own += abs(step)
-            error = operations(num_actions, first[row + 1] - first[row] + always[n + 1] - always[n]) * UNIT * own
-            total += shared
-            least, most = min(least, total - error), min(most, total + error)
-            if total < best:
-                best, choice = total, a
-        policy[n] = choice
-        above = max(above, most)
-        below = max(below, -least)
-        largest = max(largest, here)
-    return above, below, largest
-
-
-@njit(cache=True, nogil=True)
-def residuals_of_pairs(rows, common, alike, goal, order, count, high, low, policy, residual, error):
-    """As `residuals`, for j = high + low: two floats a node, so that j may be 1e16 times its differences.
-
-    residual, error (N,): T j - j, and by how much it may be off. The error of a difference of two such numbers is a
-    unit of the difference and eight units of a unit of the numbers.
-    """
-    first, node, weight = rows
-    always, always_node, always_weight = common
-    num_actions = (len(first) - 1) // len(goal)
-    above, below, first_alike = 0.0, 0.0, -1
-    for i in range(count):
-        n = order[i]
-        if goal[n]:
-            continue
-        if alike[n]:
-            if first_alike >= 0 and high[n] == high[first_alike] and low[n] == low[first_alike]:
-                policy[n], residual[n], error[n] = policy[first_alike], residual[first_alike], error[first_alike]
-                continue
-            first_alike = n
+        here, under = high[n], 0.0 if low is None else low[n]
         shared, size, scale = 0.0, 1.0, 0.0
         for k in range(always[n], always[n + 1]):
-            m = always_node[k]
-            step = always_weight[k] * _difference(high[m], low[m], high[n], low[n])
+            step = always_weight[k] * _difference(high, low, always_node[k], here, under)
             shared += step
             size += abs(step)
-            scale += always_weight[k] * (abs(high[m]) + abs(high[n]))
+            if low is not None:
+                scale += always_weight[k] * (abs(high[always_node[k]]) + abs(here))
         shared += 1.0
         best, least, most, choice = np.inf, np.inf, np.inf, 0
         for a in range(num_actions):
             row = n * num_actions + a
             total, own, reach = 0.0, size, scale
             for k in range(first[row], first[row + 1]):
-                m = node[k]
-                step = weight[k] * _difference(high[m], low[m], high[n], low[n])
+                step = weight[k] * _difference(high, low, node[k], here, under)
                 total += step
                 own += abs(step)
-                reach += weight[k] * (abs(high[m]) + abs(high[n]))
-            terms = first[row + 1] - first[row] + always[n + 1] - always[n]
-            off = operations(num_actions, terms) * UNIT * own + 8 * UNIT * UNIT * reach
+                if low is not None:
+                    reach += weight[k] * (abs(high[node[k]]) + abs(here))
+            off = operations(num_actions, first[row + 1] - first[row] + always[n + 1] - always[n]) * UNIT * own
+            if low is not None:
+                off += 8 * UNIT * UNIT * reach
             total += shared
             least, most = min(least, total - off), min(most, total + off)
             if total < best:
                 best, choice = total, a
-                error[n] = off
-        policy[n], residual[n] = choice, best
+                if low is not None:
+                    residual[n], error[n] = best, off
+        policy[n] = choice
         above = max(above, most)
         below = max(below, -least)
-    return above, below
+        largest = max(largest, here)
+    return above, below, largest
 
 
 @njit(cache=True, nogil=True)
@@ -233,12 +170,14 @@ def operations(num_actions, terms):
 
 
 @njit(cache=True, nogil=True)
-def _difference(high, low, other_high, other_low):
-    """(high + low) - (other_high + other_low), to a unit of the difference."""
-    total = high - other_high
-    part = total - high
-    rest = (high - (total - part)) - (other_high + part)
-    return total + (rest + (low - other_low))
+def _difference(high, low, m, here, under):
+    """(high[m] + low[m]) - (here + under), to a unit of the difference; without low and under where low is None."""
+    total = high[m] - here
+    if low is None:
+        return total
+    part = total - high[m]
+    rest = (high[m] - (total - part)) - (here + part)
+    return total + (rest + (low[m] - under))
 
 
 @njit(cache=True, nogil=True)
@@ -372,9 +311,10 @@ def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
 
 
 @njit(cache=True, nogil=True)
-def steps_back(low, high, outcomes, owner, into, square, steps, ball, levels, queue, via):
+def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball, levels, queue, via):
     """For outcomes i that lead to nodes low..high: steps[square[i] + j] of a shortest way from outcome j of its state
-    to node[i].
+    to node[i], where way is None; else the outcomes along those ways that steps has, one after another: way[start[i]]
+    on.
 
     NONE where the `ball` nodes nearest to node[i] do not include it. levels (N,) uint8 is zero before and after.
     """
@@ -385,33 +325,18 @@ def steps_back(low, high, outcomes, owner, into, square, steps, ball, levels, qu
         for k in range(into_first[y], into_first[y + 1]):
             i = into_outcome[k]
             x = owner[i]
-            if square[i] >= 0:
-                for j in range(first[x + 1] - first[x]):
-                    there = levels[node[first[x] + j]]
-                    steps[square[i] + j] = there - 1 if there > 0 else NONE
-        for k in range(size):
-            levels[queue[k]] = 0
-
-
-@njit(cache=True, nogil=True)
-def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball, levels, queue, via):
-    """Write the outcomes along those ways, outcome after outcome: way[start[i]] on."""
-    first, _, node, _ = outcomes
-    into_first, into_outcome = into
-    for y in range(low, high):
-        size = _search_back(y, outcomes, owner, into, ball, levels, queue, via)
-        for k in range(into_first[y], into_first[y + 1]):
-            i = into_outcome[k]
-            x = owner[i]
-            if square[i] >= 0:
-                at = start[i]
-                for j in range(first[x + 1] - first[x]):
-                    n = node[first[x] + j]
-                    if steps[square[i] + j] != NONE:
-                        while n != y:
-                            way[at] = via[n]
-                            at += 1
-                            n = node[via[n]]
+            if square[i] < 0:
+                continue
+            at = start[i] if way is not None else 0
+            for j in range(first[x + 1] - first[x]):
+                n = node[first[x] + j]
+                if way is None:
+                    steps[square[i] + j] = levels[n] - 1 if levels[n] > 0 else NONE
+                elif steps[square[i] + j] != NONE:
+                    while n != y:
+                        way[at] = via[n]
+                        at += 1
+                        n = node[via[n]]
         for k in range(size):
             levels[queue[k]] = 0
 
@@ -654,19 +579,10 @@ def _around(z, owner, into, steps, place, room):
     return size, count
 
 
-@njit(cache=True, nogil=True)
 def steps_from(hub, first, node):
     """(N,) int32: the fewest steps in which outcomes lead from the hub to each node, LOST where none do."""
-    steps = np.full(len(first) - 1, LOST, np.int32)
-    queue = np.empty(len(first) - 1, np.int64)
-    queue[0], steps[hub] = hub, 0
-    head, tail = 0, 1
-    while head < tail:
-        x = queue[head]
-        head += 1
-        for i in range(first[x], first[x + 1]):
-            if steps[node[i]] == LOST:
-                steps[node[i]] = steps[x] + 1
-                queue[tail] = node[i]
-                tail += 1
+    steps, is_hub = np.empty(len(first) - 1, np.int32), np.zeros(len(first) - 1, np.bool_)
+    is_hub[hub] = True
+    backward_order(first, node, is_hub, np.empty(len(first) - 1, np.int64), steps)
+    steps[steps < 0] = LOST
     return steps

@@ -1,7 +1,5 @@
 """Breadth-first searches from many nodes at once, one bit each, on a graph as in graph.py.
 
-Both searches begin alike; as a function of its own that beginning makes them a quarter slower.
-
 Source: Then et al. (2014), "The more the merrier: efficient multi-source graph traversal" (MS-BFS). Dense searches
 start from 512 nodes at once, in graphs whose levels are few and wide.
 """
@@ -9,16 +7,22 @@ start from 512 nodes at once, in graphs whose levels are few and wide.
 import numpy as np
 from numba import njit
 
+from pharos.kernels.graph import is_new_edge
+
 
 @njit(cache=True, nogil=True)
-def search_forward_from_many(next_states, ends, start, sources, origins, front, coming, queue, other, largest):
-    """Searches from up to 64 W sources.
+def search_from_many(table, reverse, start, sources, origins, front, coming, queue, other, largest):
+    """Searches from up to 64 W sources, along the edges or against them; table, reverse: as `graph.search` has them.
 
     origins, front, coming: (N, W) uint64, zero before; front and coming are zero again afterwards, origins[v] has the
     bits of the sources that reach v. queue, other: (N,) scratch. largest (len(sources),): their eccentricities among
     what they reach. Returns (pairs reached, table entries read).
     """
-    num_states, num_actions = next_states.shape
+    if reverse is not None:
+        first, previous, restarting = reverse
+    if table is not None:
+        next_states, ends = table
+        num_states, num_actions = next_states.shape
     width = origins.shape[1]
     for i in range(len(sources)):
         bit = np.uint64(1) << np.uint64(i % 64)
@@ -33,48 +37,25 @@ def search_forward_from_many(next_states, ends, start, sources, origins, front, 
         size = 0
         for i in range(count):
             u = queue[i]
-            if u == num_states or ends[u]:
-                if start >= 0:
-                    size = _push(u, start, origins, front, coming, other, size)
-                continue
-            reads += num_actions
-            for a in range(num_actions):
-                v = next_states[u, a]
-                if v < 0:
-                    v = num_states
-                size = _push(u, v, origins, front, coming, other, size)
-        pairs += _settle(queue, count, other, size, origins, front, coming, level, largest, width)
-        queue, other = other, queue
-        count = size
-    return pairs, reads
-
-
-@njit(cache=True, nogil=True)
-def search_backward_from_many(
-    first, previous, restarting, start, sources, origins, front, coming, queue, other, largest
-):
-    """As `search_forward_from_many`, against the direction of the edges."""
-    width = origins.shape[1]
-    for i in range(len(sources)):
-        bit = np.uint64(1) << np.uint64(i % 64)
-        origins[sources[i], i // 64] |= bit
-        front[sources[i], i // 64] |= bit
-        queue[i] = sources[i]
-        largest[i] = 0
-    count = len(sources)
-    level, pairs, reads = 0, 0, 0
-    while count:
-        level += 1
-        size = 0
-        for i in range(count):
-            v = queue[i]
-            reads += first[v + 1] - first[v]
-            for j in range(first[v], first[v + 1]):
-                size = _push(v, previous[j], origins, front, coming, other, size)
-            if v == start:
-                reads += len(restarting)
-                for j in range(len(restarting)):
-                    size = _push(v, restarting[j], origins, front, coming, other, size)
+            if reverse is not None:
+                reads += first[u + 1] - first[u]
+                for j in range(first[u], first[u + 1]):
+                    size = _push(u, previous[j], origins, front, coming, other, size)
+                if u == start:
+                    reads += len(restarting)
+                    for j in range(len(restarting)):
+                        size = _push(u, restarting[j], origins, front, coming, other, size)
+            if table is not None:
+                if u == num_states or ends[u]:
+                    if start >= 0:
+                        size = _push(u, start, origins, front, coming, other, size)
+                    continue
+                reads += num_actions
+                for a in range(num_actions):
+                    v = next_states[u, a]
+                    if v < 0:
+                        v = num_states
+                    size = _push(u, v, origins, front, coming, other, size)
         pairs += _settle(queue, count, other, size, origins, front, coming, level, largest, width)
         queue, other = other, queue
         count = size
@@ -226,11 +207,7 @@ def num_successors(next_states, ends, num_nodes):
             continue
         different = 0
         for a in range(num_actions):
-            u = next_states[v, a]
-            is_new = u != v
-            for b in range(a):
-                is_new = is_new and next_states[v, b] != u
-            different += is_new
+            different += is_new_edge(next_states, v, a)
         counts[v] = min(different, 255)
     return counts
 

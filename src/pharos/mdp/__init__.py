@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pharos.system import lazy
 
 if TYPE_CHECKING:
-    from pharos.mdp.arguments import require_mdp
+    from pharos.mdp.arguments import STEPS, check_horizon, require_mdp, whole_number
     from pharos.mdp.bisimulation import Minimization, minimize
     from pharos.mdp.chance import Chance, ChanceSetting, lazy_actions, random_actions, sticky_actions
     from pharos.mdp.dynamics import (
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
         runs_of,
         shares_of,
     )
-    from pharos.mdp.expanded import ExpandedMDP, executed_actions, nodes_of_outcomes, outcomes_of
+    from pharos.mdp.expanded import ExpandedMDP, executed_actions, mean_of_actions, nodes_of_outcomes, outcomes_of
     from pharos.mdp.outcome_table import Matrices, OutcomeTable
     from pharos.mdp.rewards import Rewards
     from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass, mass_of
@@ -46,9 +46,9 @@ __all__ = [
 ]
 _shared = """
     BEST BellmanEquation ChanceSetting Dynamics ExpandedMDP Extreme Lazy Matrices Minimization OutcomeTable Outcomes
-    PaidOutcomes Part PolicyStep PolicyTable Rewards Selection Table WORST chosen_mass count_of executed_actions mass_of
-    nodes_of_outcomes outcomes_of paid_outcomes ranged_rewards require_mdp rewards_of_outcomes rewards_of_space
-    rewards_of_staying runs_between runs_of shares_of
+    PaidOutcomes Part PolicyStep PolicyTable Rewards STEPS Selection Table WORST check_horizon chosen_mass count_of
+    executed_actions mass_of mean_of_actions nodes_of_outcomes outcomes_of paid_outcomes ranged_rewards require_mdp
+    rewards_of_outcomes rewards_of_space rewards_of_staying runs_between runs_of shares_of whole_number
 """
 
 __getattr__ = lazy.attributes(__name__)

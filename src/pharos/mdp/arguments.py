@@ -81,6 +81,16 @@ def checked_next_states(next_states: object) -> np.ndarray:
     return np.ascontiguousarray(table, np.int32 if len(table) < 2**31 else np.int64)
 
 
+STEPS = "a whole number of steps, at least 1"
+
+
+def whole_number(value: object, name: str, expected: str = "a whole number, at least 1", least: int = 1) -> int:
+    """The number; ParameterError unless it is whole, and at least that."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ParameterError(f"{name} is {value!r}; expected {expected}")
+    return int(value)
+
+
 def check_gamma(gamma: object) -> None:
     """ParameterError unless it is a discount."""
     if not (isinstance(gamma, int | float | np.floating) and math.isfinite(gamma) and 0 <= gamma <= 1):
@@ -89,10 +99,9 @@ def check_gamma(gamma: object) -> None:
 
 def check_horizon(horizon: object) -> None:
     """ParameterError unless it is a number of steps, or None."""
-    if horizon is not None and not (isinstance(horizon, int | np.integer) and 1 <= horizon < 2**31):
-        raise ParameterError(
-            f"horizon is {horizon!r}; expected a whole number of steps, at least 1 and below 2^31, or None"
-        )
+    expected = f"{STEPS} and below 2^31, or None"
+    if horizon is not None and whole_number(horizon, "horizon", expected) >= 2**31:
+        raise ParameterError(f"horizon is {horizon!r}; expected {expected}")
 
 
 def terminal_states(terminal: npt.ArrayLike | None, default: np.ndarray, allowed: np.ndarray) -> np.ndarray:

@@ -38,6 +38,39 @@ class ExpandedMDP:
     alike: np.ndarray
 
     @cached_property
+    def table(self) -> np.ndarray | None:
+        """(N, A), the only node that each choice leads to; None where some choice has several outcomes."""
+        matrix = self.matrix
+        is_single = matrix.nnz == matrix.shape[0] and (np.diff(matrix.indptr) == 1).all() and (matrix.data == 1.0).all()
+        return matrix.indices.reshape(-1, self.num_actions).astype(np.int64) if is_single else None
+
+    def expected(self, values: np.ndarray) -> np.ndarray:
+        """(N, A): the mean of values (N,) over what a choice leads to."""
+        if self.table is not None:
+            return values[self.table]
+        return np.asarray(self.matrix @ values).reshape(-1, self.num_actions)
+
+    def largest(self, values: np.ndarray) -> np.ndarray:
+        """(N, A): the largest of values (N,) over the nodes that a choice may lead to."""
+        if self.table is not None:
+            return values[self.table]
+        return np.maximum.reduceat(values[self.matrix.indices], self.matrix.indptr[:-1]).reshape(-1, self.num_actions)
+
+    def following(self, nodes: np.ndarray, choices: np.ndarray) -> np.ndarray:
+        """The nodes that some of the choices (n, A) bool in nodes (n,) may lead to, some of them several times."""
+        which, chosen = np.nonzero(choices)
+        if self.table is not None:
+            return self.table[nodes[which], chosen]
+        return np.asarray(self.matrix[nodes[which] * self.num_actions + chosen].indices)
+
+    def rewards(self, mdp: TabularMDP) -> np.ndarray:
+        """(N, A): the expected reward of each choice, in the MDP that is written out."""
+        paid = np.vstack([mdp.rewards, np.zeros((1, mdp.num_actions))])
+        paid[:-1][np.asarray(mdp.terminal)] = 0.0
+        executed = paid[np.minimum(self.underlying, mdp.num_states)]
+        return mdp.chance.chosen_values(executed, self.previous, mean_of_actions(executed)[:, None])
+
+    @cached_property
     def reversed(self) -> tuple[np.ndarray, np.ndarray]:
         """(first, previous) of the graph of all transitions that some choice may take."""
         size = len(self.underlying)
@@ -150,6 +183,14 @@ class ExpandedMDP:
             self.num_targets,
             self.alike[nodes],
         )
+
+
+def mean_of_actions(values: np.ndarray) -> np.ndarray:
+    """(N,): the mean of values (N, A) over actions, added up in their order."""
+    total = values[:, 0].copy()
+    for action in range(1, values.shape[1]):
+        total += values[:, action]
+    return total / values.shape[1]
 
 
 def executed_actions(

@@ -276,8 +276,8 @@ class QueriedPolicy:
 
     def __init__(self, mdp: TabularMDP, *, sees_previous_action: bool = False):
         self.mdp, self.num_actions = mdp, mdp.num_actions
-        self.by_pairs = mdp.is_sticky or sees_previous_action
-        self.width = mdp.num_actions + 1 if self.by_pairs else 1
+        self.width = mdp.num_actions + 1 if sees_previous_action else mdp.policy_width
+        self.by_pairs = self.width > 1
         # index + 1; memory is taken where something is written
         self._place = np.zeros(mdp.num_states * self.width, np.int32)
         # number of filled entries of the two arrays that follow, which double when they are full
@@ -373,15 +373,20 @@ class QueriedPolicy:
         """(N,) the rows of states that were reached by executing these actions."""
         return states * self.width + (actions if self.by_pairs else 0)
 
+    def reached_states(self) -> np.ndarray:
+        """(N,) the state that each state of `reached_mdp` behaves as: that of a row, or each once under sticky actions,
+        where the MDP tells previous actions apart itself."""
+        states = self.rows // self.width
+        return np.unique(states) if self.mdp.is_sticky else states
+
     def reached_mdp(self) -> tuple[TabularMDP, np.ndarray]:
         """The MDP on what is reached, and the policy on it; what is not reached has probability 0, and is the end."""
-        mdp = self.mdp
-        if not mdp.is_sticky:  # a row is a state of the new MDP
-            states, starts = self.rows // self.width, self.index(self.start_rows())
+        mdp, states = self.mdp, self.reached_states()
+        if not mdp.is_sticky:
+            starts = self.index(self.start_rows())
             return self._mdp_on(
                 states, starts, lambda next_states, executed, _: self.index(self._arrivals(next_states, executed))
             ), self.probabilities
-        states = np.unique(self.rows // self.width)
         place = np.full(mdp.num_states, -1, np.int64)
         place[states] = np.arange(states.size)
         policy = np.zeros((states.size, self.width, mdp.num_actions))

@@ -457,43 +457,32 @@ def _solution_of_reached(
     sub, reached_policy = answers.reached_mdp()
     solution = solvers.evaluate_policy(sub, reached_policy, tolerance)
     x, next_x = (_on_all_states(answers, values) for values in (solution.x, solution.next_x))
-    if mdp.is_sticky:
-        table = np.full((mdp.num_states, answers.width, mdp.num_actions), np.nan)
-        table[answers.rows // answers.width, answers.rows % answers.width] = answers.probabilities
-    else:
-        table = _scattered(answers.probabilities, answers.rows, mdp.num_states)[:, None]
+    table = np.full((mdp.num_states * answers.width, mdp.num_actions), np.nan)
+    table[answers.rows] = answers.probabilities
     return ReachedSolution(
         mdp,
         solution.error_bound,
         solution.sweeps,
         solution.seconds,
         mdp.horizon,
-        PolicyTable(mdp.num_actions, table),
+        PolicyTable(mdp.num_actions, table.reshape(mdp.num_states, answers.width, mdp.num_actions)),
         x,
         next_x,
         start=solution.value_at_start,
-        states_reached=len(np.unique(answers.rows // answers.width)),
+        states_reached=len(answers.reached_states()),
     )
 
 
 def _on_all_states(answers: QueriedPolicy, x: np.ndarray) -> np.ndarray:
     """(S + 1, W): values on the states that the policy reaches (N + 1, W), NaN elsewhere; 0 in terminal states."""
     mdp = answers.mdp
-    states = np.unique(answers.rows // answers.width) if mdp.is_sticky else answers.rows
-    values = np.full((mdp.num_states + 1, x.shape[1]), np.nan)
-    values[states] = x[:-1]
-    if mdp.is_sticky:
-        rows = states[:, None] * answers.width + np.arange(mdp.num_actions)
-        values[states] = np.where(answers.index(rows) >= 0, values[states], np.nan)
+    states = answers.reached_states()
+    rows = states[:, None] * answers.width + np.arange(mdp.width)
+    values = np.full((mdp.num_states + 1, mdp.width), np.nan)
+    values[states] = np.where(answers.index(rows) >= 0, x[:-1], np.nan)
     values[:-1][np.asarray(mdp.terminal)] = 0.0
     values[-1] = 0.0
     return values
-
-
-def _scattered(values: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
-    out = np.full((count, *values.shape[1:]), np.nan)
-    out[rows] = values
-    return out
 
 
 def steps_that_matter(mdp: TabularMDP) -> tuple[int, float]:
@@ -537,9 +526,8 @@ def table_values(mdp: TabularMDP, policies: Sequence[np.ndarray]) -> list[Evalua
         if joined.ndim > 1:
             answers = TableAnswers(joined, copies)
             answers.reach(None, mdp.horizon)
-            rows = answers.rows
-            part = (np.unique(rows // answers.width) if mdp.is_sticky else rows) // states
-            counts = np.bincount(rows // (answers.width * states), minlength=number).tolist()
+            part = answers.reached_states() // states
+            counts = np.bincount(answers.rows // (answers.width * states), minlength=number).tolist()
             copies, joined = answers.reached_mdp()
         values = solvers.evaluate_apart(copies, joined, part, mdp.start_probabilities)
         evaluations += [Evaluation(value, True, bound, n) for (value, bound), n in zip(values, counts, strict=True)]

@@ -27,7 +27,18 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from pharos.errors import DivergenceError, ParameterError
-from pharos.mdp import BEST, WORST, PolicyTable, Selection, TabularMDP, mass_of, random_actions, require_mdp
+from pharos.mdp import (
+    BEST,
+    STEPS,
+    WORST,
+    PolicyTable,
+    Selection,
+    TabularMDP,
+    mass_of,
+    random_actions,
+    require_mdp,
+    whole_number,
+)
 from pharos.solvers.convergence import Convergence
 from pharos.solvers.fixed_point import (
     MARGIN,
@@ -276,9 +287,7 @@ def checked_horizon(mdp: TabularMDP, horizon: int | None) -> int | None:
     """The horizon to use: the one given, else the MDP's own."""
     if horizon is None:
         return mdp.horizon
-    if not (isinstance(horizon, int | np.integer) and horizon >= 1):
-        raise ParameterError(f"horizon is {horizon!r}; expected a whole number of steps, at least 1")
-    return int(horizon)
+    return whole_number(horizon, "horizon", STEPS)
 
 
 # Blocks ---------------------------------------------------------------------------------------------------------------
