@@ -9,7 +9,7 @@ import re
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
@@ -19,6 +19,7 @@ from pharos.system import compiling, paths
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.text import Text
 
     from pharos.environments import Environment
     from pharos.mdp import ChanceSetting
@@ -120,15 +121,15 @@ def progress_line(what: str, *, logged: bool = False) -> Iterator[Callable[[str]
 
 
 @contextlib.contextmanager
-def progress_bar(what: str, total: int, before: str = "") -> Iterator[Callable[[int, str], None] | None]:
-    """A bar on standard error, on a terminal: call it with how much is done and a text. None elsewhere.
+def progress_bar(what: str, total: int, before: str = "") -> Iterator[Callable[[int, str], None]]:
+    """A bar on standard error, on a terminal: call it with how much is done and a text. Nothing is shown elsewhere.
 
     Args:
         before: what happens until the first call.
     """
     screen = console(stderr=True)
     if not screen.is_terminal:
-        yield None
+        yield lambda _done, _text: None
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -138,19 +139,48 @@ def progress_bar(what: str, total: int, before: str = "") -> Iterator[Callable[[
         yield lambda done, text: bar.update(task, completed=done, text=text)
 
 
+@contextlib.contextmanager
+def counted_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
+    """A bar that is called with how many of how many are done, and the name of the next one."""
+    with progress_bar(what, 1) as show:
+        yield lambda done, total, text: show(done, f"{done} of {total}: {text}")
+
+
 def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:
     """A table of two columns: what, and how much."""
+    print_table(title, ("", ""), ((name, str(value)) for name, value in facts))
+
+
+def print_table(
+    title: str,
+    columns: Sequence[str],
+    rows: Iterable[Iterable["str | Text"]],
+    *,
+    before: Iterable[str] = (),
+    notes: Iterable[str] = (),
+) -> None:
+    """A table below its title and what is said `before` it, with notes below.
+
+    Args:
+        columns: their names; `>name` has numbers, which end at one place.
+    """
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(style="cyan", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name, value in facts:
-        table.add_row(name, escape(str(value)))
+    table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(columns))
+    for number, name in enumerate(columns):
+        how: dict[str, Any] = {"justify": "right"} if name.startswith(">") else {"overflow": "fold"}
+        table.add_column(escape(name.removeprefix(">")), **how | ({} if number else {"style": "cyan", "no_wrap": True}))
+    for row in rows:
+        table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in row))
     to = console()
-    to.print(f"[bold]{escape(title)}[/bold]", soft_wrap=True)
+    if title:
+        to.print(escape(title), style="bold", soft_wrap=True)
+    for line in before:
+        to.print(escape(line), style="dim", soft_wrap=True)
     to.print(table)
+    for line in notes:
+        to.print(escape(line), style="dim", soft_wrap=True)
 
 
 def describe_chance(chance: "ChanceSetting", of_the_world: bool = False) -> str:

@@ -1,14 +1,14 @@
 """pharos benchmark: agents on frozen tasks whose every state is known, and scores with units."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, complain, console, progress_bar, termination
+from pharos.cli.answers import Answer, complain, console, counted_bar, print_table, progress_bar, termination
 from pharos.cli.command import Commands
 from pharos.cli.options import Count, file_ending, parse_seeds
 from pharos.errors import AllRunsFailed, ParameterError
@@ -87,7 +87,7 @@ def run(
                 name=name,
                 hyperparameters=hyperparameters,
                 workers=workers,
-                progress=(lambda done, text: show(int(1000 * done), text)) if show else None,
+                progress=lambda done, text: show(int(1000 * done), text),
             )
         except AllRunsFailed as all_failed:  # the answer says of each why
             outcome = all_failed.outcome
@@ -210,8 +210,8 @@ def submit(
     file = out or Path(f"{results.name}.safetensors")
     bound = None if commitment is None else benchmark.Commitment.read(commitment)
     loaded = benchmark.load_suite(suite)
-    with progress_bar("policies", 1) as tell:
-        made = benchmark.submit(results, file, loaded, author=author, note=note, commitment=bound, progress=_told(tell))
+    with counted_bar("policies") as tell:
+        made = benchmark.submit(results, file, loaded, author=author, note=note, commitment=bound, progress=tell)
     runs = sum(map(len, made.results.curves.values()))
     facts = [("runs", f"{runs:,}"), ("policies", f"{len(made.policies):,}"), ("committed", "yes" if bound else "no")]
     return Answer({"file": file, "runs": runs, "policies": len(made.policies)}, (str(file), facts))
@@ -228,8 +228,8 @@ def verify(file: Submitted, *, suite: SuiteFile = "v1") -> Answer:
     from pharos import benchmark
 
     loaded = benchmark.load_suite(suite)
-    with progress_bar("verifying", 1) as tell:
-        verdict = benchmark.verify(file, loaded, progress=_told(tell))
+    with counted_bar("verifying") as tell:
+        verdict = benchmark.verify(file, loaded, progress=tell)
     wrong = {each.name: {"claimed": each.claimed, "computed": each.found} for each in verdict.wrong}
     answer = {"holds": verdict.holds, "sha256": verdict.sha256, "verified": len(verdict.checks) - len(wrong)}
     answer |= {"wrong": wrong, "refused": verdict.refused, "missing": verdict.missing}
@@ -272,7 +272,7 @@ def audit(
     from pharos import benchmark
 
     loaded, target = benchmark.load_suite(suite), out or file.with_name(f"{file.name}.audit.json")
-    with progress_bar("runs", 1) as tell:
+    with counted_bar("runs") as tell:
         made = benchmark.make_audit(
             *(file, source, loaded),
             date=date.today().isoformat(),
@@ -280,7 +280,7 @@ def audit(
             round=round,
             elsewhere=elsewhere,
             workers=workers,
-            progress=_told(tell),
+            progress=tell,
         )
     made.write(target)
     facts = [("source", "is the one named" if made.is_source else "is another one, and was not run")]
@@ -310,14 +310,10 @@ def board(
     from pharos import benchmark
 
     suites = [benchmark.load_suite(each) for each in suite or ["v1"]]
-    with progress_bar("verifying", 1) as tell:
-        made = benchmark.benchmark_board(files, out, suites, title=title, progress=_told(tell))
+    with counted_bar("verifying") as tell:
+        made = benchmark.benchmark_board(files, out, suites, title=title, progress=tell)
     facts = [("verified", f"{len(made.verified):,}"), ("refused", f"{len(made.refused):,}"), *made.refused.items()]
     return Answer({"file": out, "verified": len(made.verified), "refused": made.refused}, (str(out), facts))
-
-
-def _told(show: Callable[[int, str], None] | None) -> Callable[[int, int, str], None] | None:
-    return None if show is None else lambda done, total, text: show(done, f"{done} of {total}: {text}")
 
 
 def _entry(task: "BenchmarkTask") -> dict[str, Any]:
@@ -335,36 +331,26 @@ def _minutes(suite: "Suite") -> dict[str, float]:
 
 
 def _print(suite: "Suite") -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    protocol, screen = suite.protocol, console()
-    tasks = many(len(suite.tasks), "task")
-    screen.print(f"[bold]{escape(suite.name)}[/bold], {tasks}: {suite.digest}", soft_wrap=True)
-    screen.print(
-        f"{protocol.steps:,} steps a task, {many(protocol.evaluations, 'evaluation')}, {many(protocol.seeds, 'seed')}, "
-        f"gamma {protocol.gamma:g}, horizon {protocol.horizon}"
-    )
-    screen.print()
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("axis", "task", "level"):
-        table.add_column(name)
-    for name in ("DQN", "PPO", "table"):
-        table.add_column(name, justify="right")
-    axis = ""
+    rows, axis = [], ""
     for ladder in [None, *suite.ladders]:
         for task in suite.core if ladder is None else ladder.tasks:
             level = "" if task.level is None or ladder is None else f"{task.level:.3g} {ladder.unit}"
             numbers = (task.predicted.get(name) for name in ("dqn", "ppo", "table"))
             cells = ("" if value is None else f"{value:.2f}" for value in numbers)
-            table.add_row("" if task.axis == axis else escape(task.axis), escape(task.name), escape(level), *cells)
+            rows.append(("" if task.axis == axis else task.axis, task.name, level, *cells))
             axis = task.axis
-    screen.print(table)
     text = "Regret as predicted before any run: 0 is optimal, 1 is uniform play."
     if minutes := _minutes(suite):
         times = ", ".join(f"{agent.upper()} {value:.0f}" for agent, value in minutes.items())
         text += f" Minutes of one processor, all seeds, as shipped: {times}"
-    screen.print(f"[dim]{text}[/dim]", soft_wrap=True)
+    protocol = suite.protocol
+    setting = (
+        f"{protocol.steps:,} steps a task, {many(protocol.evaluations, 'evaluation')}, {many(protocol.seeds, 'seed')}, "
+        f"gamma {protocol.gamma:g}, horizon {protocol.horizon}"
+    )
+    title = f"{suite.name}, {many(len(suite.tasks), 'task')}: {suite.digest}"
+    columns = ("axis", "task", "level", ">DQN", ">PPO", ">table")
+    print_table(title, columns, rows, before=[setting, ""], notes=[text])
 
 
 SuiteOption = Annotated[str | None, typer.Option(metavar="NAME|FILE.yaml", help="The results' own when not given.")]
@@ -394,47 +380,33 @@ def compare(
 
 
 def _print_comparison(comparison: "Comparison", tasks: bool) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    screen = console()
-    screen.print(
-        f"[bold]{escape(comparison.ours)}[/bold] against [bold]{escape(comparison.theirs)}[/bold]", soft_wrap=True
-    )
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for title in (
-        "",
-        escape(comparison.ours),
-        escape(comparison.theirs),
-        "difference",
-        "P(improvement)",
-        "p (Holm)",
-        "verdict",
-    ):
-        table.add_column(title, justify="left" if title in ("", "verdict") else "right")
+    rows: list[tuple[str, ...]] = []
 
     def add(name: str, each: "Difference") -> None:
         numbers = (f"{each.ours:.3f}", f"{each.theirs:.3f}", str(each.interval), f"{each.improvement.value:.2f}")
         p_value = (
             "< 0.0001" if each.adjusted < 1e-4 else "" if each.adjusted != each.adjusted else f"{each.adjusted:.2g}"
         )
-        table.add_row(escape(name), *numbers, p_value, each.verdict)
+        rows.append((name, *numbers, p_value, each.verdict))
 
     if comparison.core is not None:
         add("core", comparison.core)
     for axis, each in comparison.axes.items():
         add(axis, each.score)
         frontiers = [frontier.text(ends=False) for frontier in each.frontiers]
-        table.add_row(f"  frontier, {escape(each.unit)}", *frontiers, str(each.frontier))
+        rows.append((f"  frontier, {each.unit}", *frontiers, str(each.frontier)))
     for name, difference in comparison.tasks.items() if tasks else ():
         add(name, difference)
-    screen.print(table)
+    notes = []
     if comparison.left_out:
         number = many(len(comparison.left_out), "task")
         left_out = ", ".join(comparison.left_out[:3]) + (", ..." if len(comparison.left_out) > 3 else "")
-        screen.print(f"[dim]without {number} that one of them has not run: {escape(left_out)}[/dim]", soft_wrap=True)
+        notes.append(f"without {number} that one of them has not run: {left_out}")
     if any(each.p_value != each.p_value for each in comparison.tasks.values()):
-        screen.print("[dim]one seed has no interval; run two or more of both[/dim]")
+        notes.append("one seed has no interval; run two or more of both")
+    names = (comparison.ours, comparison.theirs, "difference", "P(improvement)", "p (Holm)")
+    columns = ("", *(f">{name}" for name in names), "verdict")
+    print_table(f"{comparison.ours} against {comparison.theirs}", columns, rows, notes=notes)
 
 
 @app.command("power")
@@ -459,24 +431,16 @@ def power(
 
 
 def _print_power(agent: str, seeds: int, scores: "dict[str, Power]", difference: float | None) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    screen = console()
-    screen.print(f"[bold]{escape(agent)}[/bold], {many(seeds, 'seed')}", soft_wrap=True)
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("score")
-    least = [f"{number} seeds" for number in next(iter(scores.values())).least_differences]
-    for title in ("standard error", *least, *([f"seeds for {difference:g}"] if difference is not None else [])):
-        table.add_column(title, justify="right")
+    rows = []
     for name, each in scores.items():
         numbers = [f"{each.standard_error:.4f}", *(f"{value:.3f}" for value in each.least_differences.values())]
         if difference is not None:
             numbers.append("more than 100,000" if each.seeds_needed is None else f"{each.seeds_needed:,}")
-        table.add_row(escape(name), *numbers)
-    screen.print(table)
-    screen.print(
-        "[dim]Under a number of seeds: the least difference between two agents of so many seeds each that is found "
-        "with power 0.8 (Welch's t, 5 %).[/dim]",
-        soft_wrap=True,
+        rows.append((name, *numbers))
+    least = [f">{number} seeds" for number in next(iter(scores.values())).least_differences]
+    columns = ["score", ">standard error", *least, *([f">seeds for {difference:g}"] if difference is not None else [])]
+    note = (
+        "Under a number of seeds: the least difference between two agents of so many seeds each that is found "
+        "with power 0.8 (Welch's t, 5 %)."
     )
+    print_table(f"{agent}, {many(seeds, 'seed')}", columns, rows, notes=[note])

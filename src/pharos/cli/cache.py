@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, bytes_of, console, progress_line, size_text
+from pharos.cli.answers import Answer, bytes_of, print_table, progress_line, size_text
 from pharos.cli.command import Commands
 from pharos.cli.options import Target, complete_target
 from pharos.errors import PharosError, StateSpaceLocked, StateSpaceTooLarge, UnknownName
@@ -108,28 +108,16 @@ def _spaces(directory: Path) -> list[dict[str, Any]]:
 
 
 def _print(directory: Path, spaces: list[dict[str, Any]], compiled: int, total: int) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("environment", style="cyan", no_wrap=True)
-    table.add_column("parameters", overflow="fold")
-    table.add_column("states", justify="right", no_wrap=True)
-    table.add_column("size", justify="right", no_wrap=True)
-    table.add_column("", no_wrap=True)
+    rows = []
     for space in spaces:
         parameters = " ".join(f"{name}={value}" for name, value in space["parameters"].items() if value is not None)
         note = "" if space["state"] == "complete" else space["state"]
-        table.add_row(
-            space["environment"], escape(parameters), f"{space['num_states']:,}", size_text(space["bytes"]), note
-        )
-    to = console()
-    if spaces:
-        to.print(table)
-    to.print(
+        rows.append((space["environment"], parameters, f"{space['num_states']:,}", size_text(space["bytes"]), note))
+    if rows:
+        print_table("", ("environment", "parameters", ">states", ">size", ""), rows)
+    print(
         f"{many(len(spaces), 'state space')} and {size_text(compiled)} of compiled rules: "
-        f"{size_text(total)} in {escape(str(directory))}",
-        soft_wrap=True,
+        f"{size_text(total)} in {directory}"
     )
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, compiling_fact, complain, console, describe_chance, progress_line
+from pharos.cli.answers import Answer, compiling_fact, complain, describe_chance, print_table, progress_line
 from pharos.cli.options import Building, Chance, Count, Discount, Seconds, Target, file_ending, parse_parameters
 from pharos.errors import ParameterError
 from pharos.system import compiling
@@ -136,55 +136,38 @@ def _represented(
 
 
 def _print(title: str, report: "Report", chance: str, definitions: bool) -> None:
-    from rich.markup import escape
-    from rich.table import Table
+    from rich.text import Text
 
-    conventions = report.conventions
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("measure", style="cyan", no_wrap=True)
-    table.add_column("value", overflow="fold")
-    table.add_column("exact")
-    table.add_column("seconds", justify="right")
-    if definitions:
-        table.add_column("definition", overflow="fold")
-        table.add_column("source", overflow="fold", style="dim")
+    rows: list[list[str | Text]] = []
     notes = []
     for result in report.results.values():
-        value = "[dim]undefined[/dim]" if result.undefined else escape(result.text)
+        value = Text("undefined", "dim") if result.undefined else result.text
         exact = "" if result.undefined else PROVEN[result.certificate.kind]
         if exact and result.name in IDEALISED:
             exact = "prediction"
         row = [result.name, value, exact, "kept" if result.kept else f"{result.seconds:.2f}"]
-        table.add_row(*row, *((escape(result.definition), escape(result.source)) if definitions else ()))
+        rows.append(row + ([result.definition, Text(result.source, "dim")] if definitions else []))
         if note := result.undefined or result.certificate.note:
             notes.append(note if note.startswith(result.name) else f"{result.name}: {note}")
-    to = console()
-    to.print(f"[bold]{escape(title)}[/bold]", soft_wrap=True)
+    conventions = report.conventions
     horizon = "none" if conventions["horizon"] is None else conventions["horizon"]
-    to.print(
+    setting = (
         f"{many(conventions['num_states'], 'state')} x {many(conventions['num_actions'], 'action')}, "
-        f"discount {conventions['gamma']:g}, horizon {horizon}, chance: {chance}",
-        style="dim",
-        soft_wrap=True,
+        f"discount {conventions['gamma']:g}, horizon {horizon}, chance: {chance}"
     )
-    to.print(table)
+    said = []
     error = conventions.get("error_bound")
     if error is not None and math.isfinite(error):
-        to.print(f"values are within {error:.2g} of the optimal ones (proven)", style="dim", soft_wrap=True)
-    for ties in _ties(report):
-        to.print(ties, style="dim", soft_wrap=True)
-    for _, how_long in compiling_fact():
-        to.print(f"compiling: {how_long}", style="dim", soft_wrap=True)
-    for note in notes:
-        to.print(escape(note), style="dim", soft_wrap=True)
+        said.append(f"values are within {error:.2g} of the optimal ones (proven)")
+    said += [*_ties(report), *(f"compiling: {how_long}" for _, how_long in compiling_fact()), *notes]
     if not {*IDEALISED}.isdisjoint(report.results):
-        to.print(
+        said.append(
             "prediction: regret of an idealised learner, 0 is optimal, 1 is uniform play; kernel_regret has "
             "expectations in the place of draws. `pharos predict` has the form that agrees best "
-            "with runs, and an interval",
-            style="dim",
-            soft_wrap=True,
+            "with runs, and an interval"
         )
+    columns = ["measure", "value", "exact", ">seconds", *(["definition", "source"] if definitions else [])]
+    print_table(title, columns, rows, before=[setting], notes=said)
 
 
 def _ties(report: "Report") -> list[str]:
@@ -258,32 +241,28 @@ def _observation(text: str) -> tuple[str, dict[str, Any]]:
 
 
 def _print_prediction(prediction: "Prediction", plot: Path | None) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    cells, screen = prediction.cells, console()
-    screen.print(
-        f"[bold]{escape(prediction.environment)}[/bold], {prediction.chance}: {prediction.states:,} states, "
-        f"{prediction.agent.upper()} after {prediction.steps:,} steps"
+    facts = [*compiling_fact(), *([("plot", plot)] if plot else [])]
+    print_table(
+        f"{prediction.environment}, {prediction.chance}: {prediction.states:,} states, "
+        f"{prediction.agent.upper()} after {prediction.steps:,} steps",
+        ("observation", "network", ">predicted regret", ">80 % interval", ">with a table"),
+        (
+            (
+                cell.observation,
+                cell.network,
+                f"{cell.value:.2f}",
+                f"{cell.low:.2f} to {cell.high:.2f}",
+                f"{cell.tabular:.2f}",
+            )
+            for cell in prediction.cells
+        ),
+        notes=[
+            *map(str, prediction.orders),
+            f"0 is optimal, 1 is uniform play. By {prediction.predictor}; of {prediction.published_cells} published "
+            f"cells of {prediction.published_classes} classes, such an interval held "
+            f"{100 * prediction.coverage:.0f} % where the class was left out.",
+            *(f"{name}: {value}" for name, value in facts),
+        ],
     )
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("observation", "network"):
-        table.add_column(name)
-    for name in ("predicted regret", "80 % interval", "with a table"):
-        table.add_column(name, justify="right")
-    for cell in cells:
-        ends = f"{cell.low:.2f} to {cell.high:.2f}"
-        table.add_row(escape(cell.observation), escape(cell.network), f"{cell.value:.2f}", ends, f"{cell.tabular:.2f}")
-    screen.print(table)
-    for order in prediction.orders:
-        screen.print(escape(str(order)))
-    screen.print(
-        f"[dim]0 is optimal, 1 is uniform play. By {prediction.predictor}; of {prediction.published_cells} published "
-        f"cells of {prediction.published_classes} classes, such an interval held "
-        f"{100 * prediction.coverage:.0f} % where the class was left out.[/dim]",
-        soft_wrap=True,
-    )
-    for name, value in [*compiling_fact(), *([("plot", plot)] if plot else [])]:
-        screen.print(f"[dim]{name}: {value}[/dim]")
     for warning in prediction.warnings:
         complain(f"warning: {warning}")

@@ -9,10 +9,10 @@ import typer
 from pharos.cli.answers import (
     Answer,
     complain,
-    console,
+    counted_bar,
     print_facts,
     print_json,
-    progress_bar,
+    print_table,
     progress_line,
     size_text,
 )
@@ -132,35 +132,33 @@ def _answer(verdict: "Verdict") -> dict[str, Any]:
 
 
 def _print(verdict: "Verdict") -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
-    for title in ("", "claimed", "computed", "may differ by", ""):
-        table.add_column(title, justify="left" if not title else "right")
-    for check in verdict.checks:
-        numbers = (f"{number:.8g}" for number in (check.claimed, check.found))
-        table.add_row(in_words(check.name), *numbers, f"{check.within:.1e}", "holds" if check.holds else "FAILS")
-    entry, to = verdict.entry, console()
-    to.print(
-        f"[bold]{escape(str(verdict.file))}[/bold]  {escape(entry.name)}: {escape(entry.config.agent)} on "
-        f"{escape(entry.config.environment)}, {entry.config.steps:,} steps",
-        soft_wrap=True,
-    )
-    to.print(table)
     if verdict.exact:
-        to.print(f"exact: evaluated in {many(verdict.states, 'state')}, error at most {verdict.error_bound:.1e}")
+        how = f"exact: evaluated in {many(verdict.states, 'state')}, error at most {verdict.error_bound:.1e}"
     else:
-        to.print(
+        how = (
             f"estimated from {verdict.episodes:,} episodes: {verdict.value:.6g} ± {verdict.error_bound:.2g} (99 %); "
-            f"the policy reaches more than {verdict.states:,} states (--max-reached)",
-            soft_wrap=True,
+            f"the policy reaches more than {verdict.states:,} states (--max-reached)"
         )
-    if verdict.claims_too_much:
-        to.print("the entry claims an exact value, which is an estimate here")
-    for objection in verdict.objections:
-        to.print(objection, soft_wrap=True)
-    to.print("the claim holds" if verdict.holds else "[bold]the claim does not hold[/bold]")
+    entry, config = verdict.entry, verdict.entry.config
+    print_table(
+        f"{verdict.file}  {entry.name}: {config.agent} on {config.environment}, {config.steps:,} steps",
+        ("", ">claimed", ">computed", ">may differ by", ""),
+        (
+            (
+                in_words(check.name),
+                *(f"{number:.8g}" for number in (check.claimed, check.found)),
+                f"{check.within:.1e}",
+                "holds" if check.holds else "FAILS",
+            )
+            for check in verdict.checks
+        ),
+        notes=[
+            how,
+            *(["the entry claims an exact value, which is an estimate here"] if verdict.claims_too_much else []),
+            *verdict.objections,
+        ],
+    )
+    print("the claim holds" if verdict.holds else "the claim does not hold")
 
 
 def board(
@@ -182,13 +180,8 @@ def board(
 
     if out.suffix.lower() not in (".html", ".htm"):
         raise ParameterError(f"--out {out}; expected a file name that ends in .html")
-    with progress_bar("verifying", 1) as tell:
-
-        def show(done: int, total: int, name: str) -> None:
-            if tell is not None:
-                tell(done, f"{done} of {total}: {name}")
-
-        made = leaderboard.board(folder, out, title=title, trust=trust, progress=show, **vars(limits))
+    with counted_bar("verifying") as tell:
+        made = leaderboard.board(folder, out, title=title, trust=trust, progress=tell, **vars(limits))
 
     def text() -> None:
         for name, reason in made.refused.items():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, console
+from pharos.cli.answers import Answer, console, print_table
 from pharos.cli.options import complete_target
 from pharos.environments import class_called, classes, declared_parameters, imported, named_instances
 from pharos.errors import UnknownName
@@ -122,12 +122,9 @@ def _print_one(cls: type["Environment"]) -> None:
         for block in group:
             rules.add_row(*(escape(text) for text in (block if titled else block[1:])))
         to.print(rules, "")
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    for heading in ("parameter", "default", "values", "meaning"):
-        table.add_column(heading, overflow="fold")
-    for name, each in _parameters(cls).items():
-        table.add_row(*(escape(text) for text in (name, _text(each["default"]), each["values"], each["meaning"])))
-    to.print(table)
+    parameters = _parameters(cls).items()
+    rows = ((name, _text(each["default"]), each["values"], each["meaning"]) for name, each in parameters)
+    print_table("", ("parameter", "default", "values", "meaning"), rows)
     if cls.instances:
         to.print(
             "\nnamed instances  " + "  ".join(f"{cls.name}/{instance}" for instance in cls.instances), highlight=False

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pharos.cli.answers import Answer, console, describe_chance, progress_bar, progress_line
+from pharos.cli.answers import Answer, describe_chance, print_table, progress_bar, progress_line
 from pharos.cli.options import Building, Gamma, Seconds, Target, discount
 from pharos.errors import ParameterError
 from pharos.mdp import ChanceSetting
@@ -139,44 +139,36 @@ def _entry(space: "StateSpace", name: str, options: dict[str, Any], price: _Pric
 
 
 def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]], price: _Price) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("observation", style="cyan", no_wrap=True)
-    for heading in ("shape", "type"):
-        table.add_column(heading)
-    for heading in ("different", "states that share one", "share", "where one acts", "loses"):
-        table.add_column(heading, justify="right")
+    rows = []
     for entry in entries:
-        words = " ".join((entry["observation"], *(f"{name}={value}" for name, value in entry["options"].items())))
         if "unavailable" in entry:
             continue
+        words = " ".join((entry["observation"], *(f"{name}={value}" for name, value in entry["options"].items())))
         shape = " x ".join(map(str, entry["shape"])) or "1"
         counts = (f"{entry[key]:,}" for key in ("num_observations", "num_sharing"))
-        share = f"{100 * entry['share']:.1f} %"
-        confused = f"{entry['num_confused']:,}"
-        table.add_row(escape(words), shape, entry["dtype"], *counts, share, confused, _loss_text(entry["loss"]))
-    to = console()
-    to.print(f"[bold]{escape(title)}[/bold]", soft_wrap=True)
-    terminal = int(space.terminal.sum())
-    to.print(f"{many(space.num_states, 'state')}, {terminal:,} of them terminal", style="dim", soft_wrap=True)
-    to.print(table)
-    for entry in entries:
-        if "unavailable" in entry:
-            to.print(escape(f"{entry['observation']}: {entry['unavailable']}"), style="dim", soft_wrap=True)
+        share, confused = f"{100 * entry['share']:.1f} %", f"{entry['num_confused']:,}"
+        rows.append((words, shape, entry["dtype"], *counts, share, confused, _loss_text(entry["loss"])))
     frames = (
         "frames: different are stacks of frames; a state shares one where some history that ends in it looks as one "
+        "that ends in another state"
     )
-    frames += "that ends in another state"
-    for note in (
-        *([frames] if any(entry["options"].get("frames", 1) != 1 for entry in entries) else []),
-        "states that share one: terminal states count like others; where one acts: those that share one with another "
-        "state, neither of them terminal",
-        f"loses: optimal value at the start less that of the best deterministic policy without memory, discount "
-        f"{price.gamma:g}, chance: {describe_chance(price.chance, space.has_chance)}",
-    ):
-        to.print(note, style="dim", soft_wrap=True)
+    print_table(
+        title,
+        (
+            *("observation", "shape", "type", ">different", ">states that share one", ">share"),
+            *(">where one acts", ">loses"),
+        ),
+        rows,
+        before=[f"{many(space.num_states, 'state')}, {int(space.terminal.sum()):,} of them terminal"],
+        notes=[
+            *(f"{entry['observation']}: {entry['unavailable']}" for entry in entries if "unavailable" in entry),
+            *([frames] if any(entry["options"].get("frames", 1) != 1 for entry in entries) else []),
+            "states that share one: terminal states count like others; where one acts: those that share one with "
+            "another state, neither of them terminal",
+            f"loses: optimal value at the start less that of the best deterministic policy without memory, discount "
+            f"{price.gamma:g}, chance: {describe_chance(price.chance, space.has_chance)}",
+        ],
+    )
 
 
 def _loss_text(loss: dict[str, Any] | None) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, complain, console, progress_line, termination
+from pharos.cli.answers import Answer, complain, console, print_table, progress_line, termination
 from pharos.cli.command import Commands
 from pharos.cli.options import Count, Seconds, Trust
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
@@ -65,9 +65,6 @@ def show(source: Inputs) -> Answer:
 
 
 def _print(study: "Specification") -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
     from pharos.study import has_regret
 
     runs = study.runs
@@ -81,21 +78,21 @@ def _print(study: "Specification") -> None:
         group["agent"][config["agent"]] = None
         group["observation"][title(config["observation"], config["observation_options"])] = None
     counts = Counter((run.instance, run.config["steps"]) for run in runs)
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("instance", "chance", "agents", "observations"):
-        table.add_column(name, overflow="fold", style="cyan" if name == "instance" else "")
-    table.add_column("steps", justify="right")
-    table.add_column("runs", justify="right")
-    for key, group in groups.items():
-        lists = (", ".join(values) for values in group.values())
-        table.add_row(escape(key[0]), *map(escape, lists), f"{key[1]:,}", str(counts[key]))
-    to = console()
-    to.print(f"[bold]{escape(study.name)}[/bold]  {escape(study.description)}", soft_wrap=True)
-    to.print(table)
-    for (instance, _), run in tasks.items():
-        if len(tasks) <= MOST_TASKS and not has_regret(run.config):
-            to.print(escape(f"{instance}, chance {run.chance}: V* is that of uniform play, so regret has no scale"))
-    to.print(f"{many(len(runs), 'run')}, {many(_steps(study), 'step')}", style="dim")
+    rows = [
+        (instance, *(", ".join(values) for values in group.values()), f"{steps:,}", str(counts[instance, steps]))
+        for (instance, steps), group in groups.items()
+    ]
+    notes = [
+        f"{instance}, chance {run.chance}: V* is that of uniform play, so regret has no scale"
+        for (instance, _), run in tasks.items()
+        if len(tasks) <= MOST_TASKS and not has_regret(run.config)
+    ]
+    print_table(
+        f"{study.name}  {study.description}",
+        ("instance", "chance", "agents", "observations", ">steps", ">runs"),
+        rows,
+        notes=[*notes, f"{many(len(runs), 'run')}, {many(_steps(study), 'step')}"],
+    )
 
 
 @app.command("run")

@@ -157,10 +157,8 @@ def _facts_of_many(
     return facts
 
 
-def _telling_of_many(show: Callable[[int, str], None] | None) -> "Callable[[Progress], None] | None":
+def _telling_of_many(show: Callable[[int, str], None]) -> "Callable[[Progress], None]":
     """Return the callback of `train_many`, which shows the mean regret of the policies, and the pace."""
-    if show is None:
-        return None
     began: list[tuple[float, int]] = []
 
     def tell(now: "Progress") -> None:
@@ -205,10 +203,8 @@ def _plot(out: Path | None) -> Path | None:
         return None
 
 
-def _telling(show: Callable[[int, str], None] | None) -> Callable[[int, int, Any], None] | None:
+def _telling(show: Callable[[int, str], None]) -> Callable[[int, int, Any], None]:
     """Return the callback of `train`, which shows the value of the policy, beside the bar."""
-    if show is None:
-        return None
 
     def tell(done: int, _steps: int, row: Mapping[str, Any]) -> None:
         show(done, f"value {row['value']:.4g}, regret {row['expected_regret']:.4g}, {many(row['episodes'], 'episode')}")
@@ -281,7 +277,7 @@ def tune(
             shortlist=shortlist_by_prediction,
             predicted=predicted,
             out=out,
-            progress=_telling_of_trials(show),
+            progress=lambda done, _trials, best: show(done, f"best {best:.4g}"),
         )
     names = ("agent", "environment", "observation", "score", "first_score", "hyperparameters", "trials")
     answer = {**{name: getattr(result, name) for name in names}, "folder": out}
@@ -326,8 +322,3 @@ def _space(words: list[str] | None) -> dict[str, tuple[Any, ...]] | None:
         choices = tuple(parse_value(part) for part in text.split(","))
         space[name] = choices if choices[0] in ("log", "linear") else ("one of", *choices)
     return space
-
-
-def _telling_of_trials(show: Callable[[int, str], None] | None) -> Callable[[int, int, float], None] | None:
-    """Return the callback of `tune`, which shows the best score so far, beside the bar."""
-    return None if show is None else lambda done, _trials, best: show(done, f"best {best:.4g}")
