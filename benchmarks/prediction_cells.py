@@ -104,8 +104,7 @@ def regret_of(run, cell, told):
     if name in known:
         return float(known[name]), known["num_states"]
     task = RunConfig.from_dict(run.config).task(trust=True, strict=True)
-    regret, _ = primary_regret(run.config, task)
-    return regret.value, task.mdp.num_states
+    return primary_regret(run.config, task).value, task.mdp.num_states
 
 
 def judge(file, resamples):
@@ -136,7 +135,7 @@ def said_of(cells, resamples):
         f"{value:.2f} ({a:.2f} to {b:.2f})" for value, a, b in zip(statistics(known), low, high, strict=True)
     )
     width = f"± {known.half_width():.2f} | {known.coverage():.2f}"
-    return f"{r_squared} | {rho} | {pairs} of {len(known.pairs[0])} | {unfitted} | {width}"
+    return f"{r_squared} | {rho} | {pairs} of {len(known.pairs.first)} | {unfitted} | {width}"
 
 
 def draw(file, picture):
@@ -218,13 +217,11 @@ def statistics(known):
         told[~use] = level + slope * x[~use]
     mean = np.average(y, weights=weights)
     total = np.sum(weights * (y - mean) ** 2)
-    first, second, apart = known.pairs
-    right = 0.5 + 0.5 * np.sign(x[first] - x[second]) * np.sign(apart)
     return (
         1 - np.sum(weights * (y - told) ** 2) / total,
         spearmanr(x.round(9), y.round(9)).statistic,
         1 - np.sum(weights * (y - x) ** 2) / total,
-        right.mean() if len(right) else np.nan,
+        known.pairs.agreement(x),
     )
 
 

@@ -171,6 +171,12 @@ def _exchanged(x: np.ndarray, y: np.ndarray, orders: np.ndarray) -> tuple[np.nda
     return scores, np.divide(of_predicted @ of_aims, lengths, out=np.full(len(orders), np.nan), where=lengths > 0)
 
 
+def percentiles(values: np.ndarray, *shares: float) -> np.ndarray:
+    """Percentiles of the values that are finite; NaN without any."""
+    finite = values[np.isfinite(values)]
+    return np.percentile(finite, shares) if len(finite) else np.full(len(shares), np.nan)
+
+
 def p_of(value: float, permuted: np.ndarray) -> float:
     """The share of permutations that are as large, the observed order among them; NaN without any."""
     finite = permuted[np.isfinite(permuted)]

@@ -133,11 +133,13 @@ class PrimaryRegret:
     """The predictor that stands for an agent.
 
     Attributes:
+        network: its name.
         value: normalised regret, 0 optimal and 1 uniform play. deviation: of one walk; NaN where nothing is drawn.
         tabular: of the same learner with a table of the states in the place of the network.
         note: what is random in it, and what half of the landmarks change where they stand for the kernel.
     """
 
+    network: str
     value: float
     deviation: float
     tabular: float
@@ -149,7 +151,7 @@ def primary_regret(
     task: "Task",
     network: Network | None = None,
     landmarks: int | None = None,
-) -> tuple[PrimaryRegret, str]:
+) -> PrimaryRegret:
     """Return the regret of a run's idealised learner by PRIMARY, and the name of the network.
 
     Args:
@@ -178,13 +180,13 @@ def primary_regret(
     if result.value is None:
         raise UndefinedMeasure(result.undefined or f"{measure} is undefined")
     value = result.value
-    regret = PrimaryRegret(
+    return PrimaryRegret(
+        str(options["representation"].conventions["network"]),
         value["value"] if agent == "dqn" else _evaluated(value),
         value.get("deviation", math.nan),
         value["tabular"],
         result.certificate.note or "",
     )
-    return regret, str(options["representation"].conventions["network"])
 
 
 def _is_named(network: str) -> bool:

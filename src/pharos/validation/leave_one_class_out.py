@@ -18,6 +18,7 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.training import CELL
 from pharos.validation import cross_validation as _held_out
+from pharos.validation.cross_validation import percentiles
 from pharos.validation.learners import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS
 
 if TYPE_CHECKING:
@@ -267,9 +268,7 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
     drawn = _held_out.resampled_classes(count, RESAMPLES, seed)
     ends = np.full((2, 2), np.nan)
     if count >= 3:
-        samples = np.stack(_held_out.held_out(x, y, classes, drawn))
-        finite = [row[np.isfinite(row)] for row in samples]
-        ends = np.array([np.percentile(row, [2.5, 97.5]) if len(row) else [np.nan] * 2 for row in finite])
+        ends = np.array([percentiles(each, 2.5, 97.5) for each in _held_out.held_out(x, y, classes, drawn)])
     predicted = _held_out.class_predictions(x, y, classes, classes)
     dummies = np.eye(count)[classes][:, 1:] if not x.shape[1] else x
     by_mdp = _held_out.class_predictions(dummies, y, cells.instances, classes)
@@ -278,7 +277,7 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
     floors, p = [np.nan, np.nan], np.nan
     if permutations and x.shape[1] and count >= 3:
         shuffled = _held_out.permuted_classes(x, y, classes, cells.places, permutations, seed)
-        floors = [_percentile(each[1:], 95) for each in shuffled]
+        floors = [float(percentiles(each[1:], 95)[0]) for each in shuffled]
         p = _held_out.p_of(shuffled[1][0], shuffled[1][1:])
     return {
         "r_squared": scores[0],
@@ -302,11 +301,6 @@ def _noise(cells: Cells, outcome: str) -> np.ndarray | None:
     if outcome == ABSOLUTE or f"{outcome}_noise" not in cells.frame:
         return None
     return cells.frame[f"{outcome}_noise"].to_numpy(float)
-
-
-def _percentile(values: np.ndarray, share: float) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.percentile(finite, share)) if len(finite) else np.nan
 
 
 def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[str, float]:
@@ -366,11 +360,9 @@ def _mixed(cells: Cells, model: Model, tabular: Sequence[str], seed: int) -> dic
         drawn = _held_out.resampled_classes(numbers.max() + 1, RESAMPLES // 2, seed)
         counts = np.vstack([np.ones((1, drawn.shape[1]), int), drawn])
         values = _held_out.partial_correlation(x[some], y[some], others[some], numbers, counts)
-        row |= {
-            name: values[0],
-            f"{name}_lower": _percentile(values[1:], 2.5),
-            f"{name}_upper": _percentile(values[1:], 97.5),
-        }
+        row |= zip(
+            (name, f"{name}_lower", f"{name}_upper"), (values[0], *percentiles(values[1:], 2.5, 97.5)), strict=True
+        )
     return row
 
 
@@ -499,10 +491,8 @@ class Pairs:
         right = np.bincount(classes[self.first], self.right(x), minlength=number)
         pairs = np.bincount(classes[self.first], minlength=number)
         total = counts @ pairs
-        shares = (counts @ right)[total > 0] / total[total > 0]
-        if len(shares) == 0:
-            return np.nan, np.nan
-        return float(np.percentile(shares, 2.5)), float(np.percentile(shares, 97.5))
+        lower, upper = percentiles((counts @ right)[total > 0] / total[total > 0], 2.5, 97.5)
+        return float(lower), float(upper)
 
     def permuted(
         self,

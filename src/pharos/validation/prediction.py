@@ -10,7 +10,6 @@ import csv
 import hashlib
 import itertools
 import json
-import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,7 +26,8 @@ from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCo
 from pharos.system.storage import plain
 from pharos.system.wording import many
 from pharos.training import CELL
-from pharos.validation.learners import POLICY_CURVES, PREDICTORS, PRIMARY, primary_regret
+from pharos.validation.learners import POLICY_CURVES, PREDICTORS, PRIMARY, primary_regret, rollouts_of
+from pharos.validation.leave_one_class_out import Pairs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 
 FILE = Path(__file__).parent / "data" / "cells.csv"
-CLEAR = 0.05
-"""Difference between the regrets of two observations of one MDP that counts, as in the studies."""
 BINS = (0.0, 0.05, 0.1, 0.2, 0.4)
 """Lower ends of the predicted differences that are counted together."""
 LEVEL = 0.8
@@ -85,33 +83,24 @@ class Published:
     def coverage(self, level: float = LEVEL) -> float:
         """The share of cells within the interval of the other classes, a mean over classes that are left out."""
         errors = np.abs(self.observed - self.predicted)
-        return float(
-            np.mean([np.mean(errors[self.classes == name] <= self.half_width(level, name)) for name in self._names])
-        )
-
-    @property
-    def _names(self) -> np.ndarray:
-        return np.unique(self.classes)
+        names = np.unique(self.classes)
+        return float(np.mean([np.mean(errors[self.classes == name] <= self.half_width(level, name)) for name in names]))
 
     def ordered(self, difference: float) -> tuple[int, int]:
         """(ordered rightly, in all) of the pairs of observations of one MDP whose predictions differ about as much.
 
-        Pairs whose regrets differ by less than CLEAR do not count.
+        Pairs whose regrets differ by less than that of `Pairs` do not count.
         """
         number = np.searchsorted(BINS, abs(difference), side="right")
-        first, second, _ = self.pairs
-        apart = self.predicted[first] - self.predicted[second]
-        same_bin = np.searchsorted(BINS, np.abs(apart), side="right") == number
-        right = np.sign(apart) == np.sign(self.observed[first] - self.observed[second])
-        return int((right & same_bin).sum()), int(same_bin.sum())
+        pairs = self.pairs
+        apart = np.abs(self.predicted[pairs.first] - self.predicted[pairs.second])
+        same_bin = np.searchsorted(BINS, apart, side="right") == number
+        return int((pairs.right(self.predicted)[same_bin] == 1).sum()), int(same_bin.sum())
 
     @property
-    def pairs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows of both cells of each pair, and the difference of what was observed."""
-        first, second = np.triu_indices(len(self.mdps), 1)
-        apart = self.observed[first] - self.observed[second]
-        clear = (self.mdps[first] == self.mdps[second]) & (np.abs(apart) > CLEAR)
-        return first[clear], second[clear], apart[clear]
+    def pairs(self) -> Pairs:
+        """Pairs of observations of one MDP whose regrets differ, see `Pairs`."""
+        return Pairs.of(self.observed, self.mdps)
 
 
 @cache
@@ -150,8 +139,8 @@ class PredictedRegret:
         observation: what the agent sees, with its options. network: name of the network.
         value: normalised regret of the learnt policies, a mean over training: 0 optimal, 1 uniform play.
         low, high: ends of the interval that held LEVEL of the published cells, at least 0.
-        deviation: standard deviation of one walk of the idealised learner; NaN where nothing is drawn.
         tabular: of the same learner with a table of the states in the place of the network.
+        deviation: standard deviation of one walk of the idealised learner; NaN where nothing is drawn.
         note: what is random or approximate in the value.
     """
 
@@ -160,8 +149,8 @@ class PredictedRegret:
     value: float
     low: float
     high: float
-    deviation: float
     tabular: float
+    deviation: float
     note: str = ""
 
     @property
@@ -171,12 +160,7 @@ class PredictedRegret:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
-        numbers = {"value": self.value, "low": self.low, "high": self.high, "tabular": self.tabular}
-        deviation = None if math.isnan(self.deviation) else self.deviation
-        return {
-            "observation": self.observation, "network": self.network, **numbers, "deviation": deviation,
-            "note": self.note,
-        }  # fmt: skip
+        return plain(vars(self))
 
 
 @dataclass(frozen=True)
@@ -335,11 +319,9 @@ def predict(
             title = f"{name}({', '.join(f'{key}={value}' for key, value in view.items())})" if view else name
             if progress is not None:
                 progress(f"predicting {agent} behind {title}")
-            regret, network_name = primary_regret(config, task, network, landmarks)
-            ends = max(0.0, regret.value - width), regret.value + width
-            cells.append(
-                PredictedRegret(title, network_name, regret.value, *ends, regret.deviation, regret.tabular, regret.note)
-            )
+            regret = primary_regret(config, task, network, landmarks)
+            low, high = max(0.0, regret.value - width), regret.value + width
+            cells.append(PredictedRegret(observation=title, low=low, high=high, **vars(regret)))
     if not cells:
         raise ParameterError("no observation to predict for; give at least one, such as 'vector'")
     return Prediction(
@@ -389,7 +371,7 @@ def regret_predictor(
     def predicted(hyperparameters: Mapping[str, Any]) -> float:
         def regret(task: Task) -> float:
             config = RunConfig.of_task(task, agent, steps=steps, hyperparameters=dict(hyperparameters))
-            return primary_regret(config.to_dict(), task)[0].value
+            return primary_regret(config.to_dict(), task).value
 
         return float(np.mean([regret(task) for task in tasks]))
 
@@ -425,10 +407,7 @@ def _check_steps(config: Mapping[str, Any]) -> None:
     if config["agent"] == "dqn":
         min_steps, what = int(hyperparameters.get("learning_starts", 0)) + 1, "learning begins"
     else:
-        min_steps, what = (
-            int(hyperparameters["n_steps"]) * int(hyperparameters.get("n_envs", 1)),
-            "the first rollout ends",
-        )
+        min_steps, what = rollouts_of(config)[0].steps, "the first rollout ends"
     if steps < min_steps:
         raise ParameterError(
             f"steps is {steps}, but {what} after {min_steps - 1:,} steps; expected at least {min_steps:,}"
@@ -437,12 +416,10 @@ def _check_steps(config: Mapping[str, Any]) -> None:
 
 def _warnings(calibration: Published, states: int, steps: int, chance: "ChanceSetting") -> Iterable[str]:
     """Warnings that the instance lies outside of the published cells."""
-    low, high = int(calibration.states.min()), int(calibration.states.max())
-    if not low <= states <= high:
-        yield f"{states:,} states: tested were {low:,} to {high:,}, so the interval is not calibrated here"
-    low, high = int(calibration.steps.min()), int(calibration.steps.max())
-    if not low <= steps <= high:
-        yield f"{steps:,} steps: tested were {low:,} to {high:,}, so the interval is not calibrated here"
+    for what, number, tested in (("states", states, calibration.states), ("steps", steps, calibration.steps)):
+        low, high = int(tested.min()), int(tested.max())
+        if not low <= number <= high:
+            yield f"{number:,} {what}: tested were {low:,} to {high:,}, so the interval is not calibrated here"
     untested = [name for name in ("sticky", "lazy", "reward_noise") if getattr(chance, name)]
     if chance.random > 0.1:
         untested.append("random above 0.1")
