@@ -192,7 +192,8 @@ def test_support_is_where_the_walk_may_be(mdp, seed):
     random = np.random.default_rng(seed)
     policy = random.integers(mdp.num_actions, size=mdp.num_states)
     walk = hardness.occupancy(mdp.with_horizon(None), policy, horizon=mdp.num_states * (mdp.num_actions + 1) + 1)
-    assert (_occupancy.support(mdp, policy) == (walk.largest.sum(axis=1) > 0)).all()
+    live = ~np.asarray(mdp.terminal)
+    assert (_occupancy.support_with_ends(mdp, policy)[:-1] & live == (walk.largest.sum(axis=1) > 0)).all()
     P, _, start = augmented(mdp)  # of terminal states and the end: what executed actions lead to
     width = mdp.num_actions + 1
     over = np.append(np.repeat(np.asarray(mdp.terminal), width), True)

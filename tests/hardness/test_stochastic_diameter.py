@@ -248,7 +248,7 @@ def test_the_farthest_target_so_far_makes_the_guess_for_the_next():
     """Every step of a lazy ring takes ten."""
     mdp = ring(20, 0.9)
     search = _Diameter(mdp, True, ExpandedMDP.of(mdp, restart=True), 1e-6, BudgetClock(hardness.Budget(), None))
-    search.run({})
+    search.run()
     assert search.targets.initial_scale == pytest.approx(10, rel=1e-3)
 
 

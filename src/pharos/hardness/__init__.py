@@ -49,16 +49,13 @@ from pharos.hardness.visitation import (
 )
 
 __all__ = [
-    "Budget",
     "Certified",
     "EffectiveHorizon",
     "Gaps",
     "Interval",
     "Measure",
     "Problem",
-    "Report",
     "Representation",
-    "Result",
     "Rollouts",
     "Sampling",
     "Schedule",
@@ -83,7 +80,6 @@ __all__ = [
     "occupancy",
     "register",
     "report",
-    "return_distribution",
     "run_gorp",
     "sampled_regret",
     "start_eccentricity",
@@ -92,6 +88,7 @@ __all__ = [
     "sum_of_reciprocal_gaps",
 ]
 _shared = """
-    ActionGapRegularity Certificate Covering ExplorationTime GorpBound GorpRuns KernelRegret LearningCurve MixingTime
-    Occupancy Progress ReturnDistribution SampledRegret Spectral StationaryHorizon chosen discounted_visits
+    ActionGapRegularity Budget Certificate Covering ExplorationTime GorpBound GorpRuns KernelRegret LearningCurve
+    MixingTime Occupancy Progress Report Result ReturnDistribution SampledRegret Spectral StationaryHorizon chosen
+    discounted_visits return_distribution
 """

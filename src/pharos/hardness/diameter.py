@@ -81,13 +81,13 @@ def diameter(
         computation in (weakly connected) real-world graphs", section 4.
     """
     _check_tolerance(tolerance)
-    spending = BudgetClock(Budget.of(budget), progress)
+    spending = BudgetClock(Budget.of(budget), progress, conventions_of(mdp, restart))
     graph = Graph.of(mdp, restart)
     if graph is None:
         return stochastic_diameter(mdp, restart, tolerance, spending)
     if needs_more_than_memory(graph):
-        return lean_diameter(graph, spending, conventions_of(mdp, restart), bounds)
-    return SumSweep(graph, spending, conventions_of(mdp, restart)).interval()
+        return lean_diameter(graph, spending, bounds)
+    return SumSweep(graph, spending).interval()
 
 
 @require_mdp
@@ -134,13 +134,13 @@ def start_eccentricity_interval(
 ) -> Interval:
     """Return `start_eccentricity` as an `Interval`: exact, or what is proven within the budget. Arguments: the same."""
     _check_tolerance(tolerance)
-    spending = BudgetClock(Budget.of(budget), None)
+    spending = BudgetClock(Budget.of(budget), None, conventions_of(mdp, restart))
     graph = Graph.of(mdp, restart)
     if graph is None:
         return stochastic_start_eccentricity(mdp, restart, tolerance, spending)
     starts = mdp.start_states[mdp.start_probabilities > 0]
     if len(starts) == 1 and needs_more_than_memory(graph):
-        return lean_eccentricity(graph, int(starts[0]), spending, conventions_of(mdp, restart))
+        return lean_eccentricity(graph, int(starts[0]), spending)
     weights = mdp.start_probabilities[mdp.start_probabilities > 0]
     mean, distance = np.zeros(graph.num_nodes), np.empty(graph.num_nodes, np.int32)
     note, infinite, largest = "", False, 0
@@ -163,18 +163,16 @@ def start_eccentricity_interval(
         lower, upper = float(mean.max()) / rounding, float(mean.max()) * rounding
     if note:
         upper = math.inf
-    return Interval(
+    interval = Interval(
         lower,
         upper,
         exact=not note,
         finite_part=0.0 if infinite else lower,
         tolerance=0.0 if len(starts) == 1 else tolerance,
-        searches=spending.searches,
         method="a breadth-first search from each start state",
-        conventions=conventions_of(mdp, restart),
         note=note,
-        seconds=spending.seconds,
     )
+    return spending.signed(interval)
 
 
 def _check_tolerance(tolerance: float) -> None:
@@ -343,9 +341,7 @@ def needs_more_than_memory(graph: Graph) -> bool:
     return 7 * entry * graph.num_nodes + first + graph.next_states.dtype.itemsize * edges > available_memory()
 
 
-def lean_diameter(
-    graph: Graph, spending: BudgetClock, conventions: dict[str, Any], folder: str | os.PathLike | None = None
-) -> Interval:
+def lean_diameter(graph: Graph, spending: BudgetClock, folder: str | os.PathLike | None = None) -> Interval:
     """The diameter, or the interval proven within the budget.
 
     folder: where bounds are kept while they are tightened, and gone on from; None: in memory.
@@ -353,7 +349,7 @@ def lean_diameter(
     store = None if folder is None else KeptBounds(Path(folder), graph)
 
     def interval(dtype: Integers) -> Interval:
-        return LeanSweep(LeanGraph(graph, dtype), spending, conventions, store).interval()
+        return LeanSweep(LeanGraph(graph, dtype), spending, store).interval()
 
     result = interval(np.int32) if store and store.dtype == np.int32 else _in_two_bytes_or_four(interval)
     if store and result.exact:
@@ -361,7 +357,7 @@ def lean_diameter(
     return result
 
 
-def lean_eccentricity(graph: Graph, source: int, spending: BudgetClock, conventions: dict[str, Any]) -> Interval:
+def lean_eccentricity(graph: Graph, source: int, spending: BudgetClock) -> Interval:
     """The largest number of steps from a state to another one."""
     reach, largest, _ = _in_two_bytes_or_four(
         lambda dtype: LeanGraph(graph, dtype).search_forward(source, large_zeros((graph.num_nodes,), dtype))
@@ -369,16 +365,8 @@ def lean_eccentricity(graph: Graph, source: int, spending: BudgetClock, conventi
     spending.searches += 1
     is_whole = reach == graph.num_nodes
     value = float(largest) if is_whole else math.inf
-    return Interval(
-        value,
-        value,
-        True,
-        finite_part=value if is_whole else 0.0,
-        searches=1,
-        method="a breadth-first search, by sweeps over the table",
-        conventions=conventions,
-        seconds=spending.seconds,
-    )
+    method = "a breadth-first search, by sweeps over the table"
+    return spending.signed(Interval(value, value, True, finite_part=value if is_whole else 0.0, method=method))
 
 
 def _in_two_bytes_or_four(result: Callable[[Integers], Result]) -> Result:
@@ -443,12 +431,10 @@ class LeanGraph:
 class LeanSweep(SumSweep):
     """`SumSweep` on a graph that is searched by sweeps, in little memory."""
 
-    def __init__(
-        self, graph: LeanGraph, spending: BudgetClock, conventions: dict[str, Any], store: KeptBounds | None = None
-    ):
+    def __init__(self, graph: LeanGraph, spending: BudgetClock, store: KeptBounds | None = None):
         """store: where the bounds are; None: in memory."""
         self.graph: Any = graph
-        self.spending, self.conventions = spending, conventions
+        self.spending = spending
         size, dtype = graph.num_nodes, graph.dtype
         if store is None:
             bounds = [large_zeros((size,), dtype) for _ in range(4)]
@@ -466,19 +452,9 @@ class LeanSweep(SumSweep):
         """The diameter, or what is proven of it. OverflowError where bounds do not fit."""
         graph = self.graph
         if not self._is_bounded() and not self._pivot(graph.pivot):
-            return Interval(
-                np.inf,
-                np.inf,
-                True,
-                unreachable_pairs=1,
-                finite_part=float(self.best),
-                counted=False,
-                searches=self.spending.searches,
-                method=self.method,
-                conventions=self.conventions,
-                note="some states cannot be reached from others; how many pairs was not counted, for want of memory",
-                seconds=self.spending.seconds,
-            )
+            note = "some states cannot be reached from others; how many pairs was not counted, for want of memory"
+            interval = Interval(np.inf, np.inf, True, 1, float(self.best), counted=False, method=self.method, note=note)
+            return self.spending.signed(interval)
         if not self._is_bounded():
             raise OverflowError  # a bound was cut
         self._sweep()

@@ -26,6 +26,7 @@ import numpy as np
 from pharos.errors import PrecisionError, UndefinedMeasure
 from pharos.hardness.gaps import optimal_solution, solved
 from pharos.hardness.gorp import gorp_bound
+from pharos.hardness.interval import fields_of
 from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
 from pharos.mdp import STEPS, ExpandedMDP, TabularMDP, require_mdp, whole_number
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
@@ -54,15 +55,7 @@ class LookAhead:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; infinite gaps are None."""
-        return {
-            "value": self.value,
-            "k_min": self.k_min,
-            "effective_planning_window": self.effective_planning_window,
-            "ks": self.ks,
-            "ms": self.ms,
-            "gaps": [gap if math.isfinite(gap) else None for gap in self.gaps],
-            "vars": self.vars,
-        }
+        return fields_of(self, "conventions")
 
     def __str__(self) -> str:
         return f"{self.value:.6g} (k_min {self.k_min}, window {self.effective_planning_window})"
@@ -88,25 +81,13 @@ class EffectiveHorizon(LookAhead):
         conventions: horizon, exploration, chance, tie tolerance.
     """
 
+    tight: float | None = field(default=None, kw_only=True)
     greedy_returns: list[float]
     optimal_return: float
     random_return: float
     worst_return: float
     num_states: int
-    tight: float | None = None
     conventions: dict[str, Any] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; infinite gaps are None."""
-        return {
-            **super().to_dict(),
-            "tight": self.tight,
-            "greedy_returns": self.greedy_returns,
-            "optimal_return": self.optimal_return,
-            "random_return": self.random_return,
-            "worst_return": self.worst_return,
-            "num_states": self.num_states,
-        }
 
 
 @require_mdp

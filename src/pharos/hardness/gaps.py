@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError
-from pharos.hardness.interval import Certified
+from pharos.hardness.interval import Certified, fields_of
 from pharos.kernels import gaps as kernels
 from pharos.mdp import BEST, BellmanEquation, TabularMDP, require_mdp
 from pharos.solvers import Solution, value_iteration
@@ -367,20 +367,7 @@ class Gaps:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; what is infinite is None."""
-        return {
-            "sum_of_reciprocals": self.sum_of_reciprocals,
-            "lower": self.lower,
-            "upper": self.upper if math.isfinite(self.upper) else None,
-            "regularized": self.regularized,
-            "minimal": self.minimal if math.isfinite(self.minimal) else None,
-            "count": self.count,
-            "ties": self.ties,
-            "unresolved": self.unresolved,
-            "histogram": self.histogram.tolist(),
-            "edges": self.edges.tolist(),
-            "tie_tolerance": self.tie_tolerance,
-            "error": self.error,
-        }
+        return fields_of(self, "small", "conventions")
 
     def __str__(self) -> str:
         ties = f", {self.unresolved} unresolved ties" if self.unresolved else ""

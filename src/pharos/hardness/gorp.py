@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.hardness.interval import fields_of
 from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
 from pharos.mdp import TabularMDP, require_mdp, whole_number
 from pharos.system.wording import many
@@ -48,16 +49,7 @@ class GorpBound:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; infinite values are None."""
-        finite = [value if math.isfinite(value) else None for value in (self.value, *self.values)]
-        return {
-            "value": finite[0],
-            "ks": self.ks,
-            "ms": self.ms,
-            "values": finite[1:],
-            "failure_probabilities": self.failure_probabilities,
-            "proven": self.proven,
-            **self.conventions,
-        }
+        return {**fields_of(self, "conventions"), **self.conventions}
 
     def __str__(self) -> str:
         return f"{self.value:.6g} (m = {', '.join('infinite' if m is None else f'{m:,}' for m in self.ms)})"

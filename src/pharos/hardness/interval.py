@@ -2,12 +2,31 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
+
+import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
 from pharos.system.compiling import Stopwatch
+
+
+def finite(value: object) -> object:
+    """The value with None in place of what is infinite or NaN, as JSON has no such numbers; arrays as lists."""
+    if isinstance(value, Mapping):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return finite(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def fields_of(result: object, *without: str) -> dict[str, Any]:
+    """The fields of a measure's result by name, `finite`, but for some."""
+    return {name: finite(value) for name, value in vars(result).items() if name not in without}
 
 
 @dataclass(frozen=True)
@@ -52,20 +71,8 @@ class Interval:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; an infinite bound is None, as in JSON nothing else is, and `infinite` says so."""
-        result: dict[str, Any] = {
-            "lower": self.lower if math.isfinite(self.lower) else None,
-            "upper": self.upper if math.isfinite(self.upper) else None,
-            "exact": self.exact,
-            "infinite": math.isinf(self.lower),
-            "unreachable_pairs": self.unreachable_pairs,
-            "finite_part": self.finite_part,
-            "counted": self.counted,
-            "tolerance": self.tolerance,
-            "searches": self.searches,
-            "method": self.method,
-            "note": self.note,
-        }
-        return result
+        first = dict.fromkeys(("lower", "upper", "exact"))  # the order of keys
+        return {**first, "infinite": math.isinf(self.lower), **fields_of(self, "conventions", "seconds")}
 
     def __str__(self) -> str:
         if math.isinf(self.lower):
@@ -130,11 +137,7 @@ class Certificate:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; infinite ends are None."""
-        ends = {
-            name: end if end is not None and math.isfinite(end) else None
-            for name, end in (("lower", self.lower), ("upper", self.upper))
-        }
-        return {"kind": self.kind, **ends, "note": self.note, **self.details}
+        return {**fields_of(self, "details"), **self.details}
 
 
 def certificate_of(outcome: object) -> Certificate:
@@ -211,8 +214,14 @@ class BudgetClock:
     Seconds of compiling do not count: what is proven must not depend on whether the code was compiled before.
     """
 
-    def __init__(self, budget: Budget, progress: Callable[[Progress], None] | None):
-        self.budget, self.progress = budget, progress
+    def __init__(
+        self,
+        budget: Budget,
+        progress: Callable[[Progress], None] | None,
+        conventions: Mapping[str, Any] = MappingProxyType({}),
+    ):
+        """conventions: what the values refer to that are measured meanwhile."""
+        self.budget, self.progress, self.conventions = budget, progress, dict(conventions)
         self._watch = Stopwatch()
         self.searches = 0
         self._reported = -math.inf
@@ -226,6 +235,10 @@ class BudgetClock:
     def is_over(self) -> bool:
         """Whether a limit is met."""
         return self.searches >= self.budget.searches or self.seconds >= self.budget.seconds
+
+    def signed(self, interval: Interval) -> Interval:
+        """The interval, with what it took and refers to."""
+        return replace(interval, conventions=self.conventions, searches=self.searches, seconds=self.seconds)
 
     def report(self, lower: float, upper: float, candidates: int, *, now: bool = False) -> None:
         """Call `progress`, where there is one and the last call is long enough ago."""

@@ -17,22 +17,19 @@ kernel, without a learner.
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from pharos.errors import UndefinedMeasure
 from pharos.hardness.representation import (
-    LANDMARKS,
     MARGIN,
-    MOST_EXACT,
     WORST_GREEDY,
     WORST_PLAYED,
-    Exact,
     Grouped,
     Identity,
     KernelOperator,
-    Landmarks,
     Learner,
     LearningCurve,
     Memory,
@@ -41,8 +38,9 @@ from pharos.hardness.representation import (
     Schedule,
     descent,
     greedy_policy,
+    operators_of,
 )
-from pharos.hardness.visitation import StandardOccupancy, drawn, standard_occupancy
+from pharos.hardness.visitation import StandardOccupancy, standard_occupancy
 from pharos.mdp import TabularMDP, require_mdp
 from pharos.solvers import Solution
 
@@ -174,31 +172,20 @@ def regret_in_kernel(
     """
     everything = learner.numbers[learner.states]
     observations = Grouped(representation.classes, everything)
-    landmarks, errors = representation.landmarks, (0.0, 0.0)
-    if landmarks is None and len(observations) > MOST_EXACT:
-        landmarks = LANDMARKS
-    observed, is_adam = observations.representatives, learner.schedule.optimizer == "adam"
-    is_exact = not landmarks or landmarks >= len(observations)
-    operator = Exact(representation.kernel, observed) if is_exact else None  # what does not fit is said at once
-    tabular = learner.curve(Grouped(np.arange(mdp.num_states), everything), Identity())
-    if not is_exact or is_adam:
+
+    @cache
+    def weights() -> np.ndarray:
         standard = standard_occupancy(mdp, learner.schedule.gamma, learner.episode)
-        weights = observations.sums(standard.states[everything])
+        return observations.sums(standard.states[everything])
 
     def learnt(operator: KernelOperator) -> LearningCurve:
-        if is_adam:
-            operator.preconditioned(np.maximum(weights, RAREST * weights.max()))
+        if learner.schedule.optimizer == "adam":
+            operator.preconditioned(np.maximum(weights(), RAREST * weights().max()))
         return learner.curve(observations, operator)
 
-    if operator is not None:
-        landmarks, curve = None, learnt(operator)
-    else:
-        assert landmarks is not None
-        chosen = observed[drawn(weights, landmarks)]
-        curve, half = (
-            learnt(Landmarks(representation.kernel, observed, some)) for some in (chosen, chosen[: landmarks // 2])
-        )
-        errors = (abs(curve.mean_greedy - half.mean_greedy), abs(curve.mean_played - half.mean_played))
+    operators, landmarks = operators_of(representation, observations, weights)  # what does not fit is said at once
+    tabular = learner.curve(Grouped(np.arange(mdp.num_states), everything), Identity())
+    curve, *half = map(learnt, operators)
     conventions = {
         **settings,
         "episode": learner.episode,
@@ -214,8 +201,8 @@ def regret_in_kernel(
         observations=len(observations),
         states=len(everything),
         landmarks=landmarks,
-        estimated_error=errors[0],
-        estimated_error_played=errors[1],
+        estimated_error=sum((abs(curve.mean_greedy - each.mean_greedy) for each in half), 0.0),
+        estimated_error_played=sum((abs(curve.mean_played - each.mean_played) for each in half), 0.0),
         conventions=conventions,
         name=learner.measure,
     )

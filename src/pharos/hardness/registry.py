@@ -172,16 +172,7 @@ def register(
         )
     if name in _MEASURES and _MEASURES[name].source != "the user" and source == "the user":
         raise ParameterError(f"{name!r} is a measure of pharos; choose another name")
-    _MEASURES[name] = Measure(
-        name=name,
-        function=function,
-        definition=definition,
-        source=source,
-        complexity=complexity,
-        version=version,
-        depends=depends,
-        on_request=on_request,
-    )
+    _MEASURES[name] = Measure(name, function, definition, source, complexity, version, depends, on_request)
     return _MEASURES[name]
 
 

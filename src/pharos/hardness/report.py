@@ -17,7 +17,7 @@ import numpy as np
 import xxhash
 
 from pharos.errors import PrecisionError, UndefinedMeasure
-from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of
+from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of, finite
 from pharos.hardness.registry import Measure, Problem, chosen
 from pharos.hardness.representation import Representation, Rollouts, Schedule
 from pharos.hardness.sampled_regret import Sampling
@@ -79,7 +79,7 @@ class Report:
         """JSON-able: `measures`, `conventions`, `seconds`; what is proven of each under `certificates`, and under
         `undefined` why some are None."""
         return {
-            "measures": {name: _finite(result.value) for name, result in self.results.items()},
+            "measures": {name: finite(result.value) for name, result in self.results.items()},
             "conventions": dict(self.conventions),
             "undefined": {name: result.undefined for name, result in self.results.items() if result.undefined},
             "certificates": {
@@ -222,16 +222,8 @@ def _infinite(value: object) -> bool:
     return isinstance(value, float) and math.isinf(value)
 
 
-def _finite(value: object) -> object:
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _conventions(problem: Problem) -> dict[str, Any]:
-    mdp, chance = problem.mdp, problem.mdp.chance
+    mdp = problem.mdp
     starts = [[int(s), float(p)] for s, p in zip(mdp.start_states[:100], mdp.start_probabilities, strict=False)]
     representation = problem.representation
     represented = (
@@ -248,13 +240,7 @@ def _conventions(problem: Problem) -> dict[str, Any]:
         "gamma": float(mdp.gamma),
         "horizon": None if problem.horizon is None else int(problem.horizon),
         "horizon_of_values": mdp.horizon,
-        "chance": {
-            "chosen": chance.chosen,
-            "previous": chance.previous,
-            "uniform": chance.uniform,
-            "first_chosen": chance.first_chosen,
-            **({"lazy": mdp.laziness} if mdp.laziness else {}),
-        },
+        "chance": {**mdp.chance.to_dict(), **({"lazy": mdp.laziness} if mdp.laziness else {})},
         "restart": problem.restart,
         "tolerance": problem.tolerance,
         "start_states": len(mdp.start_states),

@@ -6,7 +6,7 @@ is Q-learning of a network in expectation, what `kernel_regret` builds on.
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.visitation import Walk
+from pharos.hardness.visitation import Walk, drawn
 from pharos.mdp import TabularMDP, whole_number
 from pharos.solvers import Solution, evaluate_policy, regret_scale, uniform_value, value_iteration
 
@@ -274,6 +274,21 @@ class Landmarks(KernelOperator):
             past, now = now, past
             total += np.float32(coefficient) * now
         return total
+
+
+def operators_of(
+    representation: Representation, observations: Grouped, weights: Callable[[], np.ndarray]
+) -> tuple[Iterable[KernelOperator], int | None]:
+    """([the kernel over observations], None); or, where they are too many, (it by landmarks, then by half of these; how
+    many landmarks), drawn by weights (C,) of observations, which are asked for then."""
+    observed, landmarks = observations.representatives, representation.landmarks
+    if landmarks is None and len(observed) > MOST_EXACT:
+        landmarks = LANDMARKS
+    if not landmarks or landmarks >= len(observed):
+        return [Exact(representation.kernel, observed)], None
+    chosen = observed[drawn(weights(), landmarks)]
+    parts = (chosen, chosen[: landmarks // 2])
+    return (Landmarks(representation.kernel, observed, some) for some in parts), landmarks  # one at a time
 
 
 @lru_cache(maxsize=16)

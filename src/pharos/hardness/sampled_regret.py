@@ -14,21 +14,18 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.hardness.representation import (
-    LANDMARKS,
     MARGIN,
-    MOST_EXACT,
     WORST_GREEDY,
-    Exact,
     Grouped,
     Identity,
     KernelOperator,
-    Landmarks,
     Learner,
     Representation,
     Schedule,
     greedy_policy,
+    operators_of,
 )
-from pharos.hardness.visitation import drawn, standard_occupancy
+from pharos.hardness.visitation import standard_occupancy
 from pharos.mdp import TabularMDP, paid_outcomes, require_mdp, whole_number
 from pharos.solvers import Solution
 
@@ -211,22 +208,14 @@ def sampled_regret(
     learner = SampledLearner(mdp, schedule, sampling, episode, solution)
     observations = Grouped(representation.classes, learner.numbers[learner.states])
     states = Grouped(np.arange(mdp.num_states), learner.numbers[learner.states])
-    landmarks, observed = representation.landmarks, observations.representatives
-    if landmarks is None and len(observations) > MOST_EXACT:
-        landmarks = LANDMARKS
-    error = 0.0
-    if not landmarks or landmarks >= len(observations):
-        landmarks = None
-        descent, adam = learner.both(observations, Exact(representation.kernel, observed))
-    else:
-        standard = standard_occupancy(mdp, schedule.gamma, episode)
-        weights = observations.sums(standard.states[learner.numbers[learner.states]])
-        chosen = observed[drawn(weights, landmarks)]
-        (descent, adam), half = (
-            learner.both(observations, Landmarks(representation.kernel, observed, some))
-            for some in (chosen, chosen[: landmarks // 2])
-        )
-        error = abs(descent.mean + adam.mean - half[0].mean - half[1].mean) / 2
+
+    def weights() -> np.ndarray:
+        standard = standard_occupancy(mdp, learner.schedule.gamma, episode)
+        return observations.sums(standard.states[learner.numbers[learner.states]])
+
+    operators, landmarks = operators_of(representation, observations, weights)
+    (descent, adam), *half = (learner.both(observations, operator) for operator in operators)
+    error = sum((abs(descent.mean + adam.mean - one.mean - other.mean) / 2 for one, other in half), 0.0)
     of_schedule = {name: value for name, value in asdict(schedule).items() if name != "optimizer"}
     conventions = {
         "schedule": of_schedule,

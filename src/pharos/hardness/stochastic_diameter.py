@@ -44,12 +44,11 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from pharos.hardness.hitting_times import SWEEPS, HittingTimes
-from pharos.hardness.interval import BudgetClock, Interval, conventions_of
+from pharos.hardness.interval import BudgetClock, Interval
 from pharos.kernels import hitting
 from pharos.kernels.hitting import UNIT
 from pharos.mdp import ExpandedMDP, TabularMDP, outcomes_of
@@ -271,8 +270,8 @@ CRUDE = 1.01
 def stochastic_diameter(mdp: TabularMDP, restart: bool, tolerance: float, spending: BudgetClock) -> Interval:
     """The diameter of an MDP with chance: exact up to `tolerance`, or the interval proven by budget and floats."""
     choices = ExpandedMDP.of(mdp, restart)
-    conventions = {**conventions_of(mdp, restart), "nodes": len(choices.underlying), "sticky_pairs": mdp.is_sticky}
-    return _Diameter(mdp, restart, choices, tolerance, spending).run(conventions)
+    spending.conventions |= {"nodes": len(choices.underlying), "sticky_pairs": mdp.is_sticky}
+    return _Diameter(mdp, restart, choices, tolerance, spending).run()
 
 
 class TargetBounds:
@@ -335,7 +334,7 @@ class TargetBounds:
         """Settle the targets that cannot exceed what is proven."""
         self.upper[self.upper <= self.lower] = -math.inf
 
-    def interval(self, lower: float, upper: float, is_infinite: bool, conventions: dict[str, Any]) -> Interval:
+    def interval(self, lower: float, upper: float, is_infinite: bool) -> Interval:
         """What is proven, from bounds of what is finite."""
         left = self.num_open
         exact = is_infinite or (not left and math.isfinite(upper) and upper - lower <= 2 * self.tolerance * upper)
@@ -346,18 +345,10 @@ class TargetBounds:
             note = f"hitting times are so large that 64-bit floats prove no closer bounds of {self.limited} targets"
         elif not exact:
             note = "budget spent before the bounds of the last targets met"
-        return Interval(
-            math.inf if is_infinite else lower,
-            math.inf if is_infinite else upper,
-            exact,
-            finite_part=lower,
-            tolerance=self.tolerance,
-            searches=self.spending.searches,
-            method="a stochastic shortest path problem for each target, bounds from residuals",
-            conventions=conventions,
-            note=note,
-            seconds=self.spending.seconds,
-        )
+        bounds = (math.inf, math.inf) if is_infinite else (lower, upper)
+        method = "a stochastic shortest path problem for each target, bounds from residuals"
+        interval = Interval(*bounds, exact, finite_part=lower, tolerance=self.tolerance, method=method, note=note)
+        return self.spending.signed(interval)
 
 
 class _Diameter(TargetBounds):
@@ -375,7 +366,7 @@ class _Diameter(TargetBounds):
         # States that cannot be reached at all are unreachable from all others.
         self.unreachable = int(np.count_nonzero(~has_nodes)) * (choices.num_targets - 1)
 
-    def run(self, conventions: dict[str, Any]) -> Interval:
+    def run(self) -> Interval:
         """Look at targets until the bounds meet, or the budget ends."""
         connected = self.choices.is_connected
         with ThreadPoolExecutor(len(self.threads)) as pool:
@@ -386,7 +377,7 @@ class _Diameter(TargetBounds):
                 for batch in self._promising():
                     self._look_at(batch, pool, bounding=False)
         left, is_infinite = self.num_open, bool(self.unreachable) or not connected
-        result = self.interval(self.lower, self._upper(), is_infinite, conventions)
+        result = self.interval(self.lower, self._upper(), is_infinite)
         self.spending.report(result.lower, result.upper, left, now=True)
         return replace(
             result,
@@ -549,7 +540,7 @@ def stochastic_start_eccentricity(mdp: TabularMDP, restart: bool, tolerance: flo
     upper = max(search.settled_upper, float(search.upper.max()))
     if search.infinite:
         search.upper[:] = -math.inf
-    result = search.interval(search.lower, upper, search.infinite, conventions_of(mdp, restart))
+    result = search.interval(search.lower, upper, search.infinite)
     return replace(result, finite_part=0.0) if search.infinite else result
 
 

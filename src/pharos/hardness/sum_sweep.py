@@ -20,7 +20,7 @@ of cycles 1 and would spread every search over all layers; in H they do not exis
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -238,8 +238,8 @@ class SumSweep:
     as soon as no out(v), or no in(v), can exceed the largest eccentricity found.
     """
 
-    def __init__(self, graph: Graph, spending: BudgetClock, conventions: dict[str, Any]):
-        self.graph, self.spending, self.conventions = graph, spending, conventions
+    def __init__(self, graph: Graph, spending: BudgetClock):
+        self.graph, self.spending = graph, spending
         size, dtype = graph.num_nodes, graph.dtype
         self.away, self.to = np.empty(size, dtype), np.empty(size, dtype)
         self.out_lower, self.in_lower = np.zeros(size, dtype), np.zeros(size, dtype)
@@ -251,7 +251,7 @@ class SumSweep:
     def interval(self) -> Interval:
         graph = self.graph
         if not self._pivot(graph.pivot):
-            return _infinite_diameter(graph, self.spending, self.conventions)
+            return _infinite_diameter(graph, self.spending)
         note = ""
         clock = self._from_clock()
         if isinstance(clock, Interval):
@@ -269,18 +269,9 @@ class SumSweep:
     def _result(self, lower: int, upper: int, note: str) -> Interval:
         exact = lower == upper
         self.spending.report(lower, upper, 0 if exact else self._open()[0], now=True)
-        return Interval(
-            float(lower),
-            float(upper),
-            exact,
-            finite_part=float(lower),
-            counted=exact,
-            searches=self.spending.searches,
-            method=self.method,
-            conventions=self.conventions,
-            note=note,
-            seconds=self.spending.seconds,
-        )
+        bounds = float(lower), float(upper)
+        interval = Interval(*bounds, exact, finite_part=float(lower), counted=exact, method=self.method, note=note)
+        return self.spending.signed(interval)
 
     # Searches ---------------------------------------------------------------------------------------------------------
 
@@ -300,13 +291,13 @@ class SumSweep:
 
     def _search_out(self, v: int) -> None:
         _, largest, _ = self.graph.search_forward(v, self.away)
-        kernels.raise_lower(self.away, self.in_lower)
+        np.maximum(self.in_lower, self.away, out=self.in_lower)
         self._settle_out(v, largest)
         self.spending.searches += 1
 
     def _search_in(self, v: int) -> None:
         _, largest, _ = self.graph.search_backward(v, self.to)
-        kernels.raise_lower(self.to, self.out_lower)
+        np.maximum(self.out_lower, self.to, out=self.out_lower)
         self._settle_in(v, largest)
         self.spending.searches += 1
 
@@ -491,7 +482,7 @@ class SumSweep:
         return self._result(cycle + int(gap), cycle + int(gap), "")
 
 
-def _infinite_diameter(graph: Graph, spending: BudgetClock, conventions: dict[str, Any]) -> Interval:
+def _infinite_diameter(graph: Graph, spending: BudgetClock) -> Interval:
     """D of a graph that is not strongly connected: infinite, with unreachable pairs and the finite part.
 
     The value is known before any pair is counted, so of the default budget no more than COUNTING seconds go into that.
@@ -520,19 +511,9 @@ def _infinite_diameter(graph: Graph, spending: BudgetClock, conventions: dict[st
         note += f"; counted for {spending.seconds:.0f} s: the pairs from {done} of {many(size, 'state')}"
         note += ", so the counts are lower bounds"
         unreachable = max(unreachable, 1)
-    return Interval(
-        math.inf,
-        math.inf,
-        True,
-        unreachable_pairs=unreachable,
-        finite_part=float(finite),
-        counted=counted,
-        searches=spending.searches,
-        method="searches from all states, many at once",
-        conventions=conventions,
-        note=note,
-        seconds=spending.seconds,
-    )
+    method = "searches from all states, many at once"
+    interval = Interval(math.inf, math.inf, True, unreachable, float(finite), counted, method=method, note=note)
+    return spending.signed(interval)
 
 
 # Orbits ---------------------------------------------------------------------------------------------------------------

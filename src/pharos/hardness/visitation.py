@@ -21,7 +21,7 @@ import scipy  # whose `sparse` is loaded where it is used
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.gaps import optimal_solution
-from pharos.hardness.interval import Interval
+from pharos.hardness.interval import Interval, fields_of, finite
 from pharos.hardness.steps import steps_of
 from pharos.kernels import occupancy as kernels
 from pharos.mdp import (
@@ -203,8 +203,8 @@ def discounted_arrivals(
     return result, left
 
 
-def support(mdp: TabularMDP, policy: TablePolicy | None = None) -> np.ndarray:
-    """Return the states that a policy may be in at some step, however rarely: (S,) bool, without terminal ones.
+def support_with_ends(mdp: TabularMDP, policy: TablePolicy | None = None) -> np.ndarray:
+    """Return the states that a policy may be in at some step, however rarely, the end as one more: (S + 1,) bool.
 
     Args:
         policy: as for `occupancy`.
@@ -212,11 +212,6 @@ def support(mdp: TabularMDP, policy: TablePolicy | None = None) -> np.ndarray:
         ParameterError: the policy is wrong.
     Cost: O(S A); with transitions as a matrix that for each step to the last state that is met.
     """
-    return support_with_ends(mdp, policy)[:-1] & ~np.asarray(mdp.terminal)
-
-
-def support_with_ends(mdp: TabularMDP, policy: TablePolicy | None = None) -> np.ndarray:
-    """As `support`, with terminal states, and the end as one more: (S + 1,) bool."""
     walk = Walk(mdp, policy, 1)
     started, is_visited = walk.after_the_start()
     is_visited = (is_visited > 0).astype(np.float64)
@@ -462,12 +457,7 @@ class Covering:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
-        return {
-            "omega_max": self.omega_max,
-            "omega_sum": self.omega_sum,
-            "length_bound": self.length_bound,
-            "num_states": self.num_states,
-        }
+        return fields_of(self, "conventions")
 
     def __str__(self) -> str:
         return f"omega {self.omega_max:.6g} (sum {self.omega_sum:.6g}), length at most {self.length_bound:.6g} episodes"
@@ -542,14 +532,8 @@ class MixingTime:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; an infinite time is None."""
-        finite = math.isfinite(self.value)
-        return {
-            "value": self.value if finite else None,
-            "infinite": not finite,
-            "period": self.period,
-            "distance": self.distance,
-            **self.conventions,
-        }
+        value = {"value": finite(self.value), "infinite": math.isinf(self.value)}
+        return {**value, **fields_of(self, "value", "conventions"), **self.conventions}
 
     def __str__(self) -> str:
         if math.isfinite(self.value):

@@ -144,14 +144,6 @@ def bound_eccentricities(from_pivot, to_pivot, out_pivot, in_pivot, out_lower, o
 
 @interpreted_first()
 @njit(cache=True, nogil=True)
-def raise_lower(distance, lower):
-    """lower[v] = max(lower[v], distance[v])."""
-    for v in range(len(lower)):
-        lower[v] = max(lower[v], distance[v])
-
-
-@interpreted_first()
-@njit(cache=True, nogil=True)
 def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
     """Whose eccentricity may exceed `best`, and where to search next.
 

@@ -171,12 +171,7 @@ class Chance:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
-        return {
-            "chosen": self.chosen,
-            "previous": self.previous,
-            "uniform": self.uniform,
-            "first_chosen": self.first_chosen,
-        }
+        return dict(vars(self))
 
 
 @dataclass(frozen=True)

@@ -291,7 +291,7 @@ class Dynamics(ABC):
         """(S, A) bool: whether executing an action may lead to a state."""
         indicator = np.zeros(self.num_states + 1)
         indicator[state] = 1.0
-        return self.largest(indicator) > 0
+        return self.expected(indicator) > 0
 
     def reachable(self, starts: np.ndarray, steps: int | None = None) -> np.ndarray:
         """(S,) bool: the states that can be met within `steps` steps (None: any number) from the start states."""
@@ -377,11 +377,6 @@ class Dynamics(ABC):
             raise ParameterError(
                 f"age: state {s}, of age {age[s]}, leads by action {a} to state {t}, of age {age[t]}; expected more"
             )
-
-    def longest_path(self, live: np.ndarray) -> int:
-        """The number of steps of the longest way through live states (S,) bool; -1 where one can be visited again."""
-        order = self.order(live)
-        return -1 if order is None else order.longest
 
     def matrix(self, live: np.ndarray | None = None) -> "csr_matrix":
         """(S A, S + 1): the probabilities of all outcomes, row s A + a, column S for the end.

@@ -331,7 +331,15 @@ class TabularMDP:
         Which actions can be executed after which, chance says: where every action is a repetition, those of the first
         step go on. Start states without a previous action are not among them.
         """
-        return pairs_within(self, steps)
+        reached = now = np.zeros((self.num_states, self.num_actions), np.bool_)
+        if self.chance.executes_any:
+            return reached if steps == 0 else self._arrivals(self.states_within(None if steps is None else steps - 1))
+        lone, level = np.zeros(self.num_states, np.bool_), 0
+        lone[self.starts] = True
+        while (lone.any() or now.any()) and (steps is None or level < steps):
+            now = self.nodes_after(now, lone) & ~reached
+            reached, lone, level = reached | now, np.zeros_like(lone), level + 1
+        return reached
 
     def nodes_within(self, steps: int | None = None) -> np.ndarray:
         """(S, W) bool: what values belong to and can be met within `steps` steps from a start: `pairs_within` under
@@ -340,7 +348,18 @@ class TabularMDP:
 
     def nodes_after(self, nodes: np.ndarray, lone: np.ndarray) -> np.ndarray:
         """(S, W) bool: the nodes that can be met one step after these (S, W), or after starts (S,) with no action."""
-        return nodes_after(self, nodes, lone)
+        if nodes.shape[1] < self.num_actions or self.chance.executes_any:
+            after = self._arrivals(nodes.any(axis=1) | lone)
+            return after if nodes.shape[1] == self.num_actions else np.asarray(after.any(axis=1, keepdims=True))
+        states, actions = np.nonzero(nodes & ~np.asarray(self.terminal)[:, None])  # every action is a repetition
+        outcomes = self.dynamics.outcomes(states, actions)
+        after = np.vstack([self._arrivals(lone), np.zeros_like(nodes[:1])])
+        after[outcomes.states, actions[outcomes.which]] = True
+        return after[:-1]
+
+    def _arrivals(self, is_met: np.ndarray) -> np.ndarray:
+        """(S, A) bool: the pairs (state, executed action) one step after some states (S,) bool."""
+        return self.dynamics.arrivals(np.flatnonzero(is_met & ~np.asarray(self.terminal)))
 
     @property
     def lone_starts(self) -> np.ndarray:
@@ -443,39 +462,6 @@ class TabularMDP:
 
 def _as_is(rewards: Rewards) -> Rewards:
     return rewards
-
-
-# Reachable ------------------------------------------------------------------------------------------------------------
-
-
-def pairs_within(mdp: "TabularMDP", steps: int | None) -> np.ndarray:
-    """(S, A) bool: what `TabularMDP.pairs_within` says."""
-    reached = now = np.zeros((mdp.num_states, mdp.num_actions), np.bool_)
-    if mdp.chance.executes_any:
-        return reached if steps == 0 else _arrivals(mdp, mdp.states_within(None if steps is None else steps - 1))
-    lone, level = np.zeros(mdp.num_states, np.bool_), 0
-    lone[mdp.starts] = True
-    while (lone.any() or now.any()) and (steps is None or level < steps):
-        now = nodes_after(mdp, now, lone) & ~reached
-        reached, lone, level = reached | now, np.zeros_like(lone), level + 1
-    return reached
-
-
-def nodes_after(mdp: "TabularMDP", nodes: np.ndarray, lone: np.ndarray) -> np.ndarray:
-    """(S, W) bool: the nodes that can be met one step after these (S, W), or after starts (S,) with no action."""
-    if nodes.shape[1] < mdp.num_actions or mdp.chance.executes_any:
-        after = _arrivals(mdp, nodes.any(axis=1) | lone)
-        return after if nodes.shape[1] == mdp.num_actions else np.asarray(after.any(axis=1, keepdims=True))
-    states, actions = np.nonzero(nodes & ~np.asarray(mdp.terminal)[:, None])  # every action is a repetition
-    outcomes = mdp.dynamics.outcomes(states, actions)
-    after = np.vstack([_arrivals(mdp, lone), np.zeros_like(nodes[:1])])
-    after[outcomes.states, actions[outcomes.which]] = True
-    return after[:-1]
-
-
-def _arrivals(mdp: "TabularMDP", is_met: np.ndarray) -> np.ndarray:
-    """(S, A) bool: the pairs (state, executed action) one step after some states (S,) bool."""
-    return mdp.dynamics.arrivals(np.flatnonzero(is_met & ~np.asarray(mdp.terminal)))
 
 
 def restricted_to(mdp: "TabularMDP", states: np.ndarray) -> "TabularMDP":

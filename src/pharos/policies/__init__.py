@@ -28,12 +28,10 @@ from pharos.policies.value import (
 )
 
 __all__ = [
-    "Evaluation",
-    "Policy",
     "evaluate_policy",
 ]
 _shared = """
-    DeepPolicy Model PolicyAnswers PolicyLike QueriedPolicy ReachableRows ReachedSolution RecurrentPolicy Sight
-    TableAnswers TabularAgent deep_policy is_small_table is_walk policy_function policy_value reachable_rows
-    table_values walk_values
+    DeepPolicy Evaluation Model Policy PolicyAnswers PolicyLike QueriedPolicy ReachableRows ReachedSolution
+    RecurrentPolicy Sight TableAnswers TabularAgent deep_policy is_small_table is_walk policy_function policy_value
+    reachable_rows table_values walk_values
 """

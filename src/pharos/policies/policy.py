@@ -333,23 +333,35 @@ class QueriedPolicy:
 
     def reach(self, max_rows: int | None = None, steps: int | None = None) -> bool:
         """Ask the policy in all rows that it reaches within `steps`, level by level; False beyond `max_rows` rows."""
-        mdp, width = self.mdp, self.width
-        frontier = np.unique(self.start_rows())
-        level = 0
+        mdp, frontier, level = self.mdp, self._start_nodes(), 0
         while frontier.size and (steps is None or level < steps):
             level += 1
-            probabilities = self.of(frontier)
+            rows, states, previous = self._parts(frontier)
+            probabilities = self.of(rows)
             if max_rows is not None and len(self.rows) > max_rows:
                 return False
-            states, previous = np.divmod(frontier, width)
-            weights = mdp.chance.weights(probabilities, previous if self.by_pairs else None)
+            weights = mdp.chance.weights(probabilities, previous)
             which, actions = np.nonzero(weights > 0)
             outcomes = mdp.dynamics.outcomes(states[which], actions)
             live = outcomes.states < mdp.num_states
             live[live] = ~np.asarray(mdp.terminal)[outcomes.states[live]]
-            rows = np.unique(self._arrivals(outcomes.states[live], actions[outcomes.which[live]]))
-            frontier = rows[self.index(rows) < 0]
+            origin = outcomes.which[live]
+            frontier = self._unmet(rows[which[origin]], actions[origin], outcomes.states[live])
         return True
+
+    # Nodes: what is met, with all that decides what may come after: rows here.
+
+    def _start_nodes(self) -> np.ndarray:
+        return np.unique(self.start_rows())
+
+    def _parts(self, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(rows, states, previous actions) of nodes."""
+        return (nodes, *np.divmod(nodes, self.width))
+
+    def _unmet(self, rows: np.ndarray, executed: np.ndarray, next_states: np.ndarray) -> np.ndarray:
+        """The nodes, not met before, that executing actions in rows leads to."""
+        rows = np.unique(self.next_rows(rows, executed, next_states))
+        return rows[self.index(rows) < 0]
 
     def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
         """Query the policy in all rows of `reach` at once; return whether these are all.

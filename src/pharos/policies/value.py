@@ -78,28 +78,23 @@ class QueriedHistories(PolicyAnswers):
     def states_of(self, rows: np.ndarray) -> np.ndarray:
         return np.array([self._histories[row][-1] for row in rows], np.int64)
 
-    def reach(self, max_rows: int | None = None, steps: int | None = None) -> bool:
-        """See `QueriedPolicy.reach`; under sticky actions a history is visited once with each previous action."""
-        mdp, width = self.mdp, self.mdp.policy_width
-        frontier = np.unique(self.start_rows()) * width + (width - 1)
-        visited, level = set(frontier.tolist()), 0
-        while frontier.size and (steps is None or level < steps):
-            level += 1
-            rows, previous = np.divmod(frontier, width)
-            probabilities = self.of(rows)
-            if max_rows is not None and len(self.rows) > max_rows:
-                return False
-            weights = mdp.chance.weights(probabilities, previous)
-            which, actions = np.nonzero(weights > 0)
-            outcomes = mdp.dynamics.outcomes(self.states_of(rows[which]), actions)
-            live = outcomes.states < mdp.num_states
-            live[live] = ~np.asarray(mdp.terminal)[outcomes.states[live]]
-            origin = outcomes.which[live]
-            after = self.next_rows(rows[which[origin]], actions[origin], outcomes.states[live])
-            pairs = np.unique(after * width + (actions[origin] if width > 1 else 0))
-            frontier = np.array([pair for pair in pairs.tolist() if pair not in visited], np.int64)
-            visited.update(frontier.tolist())
-        return True
+    def _start_nodes(self) -> np.ndarray:
+        """Pairs of a row and the previous action: under sticky actions a history is met once with each of them."""
+        width = self.mdp.policy_width
+        nodes = np.unique(self.start_rows()) * width + (width - 1)
+        self._met = set(nodes.tolist())
+        return nodes
+
+    def _parts(self, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rows, previous = np.divmod(nodes, self.mdp.policy_width)
+        return rows, self.states_of(rows), previous
+
+    def _unmet(self, rows: np.ndarray, executed: np.ndarray, next_states: np.ndarray) -> np.ndarray:
+        width = self.mdp.policy_width
+        after = self.next_rows(rows, executed, next_states) * width + (executed if width > 1 else 0)
+        nodes = np.array([node for node in np.unique(after).tolist() if node not in self._met], np.int64)
+        self._met.update(nodes.tolist())
+        return nodes
 
     def reached_mdp(self) -> tuple[TabularMDP, np.ndarray]:
         """The MDP on the histories that are reached, and the policy on it."""

@@ -16,8 +16,8 @@ __all__ = [
     "evaluate_policy",
     "uniform_value",
     "value_iteration",
-    "worst_value",
 ]
 _shared = """
     ReferenceValues TablePolicy cumulative_expected_regret evaluate_apart regret regret_scale uniform_policy
+    worst_value
 """
