@@ -6,8 +6,7 @@ lists; in the first, three of them were repeated.
 """
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 from pharos.benchmark.repetition import SUFFIX, Audit
@@ -15,7 +14,7 @@ from pharos.benchmark.scores import score
 from pharos.benchmark.submission import Submission, SubmissionVerdict, Tell, verify
 from pharos.benchmark.suite import Suite
 from pharos.errors import ParameterError
-from pharos.leaderboard import Cell, Ranking, reason, write_page
+from pharos.leaderboard import Board, Cell, Ranking, write_page
 
 COLUMNS = (
     *(("rank", "n"), ("agent", "s"), ("author", "s"), ("form", "s"), ("core", "n"), ("interval", "s"), ("final", "n")),
@@ -29,18 +28,7 @@ INTRODUCTION = (
 )
 AUDITED, CLAIMED = "Audited", "Claimed"
 
-
-@dataclass(frozen=True)
-class BenchmarkBoard:
-    """What was made of submissions.
-
-    Attributes:
-        file: the page. verified: submissions that hold. refused: name of each other file -> why.
-    """
-
-    file: Path
-    verified: tuple[SubmissionVerdict, ...]
-    refused: Mapping[str, str]
+Judged = tuple[SubmissionVerdict, Audit | None, Suite]
 
 
 def benchmark_board(
@@ -50,7 +38,7 @@ def benchmark_board(
     *,
     title: str = "Benchmark",
     progress: Tell | None = None,
-) -> BenchmarkBoard:
+) -> Board[SubmissionVerdict]:
     """Verify submissions, and write a page with two lists of each suite: audited, and claimed.
 
     Args:
@@ -66,30 +54,26 @@ def benchmark_board(
     if not files:
         raise ParameterError("a board has no files; expected submissions of `pharos benchmark submit`")
     by_digest = {suite.digest: suite for suite in suites}
-    verdicts: list[tuple[SubmissionVerdict, Audit | None, Suite]] = []
-    refused: dict[str, str] = {}
-    for place, file in enumerate(map(Path, files)):
-        if progress is not None:
-            progress(place, len(files), file.name)
-        try:
-            verdict, suite = _verified(file, by_digest)
-            audit = audit_of(verdict)
-            score(verdict.submission.results, suite)  # or why there is none
-        except Exception as error:  # whatever is wrong with it: one row of many
-            refused[file.name] = reason(error).removeprefix(f"{file}: ")
-            continue
-        if verdict.holds:
-            verdicts.append((verdict, audit, suite))
-        else:
-            wrong = [f"{each.name}: regret {each.found:.6g}, claimed {each.claimed:.6g}" for each in verdict.wrong]
-            refused[file.name] = "; ".join((*(f"{name}: {why}" for name, why in verdict.refused.items()), *wrong))[:400]
+    made = Board[Judged](Path(out))
+
+    def judged(file: Path) -> tuple[Judged, str]:
+        verdict, suite = _verified(file, by_digest)
+        audit = audit_of(verdict)
+        score(verdict.submission.results, suite)  # or why there is none
+        wrong = [f"{each.name}: regret {each.found:.6g}, claimed {each.claimed:.6g}" for each in verdict.wrong]
+        said = "; ".join((*(f"{name}: {why}" for name, why in verdict.refused.items()), *wrong))[:400]
+        return (verdict, audit, suite), said
+
+    made.judge([(Path(file).name, Path(file)) for file in files], judged, progress)
     rankings = [
-        Ranking(f"{suite.name}: {kind.lower()}", f"Digest of the suite: {suite.digest}", _rows(verdicts, suite, kind))
+        Ranking(
+            f"{suite.name}: {kind.lower()}", f"Digest of the suite: {suite.digest}", _rows(made.verified, suite, kind)
+        )
         for suite in suites
         for kind in (AUDITED, CLAIMED)
     ]
-    write_page(out, title, rankings, COLUMNS, refused, len(verdicts), introduction=INTRODUCTION)
-    return BenchmarkBoard(Path(out), tuple(verdict for verdict, _, _ in verdicts), refused)
+    write_page(out, title, rankings, COLUMNS, made.refused, len(made.verified), introduction=INTRODUCTION)
+    return Board(made.file, tuple(verdict for verdict, _, _ in made.verified), made.refused)
 
 
 def audit_of(verdict: SubmissionVerdict) -> Audit | None:
@@ -106,9 +90,7 @@ def _verified(file: Path, suites: dict[str, Suite]) -> tuple[SubmissionVerdict, 
     return verify(file, suites[results.digest]), suites[results.digest]
 
 
-def _rows(
-    verdicts: Sequence[tuple[SubmissionVerdict, Audit | None, Suite]], suite: Suite, kind: str
-) -> list[list[Cell]]:
+def _rows(verdicts: Sequence[Judged], suite: Suite, kind: str) -> list[list[Cell]]:
     """Submissions of a suite in one list, the best core score first."""
     listed = [
         (score(verdict.submission.results, suite), verdict, audit)

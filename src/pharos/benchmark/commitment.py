@@ -56,17 +56,27 @@ class Commitment:
             ParameterError: there is no such file. FileFormatError: it is no commitment.
             ResultCorrupted: it was changed.
         """
-        try:
-            entry = storage.read_json(Path(file), FileFormatError, "ask for it again")
-        except FileNotFoundError:
-            raise ParameterError(f"{file}: no such file; `pharos benchmark commit` writes it") from None
-        if not isinstance(entry, dict) or entry.get("format") != FORMAT:
-            raise FileFormatError(f"{file}: is no commitment; expected a file of `pharos benchmark commit`")
+        entry = read_object(file, "commitment", "commit", "ask for it again")
         said = {name: value for name, value in entry.items() if name not in ("format", "sha256")}
         commitment = records.read(Commitment, said, f"{file}: the commitment")
         if commitment.digest != entry.get("sha256"):
             raise ResultCorrupted(f"{file}: what it says was changed after it was written; ask for it again")
         return commitment
+
+
+def read_object(file: str | os.PathLike, what: str, command: str, advice: str) -> dict[str, Any]:
+    """The entries of a file that `pharos benchmark COMMAND` wrote.
+
+    Raises:
+        ParameterError: there is no such file. FileFormatError: it is another one; `advice` says what to do.
+    """
+    try:
+        entry = storage.read_json(Path(file), FileFormatError, advice)
+    except FileNotFoundError:
+        raise ParameterError(f"{file}: no such file; `pharos benchmark {command}` writes it") from None
+    if not isinstance(entry, dict) or entry.get("format") != FORMAT:
+        raise FileFormatError(f"{file}: is no {what}; expected a file of `pharos benchmark {command}`")
+    return entry
 
 
 def make_commitment(

@@ -86,10 +86,6 @@ class Contents:
         """How many of these tasks the agent ran."""
         return sum(task.name in self.agent.score.tasks for task in tasks)
 
-    def observed(self, task: BenchmarkTask) -> Interval | None:
-        """Normalised regret of the agent on a task, clipped to [0, 1]; None where it did not run."""
-        return regret_of(self.agent, task)
-
 
 def contents_of(
     results: Source,
@@ -186,7 +182,7 @@ def listed(parts: Sequence[str]) -> str:
 
 def residuals(contents: Contents) -> list[tuple[BenchmarkTask, Interval, float]]:
     """Tasks whose regret is more than 0.2 above the predicted one, the largest first: task, observed, predicted."""
-    pairs = [(task, contents.observed(task), contents.predicted(task)) for task in contents.suite.tasks]
+    pairs = [(task, regret_of(contents.agent, task), contents.predicted(task)) for task in contents.suite.tasks]
     rows = [(task, own, expected) for task, own, expected in pairs if own is not None and expected is not None]
     rows.sort(key=lambda row: row[2] - row[1].value)
     return [row for row in rows if row[1].value - row[2] > RESIDUAL]

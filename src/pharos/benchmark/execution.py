@@ -118,7 +118,7 @@ def run(
     with storage.lock(folder, FolderLocked, "running a benchmark"):
         record = _claimed(folder, form, chosen, name or form.label)
         jobs = [Job(task, seed, folder / "runs" / task.name / f"seed-{seed}") for task in entries for seed in numbers]
-        form.train(jobs, protocol, usable_workers(workers), folder / "checkpoints", progress or _silent)
+        form.train(jobs, protocol, usable_workers(workers), folder / "checkpoints", progress or (lambda *_: None))
         return _collected(folder, form, chosen, record, jobs)
 
 
@@ -138,10 +138,6 @@ def selected(suite: Suite, tasks: str | Iterable[str] | None) -> tuple[Benchmark
         if word not in names:
             raise UnknownName(f"axis or task of suite {suite.name}", word, sorted(names))
     return tuple(task for task in suite.tasks if task.axis in words or task.name in words)
-
-
-def _silent(_done: float, _text: str) -> None:
-    """Nobody is told."""
 
 
 def _claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str, Any]:

@@ -218,7 +218,7 @@ def _plane(contents: Contents) -> Element | None:
     points = [
         (f"{task.name}: {description(task)}", table, task.predicted[name] - table, own.value)
         for task in contents.suite.tasks
-        if (own := contents.observed(task)) is not None and {"table", name} <= task.predicted.keys()
+        if (own := regret_of(contents.agent, task)) is not None and {"table", name} <= task.predicted.keys()
         for table in [task.predicted["table"]]
     ]
     if len(points) < 2:

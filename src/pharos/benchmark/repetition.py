@@ -13,23 +13,22 @@ import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pharos.agents import BATCHED
 from pharos.benchmark.agents import agent_form, sha256
+from pharos.benchmark.commitment import FORMAT, read_object
 from pharos.benchmark.execution import run
 from pharos.benchmark.results import AgentResults
 from pharos.benchmark.scores import check_suite
 from pharos.benchmark.submission import Submission, Tell, sha256_of_source
 from pharos.benchmark.suite import Suite
-from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCorrupted
+from pharos.errors import FileFormatError, PharosError, ResultCorrupted
 from pharos.system import records, storage
 from pharos.system.wording import in_one_line
 
-FORMAT = 1
 SUFFIX = ".audit.json"
 PAIRS = 3
 CONFIDENCE = 0.99
@@ -104,13 +103,8 @@ class Audit:
         Raises:
             ParameterError: there is no such file. FileFormatError: it is no audit. ResultCorrupted: it was changed.
         """
-        try:
-            entry = storage.read_json(Path(file), FileFormatError, "audit again")
-        except FileNotFoundError:
-            raise ParameterError(f"{file}: no such file; `pharos benchmark audit` writes it") from None
-        if not isinstance(entry, dict) or entry.get("format") != FORMAT or storage.DIGEST not in entry:
-            raise FileFormatError(f"{file}: is no audit; expected a file of `pharos benchmark audit`")
-        if not storage.is_intact(entry):
+        entry = read_object(file, "audit", "audit", "audit again")
+        if storage.DIGEST not in entry or not storage.is_intact(entry):
             raise ResultCorrupted(f"{file}: what it says was changed after it was written; audit again")
         said = {name: entry[name] for name in entry if name not in ("format", "holds", storage.DIGEST)}
         repeats = said.get("repeats")

@@ -25,12 +25,11 @@ from pharos.benchmark.results import AgentResults, entries_of
 from pharos.benchmark.scores import check_suite
 from pharos.benchmark.suite import BenchmarkTask, Suite, sha256_of_json
 from pharos.errors import FileFormatError, ParameterError, PharosError
-from pharos.leaderboard import Check, in_file, read_sealed, stored_table, write_sealed
+from pharos.leaderboard import Check, check_ending, in_file, read_sealed, stored_table, write_checked, write_sealed
 from pharos.system import records
 from pharos.training import Task, evaluate_agent, load_agent
 
 FORMAT = 1
-SUFFIX = ".safetensors"
 WHAT = "submission to a benchmark"
 TOLERANCE = 1e-6
 """Of normalised regret: processors round sums of values in another way."""
@@ -140,9 +139,7 @@ def submit(
         ParameterError: the folder holds no results, or of another suite; a text cannot be printed.
         FileFormatError: a run is damaged.
     """
-    folder, target = Path(folder), Path(file)
-    if target.suffix.lower() != SUFFIX:
-        raise ParameterError(f"{target}: expected a file name that ends in {SUFFIX}")
+    folder, target = Path(folder), check_ending(Path(file))
     results = AgentResults.read(folder)
     check_suite(results, suite, str(folder))
     policies: dict[tuple[str, int], np.ndarray] = {}
@@ -159,13 +156,7 @@ def submit(
             f"{folder}: is of another source or other hyperparameters than the commitment to {commitment.agent} says; "
             f"leave the commitment out, or run what was committed"
         )
-    target.parent.mkdir(parents=True, exist_ok=True)
-    made.write(target)
-    try:
-        return Submission.read(target)
-    except FileFormatError as error:
-        target.unlink()
-        raise ParameterError(str(error)) from None
+    return write_checked(target, lambda: made.write(target), lambda: Submission.read(target))
 
 
 def final_policy(run: Path, task: Task) -> np.ndarray | None:

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import math
 import os
 import re
 import shlex
@@ -15,14 +14,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 import typer
 
-from pharos.system import compiling, paths
+from pharos.system import compiling, paths, storage
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
     from pharos.environments import Environment
-    from pharos.mdp import ChanceSetting
 
 INTERRUPTED = "interrupted; finished work is kept, and the same command goes on from there"
 NOTABLE_SECONDS = 0.2  # of compiling, beside those of work
@@ -58,25 +56,16 @@ class Answer(NamedTuple):
 
 def print_json(answer: Mapping[str, Any]) -> None:
     """One JSON object on standard output; what JSON cannot say (infinity, not a number) is null."""
-    print(json.dumps(_plain(answer), allow_nan=False))
+    print(json.dumps(storage.plain(answer), default=_plain, allow_nan=False))
 
 
 def _plain(value: object) -> object:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [_plain(item) for item in value]
-    if hasattr(value, "tolist"):  # numbers and arrays of NumPy
-        return _plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, bool | int | str):
-        return value
+    """What is neither a number nor text, as JSON has it: sets and objects; text of all else."""
+    if isinstance(value, set | frozenset):
+        return storage.plain(list(value))
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _plain(dataclasses.asdict(value))
-    if hasattr(value, "to_dict"):
-        return _plain(value.to_dict())
-    return str(value)
+        return storage.plain(dataclasses.asdict(value))
+    return storage.plain(value.to_dict()) if hasattr(value, "to_dict") else str(value)
 
 
 def console(*, stderr: bool = False) -> "Console":
@@ -181,19 +170,6 @@ def print_table(
     to.print(table)
     for line in notes:
         to.print(escape(line), style="dim", soft_wrap=True)
-
-
-def describe_chance(chance: "ChanceSetting", of_the_world: bool = False) -> str:
-    """Chance in words.
-
-    Args:
-        of_the_world: whether executing an action may have several outcomes itself.
-    """
-    parts = ["of the world"] * of_the_world
-    parts += [f"{name} actions {p:g}" for name in ("sticky", "random", "lazy") if (p := getattr(chance, name))]
-    parts += [f"reward noise {chance.reward_noise:g}"] * bool(chance.reward_noise)
-    parts += [f"rewards {chance.reward_delay} steps late"] * bool(chance.reward_delay)
-    return ", ".join(parts) or "none"
 
 
 def describe_discount(gamma: float, horizon: int | None) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, compiling_fact, describe_chance, describe_discount, progress_line, termination
+from pharos.cli.answers import Answer, compiling_fact, describe_discount, progress_line, termination
 from pharos.cli.options import (
     Building,
     Chance,
@@ -108,7 +108,7 @@ def solve(
         ("uniform policy at the start", f"{uniform.value_at_start:.8g}"),
         ("error at most", f"{max(solution.error_bound, uniform.error_bound):.2g}"),
         ("discount", describe_discount(solution.gamma, solution.horizon)),
-        ("chance", describe_chance(chance, mdp.dynamics.has_chance)),
+        ("chance", chance.in_words(mdp.dynamics.has_chance)),
         ("states", f"{mdp.num_states:,} x {many(mdp.num_actions, 'action')}"),
         ("sweeps", f"{solution.sweeps} in {solution.seconds:.2f} s"),
         *compiling_fact(),
@@ -231,7 +231,7 @@ def evaluate(
         ("error at most", f"{max(each.error_bound for each in every):.2g}{_estimated(worth)}{rounding}"),
         *([] if source == "given" else [("setting", source)]),
         ("discount", describe_discount(mdp.gamma, mdp.horizon)),
-        ("chance", describe_chance(chance, mdp.dynamics.has_chance)),
+        ("chance", chance.in_words(mdp.dynamics.has_chance)),
     ]
     return Answer(answer, (f"{policy} policy on {target.title}", facts))
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, compiling_fact, complain, describe_chance, print_table, progress_line
+from pharos.cli.answers import Answer, compiling_fact, complain, print_table, progress_line
 from pharos.cli.options import Building, Chance, Count, Discount, Seconds, Target, file_ending, parse_parameters
 from pharos.errors import ParameterError
 from pharos.system import compiling
@@ -111,7 +111,7 @@ def hardness(
         )
 
     def table() -> None:
-        _print(target.title, report, describe_chance(chance, mdp.dynamics.has_chance), definitions)
+        _print(target.title, report, chance.in_words(mdp.dynamics.has_chance), definitions)
 
     answer = {**report.to_dict(), "compiling_seconds": compiling.seconds()}
     return Answer(answer, report.to_latex() if latex else table)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pharos.cli.answers import Answer, describe_chance, print_table, progress_bar, progress_line
+from pharos.cli.answers import Answer, print_table, progress_bar, progress_line
 from pharos.cli.options import Building, Gamma, Seconds, Target, discount
 from pharos.errors import ParameterError
 from pharos.mdp import ChanceSetting
@@ -166,7 +166,7 @@ def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]], price
             "states that share one: terminal states count like others; where one acts: those that share one with "
             "another state, neither of them terminal",
             f"loses: optimal value at the start less that of the best deterministic policy without memory, discount "
-            f"{price.gamma:g}, chance: {describe_chance(price.chance, space.has_chance)}",
+            f"{price.gamma:g}, chance: {price.chance.in_words(space.has_chance)}",
         ],
     )
 

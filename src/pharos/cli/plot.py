@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from pharos.cli.answers import Answer, complain, describe_chance, print_json, progress_line
+from pharos.cli.answers import Answer, complain, print_json, progress_line
 from pharos.cli.command import Commands
 from pharos.cli.evaluate import POLICIES, read_policy, solution_of
 from pharos.cli.options import (
@@ -81,7 +81,7 @@ def value(
     solution = solution_of(mdp, policy, decisions, 1e-6)
     title = f"{target.title}, {policy if policy in POLICIES else Path(policy).name}"
     if chance:
-        title += f", {describe_chance(chance)}"
+        title += f", {chance.in_words()}"
     facts = {"policy": policy, "value_at_start": solution.value_at_start, "gamma": mdp.gamma, "horizon": mdp.horizon}
     if fixed:
         title += f", {' '.join(f'{name}={value}' for name, value in fixed.items())}"

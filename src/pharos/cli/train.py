@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, compiling_fact, complain, describe_chance, progress_bar
+from pharos.cli.answers import Answer, compiling_fact, complain, progress_bar
 from pharos.cli.options import Count, Discount, Seed, Target, parse_seeds, parse_value
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.system import compiling
@@ -93,7 +93,7 @@ def train(
         "folder": out,
         "plot": picture,
     }
-    facts = _facts(result, training.steps, describe_chance(training.chance, env.has_chance))
+    facts = _facts(result, training.steps, training.chance.in_words(env.has_chance))
     if out is not None:
         facts += [("results", out), *([("plot", picture)] if picture else [])]
     return Answer(answer, (f"{title}, {result.config['observation']}", facts))

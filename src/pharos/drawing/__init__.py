@@ -15,7 +15,10 @@ if TYPE_CHECKING:
         Window,
         check_state,
         colored_text,
+        empty_grid,
+        enlarged,
         episode,
+        fitting_cell,
         ground_of,
         human,
         image,
@@ -37,8 +40,8 @@ __all__ = [
     "text_drawing",
 ]
 _shared = """
-    INK NIGHT Window check_state color_of colored_text glyph_of ground_of inside planes_of save_gif save_png scenery_of
-    shade shape_of sprite_of sprite_pixels tile
+    INK NIGHT Window check_state color_of colored_text empty_grid enlarged fitting_cell glyph_of ground_of inside
+    planes_of save_gif save_png scenery_of shade shape_of sprite_of sprite_pixels tile
 """
 
 __getattr__ = lazy.attributes(__name__)

@@ -111,21 +111,26 @@ def human(env: Environment, state: Sequence[int], *, cell: int | None = None) ->
     """
     planes = planes_of(env, state)
     if (own := env.picture(state)) is not None:
-        return _enlarged(own, LEAST_PICTURE)
-    _, rows, columns = planes.shape
-    cell = cell or _fitting_cell(rows, columns)
-    margin = cell // 2
-    canvas = np.empty((rows * cell + 2 * margin, columns * cell + 2 * margin, 3), np.float64)
-    canvas[:] = NIGHT
-    margins = (margin, margin, margin, margin)
-    ground_of(env.look.ground)(canvas, (cell, cell), margins)
-    court = inside(canvas, margins)
+        return enlarged(own, LEAST_PICTURE)
+    cell = cell or fitting_cell(planes.shape[1], planes.shape[2], HEIGHT, WIDTH)
+    canvas = empty_grid(env, cell)
+    court = inside(canvas, (cell // 2,) * 4)
     for plane, (name, layer) in zip(planes, env.layers.items(), strict=True):
         for row, column in np.argwhere(plane):
             thing = tile(name, layer, int(plane[row, column]), cell)
             place = court[row * cell : (row + 1) * cell, column * cell : (column + 1) * cell]
             place += (thing[..., :3] - place) * thing[..., 3:]
     return np.rint(canvas).astype(np.uint8)
+
+
+def empty_grid(env: Environment, cell: int) -> np.ndarray:
+    """(H, W, 3) float64: the ground of an environment, without things, within margins of half a cell."""
+    rows, columns = env.grid()
+    margin = cell // 2
+    canvas = np.empty((rows * cell + 2 * margin, columns * cell + 2 * margin, 3), np.float64)
+    canvas[:] = NIGHT
+    ground_of(env.look.ground)(canvas, (cell, cell), (margin,) * 4)
+    return canvas
 
 
 # Pictures -> files ----------------------------------------------------------------------------------------------------
@@ -150,7 +155,7 @@ def save_png(path: str | os.PathLike, picture: np.ndarray, *, caption: str = "",
     """Write a picture as PNG; small ones are enlarged by a whole factor to `at_least` pixels on their longer side."""
     path = Path(path)
     with storage.replacing(path) as file:
-        image(_enlarged(picture, at_least), caption).save(file, format="PNG", optimize=True)
+        image(enlarged(picture, at_least), caption).save(file, format="PNG", optimize=True)
     return path
 
 
@@ -167,7 +172,7 @@ def save_gif(
 
     path = Path(path)
     lines = captions or [""] * len(pictures)
-    frames = [image(_enlarged(picture, at_least), line) for picture, line in zip(pictures, lines, strict=True)]
+    frames = [image(enlarged(picture, at_least), line) for picture, line in zip(pictures, lines, strict=True)]
     samples = frames[:: max(1, len(frames) // 8)][:8] + frames[-1:]
     montage = Image.new("RGB", (frames[0].width, frames[0].height * len(samples)))
     for i, frame in enumerate(samples):
@@ -181,13 +186,15 @@ def save_gif(
     return path
 
 
-def _enlarged(picture: np.ndarray, at_least: int) -> np.ndarray:
+def enlarged(picture: np.ndarray, at_least: int) -> np.ndarray:
+    """A picture by a whole factor so large that its longer side has `at_least` pixels."""
     factor = max(1, -(-at_least // max(picture.shape[:2])))
     return picture.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
-def _fitting_cell(rows: int, columns: int) -> int:
-    fits = [cell for cell in CELLS if (rows + 1) * cell <= HEIGHT and (columns + 1) * cell <= WIDTH]
+def fitting_cell(rows: int, columns: int, height: int, width: int) -> int:
+    """Pixels of a cell, the most with which a grid and its margins fit; CELLS[0] where none does."""
+    fits = [cell for cell in CELLS if (rows + 1) * cell <= height and (columns + 1) * cell <= width]
     return fits[-1] if fits else CELLS[0]
 
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         class_of,
         classes,
         imported,
+        instance_name,
         list_environments,
         make,
         named_instances,
@@ -105,8 +106,8 @@ __all__ = [
 ]
 _shared = """
     BUILT_IN BuiltIn CELL CELLS Color Components Ground Kind Margin Parameter Shape Sprite VALUED_CELLS as_tuples
-    class_called class_of declared_parameters imported integers named_instances on_registration one_of source_of
-    start_distribution
+    class_called class_of declared_parameters imported instance_name integers named_instances on_registration one_of
+    source_of start_distribution
 """
 
 __getattr__ = lazy.attributes(__name__)

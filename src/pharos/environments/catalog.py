@@ -4,6 +4,7 @@ The built-in classes are listed in built_in.py, and a class is loaded when it is
 joins the catalogue with `register`.
 """
 
+import contextlib
 import dataclasses
 import importlib
 import os
@@ -95,6 +96,21 @@ def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:
         for name, cls in classes().items()
         for instance, parameters in cls.instances.items()
     }
+
+
+def instance_name(environment: str, parameters: Mapping[str, Any]) -> str:
+    """`frozen_lake/8x8` where an instance of the class has these parameters, else the class and what differs from its
+    defaults; of a class that is not loaded, with all of them.
+    """
+    cls, setting = class_called(environment), {name: as_tuples(value) for name, value in parameters.items()}
+    usual: Mapping[str, Any] = dict.fromkeys(setting)
+    if cls is not None:
+        for name in cls.instances:
+            if make(f"{environment}/{name}").parameters == setting:
+                return f"{environment}/{name}"
+        with contextlib.suppress(TypeError):  # a parameter has no default
+            usual = cls().parameters
+    return " ".join([environment, *(f"{name}={value}" for name, value in setting.items() if value != usual.get(name))])
 
 
 def imported(path: str, folder: str | os.PathLike | None = None) -> type[Environment]:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.drawing import NIGHT, ground_of, image, planes_of, tile
+from pharos.drawing import empty_grid, fitting_cell, image, planes_of, tile
 from pharos.environments import Environment, Layer, State
 from pharos.errors import ParameterError
 from pharos.explorer.keys import keys_of
@@ -440,8 +440,7 @@ def number(value: float | np.floating) -> float | None:
 # Picture --------------------------------------------------------------------------------------------------------------
 
 
-CELLS = (8, 16, 24, 32, 48, 64)  # pixels of a cell
-LONGEST = 720  # pixels of the longer side of a drawing, where cells are not smaller than CELLS[0] for it
+LONGEST = 720  # pixels of the longer side of a drawing, where cells are not the smallest for it
 
 
 class Pictures:
@@ -489,12 +488,7 @@ def kit_of(env: Environment) -> dict[str, Any]:
         `layers`, their names.
     """
     rows, columns = env.grid()
-    fits = [cell for cell in CELLS if (max(rows, columns) + 1) * cell <= LONGEST]
-    cell = fits[-1] if fits else CELLS[0]
-    margin = cell // 2
-    canvas = np.empty((rows * cell + 2 * margin, columns * cell + 2 * margin, 3), np.float64)
-    canvas[:] = NIGHT
-    ground_of(env.look.ground)(canvas, (cell, cell), (margin,) * 4)
+    cell = fitting_cell(rows, columns, LONGEST, LONGEST)
     tiles = [
         [url_of(tile(name, layer, value + 1, cell) * (1, 1, 1, 255)) for value in range(num_kinds(layer))]
         for name, layer in env.layers.items()
@@ -503,8 +497,8 @@ def kit_of(env: Environment) -> dict[str, Any]:
         "rows": rows,
         "columns": columns,
         "cell": cell,
-        "margin": margin,
-        "ground": url_of(canvas),
+        "margin": cell // 2,
+        "ground": url_of(empty_grid(env, cell)),
         "tiles": tiles,
         "layers": list(env.layers),
     }

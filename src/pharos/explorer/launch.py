@@ -361,7 +361,7 @@ def exploration_of(
         space=space,
         learnt=learnt,
         title=title,
-        chance=described(chance, mdp),
+        chance=chance.in_words(mdp.dynamics.has_chance),
         progress=progress,
     )
 
@@ -394,7 +394,7 @@ def _of_run(
     space = task.space
     mdp = task.chance.of(space.mdp(gamma=GAMMA if gamma is None else gamma))
     title = title or _title(task.env)
-    setting = described(task.chance, mdp)
+    setting = task.chance.in_words(mdp.dynamics.has_chance)
     return Exploration(mdp, env=task.env, space=space, learnt=learnt, title=title, chance=setting, progress=progress)
 
 
@@ -407,13 +407,6 @@ def _facts(record: Mapping[str, Any], task: Task) -> dict[str, str]:
         if isinstance(result.get(name), int | float):
             facts[f"{word} there"] = f"{result[name]:.6g}"
     return facts
-
-
-def described(chance: ChanceSetting, mdp: TabularMDP) -> str:
-    """Chance in words; "none" where there is none."""
-    parts = ["of the world"] * mdp.dynamics.has_chance
-    parts += [f"{kind} actions {p:g}" for kind in ("sticky", "random", "lazy") if (p := getattr(chance, kind))]
-    return ", ".join(parts) or "none"
 
 
 def _title(env: Environment) -> str:

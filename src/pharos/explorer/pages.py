@@ -253,7 +253,7 @@ def contents(world: Exploration) -> dict[str, Any]:
         for state in range(mdp.num_states)
         for previous in before
     }
-    fields = {name: [_plain(value) for value in quantity(world, name, states)] for name in quantities(world)}
+    fields = {name: [number(value) for value in quantity(world, name, states)] for name in quantities(world)}
     wrong = {name: world.wrong(name) for name in world.policies}
     return _shortened({"about": world.about(), "positions": positions, "fields": fields, "wrong": wrong})
 
@@ -288,10 +288,6 @@ def write(world: Exploration, path: str | os.PathLike) -> Path:
 
 def _place(state: int, previous: int | None) -> str:
     return f"{state}" if previous is None else f"{state},{previous}"
-
-
-def _plain(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _shortened(data: object) -> Any:

@@ -4,12 +4,14 @@ from pharos.leaderboard.board import Board, Cell, Ranking, board, reason, write_
 from pharos.leaderboard.entry import (
     Claim,
     Entry,
+    check_ending,
     check_values,
     in_file,
     read,
     read_sealed,
     stored_table,
     submit,
+    write_checked,
     write_sealed,
 )
 from pharos.leaderboard.verification import Check, Verdict, verify
@@ -22,5 +24,6 @@ __all__ = [
     "verify",
 ]
 _shared = """
-    Board Cell Check Claim Entry Ranking check_values in_file read_sealed reason stored_table write_page write_sealed
+    Board Cell Check Claim Entry Ranking check_ending check_values in_file read_sealed reason stored_table write_checked
+    write_page write_sealed
 """

@@ -11,31 +11,23 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
-from pharos.environments import Environment, make
-from pharos.errors import ParameterError, PharosError
+from pharos.environments import instance_name
+from pharos.errors import ParameterError
 from pharos.leaderboard.entry import SUFFIX, Entry
-from pharos.leaderboard.verification import (
-    MAX_HORIZON,
-    MAX_SECONDS,
-    MAX_STATES,
-    REACHED,
-    TOLERANCE,
-    Verdict,
-    task_key,
-    verify,
-)
+from pharos.leaderboard.verification import Verdict, task_key, verify
 from pharos.observations import title as observation_title
 from pharos.system import storage
-from pharos.system.wording import in_words, templates
+from pharos.system.wording import in_one_line, in_words, templates
 from pharos.training import TaskValues
 
 if TYPE_CHECKING:
     from jinja2 import Template
 
+T = TypeVar("T")
 LONGEST_REASON = 400
 
 Progress = Callable[[int, int, str], None]
@@ -60,18 +52,39 @@ class Ranking:
 
 
 @dataclass
-class Board:
-    """What was made of a folder.
+class Board(Generic[T]):
+    """What was made of files.
 
     Attributes:
         file: the page.
-        verified: entries whose claim holds.
+        verified: verdicts on those whose claim holds.
         refused: name of each other file -> why.
     """
 
     file: Path
-    verified: list[Verdict] = field(default_factory=list)
+    verified: Sequence[T] = ()
     refused: dict[str, str] = field(default_factory=dict)
+
+    def judge(
+        self, files: Sequence[tuple[str, Path]], judged: Callable[[Path], tuple[T, str]], progress: Progress | None
+    ) -> None:
+        """Verify files, by name and path.
+
+        Args:
+            judged: gives the verdict on a file, and why it does not hold; "" where it does.
+        """
+        for k, (name, path) in enumerate(files):
+            if progress is not None:
+                progress(k, len(files), name)
+            try:
+                verdict, objection = judged(path)
+            except Exception as error:  # whatever is wrong with it, and whatever pharos lacks for it: one row of many
+                self.refused[name] = reason(error).removeprefix(f"{path}: ")
+                continue
+            if objection:
+                self.refused[name] = objection
+            else:
+                self.verified = (*self.verified, verdict)
 
 
 COLUMNS = (
@@ -95,22 +108,17 @@ def board(
     out: str | os.PathLike,
     *,
     title: str = "Leaderboard",
-    trust: bool = False,
-    tolerance: float = TOLERANCE,
-    max_states: int = MAX_STATES,
-    max_reached: int = REACHED,
-    max_horizon: int = MAX_HORIZON,
-    max_seconds: float = MAX_SECONDS,
     progress: Progress | None = None,
-) -> Board:
+    **options: Any,
+) -> Board[Verdict]:
     """Verify every entry in a folder, and write a page that ranks them; entries of one task share its solution.
 
     Args:
         folder: entries, *.safetensors, in it and below.
         out: the page, one self-contained file of HTML.
         title: of the page.
-        trust, tolerance, max_states, max_reached, max_horizon, max_seconds: as for `verify`, for each entry.
         progress: called with how many entries are done, how many there are, and the next one.
+        options: trust, tolerance, max_states, max_reached, max_horizon, max_seconds, as for `verify`, for each entry.
     Returns:
         What holds and what was refused; those refused stand at the end of the page, with the reason.
     Raises:
@@ -121,29 +129,13 @@ def board(
     if not files:
         raise ParameterError(f"{place}: expected a folder with entries, *{SUFFIX}; `pharos submit RUN` makes one")
     _template()  # or what is missing for it is told before anything is verified
-    made, values = Board(Path(out)), dict[str, TaskValues]()
-    for k, path in enumerate(files):
-        name = path.relative_to(place).as_posix()
-        if progress is not None:
-            progress(k, len(files), name)
-        try:
-            verdict = verify(
-                path,
-                trust=trust,
-                tolerance=tolerance,
-                max_states=max_states,
-                max_reached=max_reached,
-                max_horizon=max_horizon,
-                max_seconds=max_seconds,
-                values=values,
-            )
-        except Exception as error:  # whatever is wrong with it, and whatever pharos lacks for it: one row of many
-            made.refused[name] = reason(error).removeprefix(f"{path}: ")
-            continue
-        if verdict.holds:
-            made.verified.append(verdict)
-        else:
-            made.refused[name] = why_not(verdict)
+    made, values = Board[Verdict](Path(out)), dict[str, TaskValues]()
+
+    def judged(path: Path) -> tuple[Verdict, str]:
+        verdict = verify(path, values=values, **options)
+        return verdict, "" if verdict.holds else why_not(verdict)
+
+    made.judge([(path.relative_to(place).as_posix(), path) for path in files], judged, progress)
     write_page(made.file, title, _rankings(made.verified), COLUMNS, made.refused, len(made.verified))
     return made
 
@@ -158,7 +150,9 @@ def write_page(
     introduction: str = "",
 ) -> None:
     """Write the page of a board; the introduction goes in the place of the usual one."""
-    script = _script()
+    import pharos
+
+    script = (Path(__file__).parent / "templates" / "sort.js.j2").read_text(encoding="utf-8")
     text = _template().render(
         title=title,
         rankings=rankings,
@@ -166,7 +160,7 @@ def write_page(
         refused=refused,
         verified=verified,
         introduction=introduction,
-        version=_version(),
+        version=pharos.__version__,
         script=script,
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
@@ -179,9 +173,8 @@ def _template() -> "Template":
 
 
 def reason(error: Exception) -> str:
-    """An error in a line, with its kind where pharos did not raise it on purpose."""
-    text = " ".join(str(error).split())[:LONGEST_REASON]
-    return text if isinstance(error, PharosError) and text else f"{type(error).__name__}: {text}".removesuffix(": ")
+    """An error in a line of LONGEST_REASON letters."""
+    return in_one_line(error)[:LONGEST_REASON].removesuffix(": ") or type(error).__name__
 
 
 def why_not(verdict: Verdict) -> str:
@@ -212,7 +205,7 @@ def _rankings(verdicts: Sequence[Verdict]) -> list[Ranking]:
             f"V* = {first.value_optimal:.6g}, V of acting at random = {first.value_uniform:.6g}."
         )
         rows = [_row(rank, verdict, _copies(verdict.entry, group)) for rank, verdict in enumerate(group, 1)]
-        name = _name_of(config.environment, first.entry.config.parameters)
+        name = instance_name(config.environment, config.parameters)
         rankings.append(Ranking(f"{name}{'' if not config.chance else f', {config.chance}'}", setting, rows))
     return sorted(rankings, key=lambda ranking: (ranking.title, ranking.setting))
 
@@ -257,34 +250,3 @@ def _row(rank: int, verdict: Verdict, copies: str) -> list[Cell]:
 
 def _number(value: object, style: str) -> Cell:
     return Cell(format(value, style), repr(value))
-
-
-def _name_of(environment: str, parameters: object) -> str:
-    """The named instance that has these parameters, or the class with what is not its default."""
-    if ":" in environment:
-        return environment
-    try:
-        cls = type(make(environment))
-    except (PharosError, TypeError):
-        return environment
-    wanted = storage.plain(parameters)
-    for instance in cls.instances:
-        if _plain_parameters(make(f"{environment}/{instance}")) == wanted:
-            return f"{environment}/{instance}"
-    usual = _plain_parameters(make(environment))
-    words = [f"{name}={value}" for name, value in wanted.items() if usual.get(name) != value]
-    return " ".join((environment, *words))
-
-
-def _plain_parameters(env: Environment) -> dict[str, object]:
-    return storage.plain(env.parameters)
-
-
-def _version() -> str:
-    import pharos
-
-    return pharos.__version__
-
-
-def _script() -> str:
-    return (Path(__file__).parent / "templates" / "sort.js.j2").read_text(encoding="utf-8")

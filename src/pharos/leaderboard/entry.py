@@ -325,17 +325,27 @@ def submit(
         training={key: result.get(key) for key in TRAINING} | {"seconds": record.get("seconds")},
         arrays={POLICY: stored_table(run)} if config.is_tabular else _network(run),
     )
-    target = Path(f"{config.id}{SUFFIX}" if file is None else file)
+    target = check_ending(Path(f"{config.id}{SUFFIX}" if file is None else file))
+    write_checked(target, lambda: write(entry, target), lambda: read(target))
+    return target
+
+
+def check_ending(target: Path) -> Path:
+    """The file, whose name ends in SUFFIX; else ParameterError."""
     if target.suffix.lower() != SUFFIX:
         raise ParameterError(f"{target}: expected a file name that ends in {SUFFIX}")
+    return target
+
+
+def write_checked(target: Path, write: Callable[[], None], read: Callable[[], T]) -> T:
+    """What is read of a file once it is written; ParameterError, and no file, where it is one that `read` refuses."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    write(entry, target)
+    write()
     try:
-        read(target)
+        return read()
     except FileFormatError as error:
         target.unlink()
         raise ParameterError(str(error)) from None
-    return target
 
 
 def _rules_version(run: Path, record: dict[str, Any], config: RunConfig) -> int:

@@ -240,6 +240,18 @@ class ChanceSetting:
         mdp = sticky_actions(mdp, self.sticky) if self.sticky else mdp
         return random_actions(mdp, self.random) if self.random else mdp
 
+    def in_words(self, of_the_world: bool = False) -> str:
+        """`sticky actions 0.25, reward noise 0.5`, or "none".
+
+        Args:
+            of_the_world: whether executing an action may have several outcomes itself.
+        """
+        parts = ["of the world"] * of_the_world
+        parts += [f"{name} actions {p:g}" for name in ("sticky", "random", "lazy") if (p := getattr(self, name))]
+        parts += [f"reward noise {self.reward_noise:g}"] * bool(self.reward_noise)
+        parts += [f"rewards {self.reward_delay} steps late"] * bool(self.reward_delay)
+        return ", ".join(parts) or "none"
+
     def __bool__(self) -> bool:
         return any(vars(self).values())
 

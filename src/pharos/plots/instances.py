@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from pharos.drawing import NIGHT, image, save_gif
+from pharos.drawing import NIGHT, enlarged, image, save_gif
 from pharos.errors import ParameterError, UnknownName
 from pharos.interaction import GymEnv
 from pharos.observations import render as render_state
@@ -428,15 +428,10 @@ def policies(
         for label, episode in zip(agents, played, strict=True):
             state, gained = episode[min(step, len(episode) - 1)]
             over = "   over" if step >= len(episode) - 1 else ""
-            picture = _enlarged(render_state(task.env, state, observation))
+            picture = enlarged(render_state(task.env, state, observation), 200)
             parts.append(np.asarray(image(picture, f"{label}   return {gained:g}{over}")))
         frames.append(_beside(parts))
     return save_gif(path, frames, frames_per_second=frames_per_second)
-
-
-def _enlarged(picture: np.ndarray) -> np.ndarray:
-    factor = max(1, -(-200 // max(picture.shape[:2])))
-    return picture.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
 def _beside(parts: Sequence[np.ndarray]) -> np.ndarray:

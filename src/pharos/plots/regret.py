@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.agents import agent_kind
-from pharos.environments import as_tuples, class_called, make
+from pharos.environments import class_called, instance_name
 from pharos.errors import ParameterError
 from pharos.observations import title
 from pharos.plots.style import (
@@ -148,7 +148,7 @@ def _in_words(config: dict[str, Any]) -> str:
     """`Frozen lake 8x8`; of an imported MDP the name of its folder."""
     if config["environment"] == IMPORTED:
         return Path(config["parameters"]["folder"]).name
-    name, *setting = _instance(config["environment"], config["parameters"]).split(" ")
+    name, *setting = instance_name(config["environment"], config["parameters"]).split(" ")
     if class_called(config["environment"]) is not None:
         name = name.replace("_", " ").replace("/", " ")
         name = name[:1].upper() + name[1:]
@@ -159,21 +159,6 @@ def _spaced(steps: int) -> str:
     """`300 k`."""
     text = thousands(steps)
     return f"{text[:-1]} {text[-1]}" if text[-1].isalpha() else text
-
-
-def _instance(environment: str, parameters: dict[str, Any]) -> str:
-    """`frozen_lake/8x8` where the instance has a name, else the class and what differs from its defaults."""
-    cls = class_called(environment)
-    setting = as_tuples(parameters)
-    if cls is None:
-        return " ".join(
-            [environment, *(f"{name}={value}" for name, value in setting.items() if value not in (None, ()))]
-        )
-    for name in cls.instances:
-        if make(f"{environment}/{name}").parameters == setting:
-            return f"{environment}/{name}"
-    usual = cls().parameters
-    return " ".join([environment, *(f"{name}={value}" for name, value in setting.items() if value != usual.get(name))])
 
 
 def _varies(name: str, configs: list[dict[str, Any]]) -> bool:
