@@ -140,6 +140,9 @@ def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:
     print_table(title, ("", ""), ((name, str(value)) for name, value in facts))
 
 
+MANY_COLUMNS = 6  # so many leave no room for names in one line
+
+
 def print_table(
     title: str,
     columns: Sequence[str],
@@ -157,9 +160,10 @@ def print_table(
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(columns))
+    first: dict[str, Any] = {"style": "cyan", "no_wrap": len(columns) < MANY_COLUMNS}
     for number, name in enumerate(columns):
         how: dict[str, Any] = {"justify": "right"} if name.startswith(">") else {"overflow": "fold"}
-        table.add_column(escape(name.removeprefix(">")), **how | ({} if number else {"style": "cyan", "no_wrap": True}))
+        table.add_column(escape(name.removeprefix(">")), **how | ({} if number else first))
     for row in rows:
         table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in row))
     to = console()
