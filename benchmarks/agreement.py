@@ -50,7 +50,7 @@ LAKES, GRIDS = [LAKE, "frozen_lake/4x4"], [GRID, "simple_grid/4x4-decoy"]
 FREEWAYS = [freeway(1, 3), freeway(2, 3), freeway(3, 5)]
 # agent, environment, chance, observation, steps, runs of Stable-Baselines3 after a second look: 8 cells an agent
 CELLS = (
-    ("dqn", LAKE, "plain", "vector", 5000, 108),
+    ("dqn", LAKE, "plain", "vector", 5000, 216),
     ("dqn", LAKE, RANDOM, "vector", 5000, 55),
     ("dqn", GRID, STICKY, "vector", 2500, 152),
     ("dqn", GRID, "plain", "simple_image", 2500, 109),
