@@ -351,7 +351,7 @@ def test_dynamics_answer_the_same(mdp, seed):
         lambda d: d.matrix().toarray(),
         lambda d: d.restricted_to(np.unique(some)).matrix().toarray(),
         lambda d: d.sample(some, chosen, np.random.default_rng(seed)),
-        lambda d: getattr(d.order(~np.asarray(mdp.terminal)), "longest", None),
+        lambda d: getattr(d.order(~np.asarray(mdp.terminal)), "longest", -1),
         lambda d: d.components(~np.asarray(mdp.terminal), 1).order,
         lambda d: np.concatenate([np.asarray(each, float) for each in d.outcomes(some, chosen)]),
         lambda d: d.part(0, (size + 1) // 2)[0].matrix().toarray() if size > 1 else 0,
