@@ -30,6 +30,7 @@ IMAGES = ROOT / "docs" / "images"
 SEALED = STUDIES / "sealed-1"
 SMALL = ("simple_grid", "frozen_lake")
 NAMES = {"simple_grid": "grids", "frozen_lake": "lakes", "freeway": "Freeway", "breakout": "Breakout", "all": "all"}
+SAME_HARD = "DQN and PPO find the same hard"
 PRIMARY = {"dqn": "kernel_regret", "ppo": "clipped_regret_evaluated"}
 ROWS = (  # of the table of findings: in words, the finding and its class as in `study.findings`
     ("images harder for DQN: grids", "the harder observation of DQN", "simple_grid"),
@@ -52,7 +53,7 @@ ROWS = (  # of the table of findings: in words, the finding and its class as in 
         "hardness explains vectors better than images",
         "all",
     ),
-    ("DQN and PPO find the same hard (r = 0.81)", "DQN and PPO find the same hard", "all"),
+    (f"{SAME_HARD} (r = 0.81)", SAME_HARD, "all"),
 )
 
 
@@ -99,16 +100,16 @@ def found(name):
     predictors = study.specification("classes").hardness.predictors
     done, rows = runs(name), {}
     complete = done if name == "classes" else done[done["environment"].isin(SMALL)]
-    for some, chosen in ((done, False), (complete, True)):
+    for some, needs_all in ((done, False), (complete, True)):
         cells = study.cells(some, measures)
         for row in study.findings(cells, study.models(cells, measures=predictors)).to_dict("records"):
-            if (row["of"] == "all" and row["finding"] != "DQN and PPO find the same hard") == chosen:
+            if (row["of"] == "all" and row["finding"] != SAME_HARD) == needs_all:
                 rows[row["finding"], row["of"]] = row | {"runs": number_of_runs(row, some)}
     return rows
 
 
 def number_of_runs(row, done):
-    agents = {"the learner with more regret": ("dqn", "q_learning"), "DQN and PPO find the same hard": ("dqn", "ppo")}
+    agents = {"the learner with more regret": ("dqn", "q_learning"), SAME_HARD: ("dqn", "ppo")}
     used = done[done["agent"].isin(agents.get(row["finding"], ("dqn",)))]
     if row["of"] != "all":
         used = used[used["environment"] == row["of"]]

@@ -100,10 +100,10 @@ def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:
 
 def instance_name(environment: str, parameters: Mapping[str, object]) -> str:
     """`frozen_lake/8x8` where an instance of the class has these parameters, else the class and what differs from its
-    defaults; of a class that is not loaded, with all of them.
+    defaults; of a class that is not loaded, with all that say something.
     """
     cls, setting = class_called(environment), {name: as_tuples(value) for name, value in parameters.items()}
-    usual: Mapping[str, object] = dict.fromkeys(setting)
+    usual: Mapping[str, object] = {name: value for name, value in setting.items() if value in (None, ())}
     if cls is not None:
         for name in cls.instances:
             if make(f"{environment}/{name}").parameters == setting:
