@@ -140,7 +140,7 @@ def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:
     print_table(title, ("", ""), ((name, str(value)) for name, value in facts))
 
 
-MANY_COLUMNS = 6  # so many leave no room for names in one line
+LONGEST_NAME = 30  # of a first column whose names stay in one line, whatever room that leaves for others
 
 
 def print_table(
@@ -160,20 +160,22 @@ def print_table(
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(columns))
-    first: dict[str, Any] = {"style": "cyan", "no_wrap": len(columns) < MANY_COLUMNS}
+    lines = [tuple(row) for row in rows]
+    longest = max((len(line[0]) for line in lines), default=0)
+    first: dict[str, Any] = {"style": "cyan", "no_wrap": longest <= LONGEST_NAME}
     for number, name in enumerate(columns):
         how: dict[str, Any] = {"justify": "right"} if name.startswith(">") else {"overflow": "fold"}
         table.add_column(escape(name.removeprefix(">")), **how | ({} if number else first))
-    for row in rows:
-        table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in row))
+    for line in lines:
+        table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in line))
     to = console()
     if title:
         to.print(escape(title), style="bold", soft_wrap=True)
-    for line in before:
-        to.print(escape(line), style="dim", soft_wrap=True)
+    for text in before:
+        to.print(escape(text), style="dim", soft_wrap=True)
     to.print(table)
-    for line in notes:
-        to.print(escape(line), style="dim", soft_wrap=True)
+    for text in notes:
+        to.print(escape(text), style="dim", soft_wrap=True)
 
 
 def describe_discount(gamma: float, horizon: int | None) -> str:
