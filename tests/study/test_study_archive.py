@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from pathlib import Path
 
 import pandas as pd
 import pyarrow as pa
@@ -12,6 +13,7 @@ import pytest
 import fake_training
 from pharos import study
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
+from pharos.training import run_id
 
 BLOCK = {
     "environments": ["frozen_lake/4x4"],
@@ -182,6 +184,32 @@ def test_packed_studies_of_older_versions_are_read(folder, packed, tmp_path):
     place, added = study.unpack(packed, tmp_path / "other")
     assert added == 8
     same_study(place, folder)
+
+
+LARGE = Path(__file__).parents[2] / "docs" / "studies" / "classes" / "large.parquet"
+
+
+def test_a_study_packed_when_the_library_had_other_hyperparameters_is_read_with_those(tmp_path):
+    place, added = study.unpack(LARGE, tmp_path / "large")
+    status = study.status(place)
+    assert (added, status.finished, status.missing) == (100, 100, 0)
+    again = study.pack(place, file=tmp_path / "again.parquet")
+    assert again == study.unpack(tmp_path / "again.parquet", tmp_path / "again")[1] == 100
+
+
+@pytest.mark.parametrize("change", [{"learning_rate": 0.00026}, {"n_steps": 5}])
+def test_hyperparameters_that_the_library_never_had_are_refused(tmp_path, change):
+    copy = Path(shutil.copy(LARGE, tmp_path))
+    rows = pq.read_table(copy).to_pydict()
+    number = next(i for i, record in enumerate(rows["record"]) if '"learning_rate": 0.00025' in record)
+    record = json.loads(rows["record"][number])
+    record["config"]["hyperparameters"] |= change
+    record["id"] = run_id(record["config"])
+    texts = {"record": json.dumps(record), "id": record["id"]}
+    columns = {name: lambda old, new=new: [*old[:number], new, *old[number + 1 :]] for name, new in texts.items()}
+    changed(copy, **columns)
+    with pytest.raises(FileFormatError, match="is not one of the study, or its configuration was changed"):
+        study.unpack(copy, tmp_path / "large")
 
 
 def test_damaged_runs_are_not_packed(folder, tmp_path):

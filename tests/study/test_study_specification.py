@@ -97,6 +97,14 @@ def test_a_block_may_say_otherwise_than_the_whole():
     assert (third["steps"], third["evaluation_interval"], third["gamma"], third["horizon"]) == (100, 1, 0.9, 100)
 
 
+def test_defaults_of_a_study_go_before_those_of_the_library_and_below_those_of_a_block():
+    block = {"environments": ["frozen_lake"], "agents": ["dqn", "ppo"], "hyperparameters": {"dqn": {"gamma": 0.5}}}
+    defaults = {"dqn": {"frozen_lake": {"vector": {"gamma": 0.9, "n_steps": 3}}}}
+    dqn, ppo = specification({"name": "a", "seeds": 1, "defaults": defaults, "blocks": [block]}).runs
+    assert dqn.config["hyperparameters"] == {"gamma": 0.5, "n_steps": 3}
+    assert ppo.config["hyperparameters"]["n_epochs"] == 4
+
+
 @pytest.mark.parametrize(
     ("line", "wrong", "expected"),
     [
@@ -119,6 +127,7 @@ def test_a_block_may_say_otherwise_than_the_whole():
         (12, "    hyperparameters: {a2c: patient}", "specification:12: unknown agent of this block 'a2c'"),
         (12, "    agents: [dqn]", "specification:12: the key 'agents' stands there twice (line 11)"),
         (12, "    hyperparameters: [", "specification:13"),
+        (2, "defaults: {dqm: {frozen_lake: {}}}", "specification:2: unknown agent 'dqm'; did you mean 'dqn'?"),
         (1, "blocks: 3\nname: a", "specification:8: the key 'blocks' stands there twice (line 1)"),
     ],
 )  # fmt: skip

@@ -59,6 +59,15 @@ def test_every_cell_that_sees_observations_is_predicted(predicted):
     assert plain["tabular_regret"] == hidden["tabular_regret"]
 
 
+def test_only_the_blocks_that_are_asked_for_are_predicted(tmp_path, monkeypatch):
+    monkeypatch.setattr("pharos.validation.predicted", lambda _: {})
+    block = {"environments": ["frozen_lake/4x4"], "agents": ["dqn"]}
+    two = study.specification({"name": "two", "blocks": [block, {**block, "environments": ["frozen_lake/8x8"]}]})
+    assert study.predict(two, tmp_path, blocks=[2])["instance"].tolist() == ["frozen_lake/8x8"]
+    with pytest.raises(ParameterError, match="block 3: study 'two' has blocks 1 to 2"):
+        study.predict(two, tmp_path, blocks=[3])
+
+
 def test_an_actor_critic_is_idealised_with_the_rollouts_and_the_lambda_of_its_agent(monkeypatch):
     rollouts = []
 

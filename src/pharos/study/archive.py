@@ -13,7 +13,7 @@ from pharos import training
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.study import worker as _worker
 from pharos.study.execution import claim, opened
-from pharos.study.specification import Source, parse
+from pharos.study.specification import Source, Specification, parse
 from pharos.system import storage
 from pharos.training import run_id
 
@@ -24,6 +24,28 @@ FORMAT = 1
 CURVE_COLUMNS = ("step",)
 _STUDY, _FORMAT, _DIGESTS = b"pharos.study", b"pharos.format", b"pharos.digests"
 _AGAIN = "fetch or pack it again"
+EARLIER = {
+    "dqn": {
+        "breakout": {
+            "vector": {
+                "learning_rate": 0.00025,
+                "buffer_size": 100000,
+                "learning_starts": 5000,
+                "batch_size": 32,
+                "gamma": 0.99,
+                "train_freq": 4,
+                "gradient_steps": 1,
+                "target_update_interval": 1000,
+                "exploration_initial_eps": 1.0,
+                "exploration_final_eps": 0.02,
+                "exploration_fraction": 0.1,
+                "max_grad_norm": 10,
+            }
+        }
+    }
+}
+"""Hyperparameters that the library had once, by agent, class and observation. Whoever changes those of the library adds
+here what they were, so that studies which were packed before can be read."""
 
 
 def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str | os.PathLike) -> int:
@@ -93,7 +115,8 @@ def unpack(
     Args:
         file: written by `pack`.
         folder: of the study; studies/NAME in the current directory when not given. Runs that it has stay as they are.
-        into: another study, which gets those of the runs that it has as well; None: the packed one.
+        into: another study, which gets those of the runs that it has as well; None: the packed one, with the defaults
+            of hyperparameters that it was packed with.
         trust: whether code that the packed study names may be imported, from beside the file; `into` is read in its
             place.
     Returns:
@@ -104,8 +127,7 @@ def unpack(
     """
     file = Path(file)
     text, table, digests = _read(file)
-    packed = parse(text, str(file), folder=file.absolute().parent, trust=trust) if into is None else into
-    target, place = opened(packed, folder, trust=trust or None)
+    target, place = opened(_study(file, text, table, trust) if into is None else into, folder, trust=trust or None)
     wanted = {run.id for run in target.runs}
     runs = []
     for row in _rows(file, table):
@@ -145,6 +167,15 @@ def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ResultCorrupted(f"{file}: its description cannot be read: {error}; {_AGAIN}") from None
     return text, table, digests
+
+
+def _study(file: Path, text: str, table: "pa.Table", trust: bool) -> Specification:
+    """The packed study; with the defaults of then, where the library had others when it was packed."""
+    study = parse(text, str(file), folder=file.absolute().parent, trust=trust)
+    if not study.defaults and not set(table["id"].to_pylist()) <= {run.id for run in study.runs}:
+        said = yaml.safe_dump({"defaults": EARLIER})
+        return parse(f"{text}\n{said}", str(file), folder=file.absolute().parent, trust=trust)
+    return study
 
 
 def _rows(file: Path, table: "pa.Table") -> list[dict[str, Any]]:

@@ -272,6 +272,7 @@ class Specification(_Part):
     gamma: Gamma = 1.0
     horizon: HorizonEntry = "limit"
     hyperparameters: dict[str, dict[str, Any]] = {}
+    defaults: dict[str, dict[str, dict[str, dict[str, Any]]]] = {}
     engine: EngineEntry = "sb3"
     hardness: Hardness = Field(default_factory=Hardness)
 
@@ -280,7 +281,7 @@ class Specification(_Part):
         """Every run, each once, in the order of the blocks."""
         runs: dict[str, Run] = {}
         for block in self.blocks:
-            for run in self._runs_of(block):
+            for run in self.runs_of(block):
                 runs.setdefault(run.id, run)
         options: dict[str, set[str]] = {}  # of the observations that share a title
         for run in runs.values():
@@ -291,7 +292,8 @@ class Specification(_Part):
             for run in runs.values()
         )
 
-    def _runs_of(self, block: Block) -> Iterator[Run]:
+    def runs_of(self, block: Block) -> Iterator[Run]:
+        """The runs of one block."""
         steps = block.steps or self.steps
         evaluations = block.evaluations or self.evaluations
         gamma = self.gamma if block.gamma is None else block.gamma
@@ -343,9 +345,12 @@ class Specification(_Part):
         return said if isinstance(said, str) else said.get(agent, "sb3")
 
     def _hyperparameters(self, block: Block, agent: str, environment: str, observation: str) -> dict[str, Any]:
-        """All of them, those of the library's table included: when that changes, these are other runs."""
+        """All of them, the defaults included (of the study, else of the library): with others these are other runs."""
         entry = block.hyperparameters.get(agent, {})
         own = self.hyperparameters[entry] if isinstance(entry, str) else entry
+        usual = self.defaults.get(agent, {}).get(environment, {}).get(observation)
+        if usual is not None:
+            return {**usual, **own}
         return hyperparameters(agent, environment, observation, own)
 
 

@@ -372,6 +372,9 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
     """What only the whole specification shows: names of agents and of hyperparameters, environments that cannot be
     made."""
     number = 0
+    for agent in specification.defaults:
+        if not _is_agent(agent):
+            yield ("defaults", agent), str(UnknownName("agent", agent, AGENTS))
     for i, block in enumerate(specification.blocks):
         kinds = len(block.environments) * len(block.chance) * len(block.agents) * len(block.observations)
         number += kinds * len(block.seeds or specification.seeds)
@@ -388,12 +391,12 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
             yield ("blocks", i), "gamma is 1 and horizon is none, so values may be infinite; expected a gamma below 1"
         said = specification.engine if block.engine is None else block.engine
         for agent in said if isinstance(said, dict) else ():
-            if agent not in AGENTS and not is_reference(agent):
+            if not _is_agent(agent):
                 where: Loc = ("engine",) if block.engine is None else ("blocks", i, "engine")
                 yield where, str(UnknownName("agent", agent, AGENTS))
         for j, agent in enumerate(block.agents):
             try:
-                if agent not in AGENTS and not is_reference(agent):
+                if not _is_agent(agent):
                     raise UnknownName("agent", agent, AGENTS)
                 agent_source(agent, specification.folder, check=False)
                 if specification.engine_of(block, agent) == "batched" and agent not in (*BATCHED, "q_learning"):
@@ -409,6 +412,10 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
                 yield loc, str(UnknownName("agent of this block", agent, block.agents))
             elif isinstance(own, str) and own not in specification.hyperparameters:
                 yield loc, str(UnknownName("set of hyperparameters", own, specification.hyperparameters))
+
+
+def _is_agent(name: str) -> bool:
+    return name in AGENTS or is_reference(name)
 
 
 def _messages(error: ValidationError, name: str, root: object) -> str:

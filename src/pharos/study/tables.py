@@ -458,8 +458,7 @@ def _part_of(
         wrong = [block for block in blocks if not 1 <= block <= len(study.blocks)]
         if wrong:
             raise ParameterError(f"block {wrong[0]}: study {study.name!r} has blocks 1 to {len(study.blocks)}")
-        part = study.model_copy(update={"blocks": [study.blocks[block - 1] for block in blocks]})
-        ids = {run.id for run in part.runs}
+        ids = {run.id for block in blocks for run in study.runs_of(study.blocks[block - 1])}
         runs = tuple(run for run in runs if run.id in ids)
     for what, names, name_of in (
         ("agent", agents, lambda run: run.configuration.agent),
