@@ -15,13 +15,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
+from scipy import stats
 
 from pharos import study
 from pharos.study.blocks import Run
 from pharos.study.specification import parse
 from pharos.study.tables import row_of
 from pharos.training import CELL, RunConfig
-from pharos.validation.cross_validation import class_predictions
+from pharos.validation.cross_validation import class_predictions, holm, resampled_classes
 from pharos.validation.prediction import FILE
 
 ROOT = Path(__file__).parents[1]
@@ -29,31 +30,25 @@ STUDIES = ROOT / "docs" / "studies"
 IMAGES = ROOT / "docs" / "images"
 SEALED = STUDIES / "sealed-1"
 SMALL = ("simple_grid", "frozen_lake")
+STUDY_NAMES = {"A": "classes", "B": "paper"}  # in the text, and of `runs`
+RESAMPLES = 1000
 NAMES = {"simple_grid": "grids", "frozen_lake": "lakes", "freeway": "Freeway", "breakout": "Breakout", "all": "all"}
 SAME_HARD = "DQN and PPO find the same hard"
 PRIMARY = {"dqn": "kernel_regret", "ppo": "clipped_regret_evaluated"}
 ROWS = (  # of the table of findings: in words, the finding and its class as in `study.findings`
-    ("images harder for DQN: grids", "the harder observation of DQN", "simple_grid"),
-    ("images harder for DQN: lakes", "the harder observation of DQN", "frozen_lake"),
-    ("vectors harder for DQN: Freeway", "the harder observation of DQN", "freeway"),
-    ("vectors harder for DQN: Breakout", "the harder observation of DQN", "breakout"),
-    ("DQN worse than a table: grids", "the learner with more regret", "simple_grid"),
-    ("DQN worse than a table: lakes", "the learner with more regret", "frozen_lake"),
-    ("a table worse than DQN: Freeway", "the learner with more regret", "freeway"),
-    ("a table worse than DQN: Breakout", "the learner with more regret", "breakout"),
-    ("one model explains next to nothing (R² 0.09)", "one model explains next to nothing", "all"),
-    (
-        "one by representation explains more (0.48)",
-        "models by representation explain more than one",
-        "all",
-    ),
-    ("one by class explains more (0.65)", "models by class explain more than one", "all"),
-    (
-        "vectors are explained better than images (0.6, 0.3)",
-        "hardness explains vectors better than images",
-        "all",
-    ),
-    (f"{SAME_HARD} (r = 0.81)", SAME_HARD, "all"),
+    ("images harder: grids", "the harder observation of DQN", "simple_grid"),
+    ("images harder: lakes", "the harder observation of DQN", "frozen_lake"),
+    ("vectors harder: Freeway", "the harder observation of DQN", "freeway"),
+    ("vectors harder: Breakout", "the harder observation of DQN", "breakout"),
+    ("DQN worse than table: grids", "the learner with more regret", "simple_grid"),
+    ("DQN worse than table: lakes", "the learner with more regret", "frozen_lake"),
+    ("table worse than DQN: Freeway", "the learner with more regret", "freeway"),
+    ("table worse than DQN: Breakout", "the learner with more regret", "breakout"),
+    ("one model explains nothing (0.09)", "one model explains next to nothing", "all"),
+    ("models by observation: better (0.48)", "models by representation explain more than one", "all"),
+    ("models by class: better (0.65)", "models by class explain more than one", "all"),
+    ("vectors better than images (0.6, 0.3)", "hardness explains vectors better than images", "all"),
+    ("DQN and PPO correlate (r = 0.81)", SAME_HARD, "all"),
 )
 
 
@@ -92,7 +87,7 @@ def runs(name):
 
 @cache
 def found(name):
-    """(finding, class) -> its row of `study.findings`, with the number of runs behind it.
+    """(finding, class) -> its row of `study.findings`, with the numbers of tasks and runs behind it.
 
     Of `paper`, whose large instances lack images, models and agreement are those of grids and lakes.
     """
@@ -104,18 +99,18 @@ def found(name):
         cells = study.cells(some, measures)
         for row in study.findings(cells, study.models(cells, measures=predictors)).to_dict("records"):
             if (row["of"] == "all" and row["finding"] != SAME_HARD) == needs_all:
-                rows[row["finding"], row["of"]] = row | {"runs": number_of_runs(row, some)}
+                rows[row["finding"], row["of"]] = row | size(row, some)
     return rows
 
 
-def number_of_runs(row, done):
+def size(row, done):
     agents = {"the learner with more regret": ("dqn", "q_learning"), SAME_HARD: ("dqn", "ppo")}
     used = done[done["agent"].isin(agents.get(row["finding"], ("dqn",)))]
     if row["of"] != "all":
         used = used[used["environment"] == row["of"]]
     if row["finding"] == "the learner with more regret":
         used = used[used["observation"] != "simple_image"]
-    return len(used)
+    return {"runs": len(used), "tasks": used.groupby(["instance", "chance"]).ngroups}
 
 
 def number(value, digits=2):
@@ -135,16 +130,16 @@ def findings_table():
     rows = []
     for words, *key in ROWS:
         row = [words]
-        for name in ("classes", "paper"):
+        for name in STUDY_NAMES.values():
             one = found(name)[tuple(key)]
             if one["verdict"] == "no data":
                 row += ["–", "–", "–"]
                 continue
             digits = 3 if one["of"] != "all" else 2
-            row += [one["runs"], interval(one["effect"], one["lower"], one["upper"], digits)]
+            row += [f"{one['tasks']}/{one['runs']}", interval(one["effect"], one["lower"], one["upper"], digits)]
             row += [one["verdict"].removesuffix(", mostly by class")]
         rows.append(row)
-    head = [("`classes`, runs", "effect (95 %)", "verdict"), ("`paper`, runs", "effect (95 %)", "verdict")]
+    head = [(f"{name}: tasks/runs", "effect (95 %)", "verdict") for name in STUDY_NAMES]
     return markdown(["finding of the paper", *head[0], *head[1]], rows)
 
 
@@ -160,15 +155,18 @@ def models_table():
 
 
 def encodings_table():
-    """PPO on the three grids with a decoy, by what it sees."""
+    """PPO on the three grids with a decoy, by what it sees; intervals by Student's t over seeds within tasks."""
     done = runs("one_hot")
     done = done[(done["agent"] == "ppo") & done["instance"].str.contains("simple_grid/.*-decoy")]
-    table = done.groupby("observation")["normalized_regret"].agg(["mean", "size"])
-    rows = [
-        [f"`{name}`", table["size"][name], number(table["mean"][name], 3)]
-        for name in ("one_hot", "simple_image", "vector")
-    ]
-    return markdown(["observation", "runs", "normalised regret"], rows)
+    rows = []
+    for name in ("one_hot", "simple_image", "vector"):
+        some = done[done["observation"] == name]
+        tasks = some.groupby(["instance", "chance"])["normalized_regret"].agg(["mean", "var", "size"])
+        error = np.sqrt((tasks["var"] / tasks["size"]).sum()) / len(tasks)
+        half = stats.t.ppf(0.975, (tasks["size"] - 1).sum()) * error
+        mean = tasks["mean"].mean()
+        rows.append([LABELS.get(name, name), len(some), interval(mean, mean - half, mean + half, 3)])
+    return markdown(["observation", "runs", "normalised regret (95 %)"], rows)
 
 
 @cache
@@ -221,27 +219,48 @@ def judged():
 def sealed_table():
     rows = []
     for agent, predictor, words in (
-        ("ppo", "clipped_regret_evaluated", "`clipped_regret_evaluated`, named before"),
-        ("dqn", "kernel_regret", "`kernel_regret`, named before"),
-        ("dqn", "sampled_regret", "`sampled_regret`, proposed after"),
-        ("ppo", "policy_tabular_regret", "the same learner on a table"),
-        ("dqn", "tabular_regret", "the same learner on a table"),
-        ("ppo", "tabular measures", "tabular measures together"),
-        ("dqn", "tabular measures", "tabular measures together"),
+        ("ppo", "clipped_regret_evaluated", "`clipped_regret_evaluated`"),
+        ("dqn", "kernel_regret", "`kernel_regret`"),
+        ("dqn", "sampled_regret", "`sampled_regret`, after the test"),
+        ("ppo", "policy_tabular_regret", "learner on a table"),
+        ("dqn", "tabular_regret", "learner on a table"),
+        ("ppo", "tabular measures", "tabular measures"),
+        ("dqn", "tabular measures", "tabular measures"),
     ):
         row = judged()[agent, predictor]
         said = [interval(*(row[name + end] for end in ("", "_lower", "_upper"))) for name in ("r_squared", "rho")]
+        without_line = "–"
+        if predictor in (both := joined(agent)):
+            left = variance_share(both["greedy"] - both[predictor], both)
+            without_line = interval(1 - left[0], 1 - left[2], 1 - left[1])
         share = "0.50"  # of what is the same for all observations of an MDP
         if row["agreement_lower"] == row["agreement_lower"]:
             share = interval(*(row["agreement" + end] for end in ("", "_lower", "_upper")))
-        rows.append([agent.upper(), words, *said, share])
-    return markdown(["agent", "predictor", "R², class left out", "rank correlation", "pairs in order"], rows)
+        rows.append([agent.upper(), words, *said, share, without_line])
+    head = ["agent", "predictor", "R², class left out", "rank correlation", "pairs in order", "R², no line"]
+    return markdown(head, rows)
+
+
+def joined(agent):
+    """Cells of the sealed test with their predictions."""
+    cells, predictions, _ = sealed()
+    return predictions[predictions["agent"] == agent].merge(cells, on=CELL)
+
+
+def variance_share(part, cells):
+    """The share of the variance of greedy regret that `part` of it has, and its 95 % interval over classes."""
+    classes = np.unique(cells["environment"], return_inverse=True)[1]
+    counts = np.vstack([np.ones(classes.max() + 1, int), resampled_classes(classes.max() + 1, RESAMPLES, 0)])
+    regret = cells["greedy"].to_numpy(float)
+    columns = (part.to_numpy(float) ** 2, regret**2, regret, np.ones(len(cells)))
+    own, squares, total, number = (counts @ np.bincount(classes, column) for column in columns)
+    shares = own / (squares - total**2 / number)
+    return shares[0], *np.percentile(shares[1:], [2.5, 97.5])
 
 
 def misses(agent, predictor):
     """Class -> mean of observed less predicted regret, each class predicted by a line through the others."""
-    cells, predictions, _ = sealed()
-    both = predictions[predictions["agent"] == agent].merge(cells, on=CELL)
+    both = joined(agent)
     classes = np.unique(both["environment"], return_inverse=True)[1]
     observed = both["greedy"].to_numpy(float)
     told = class_predictions(both[[predictor]].to_numpy(float), observed, classes, classes)
@@ -250,40 +269,57 @@ def misses(agent, predictor):
 
 def facts():
     """Phrases of the text that hold numbers, each as the text has it."""
+    return [*facts_of_findings(), *facts_of_the_sealed_test()]
+
+
+def facts_of_findings():
+    small = [study.cells(done[done["environment"].isin(SMALL)]) for done in map(runs, STUDY_NAMES.values())]
+    r = [f"{study.agreement(cells, name)[0]:.2f}" for name in ("return", "normalized_regret") for cells in small]
+    said = ["r of returns is {} in A and {} in B, r of normalised regret {} and {}".format(*r)]
+    for title, name in STUDY_NAMES.items():
+        verdicts = [row["verdict"].split(",")[0] for row in found(name).values()]
+        counts = [verdicts.count(each) for each in ("agrees", "disagrees", "undecided")]
+        count = "of {} findings our {} study".format(sum(counts), {"A": "first", "B": "second"}[title])
+        said.append("{} agrees with {}, disagrees with {} and leaves {} undecided".format(count, *counts))
+        p = np.array([row["p"] for row in found(name).values() if row["p"] == row["p"]])
+        said.append(f"{(holm(p) < 0.05).sum()} of {(p < 0.05).sum()} in {title}")
+        done = runs(name)
+        said.append(f"{(~done['exact']).sum()} of {len(done)} runs")
     measures = pd.read_csv(STUDIES / "classes" / "hardness.csv")
+    said.append(f"{measures['num_states'].min():,} to {measures['num_states'].max():,} states")
+    power = [found("classes")[finding, "frozen_lake"]["power"] for _, finding, of in ROWS if of == "frozen_lake"]
+    said.append(f"a power of {power[0]:.2f} and {power[1]:.2f}")
+    return said
+
+
+def facts_of_the_sealed_test():
     cells, predictions, done = sealed()
     dates = done.merge(predictions, on=CELL)
     if len(dates) != len(done) or (dates["written"] < dates["date"]).any():
         raise ValueError("a run was finished before its prediction was written")
-    said = [f"{len(done)} runs", f"{len(cells)} cells, {len(cells) // 2} an agent"]
+    states = pd.read_csv(SEALED / "hardness.csv")["num_states"]
+    said = [
+        f"{len(done)} runs",
+        f"{len(cells)} cells, {len(cells) // 2} an agent",
+        f"{len(states)} instances of {states.min()} to {states.max()} states",
+    ]
     within, pairs, images = {}, {}, {}
     for agent, part in cells.groupby("agent"):
-        regret, mdps = part["greedy"], part.groupby("instance")["greedy"]
-        within[agent] = ((regret - mdps.transform("mean")) ** 2).sum() / ((regret - regret.mean()) ** 2).sum()
+        mdps = part.groupby("instance")["greedy"]
+        within[agent] = interval(*variance_share(part["greedy"] - mdps.transform("mean"), part))
         row, sizes = judged()[agent, PRIMARY[agent]], mdps.size()
         pairs[agent] = f"{row['pairs']} of {(sizes * (sizes - 1) // 2).sum()}"
         images[agent] = f"{row['image_agreement'] * row['image_pairs']:g} of {row['image_pairs']}"
     said += [
-        f"{within['dqn']:.2f} of the variance of DQN's regret and {within['ppo']:.2f} of PPO's",
-        f"{pairs['dqn']} pairs for DQN and {pairs['ppo']} for PPO",
-        f"{images['dqn']} for DQN and {images['ppo']} for PPO",
+        f"{within['dqn']} of the variance of DQN's regret and {within['ppo']} of PPO's",
+        f"{pairs['dqn']} for DQN and {pairs['ppo']} for PPO",
+        f"{images['dqn']} pairs for DQN and {images['ppo']} for PPO",
     ]
     spread = cells[cells["agent"] == "dqn"].groupby("instance")["greedy"].agg(np.ptp)
     said.append(f"by more than 0.2 on {(spread > 0.2).sum()} of {len(spread)} MDPs")
-    hanoi = cells.merge(predictions, on=CELL).query("agent == 'dqn' and instance == 'games.py:Hanoi(discs=3)'")
-    hanoi = hanoi.assign(kind=hanoi["observation"].map(kind)).set_index("kind")
-    for column, verb in (("greedy", "was"), ("kernel_regret", "had been predicted as")):
-        image, vector = (hanoi[column][name] for name in ("simple_image", "vector"))
-        said.append(f"{verb} {image:.2f} by its image and {vector:.2f} by its vector")
-    said.append(f"{measures['num_states'].min():,} to {measures['num_states'].max():,} states")
-    done = runs("classes")
-    said.append(f"{(~done['exact']).sum()} of {len(done)} runs")
-    power = [found("classes")[finding, "frozen_lake"]["power"] for _, finding, of in ROWS if of == "frozen_lake"]
-    said.append(f"a power of {power[0]:.2f} and {power[1]:.2f}")
-    for name in ("classes", "paper"):
-        small = study.cells(runs(name)[runs(name)["environment"].isin(SMALL)])
-        r = [study.agreement(small, column)[0] for column in ("return", "normalized_regret")]
-        said.append(f"{r[0]:.2f} for returns and {r[1]:.2f} for normalised regret in `{name}`")
+    hanoi = joined("dqn").query("instance == 'games.py:Hanoi(discs=3)'")
+    image = hanoi[hanoi["observation"].map(kind) == "simple_image"].iloc[0]
+    said.append(f"by its image, {image['greedy']:.2f} for a predicted {image['kernel_regret']:.2f}")
     return said
 
 
@@ -315,7 +351,7 @@ LABELS = {"simple_image": "image", "one_hot": "one-hot"}
 
 
 def regret_figure():
-    """Regret of the policy of the moment over training, means over instances and seeds."""
+    """Regret of the policy of the moment over training: means over runs of a class, bands of two standard errors."""
     from matplotlib.figure import Figure
 
     from pharos.plots.style import legend_below
@@ -325,9 +361,11 @@ def regret_figure():
     axes = drawn.subplots(2, 2).ravel()
     for axis, (name, label) in zip(axes, list(NAMES.items())[:4], strict=True):
         for (agent, observation), some in points[points["environment"] == name].groupby(["agent", "observation"]):
-            curve = some.groupby("step")["normalized_regret"].mean()
+            table = some.groupby("step")["normalized_regret"].agg(["mean", "sem"])
+            curve, half = table["mean"], 2 * table["sem"]
             color = LOOKS.get(observation, ("#009E73",))[0]
             words = "table" if agent == "q_learning" else f"{agent.upper()}, {LABELS.get(observation, observation)}"
+            axis.fill_between(curve.index / 1000, curve - half, curve + half, color=color, alpha=0.15, linewidth=0)
             axis.plot(
                 curve.index / 1000, curve, "--" if agent == "ppo" else "-", color=color, label=words, linewidth=1.4
             )
@@ -371,11 +409,10 @@ def sealed_figure():
     """Regret that was predicted before the runs, against observed regret, on classes that nobody had used."""
     from matplotlib.figure import Figure
 
-    cells, predictions, _ = sealed()
     drawn = Figure(figsize=(3.4, 2.2), layout="constrained")
     axes = drawn.subplots(1, 2, sharey=True)
     for axis, (agent, predictor) in zip(axes, PRIMARY.items(), strict=True):
-        both = predictions[predictions["agent"] == agent].merge(cells, on=CELL)
+        both = joined(agent)
         axis.plot([0, 1.7], [0, 1.7], color="#999999", linewidth=0.9, zorder=0)
         for name, some in both.groupby(both["observation"].map(kind)):
             color, mark = LOOKS[name]
@@ -399,8 +436,11 @@ def misses_figure():
     for place, name in enumerate(before.index):
         axis.plot([before[name], after[name]], [place, place], color="#999999", linewidth=0.9, zorder=1)
     places = np.arange(len(before))
-    axis.scatter(before, places, 18, "#D55E00", marker="s", label="expectations (named before)", zorder=2)
-    axis.scatter(after[before.index], places, 18, "#0072B2", marker="o", label="samples (proposed after)", zorder=2)
+    for values, color, mark, label in (
+        (before, "#D55E00", "s", "kernel_regret (named before)"),
+        (after[before.index], "#0072B2", "o", "sampled_regret (proposed after)"),
+    ):
+        axis.scatter(values, places, 18, color, marker=mark, label=label, zorder=2)
     axis.axvline(0, color="#23262d", linewidth=0.9)
     axis.set(yticks=places, yticklabels=[name.replace("_", " ") for name in before.index])
     axis.set(xlabel="observed less predicted regret of DQN")

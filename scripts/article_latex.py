@@ -21,14 +21,17 @@ HEAD = r"""\documentclass[10pt,twocolumn]{article}
 \usepackage[T1]{fontenc}\usepackage[utf8]{inputenc}
 \usepackage{times,caption,amsmath,amssymb,booktabs,graphicx,tabularx,textcomp}
 \usepackage[a4paper,margin=18mm,columnsep=7mm]{geometry}
-\usepackage[hidelinks]{hyperref}
+\usepackage{xcolor}\usepackage[colorlinks,allcolors=blue!55!black]{hyperref}
 \setlength{\emergencystretch}{3em}\setcounter{secnumdepth}{0}
 \renewcommand{\topfraction}{0.9}\renewcommand{\textfraction}{0.05}
-\makeatletter\renewcommand{\@biblabel}[1]{}\makeatother
-\title{%s}
+\makeatletter\renewcommand{\@biblabel}[1]{}
+\renewcommand{\section}{\@startsection{section}{1}{0pt}{-2.2ex plus -.6ex}{.8ex}{\large\bfseries\raggedright}}
+\def\@listi{\leftmargin1.5em\topsep3pt\partopsep0pt\parsep0pt\itemsep2pt}\let\@listI\@listi\@listi\makeatother
+\title{\vspace{-12mm}%s}
 \author{The pharos authors\\{\small\url{https://github.com/pharos-rl/pharos}}}
 \date{}\begin{document}\maketitle
 """
+REFERENCES = r"\setlength{\itemsep}{1pt}\setlength{\parsep}{0pt}"
 SPECIAL = {
     **{letter: "\\" + letter for letter in "&%#_{}$"},
     **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
@@ -107,7 +110,7 @@ def block(text, after):
         name = "itemize" if kind[1] == "- " else "enumerate"
         items = re.split(r"\n(?:- |\d+\. )", text[len(kind[1]) :])
         body = "\n".join(r"\item " + inline(" ".join(item.split())) for item in items)
-        return environment(name, body, "\\setlength{\\itemsep}{2pt}\\setlength{\\parskip}{0pt}"), 0
+        return environment(name, body), 0
     return inline(words), 0
 
 
@@ -126,8 +129,10 @@ def latex(page):
         elif blocks[place] == "## References":
             items = re.split(r"\n- ", "\n" + blocks[place + 1])[1:]
             entries = "\n".join(rf"\bibitem{{{n}}} " + inline(" ".join(item.split())) for n, item in enumerate(items))
-            text, used = environment("small", environment("thebibliography", entries, "{99}")), 1
-        parts.append(text)
+            text, used = environment("small", environment("thebibliography", REFERENCES + entries, "{99}")), 1
+        # A wide table appears at the top of the next page, so it is written a section early.
+        sections = [n for n, part in enumerate(parts) if part.startswith(r"\section")]
+        parts.insert(sections[-2:][0] if text.startswith(r"\begin{table*}") and sections else len(parts), text)
         place += 1 + used
     joined = "\n\n".join([*parts, r"\end{document}"]) + "\n"
     return re.sub(r"\n+(\\begin{equation\*}.*?\\end{equation\*})\n+(?=[a-z])", r"\n\1\n", joined, flags=re.DOTALL)

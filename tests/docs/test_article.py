@@ -61,6 +61,20 @@ def test_findings_of_the_runs_are_the_kept_ones(monkeypatch):
         assert row["effect"] == pytest.approx(kept["effect"][key], abs=1e-9) and row["verdict"] == kept["verdict"][key]
 
 
+@pytest.mark.slow
+def test_shares_of_variance(monkeypatch):
+    """What differs between MDPs has the rest of the variance,."""
+    article = script("article", monkeypatch)
+    for agent in ("dqn", "ppo"):
+        cells = article.joined(agent)
+        regret, mean = cells["greedy"], cells.groupby("instance")["greedy"].transform("mean")
+        within, between = (article.variance_share(part, cells) for part in (regret - mean, mean - regret.mean()))
+        assert within[0] + between[0] == pytest.approx(1) and 0 < within[1] < within[0] < within[2] < 1
+        assert article.variance_share(regret - regret.mean(), cells)[0] == pytest.approx(1)
+        twice = article.pd.concat([cells, cells])
+        assert article.variance_share(article.pd.concat([regret - mean] * 2), twice) == pytest.approx(within)
+
+
 def test_the_article_is_short_and_has_few_figures():
     assert len([word for word in PAGE.split() if re.search(r"\w", word)]) <= 2500
     figures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", PAGE)
@@ -85,6 +99,16 @@ def test_latex_has_every_cell_of_every_table_and_every_figure(monkeypatch):
     assert text.count(r"\includegraphics") == PAGE.count("![")
     assert text.count(r"\bibitem") == PAGE.count("\n- ", PAGE.index("## References"))
     assert "**" not in text and "](" not in text
+
+
+def test_wide_tables_are_written_a_section_early(monkeypatch):
+    latex = script("article_latex", monkeypatch)
+    row = "| " + " | ".join(["word"] * 20) + " |"
+    page = "# T\n\n## One\n\na\n\n## Two\n\nb\n\n**Table 1.** Wide.\n\n" + "\n".join([row, row, row])
+    text = latex.latex(page)
+    assert text.index(r"\begin{table*}") < text.index(r"\section{One}") < text.index(r"\section{Two}")
+    narrow = latex.latex(page.replace(row, "| a | b |"))
+    assert narrow.index(r"\section{Two}") < narrow.index(r"\begin{table}")
 
 
 def test_latex_of_what_a_line_may_hold(monkeypatch):
