@@ -21,7 +21,7 @@ from pharos.hardness.diameter import LeanGraph
 from pharos.hardness.sum_sweep import Graph
 from pharos.mdp import BEST, BellmanEquation, Table, sticky_actions
 from pharos.state_space import search
-from pharos.system.packed_indices import PackedIndices
+from pharos.system.arrays import PackedIndices
 
 
 def sweeps(mdp, dynamics):

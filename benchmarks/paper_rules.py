@@ -35,7 +35,7 @@ from scipy.stats import spearmanr
 
 import pharos
 from pharos.environments import make
-from pharos.environments.parameters import parameter
+from pharos.environments.base import parameter
 from pharos.environments.worlds import breakout as rules
 from pharos.environments.worlds.breakout import Breakout, no_brick_is_left
 from pharos.environments.worlds.freeway import Freeway

@@ -36,7 +36,7 @@ def test_the_code_of_the_page_reads_what_pharos_wrote(name, tmp_path, monkeypatc
 @pytest.mark.parametrize(("most_codes", "possible_share"), [(2**16, 1.0), (2**16, 0.3), (2, 1.0), (2, 0.3)])
 def test_the_code_of_the_page_reads_chance(most_codes, possible_share, tmp_path, monkeypatch):
     """Dense and one after another, with a palette and without."""
-    monkeypatch.setattr(importlib.import_module("pharos.state_space.outcome_journal"), "MOST_CODES", most_codes)
+    monkeypatch.setattr(importlib.import_module("pharos.state_space.journal"), "MOST_CODES", most_codes)
     world = ChanceWorld(num_positions=50, seed=3, vectors=0, possible_share=possible_share)
     space = pharos.build(world, tmp_path / "space", progress=False)
     assert (("offsets.bin" in space.manifest["arrays"]), ("palette.bin" in space.manifest["arrays"])) == (

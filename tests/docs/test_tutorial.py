@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from pharos.environments import catalog
-from pharos.system import paths
+from pharos.system import storage
 from pharos.system.compiling import private_folder
 
 PAGE = Path(__file__).parents[2] / "docs" / "adding-an-environment.md"
@@ -28,7 +28,7 @@ def page(monkeypatch, tmp_path):
     module = types.ModuleType("tutorial_page")
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setattr(catalog, "_REGISTERED", {})
-    (tmp_path / "compiled").symlink_to(private_folder(paths.cache_directory()))
+    (tmp_path / "compiled").symlink_to(private_folder(storage.cache_directory()))
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
     return module
 

@@ -47,7 +47,7 @@ class Line(Environment):
 PRINTED = """
 import sys
 from pharos import make
-from pharos.rules.fingerprint import fingerprint_of_rules
+from pharos.rules.compiler import fingerprint_of_rules
 print(fingerprint_of_rules(make(sys.argv[1]), ("transition", "is_terminal")))
 """
 

@@ -14,12 +14,12 @@ from test_resuming import FullDisk, _build_and_die_at, _InterruptAtLine, build, 
 import pharos
 from pharos.errors import DiskFull, PharosError, StateSpaceCorrupted, StateSpaceMismatch, StateSpaceTooLarge
 from pharos.state_space import read_manifest
-from pharos.system.packed_indices import PACKED, PackedIndices, unpacked
+from pharos.system.arrays import PACKED, PackedIndices, unpacked
 from worlds import ChanceWorld
 
 search = importlib.import_module("pharos.state_space.search")
 table = importlib.import_module("pharos.state_space.table")
-outcome_journal = importlib.import_module("pharos.state_space.outcome_journal")
+journal = importlib.import_module("pharos.state_space.journal")
 
 DENSE = ChanceWorld(num_positions=3000, seed=1, vectors=0, possible_share=1.0, end_share=0.05)
 RAGGED = ChanceWorld(num_positions=3000, seed=1, vectors=0, possible_share=0.3, end_share=0.05)
@@ -44,7 +44,7 @@ def small_blocks(monkeypatch):
 def case(request, monkeypatch, tmp_path):
     """(world, the files of its undisturbed build)."""
     world, codes = FOLDERS[request.param]
-    monkeypatch.setattr(outcome_journal, "MOST_CODES", codes)
+    monkeypatch.setattr(journal, "MOST_CODES", codes)
     if request.param not in _undisturbed:
         _undisturbed[request.param] = files_of(build(world, tmp_path / "undisturbed", workers=1).folder)
     return world, _undisturbed[request.param]
@@ -167,7 +167,7 @@ def test_what_a_killed_build_left_behind_its_end_is_removed(case, tmp_path):
 @pytest.fixture(params=FOLDERS)
 def folder(request, monkeypatch, tmp_path):
     world, codes = FOLDERS[request.param]
-    monkeypatch.setattr(outcome_journal, "MOST_CODES", codes)
+    monkeypatch.setattr(journal, "MOST_CODES", codes)
     return build(world, tmp_path / "space").folder
 
 
@@ -288,9 +288,9 @@ def naive_value(folder, rewards, gamma) -> float:
 
 def survive(folder, which, mutations) -> None:
     """Read and solve each mutant; anything but one line of pharos, or the right value, ends the process."""
-    world, outcome_journal.MOST_CODES = FOLDERS[which]
+    world, journal.MOST_CODES = FOLDERS[which]
     world = ChanceWorld(**{**world.parameters, "num_positions": 120, "end_share": 0.0})
-    outcome_journal.MOST_CODES = min(outcome_journal.MOST_CODES, 2**16 if "spelled" not in which else 10)
+    journal.MOST_CODES = min(journal.MOST_CODES, 2**16 if "spelled" not in which else 10)
     pharos.build(world, folder, progress=False)
     files = {path.name: path.read_bytes() for path in folder.iterdir()}
     rewards = pharos.load(folder, environment=world).mdp().rewards

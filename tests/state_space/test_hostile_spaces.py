@@ -10,8 +10,8 @@ import pharos
 from pharos import exporters, importers
 from pharos.errors import StateSpaceCorrupted, StateSpaceError, StateSpaceMismatch
 from pharos.mdp import TabularMDP
-from pharos.state_space import files as writing
 from pharos.state_space import manifest as manifests
+from pharos.state_space import manifest as writing
 from pharos.state_space import store as reading
 
 BREAKOUT = {"height": 7, "columns": 4, "brick_rows": 1}  # 1,658 states

@@ -25,11 +25,11 @@ from pharos.errors import StateSpaceCorrupted, StateSpaceMismatch, StateSpaceToo
 from pharos.interaction import GymEnv, make_vec
 from pharos.mdp import OutcomeTable, Table, lazy_actions, random_actions, sticky_actions
 from pharos.solvers import evaluate_policy, ranked, uniform_value, value_iteration, worst_value
-from pharos.state_space import files as writing
 from pharos.state_space import manifest as manifests
+from pharos.state_space import manifest as writing
 from pharos.state_space import search
-from pharos.system import memory, packed_indices
-from pharos.system.packed_indices import INT40, PACKED, PackedIndices, blocks_of, holds_end
+from pharos.system import arrays, memory
+from pharos.system.arrays import INT40, PACKED, PackedIndices, blocks_of, holds_end
 from rank_threads import threads
 from strategies import deterministic_mdps, outcome_mdps
 from worlds import ChanceWorld
@@ -71,7 +71,7 @@ def test_it_reads_like_an_array_of_64_bits(plain, data):
     assert (np.asarray(indices.rows(low, high)) == plain[low:high]).all()
     assert np.asarray(indices, np.float64).dtype == np.float64
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(packed_indices, "_BLOCK", data.draw(st.integers(1, 7)))
+        patch.setattr(arrays, "_BLOCK", data.draw(st.integers(1, 7)))
         parts = list(blocks_of(indices))
     assert [first for first, _ in parts] == np.cumsum([0, *(len(part) for _, part in parts)])[:-1].tolist()
     assert (np.concatenate([part for _, part in parts]) == plain).all()
@@ -223,8 +223,8 @@ def test_a_part_has_the_same_next_states_whatever_the_width_and_the_blocks(state
     plain = np.random.default_rng(seed).integers(-1, states, (states, actions))
     start, stop = sorted(data.draw(st.tuples(st.integers(0, states), st.integers(0, states))))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(packed_indices, "_BLOCK", data.draw(st.integers(1, 40)))
-        patch.setattr(packed_indices, "INT32_STATES", data.draw(st.sampled_from([0, 2**31 - 1])))
+        patch.setattr(arrays, "_BLOCK", data.draw(st.integers(1, 40)))
+        patch.setattr(arrays, "INT32_STATES", data.draw(st.sampled_from([0, 2**31 - 1])))
         local, halo = Table(PackedIndices.of(plain)).part(start, stop)
     halo = halo.tolist()
     assert halo == sorted({t for row in plain[start:stop].tolist() for t in row if t >= 0 and not start <= t < stop})
@@ -302,7 +302,7 @@ def refuse_to_unpack_all(monkeypatch):
 
     def some(self, where):
         assert where != slice(None) if isinstance(where, slice) else True, "all of the successors were unpacked"
-        return packed_indices.unpacked(self.packed[where])
+        return arrays.unpacked(self.packed[where])
 
     monkeypatch.setattr(PackedIndices, "__array__", refused)
     monkeypatch.setattr(PackedIndices, "__getitem__", some)

@@ -22,8 +22,7 @@ from pharos.errors import MissingExtra, ParameterError, RuleError, StateSpaceErr
 from pharos.kernels import hash_table
 from pharos.ranks import Halo, RankFailed, cuts_of, run_spmd
 from pharos.state_space import ranked_table, search
-from pharos.state_space.files import lock
-from pharos.state_space.manifest import Plan
+from pharos.state_space.manifest import Plan, lock
 from pharos.state_space.progress import reporter
 from pharos.state_space.search import Options, journal_of
 from rank_threads import Killed, fails_at, loop

@@ -19,9 +19,9 @@ import pytest
 
 import pharos
 from pharos.errors import DiskFull, RuleError, StateSpaceIncomplete, StateSpaceLocked, StateSpaceTooLarge
-from pharos.state_space import files as writing
+from pharos.state_space import manifest as writing
 from pharos.system import storage
-from pharos.system.packed_indices import PackedIndices
+from pharos.system.arrays import PackedIndices
 from worlds import Row, TableWorld
 
 building = importlib.import_module("pharos.state_space.build")

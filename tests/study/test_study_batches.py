@@ -21,8 +21,7 @@ from pharos.errors import ParameterError
 from pharos.study import batches as _batches
 from pharos.study import execution as _execution
 from pharos.study.batches import Batches
-from pharos.system.paths import cache_directory
-from pharos.system.storage import sealed
+from pharos.system.storage import cache_directory, sealed
 from pharos.training import read_record, train_config
 
 TESTS = Path(__file__).parents[1]

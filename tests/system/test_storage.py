@@ -336,7 +336,7 @@ def test_nothing_heavy_is_loaded():
 
 
 def test_what_is_appended_is_sent_on_to_the_disk_without_gaps(tmp_path, monkeypatch):
-    from pharos.state_space.files import SENT_BYTES, GrowingFile
+    from pharos.state_space.manifest import SENT_BYTES, GrowingFile
 
     sent = []
     monkeypatch.setattr(storage, "write_out", lambda descriptor, start, size: sent.append((start, start + size)))

@@ -95,7 +95,7 @@ class QLearning:
 
     def learn(self, steps: int) -> "QLearning":
         """Learn for so many more steps."""
-        from pharos.kernels.learning import q_learning
+        from pharos.kernels.stepping import q_learning
 
         mdp, options = self.mdp, self.options
         cumulative = np.cumsum(mdp.start_probabilities)

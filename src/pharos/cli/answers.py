@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 import typer
 
-from pharos.system import compiling, paths, storage
+from pharos.system import compiling, storage
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -210,7 +210,7 @@ def written(value: object) -> str:
 def compiling_fact() -> list[tuple[str, str]]:
     """Seconds of compiling in this command as a fact, or none where they are few."""
     seconds = compiling.seconds()
-    suffix = "" if paths.is_temporary() else ", kept for the next time"
+    suffix = "" if storage.is_cache_temporary() else ", kept for the next time"
     return [("compiling", f"{seconds:.1f} s{suffix}")] if seconds >= NOTABLE_SECONDS else []
 
 

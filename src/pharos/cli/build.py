@@ -122,7 +122,7 @@ def _table_of(goal: Target) -> "TabularMDP":
 def _counts_of_space(goal: Target, building: Building) -> dict[str, int]:
     """Counts of a folder, or of the cache where the space is there; else it is built beside the cache and removed."""
     from pharos.state_space import cached_folder, load, read_manifest
-    from pharos.system import paths
+    from pharos.system import storage
 
     if goal.environment is None:
         assert goal.path is not None
@@ -130,7 +130,7 @@ def _counts_of_space(goal: Target, building: Building) -> dict[str, int]:
     manifest = read_manifest(cached_folder(goal.environment))
     if manifest is not None and manifest["complete"]:
         return counts_of(goal.space(building))
-    place = paths.cache_directory()
+    place = storage.cache_directory()
     place.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix="count-", dir=place))
     try:

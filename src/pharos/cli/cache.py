@@ -34,9 +34,9 @@ app = Commands(help="List or clear the cached state spaces.", no_args_is_help=Fa
 @app.command("list")
 def list_() -> Answer:
     """Show the cached state spaces and how much room they take."""
-    from pharos.system import paths
+    from pharos.system import storage
 
-    directory = paths.cache_directory()
+    directory = storage.cache_directory()
     spaces = _spaces(directory)
     compiled = sum(map(bytes_of, _compiled(directory)))
     total = compiled + sum(space["bytes"] for space in spaces)
@@ -51,9 +51,9 @@ def clear(environments: Annotated[list[str] | None, typer.Argument(metavar="[ENV
     Args:
         environments: Clear only these: names of environments or of cached folders.
     """
-    from pharos.system import paths, storage
+    from pharos.system import storage
 
-    directory = paths.cache_directory()
+    directory = storage.cache_directory()
     spaces = _spaces(directory)
     names = {space["environment"] for space in spaces} | {space["name"] for space in spaces}
     for name in environments or ():
@@ -75,9 +75,9 @@ def clear(environments: Annotated[list[str] | None, typer.Argument(metavar="[ENV
 
 
 def _compiled(directory: Path) -> list[Path]:
-    from pharos.system import paths
+    from pharos.system import storage
 
-    return [folder for folder in paths.compiled_folders(directory) if folder.is_dir() and not folder.is_symlink()]
+    return [folder for folder in storage.compiled_folders(directory) if folder.is_dir() and not folder.is_symlink()]
 
 
 def _spaces(directory: Path) -> list[dict[str, Any]]:

@@ -62,9 +62,9 @@ def solve(
     with termination():
         mdp = target.mdp(building, gamma=gamma, horizon=horizon, chance=chance)
     from pharos.solvers import uniform_value, value_iteration
-    from pharos.system import paths
+    from pharos.system import storage
 
-    checkpoint = (values or paths.cache_directory() / "values") if ranks != 1 else None
+    checkpoint = (values or storage.cache_directory() / "values") if ranks != 1 else None
     suffix = ".npy" if dtype == "float64" else f"-{dtype}.npy"
     with progress_line("solving") as report, termination():
 

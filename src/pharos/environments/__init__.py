@@ -10,17 +10,27 @@ from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.environments.base import (
+        CELL,
+        CELLS,
+        VALUED_CELLS,
         Color,
         Components,
         Environment,
         Ground,
+        Kind,
         Layer,
         Look,
         Margin,
+        Parameter,
         Scenery,
         Shape,
         Sprite,
         State,
+        as_tuples,
+        declared_parameters,
+        integers,
+        one_of,
+        parameter,
         start_distribution,
     )
     from pharos.environments.catalog import (
@@ -38,18 +48,6 @@ if TYPE_CHECKING:
     from pharos.environments.mini_grid.mini_grid import MiniGrid
     from pharos.environments.mini_grid.mini_grid_empty import MiniGridEmpty
     from pharos.environments.mini_grid.mini_grid_rooms import MiniGridRooms
-    from pharos.environments.parameters import (
-        CELL,
-        CELLS,
-        VALUED_CELLS,
-        Kind,
-        Parameter,
-        as_tuples,
-        declared_parameters,
-        integers,
-        one_of,
-        parameter,
-    )
     from pharos.environments.worlds.blackjack import Blackjack
     from pharos.environments.worlds.breakout import Breakout
     from pharos.environments.worlds.catch import Catch

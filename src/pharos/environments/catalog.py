@@ -13,9 +13,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pharos.environments.base import Environment
+from pharos.environments.base import Environment, as_tuples
 from pharos.environments.built_in import BUILT_IN, announce
-from pharos.environments.parameters import as_tuples
 from pharos.errors import ParameterError, UnknownName
 from pharos.system import mdp_files, sources
 from pharos.system.sources import Source

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from pharos.environments.base import Environment, Layer
-from pharos.environments.parameters import store
+from pharos.environments.base import Environment, Layer, store
 from pharos.errors import FileFormatError, ParameterError
 from pharos.system import mdp_files, storage
-from pharos.system.outcome_rows import OutcomeRows
+from pharos.system.arrays import OutcomeRows
 
 TIME_LIMIT = 1000  # of an MDP that has no horizon, and whose source has no limit
 MOST_ENTRIES = 1 << 28  # of a table of outcomes, written out

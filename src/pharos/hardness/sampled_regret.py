@@ -280,7 +280,7 @@ class SampledLearner(Learner):
         self, observations: Grouped, operator: KernelOperator, looks: np.ndarray, seed: int
     ) -> Iterator[np.ndarray]:
         """Yield the learnt values (C, A) of one walk at each of the steps `looks`, ascending."""
-        from pharos.kernels import learning as kernels
+        from pharos.kernels import stepping as kernels
 
         schedule, sampling, mdp = self.schedule, self.sampling, self._all
         count, num_actions = len(observations), mdp.num_actions

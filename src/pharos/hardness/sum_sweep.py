@@ -29,7 +29,7 @@ from pharos.hardness.interval import Budget, BudgetClock, Interval
 from pharos.kernels import graph as kernels
 from pharos.kernels import many_searches
 from pharos.mdp import TabularMDP
-from pharos.system.packed_indices import Indices
+from pharos.system.arrays import Indices
 from pharos.system.wording import many
 
 

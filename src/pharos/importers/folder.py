@@ -12,7 +12,7 @@ import numpy as np
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, FolderLocked, ParameterError
 from pharos.mdp import OutcomeTable, TabularMDP
-from pharos.system import mdp_files, paths, storage
+from pharos.system import mdp_files, storage
 from pharos.system.mdp_files import (
     AGAIN,
     COMMON,
@@ -181,7 +181,7 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
     _check_without_chance(mdp)
     if mdp.folder is not None and is_folder(mdp.folder):
         return make("imported", folder=os.fspath(mdp.folder))
-    place = paths.cache_directory() / "imported"
+    place = storage.cache_directory() / "imported"
     parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
     said = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon, str(mdp.chance), sorted(parts.items())]
     folder = place / storage.digest_of_json(said)

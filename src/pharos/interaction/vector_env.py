@@ -32,7 +32,7 @@ from pharos.kernels import stepping
 from pharos.kernels.stepping import DISABLED, SAME_STEP, Batch, first_outside
 from pharos.mdp import OutcomeTable, rewards_of_outcomes, rewards_of_staying
 from pharos.observations import NO_ACTION, Index, Seen, in_blocks
-from pharos.system.packed_indices import as_array
+from pharos.system.arrays import as_array
 from pharos.system.records import split
 
 if TYPE_CHECKING:

@@ -41,7 +41,7 @@ from numba.extending import (
 
 from pharos.kernels.hash_table import mixed, prefetch, slot_of
 from pharos.kernels.interpreted import interpreted_first, overload
-from pharos.system.packed_indices import PACKED, PackedIndices
+from pharos.system.arrays import PACKED, PackedIndices
 
 # Indices of 40 bits ---------------------------------------------------------------------------------------------------
 

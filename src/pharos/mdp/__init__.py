@@ -8,9 +8,22 @@ from typing import TYPE_CHECKING
 from pharos.system import lazy
 
 if TYPE_CHECKING:
+    from pharos.mdp.actions import (
+        BEST,
+        WORST,
+        Chance,
+        ChanceSetting,
+        Extreme,
+        PolicyTable,
+        Selection,
+        chosen_mass,
+        lazy_actions,
+        mass_of,
+        random_actions,
+        sticky_actions,
+    )
     from pharos.mdp.arguments import STEPS, check_horizon, require_mdp, whole_number
     from pharos.mdp.bisimulation import Minimization, minimize
-    from pharos.mdp.chance import Chance, ChanceSetting, lazy_actions, random_actions, sticky_actions
     from pharos.mdp.dynamics import (
         BellmanEquation,
         Dynamics,
@@ -22,18 +35,16 @@ if TYPE_CHECKING:
         shares_of,
     )
     from pharos.mdp.expanded import ExpandedMDP, executed_actions, mean_of_actions, nodes_of_outcomes, outcomes_of
-    from pharos.mdp.outcome_table import Matrices, OutcomeTable
-    from pharos.mdp.rewards import Rewards
-    from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass, mass_of
-    from pharos.mdp.space_rewards import (
+    from pharos.mdp.rewards import (
         PaidOutcomes,
+        Rewards,
         paid_outcomes,
         ranged_rewards,
         rewards_of_outcomes,
         rewards_of_space,
         rewards_of_staying,
     )
-    from pharos.mdp.table import Lazy, Table
+    from pharos.mdp.table import Lazy, Matrices, OutcomeTable, Table
     from pharos.mdp.tabular import Part, TabularMDP
 
 __all__ = [

@@ -14,7 +14,7 @@ from pharos.errors import ParameterError
 from pharos.mdp.arguments import require_mdp
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.tabular import TabularMDP
-from pharos.system.packed_indices import Indices
+from pharos.system.arrays import Indices
 
 
 @dataclass(frozen=True, eq=False)

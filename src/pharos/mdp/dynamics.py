@@ -4,7 +4,7 @@
 chance of choosing, no policy and no terminal states; a `BellmanEquation` brings them along where a whole backup is
 wanted.
 
-A way of storing transitions is one class: `Table` (table.py), `OutcomeTable` (outcome_table.py). It needs the methods
+A way of storing transitions is one class: `Table` (table.py), `OutcomeTable` (also there). It needs the methods
 that are abstract here, four attributes, and arrays that kernels/outcomes.py can read: all loops are compiled, each
 written once for all of them. docs/decisions/0008-one-operator.md says why, and where the next class goes.
 
@@ -24,11 +24,10 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.kernels import bellman, graph, occupancy, outcomes
-from pharos.mdp.chance import Chance
+from pharos.mdp.actions import Chance, Extreme, PolicyTable, Selection, States
 from pharos.mdp.rewards import Rewards
-from pharos.mdp.selection import Extreme, PolicyTable, Selection, States
+from pharos.system.arrays import Indices, room_for_indices
 from pharos.system.memory import pieces_from_the_end, rows_with_room
-from pharos.system.packed_indices import Indices, room_for_indices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

@@ -3,17 +3,31 @@
 Games pay few different rewards: up to 256 distinct values are kept as one byte for each transition and a palette of
 float64, an eighth of the memory of (S, A) float64 and an eighth of what a sweep has to stream; more are kept as
 float64.
+
+Those of stored transitions are computed in parallel after the build, and replaced without building again.
 """
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from pharos.errors import ParameterError
+from pharos.environments import Environment
+from pharos.errors import ParameterError, StateSpaceError
 from pharos.mdp.arguments import as_array
 from pharos.system.memory import large_zeros
+from pharos.system.workers import usable_workers
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from pharos.mdp.tabular import TabularMDP
+    from pharos.state_space import StateSpace
+
 
 _BLOCK = 1 << 16
 # Entries of a palette that each reward is compared with, before it is searched for.
@@ -195,3 +209,246 @@ def expected_over_outcomes(rewards: npt.ArrayLike, probabilities: np.ndarray) ->
             f"the reward of state {s}, action {a}, outcome {k} is {array[s, a, k]}; expected a finite number"
         )
     return (probabilities * np.where(possible, array, 0.0)).sum(axis=2)
+
+
+# Rewards of stored transitions ----------------------------------------------------------------------------------------
+
+
+_ROWS = 1 << 16
+
+
+def rewards_of_space(
+    space: "StateSpace", rewards: "npt.ArrayLike | Callable[..., float] | None" = None, *, workers: int | None = None
+) -> "Rewards":
+    """The rewards of all transitions of a state space.
+
+    Args:
+        rewards: None, an (S, A) array, or a function reward(self, state, action, next_state) -> float, or with the
+            outcome as one more argument.
+        workers: threads; the result does not depend on them.
+    Raises:
+        ParameterError: the array has the wrong shape, or holds NaN or infinity.
+        RuleError: the reward function gave NaN or infinity for a transition, which the message names.
+    """
+    shape = (space.num_states, space.num_actions)
+    if rewards is not None and not callable(rewards):
+        array = np.asarray(rewards, np.float64)
+        if array.shape != shape:
+            raise ParameterError(
+                f"{space}: rewards have shape {array.shape}; expected {shape}, one for each state and action"
+            )
+        return Rewards.from_array(array)
+    if space.environment is None:
+        raise StateSpaceError(
+            f"{space.folder}: pharos does not know the class {space.manifest['environment']!r}, so it cannot compute "
+            f"the rewards; import the module that registers it, or pass rewards as an (S, A) array"
+        )
+    env = space.environment if rewards is None else _with_reward(space.environment, rewards)
+    return _collected(space, env, _blocks(space, env, workers))
+
+
+def ranged_rewards(space: "StateSpace") -> "Rewards":
+    """The rewards by the rules, of which each range is computed when it is asked for."""
+    env = space.environment
+    assert env is not None
+
+    def compute(start: int, stop: int) -> "Rewards":
+        return _collected(space, env, _blocks(space, env, None, start, stop), start, stop)
+
+    return RangedRewards((space.num_states, space.num_actions), compute)
+
+
+def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "Rewards":
+    """What the rules pay for going from a state to itself, whether an action leads there or not; 0 in terminal states.
+
+    Args:
+        reward: a function reward(self, state, action, next_state) in place of the environment's.
+    Raises:
+        RuleError: NaN or infinity.
+    """
+    from pharos.rules import rules_of
+
+    assert space.environment is not None
+    env = space.environment if reward is None else _with_reward(space.environment, reward)
+    rules, num_actions = rules_of(env).rewards_of(space.num_states), space.num_actions
+
+    def blocks() -> Iterator[tuple[int, np.ndarray]]:
+        for start in range(0, space.num_states, _ROWS):
+            stop = min(start + _ROWS, space.num_states)
+            states, terminal, count = space.packed_states[start:stop], space.terminal[start:stop], stop - start
+            own = np.repeat(np.arange(count), num_actions)
+            if space.has_chance:
+                outcomes = np.arange(len(own)), own, np.ones(len(own))
+                nothing = np.full(len(own), -1)
+                yield start, rules.expected_block(states, outcomes, terminal, 0, count, nothing)
+            else:
+                table = own.reshape(count, num_actions).astype(space.successors.dtype)
+                yield start, rules.block(states, table, terminal, 0, count)
+
+    return _collected(space, env, blocks())
+
+
+def _collected(
+    space: "StateSpace",
+    env: Environment,
+    blocks: Iterator[tuple[int, np.ndarray]],
+    first: int = 0,
+    last: int | None = None,
+) -> "Rewards":
+    """Blocks (first state, rewards) of the states [first, last) as one; RuleError where one is not finite."""
+    from pharos.rules import refused_reward
+
+    stop = space.num_states if last is None else last
+    collector = RewardsCollector((stop - first, space.num_actions))
+    for start, block in blocks:
+        if not np.isfinite(block).all():
+            s, a = map(int, np.argwhere(~np.isfinite(block))[0])
+            raise refused_reward(env, space.state(start + s), a, f"is {block[s, a]}; expected a finite number")
+        collector.add(start - first, block)
+    return collector.finish()
+
+
+def rewards_of_outcomes(space: "StateSpace") -> np.ndarray:
+    """What each possible outcome of a state space with chance pays when it is drawn: (N,) float64, in their order.
+
+    Raises:
+        RuleError: the reward function raised an exception.
+    """
+    from pharos.rules import rules_of
+
+    assert space.environment is not None
+    rules = rules_of(space.environment).rewards_of(space.num_states)
+    blocks = [np.empty(0)]
+    for start in range(0, space.num_states, _ROWS):
+        stop = min(start + _ROWS, space.num_states)
+        which, successors, _ = space.dynamics.entries_of(np.arange(start, stop))
+        number = np.arange(len(which)) - np.searchsorted(which, which)  # of each outcome within its row
+        paid = np.zeros(len(which))
+        for k in range(int(number.max(initial=-1)) + 1):  # as if the k-th were the only one
+            now = number == k
+            outcomes = which[now], successors[now], np.ones(int(now.sum()))
+            ranks = np.full(len(outcomes[0]), k)
+            means = rules.expected_block(space.packed_states, outcomes, space.terminal, start, stop, ranks)
+            paid[now] = means.reshape(-1)[which[now]]
+        blocks.append(paid)
+    return np.concatenate(blocks)
+
+
+class PaidOutcomes(NamedTuple):
+    """What executing an action may lead to and pay, in all states.
+
+    Attributes:
+        which: (N,) row s A + a of the state and the executed action, ascending.
+        states: (N,) next states, S for the end.
+        rewards: (N,) what this outcome pays.
+        probabilities: (N,) float64 > 0.
+    """
+
+    which: np.ndarray
+    states: np.ndarray
+    rewards: np.ndarray
+    probabilities: np.ndarray
+
+
+def paid_outcomes(mdp: "TabularMDP") -> PaidOutcomes:
+    """The possible outcomes of all states and executed actions of an MDP, each with what it pays when it is drawn.
+
+    A reward is the outcome's own where the MDP is of an environment whose rewards it has, else the expected one of
+    state and action. Cost: some 50 bytes an outcome; for MDPs that fit.
+    """
+    num_states, num_actions = mdp.num_states, mdp.num_actions
+    expected = np.ravel(mdp.rewards)
+    rows = np.arange(num_states * num_actions)
+    which, states, probabilities = mdp.dynamics.outcomes(rows // num_actions, rows % num_actions)
+    outcomes = PaidOutcomes(which, np.asarray(states, np.int64), expected[which], probabilities)
+    own = _outcomes_of_environment(mdp)
+    if own is None:
+        return outcomes
+    count = len(expected)
+    mean = np.bincount(own.which, own.rewards * own.probabilities, count)
+    largest = np.ones(count)
+    np.maximum.at(largest, own.which, np.abs(own.rewards))
+    is_own = np.abs(mean - expected) <= 1e-9 * largest  # else rewards were replaced
+    parts = [
+        [column[chosen[table.which]] for column in table] for table, chosen in ((own, is_own), (outcomes, ~is_own))
+    ]
+    joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
+    order = np.argsort(joined[0], kind="stable")
+    return PaidOutcomes(*(column[order] for column in joined))
+
+
+def _outcomes_of_environment(mdp: "TabularMDP") -> PaidOutcomes | None:
+    """By the rules, where the MDP has chance and is of an environment."""
+    from pharos.state_space import load
+
+    if mdp.folder is None or mdp.dynamics.is_deterministic:
+        return None
+    space = load(mdp.folder, verify=False, environment=mdp.environment)
+    if space.environment is None:
+        return None
+    rows, stays = np.arange(space.num_states * space.num_actions), mdp.laziness
+    if space.has_chance:
+        which, successors, probabilities = space.dynamics.entries_of(np.arange(space.num_states))
+        columns = [which, successors, rewards_of_outcomes(space), (1.0 - stays) * probabilities]
+    else:  # lazy actions alone
+        paid = rewards_of_space(space).array.ravel()
+        columns = [rows, np.ravel(space.successors), paid, np.full(len(rows), 1.0 - stays)]
+    if stays:
+        staying = rows, rows // space.num_actions, rewards_of_staying(space).array.ravel(), np.full(len(rows), stays)
+        columns = [np.concatenate(pair) for pair in zip(columns, staying, strict=True)]
+        by_row = np.argsort(columns[0], kind="stable")
+        columns = [column[by_row] for column in columns]
+    return _joined(PaidOutcomes(*columns))
+
+
+def _joined(outcomes: PaidOutcomes) -> PaidOutcomes:
+    """Those of a row that lead to the same state and pay the same as one, in the place of the first."""
+    which, states, rewards, probabilities = outcomes
+    order = np.lexsort((rewards, states, which))
+    key = np.stack([which, states, rewards])[:, order]
+    begins = np.flatnonzero(np.append(True, (key[:, 1:] != key[:, :-1]).any(axis=0)))
+    first = np.minimum.reduceat(order, begins)
+    place = np.argsort(first)
+    first, sums = first[place], np.add.reduceat(probabilities[order], begins)[place]
+    return PaidOutcomes(which[first], states[first], rewards[first], sums)
+
+
+def _blocks(
+    space: "StateSpace", env: Environment, workers: int | None, first: int = 0, last: int | None = None
+) -> Iterator[tuple[int, np.ndarray]]:
+    """(start, rewards of the states from start on), in order, of the states [first, last)."""
+    from pharos.rules import rules_of
+
+    rules = rules_of(env).rewards_of(space.num_states)
+    end = space.num_states if last is None else last
+    starts = range(first, end, _ROWS)
+    states, terminal = space.packed_states, space.terminal
+    successors, dynamics = None if space.has_chance else space.successors, space.dynamics
+
+    def block(start: int) -> np.ndarray:
+        stop = min(start + _ROWS, end)
+        if successors is not None:
+            return rules.block(states, successors, terminal, start, stop)
+        return rules.expected_block(states, dynamics.entries_of(np.arange(start, stop)), terminal, start, stop)
+
+    threads = rules.threads(usable_workers(workers))
+    with ThreadPoolExecutor(threads) as pool:
+        window = 2 * threads
+        pending = [pool.submit(block, start) for start in starts[:window]]
+        for i, start in enumerate(starts):
+            rewards = pending[i % window].result()
+            if i + window < len(starts):
+                pending[i % window] = pool.submit(block, starts[i + window])
+            yield start, rewards
+
+
+def _with_reward(env: Environment, reward: Callable) -> Environment:
+    """An environment with the same rules and parameters but another reward function."""
+    names = list(inspect.signature(reward).parameters)
+    if len(names) not in (4, 5):
+        raise ParameterError(
+            f"a reward function takes (self, state, action, next_state); found ({', '.join(names)}); the outcome may "
+            f"be a fifth argument"
+        )
+    cls: type[Environment] = type(type(env).__name__, (type(env),), {"reward": reward, "__module__": reward.__module__})
+    return cls(**env.parameters)

@@ -1,15 +1,39 @@
-"""Dynamics with one next state for each state and action: games, and whatever is deterministic.
+"""Tables of transitions.
 
-Dynamics in which now and then nothing happens: nothing is copied, neither successors nor probabilities.
+`Table`: one next state for each state and action, games and whatever is deterministic. `Lazy`: a table in which now and
+then nothing happens; nothing is copied, neither successors nor probabilities. `OutcomeTable`: several outcomes for each
+state and action, games whose rules have chance.
+
+Arrays of outcomes as users write them are checked, and held compactly. A sparse matrix of transitions becomes such a
+table too (`Matrices`).
 """
 
-from functools import partial
+import math
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
+from pharos.errors import ParameterError
+from pharos.kernels import outcomes as kernels
+from pharos.mdp.actions import States
+from pharos.mdp.arguments import as_array
 from pharos.mdp.dynamics import Dynamics, Order, Outcomes, as_indices, split
-from pharos.mdp.selection import States
-from pharos.system.packed_indices import Indices, PackedIndices, blocks_of, holds_end, rows_of
+from pharos.system.arrays import (
+    SUM_TOLERANCE,
+    Indices,
+    OutcomeCheck,
+    OutcomeRows,
+    PackedIndices,
+    WrongOutcomes,
+    blocks_of,
+    holds_end,
+    rows_of,
+)
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 
 class Table(Dynamics):
@@ -177,3 +201,365 @@ class Lazy(Dynamics):
 
     def merged(self, classes: np.ndarray, representatives: np.ndarray) -> Dynamics:
         return Lazy(self.tables.merged(classes, representatives), self.laziness)
+
+
+# Several outcomes -----------------------------------------------------------------------------------------------------
+
+
+# The share of a dense table that may be padding before successors are kept one row after another.
+MOST_PADDING = 0.3
+# Vectors of probabilities that codes of one and of two bytes tell apart.
+FEW, MANY = 1 << 8, 1 << 16
+
+
+def checked_outcomes(successors: npt.ArrayLike, probabilities: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Both as arrays (S, A, K), the probabilities as float64.
+
+    Raises:
+        ParameterError: a shape or type is wrong, an index is outside, or a row holds no probabilities; the first such
+            entry is named.
+    """
+    table, chances = as_array(successors, "successors"), as_array(probabilities, "probabilities")
+    if table.ndim != 3 or table.size == 0 or table.dtype.kind not in "iu":
+        raise ParameterError(
+            f"successors have shape {table.shape} and type {table.dtype}; expected integers of shape "
+            "(states, actions, outcomes)"
+        )
+    if chances.shape != table.shape or chances.dtype.kind not in "iufb":
+        raise ParameterError(
+            f"probabilities have shape {chances.shape} and type {chances.dtype}; expected numbers of shape "
+            f"{table.shape}, one for each successor"
+        )
+    chances = chances.astype(np.float64, copy=False)
+    wrong = ~((chances >= 0) & (chances <= 1 + SUM_TOLERANCE))  # also NaN
+    if wrong.any():
+        s, a, k = map(int, np.argwhere(wrong)[0])
+        raise ParameterError(f"probabilities[{s}, {a}, {k}] is {chances[s, a, k]}; expected a number from 0 to 1")
+    sums = chances.sum(axis=2)
+    wrong = ~(np.abs(sums - 1) <= SUM_TOLERANCE)
+    if wrong.any():
+        s, a = map(int, np.argwhere(wrong)[0])
+        raise ParameterError(
+            f"the probabilities of state {s}, action {a} sum to {sums[s, a]}; expected 1: give the end of the episode, "
+            "successor -1, the rest"
+        )
+    wrong = (table < -1) | (table >= len(table))
+    if wrong.any():
+        s, a, k = map(int, np.argwhere(wrong)[0])
+        raise ParameterError(
+            f"successors[{s}, {a}, {k}] is {table[s, a, k]}; expected a state from 0 to {len(table) - 1}, or -1 for "
+            "the end"
+        )
+    return table, chances
+
+
+def compact_outcomes(
+    successors: np.ndarray, probabilities: np.ndarray, *, most_padding: float = MOST_PADDING, most_vectors: int = MANY
+) -> dict[str, Any]:
+    """What an `OutcomeTable` is made of, from (S, A, K) arrays: possible ones alone, in their order."""
+    num_states, num_actions, _ = successors.shape
+    possible = probabilities > 0
+    counts = possible.sum(axis=2)
+    if not possible[..., : counts.min()].all() or (possible[..., 1:] > possible[..., :-1]).any():
+        order = np.argsort(~possible, axis=2, kind="stable")  # possible ones first
+        successors, probabilities, possible = (
+            np.take_along_axis(each, order, axis=2) for each in (successors, probabilities, possible)
+        )
+    width = int(counts.max())
+    successors, probabilities, possible = (each[..., :width] for each in (successors, probabilities, possible))
+    result: dict[str, Any] = {"num_actions": num_actions}
+    ragged = counts.sum() < (1 - most_padding) * num_states * num_actions * width
+    if ragged:
+        result["offsets"] = np.concatenate([[0], np.cumsum(counts.ravel())])
+        result["successors"] = as_indices(successors[possible], num_states)
+    else:
+        result["successors"] = as_indices(np.where(possible, successors, successors[..., :1]), num_states)
+    codes, palette = _palette(np.ascontiguousarray(probabilities).reshape(-1, width), most_vectors)
+    if palette is None:
+        result["probabilities"] = probabilities[possible] if ragged else np.ascontiguousarray(probabilities)
+    else:
+        result.update(codes=codes.reshape(num_states, num_actions), palette=palette)
+    return result
+
+
+def _palette(vectors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """(codes (N,), the distinct ones (P, K) in the order in which they appear) of vectors (N, K).
+
+    None where they are more than `most`.
+    """
+    from pharos.kernels import partition
+
+    vectors = vectors + 0.0  # -0.0 and 0.0 are one number
+    numbers, count = partition.numbered_rows(vectors)
+    if count > most:
+        return numbers, None
+    palette = np.empty((count, vectors.shape[1]))
+    palette[numbers] = vectors
+    return numbers.astype(np.uint8 if count <= FEW else np.uint16), palette
+
+
+# Executions whose outcomes NumPy lists sooner than a kernel is compiled.
+_FEW = 1 << 14
+
+
+class OutcomeTable(OutcomeRows, Dynamics):
+    """Several next states for each state and action, and their probabilities, as the tables of `OutcomeRows`."""
+
+    def __init__(self, successors: Indices, num_actions: int, **others: Indices | None):
+        """others: offsets, codes, palette, probabilities; see `OutcomeRows`, which also raises."""
+        super().__init__(successors, **others)
+        self.num_actions = num_actions
+        rows = len(successors) * num_actions if self.offsets is None else len(self.offsets) - 1
+        self.num_states = rows // num_actions
+
+    @staticmethod
+    def from_arrays(successors: npt.ArrayLike, probabilities: npt.ArrayLike) -> "OutcomeTable":
+        """From (S, A, K) successors, -1 for the end, and probabilities; what is impossible is left out.
+
+        Up to 65,536 distinct vectors of probabilities become a palette. Rows are kept one after another where more than
+        30 % of (S, A, K) would be padding.
+
+        Raises:
+            ParameterError: a shape, an index or a probability is wrong, or a row does not sum to 1 within 1e-9; the
+                first such entry is named.
+        """
+        return OutcomeTable(**compact_outcomes(*checked_outcomes(successors, probabilities)))
+
+    def check(self) -> None:
+        """ParameterError where the arrays, whoever wrote them, are not what the attributes say. Cost: O(S A K)."""
+        pairs, size = (self.num_states, self.num_actions), self.successors.shape
+        fitting = {
+            "successors": ("iu", size if len(size) == 1 else (*pairs, *size[2:3])),
+            "offsets": ("iu", (self.num_states * self.num_actions + 1,)),
+            "codes": ("u", pairs),
+            "palette": ("f", (*self.by_name.get("palette", self.successors).shape[:1], self.num_outcomes)),
+            "probabilities": ("f", size),
+        }
+        for name, array in self.by_name.items():
+            kinds, shape = fitting[name]
+            is_float = kinds != "f" or array.dtype == np.float64
+            if array.shape != shape or array.dtype.kind not in kinds or not is_float or not array.size:
+                kind = {"iu": "integers", "u": "unsigned integers", "f": "float64"}[kinds]
+                text = f"shape {array.shape} and type {array.dtype}"
+                raise ParameterError(f"{name}: {text}; expected {kind} of shape {shape}")
+        try:
+            OutcomeCheck(self, pairs, self.num_outcomes, -1).block(0, self.num_states)
+        except WrongOutcomes as error:
+            raise ParameterError(f"{error.name}: {error}") from None
+
+    # What it says of itself -------------------------------------------------------------------------------------------
+
+    @property
+    def operations(self) -> int:  # type: ignore[override]
+        return 2 * self.num_outcomes
+
+    @cached_property
+    def for_kernels(self) -> tuple[object, ...]:  # type: ignore[override]
+        codes, weights = self.codes, self.palette
+        if self.probabilities is not None:
+            weights = self.probabilities.reshape(-1)
+        shape = (self.num_states, self.num_actions)
+        return self.flat, self.offsets, None if codes is None else codes.reshape(-1), weights, shape, self.num_outcomes
+
+    def for_kernels_with(self, values: np.ndarray) -> tuple[object, ...]:
+        """`for_kernels` with other values, (N,) of all possible outcomes in order, in the place of the successors."""
+        if len(values) < self.successors.size:  # padding
+            rows = np.arange(self.num_states * self.num_actions)
+            which = self.possible(rows)[0]
+            counts = np.bincount(which, minlength=len(rows))
+            padded = np.zeros((len(rows), self.num_outcomes), values.dtype)
+            padded[np.arange(self.num_outcomes) < counts[:, None]] = values
+            values = padded.reshape(-1)
+        return (values, *self.for_kernels[1:])
+
+    @cached_property
+    def for_sweeps(self) -> tuple[object, ...]:  # type: ignore[override]
+        return (*self.for_kernels[:-1], kernels.each_of(self.num_outcomes))
+
+    @cached_property
+    def mass(self) -> float:  # type: ignore[override]
+        if self.palette is not None:  # the sign of a sum by fsum is that of the exact one
+            beyond = max(math.fsum([*vector, -1.0]) for vector in np.asarray(self.palette).tolist())
+            return 1.0 if beyond <= 0 else math.nextafter(1.0 + beyond, 2.0)
+        sums = self.expected(np.ones(self.num_states + 1))
+        return max(1.0, float(sums.max()) * (1 + self.num_outcomes * _UNIT))
+
+    @cached_property
+    def has_ends(self) -> bool:  # type: ignore[override]
+        return holds_end(self.successors)
+
+    @cached_property
+    def is_deterministic(self) -> bool:  # type: ignore[override]
+        return bool(kernels.have_one_outcome(self.for_kernels))
+
+    @cached_property
+    def _table(self) -> Indices:
+        pairs = self.num_states, self.num_actions
+        if self.successors.size == self.num_states * self.num_actions:
+            return self.successors.reshape(pairs)
+        return np.ascontiguousarray(self.successors[..., 0])
+
+    def deterministic_table(self) -> Indices | None:
+        return self._table if self.is_deterministic else None
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {name: np.asarray(array) for name, array in self.by_name.items()}
+
+    # What executing does ----------------------------------------------------------------------------------------------
+
+    def expected(self, x: np.ndarray, states: States = slice(None)) -> np.ndarray:
+        rows = np.arange(self.num_states)[states]
+        flat = np.ascontiguousarray(x, np.float64).reshape(len(x), x.shape[1] if x.ndim > 1 else 1, -1)
+        out = np.empty((len(rows), self.num_actions, flat.shape[2]))
+        kernels.expected(self.for_kernels, flat, rows, out)
+        return out.reshape(len(rows), self.num_actions, *x.shape[2:])
+
+    def entries(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        states, actions = np.asarray(states, np.int64), np.asarray(actions, np.int64)
+        rows = states * self.num_actions + actions
+        if len(rows) < _FEW:
+            return self.possible(rows)
+        size = int((self.begins(rows + 1) - self.begins(rows)).sum())
+        columns = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size)
+        count = kernels.entries(self.for_kernels, states, actions, *columns)
+        which, following, probabilities = (column[:count] for column in columns)
+        return which, following, probabilities
+
+    def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        if self.is_deterministic:
+            return self._table[states, actions]
+        drawn = np.empty(len(states), np.int64)
+        kernels.draw(self.for_kernels, np.asarray(states), np.asarray(actions), rng.random(len(states)), drawn)
+        return drawn
+
+    def part(self, start: int, stop: int) -> tuple["OutcomeTable", np.ndarray]:
+        first, last = self.begins(np.array([start, stop]) * self.num_actions).tolist()
+        entries = rows_of(self.flat, first, last)
+        local, halo = split(partial(blocks_of, entries), entries.shape, start, stop)
+        return self._of_states(slice(start, stop), slice(first, last), local), halo
+
+    def restricted_to(self, states: np.ndarray) -> "OutcomeTable":
+        """These states alone; what leads out of them leads back to where it came from."""
+        number = np.full(self.num_states + 1, -2, np.int64)
+        number[states], number[-1] = np.arange(len(states)), -1
+        return self._renumbered(states, number)
+
+    def merged(self, classes: np.ndarray, representatives: np.ndarray) -> "OutcomeTable":
+        return self._renumbered(representatives, np.append(classes, -1))
+
+    def ends_and_stays(self) -> tuple[np.ndarray, np.ndarray]:
+        """(S,) bool each: whether all that a state leads to is the end; and whether it is the end or the state."""
+        successors, states = np.asarray(self.flat), np.arange(self.num_states + 1)
+        first = self.begins(states * self.num_actions)
+        ends = successors == -1
+        stays = ends | (successors == np.repeat(states[:-1].astype(successors.dtype), np.diff(first)))
+        return np.logical_and.reduceat(ends, first[:-1]), np.logical_and.reduceat(stays, first[:-1])
+
+    # Parts of it ------------------------------------------------------------------------------------------------------
+
+    def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
+        """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for where it came from."""
+        which, places = self.places(self._rows(np.asarray(states)))
+        following = number[self.flat[places]]
+        following = np.where(following == -2, which // self.num_actions, following)
+        return self._of_states(states, places, as_indices(following, len(states)))
+
+    def _of_states(self, states: States, places: States, successors: Indices) -> "OutcomeTable":
+        """The rows of some states, with other successors (N,); places (N,) of their entries, all and in order."""
+        arrays: dict[str, Any] = {"successors": successors.reshape(-1, *self.successors.shape[1:])}
+        if self.offsets is not None:
+            rows = self._rows(np.arange(self.num_states)[states])
+            arrays["offsets"] = np.append(0, np.cumsum(self.begins(rows + 1) - self.begins(rows)))
+        if self.probabilities is None:
+            arrays.update(codes=np.array(np.asarray(self.codes)[states]), palette=self.palette)
+        else:
+            probabilities = np.array(self.probabilities.reshape(-1)[places])
+            arrays["probabilities"] = probabilities.reshape(arrays["successors"].shape)
+        return OutcomeTable(num_actions=self.num_actions, **arrays)
+
+    def _rows(self, states: np.ndarray) -> np.ndarray:
+        """The rows s A + a of some states."""
+        return (states[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
+
+
+class Matrices(OutcomeTable):
+    """A table of outcomes, row after row, that was given as a sparse matrix, and is kept in files as one.
+
+    Attributes:
+        transitions: (S A, S) CSR float64, row s A + a; what a row lacks to 1 is the probability that the episode ends,
+            but for 4 (n + 2) units of 2^-53 where rows have n entries: as much as their own rounding may lack.
+    """
+
+    def __init__(self, transitions: "csr_matrix", num_actions: int):
+        if not transitions.data.all():
+            transitions = transitions.copy()
+            transitions.eliminate_zeros()
+        self.transitions = transitions
+        counts = np.diff(transitions.indptr)
+        lacking = 1 - np.asarray(transitions.sum(axis=1)).ravel()
+        ending = np.flatnonzero(lacking > 4 * (int(counts.max(initial=0)) + 2) * 2.0**-53)
+        places, offsets = transitions.indptr[ending + 1], transitions.indptr
+        successors, probabilities = transitions.indices, transitions.data
+        if len(ending):
+            successors = np.insert(successors, places, -1)
+            probabilities = np.insert(probabilities, places, lacking[ending])
+            offsets = offsets + np.searchsorted(ending, np.arange(len(offsets)))
+        super().__init__(successors, num_actions, offsets=offsets, probabilities=probabilities)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        matrix = self.transitions
+        names = ("transitions_data", "transitions_indices", "transitions_indptr")
+        return dict(zip(names, (matrix.data, matrix.indices, matrix.indptr), strict=True))
+
+
+def transitions_of(P: object) -> tuple["csr_matrix", int]:
+    """((S A, S) CSR float64 with rows s A + a, A), from any form that `TabularMDP.from_matrices` takes.
+
+    Raises:
+        ParameterError: the shape does not fit, or entries or their sums are no probabilities.
+    """
+    from scipy import sparse
+
+    if isinstance(P, list | tuple) and len(P) and sparse.issparse(P[0]):
+        num_states, num_actions = P[0].shape[0], len(P)
+        stacked = sparse.vstack([sparse.csr_matrix(matrix) for matrix in P]).tocsr()
+        order = (np.arange(num_actions)[None, :] * num_states + np.arange(num_states)[:, None]).ravel()
+        matrix = stacked[order]
+    elif sparse.issparse(P):
+        matrix = sparse.csr_matrix(P, dtype=np.float64)
+        num_states = matrix.shape[1]
+        num_actions = matrix.shape[0] // max(num_states, 1)
+    else:
+        dense = as_array(P, "P", np.float64)
+        if dense.ndim != 3 or dense.shape[0] != dense.shape[2]:
+            raise ParameterError(f"P has shape {dense.shape}; expected (states, actions, states)")
+        num_states, num_actions = dense.shape[:2]
+        matrix = sparse.csr_matrix(dense.reshape(num_states * num_actions, num_states))
+    if matrix.shape != (num_states * num_actions, num_states) or not num_actions:
+        raise ParameterError(f"P has shape {matrix.shape}; expected (states * actions, states)")
+    matrix = matrix.astype(np.float64)
+    matrix.sum_duplicates()
+    if not (np.isfinite(matrix.data).all() and (matrix.data >= 0).all()):
+        raise ParameterError("P has entries that are negative, NaN or infinite; expected probabilities")
+    sums = np.asarray(matrix.sum(axis=1)).ravel()
+    if (sums > 1 + 1e-9).any():
+        row = int(np.argmax(sums))
+        raise ParameterError(
+            f"P of state {row // num_actions}, action {row % num_actions} sums to {sums[row]}; expected at most 1"
+        )
+    return matrix, num_actions
+
+
+def expected_rewards(P: object, R: npt.ArrayLike, num_states: int, num_actions: int) -> np.ndarray:
+    """(S, A) expected rewards, from (S, A); from (S,), alike for every action; or from (S, A, S) with a dense P.
+
+    What is none of these comes back as it is.
+    """
+    rewards = as_array(R, "R", np.float64)
+    if rewards.shape == (num_states, num_actions, num_states) and isinstance(P, np.ndarray | list | tuple):
+        probabilities = np.asarray(P)
+        if probabilities.dtype != object and probabilities.shape == rewards.shape:
+            return (probabilities * rewards).sum(axis=2)
+    if rewards.shape == (num_states,):
+        return np.repeat(rewards[:, None], num_actions, axis=1)
+    return rewards

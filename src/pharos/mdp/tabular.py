@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
+from pharos.mdp.actions import Chance, PolicyTable, Selection
 from pharos.mdp.arguments import (
     check_gamma,
     check_horizon,
@@ -21,20 +22,19 @@ from pharos.mdp.arguments import (
     start_of,
     terminal_states,
 )
-from pharos.mdp.chance import Chance
 from pharos.mdp.dynamics import Dynamics, Order
-from pharos.mdp.outcome_table import (
+from pharos.mdp.rewards import Rewards, expected_over_outcomes, rewards_of_shape
+from pharos.mdp.table import (
+    Lazy,
     Matrices,
     OutcomeTable,
+    Table,
     checked_outcomes,
     compact_outcomes,
     expected_rewards,
     transitions_of,
 )
-from pharos.mdp.rewards import Rewards, expected_over_outcomes, rewards_of_shape
-from pharos.mdp.selection import PolicyTable, Selection
-from pharos.mdp.table import Lazy, Table
-from pharos.system.packed_indices import Indices
+from pharos.system.arrays import Indices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

@@ -37,7 +37,7 @@ from pharos.policies.policy import (
 )
 from pharos.solvers import Solution
 from pharos.state_space import load
-from pharos.system.packed_indices import as_array
+from pharos.system.arrays import as_array
 
 # Histories whose frames are drawn at once
 BATCH = 512

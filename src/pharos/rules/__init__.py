@@ -5,7 +5,7 @@ Only what loads no Numba is imported at once; the rest is when it is asked for.
 
 from typing import TYPE_CHECKING
 
-from pharos.rules.fingerprint import fingerprint_of_rules, mutable_attributes
+from pharos.rules.compiler import fingerprint_of_rules, mutable_attributes
 from pharos.rules.layout import Layout, layout_of, pack, unpack
 from pharos.system import lazy
 

@@ -14,7 +14,7 @@ from pharos.environments import Environment
 from pharos.errors import RuleError
 from pharos.rules.compiler import Function, KernelCache, compiler_of, numeric_attributes, type_text
 from pharos.rules.layout import Layout
-from pharos.system.packed_indices import Indices, PackedIndices
+from pharos.system.arrays import Indices, PackedIndices
 
 if TYPE_CHECKING:
     from pharos.rules.exploration import ExplorationKernels

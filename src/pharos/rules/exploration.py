@@ -19,7 +19,7 @@ from numba import int64
 from pharos.kernels.hash_table import COUNT, DEPTH, FAULT, FIRST, LEVEL_END, entry_at, mixed, prefetch, slot_of
 from pharos.rules.compiler import CompiledRules, Compiler, Constructor, Function
 from pharos.rules.packed_view import fault, get_word, packed_view, read_only_view, set_word
-from pharos.system.outcome_rows import SUM_TOLERANCE
+from pharos.system.arrays import SUM_TOLERANCE
 
 BATCH = 16  # states expanded before their successors are looked up: enough look-ups to hide the memory's latency
 

@@ -18,7 +18,7 @@ from pharos.environments import Environment
 from pharos.errors import RuleError
 from pharos.kernels.hash_table import COUNT, FIRST, find, insert_missing, pack_rows, slots_of, unpack_rows
 from pharos.rules.layout import Layout, unpack
-from pharos.system.outcome_rows import SUM_TOLERANCE
+from pharos.system.arrays import SUM_TOLERANCE
 
 
 class Branches(NamedTuple):

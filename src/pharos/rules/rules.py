@@ -35,7 +35,7 @@ from pharos.rules.compiled import (
 from pharos.rules.compiler import reason_of
 from pharos.rules.layout import Layout, layout_of
 from pharos.system import compiling
-from pharos.system.packed_indices import Indices
+from pharos.system.arrays import Indices
 
 Engine = TypeVar("Engine")
 Reasons = dict[tuple[object, ...] | None, str]  # signature of the instances -> why Numba does not compile them

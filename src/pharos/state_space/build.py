@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceLocked, StateSpaceMismatch
-from pharos.state_space.files import lock
-from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, Plan, read_manifest
+from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, Plan, lock, read_manifest
 from pharos.state_space.progress import Progress, reporter
 from pharos.state_space.store import StateSpace, load
 from pharos.state_space.stored import SHARDS, check_files
 from pharos.system import memory as machine
-from pharos.system import paths, storage
+from pharos.system import storage
 
 if TYPE_CHECKING:
     from pharos.ranks import Rank
@@ -104,7 +103,7 @@ def _build(
     plan: Plan, path: Path, rank: "Rank | None", options: "Options", progress: Progress | bool | None, hold: Hold
 ) -> bool:
     """Make the folder hold the finished state space; returns whether it did before."""
-    from pharos.state_space.outcome_journal import remove_parts
+    from pharos.state_space.journal import remove_parts
     from pharos.state_space.ranked_table import RankedSearch
     from pharos.state_space.search import Search, check_size, journal_of
 
@@ -142,7 +141,7 @@ def folder_of(plan: Plan) -> Path:
     """The same, of a plan."""
     content = json.dumps([plan.identity, plan.fingerprint, plan.format_version], sort_keys=True)
     digest = hashlib.sha256(content.encode()).hexdigest()[:16]
-    return paths.cache_directory() / "spaces" / f"{plan.env.name}-{digest}"
+    return storage.cache_directory() / "spaces" / f"{plan.env.name}-{digest}"
 
 
 def _manifest_of(plan: Plan, path: Path) -> dict[str, Any] | None:

@@ -3,36 +3,52 @@ checkpoints.
 
 Data first, then the manifest that speaks of it: whatever kills the process, the last manifest is true, and the same
 command goes on from there.
+
+Chance. While the build goes on, possible outcomes are appended one after another, with a code for each state and
+action, whose vector in the palette says how many there are and how likely they are. Where there are more vectors than
+codes, the probabilities are spelled out, once and for all. `OutcomeParts` makes the files of the finished build from
+these: rows are padded to equal length where little of that would be padding, and codes take one byte where that
+suffices.
 """
 
 import contextlib
+import os
+import shutil
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pharos.errors import DiskFull
+from pharos.kernels import outcomes as kernels
 from pharos.rules import pack
-from pharos.state_space.files import GrowingFile, write_manifest
 from pharos.state_space.manifest import (
     ARRAYS,
+    CODES,
     INDEX_TYPES,
     INT40_VERSION,
+    MOST_CODES,
+    OFFSETS,
+    PALETTE,
     PARTS,
+    PROBABILITIES,
     STATES,
     SUCCESSORS,
     SUCCESSORS40,
     TERMINAL,
+    GrowingFile,
     Plan,
+    cannot_write,
     successors_name,
+    write_manifest,
 )
-from pharos.state_space.stored import check_rules
+from pharos.state_space.stored import check_outcome_rules, check_rules, states_to_check
 from pharos.state_space.table import Block
-from pharos.system.packed_indices import as_stored, dtype_of, from_stored
+from pharos.system.arrays import OutcomesOfState, as_stored, dtype_of, from_stored
 
 BLOCK_BYTES = 1 << 22  # of a file that are copied at a time
 
@@ -262,3 +278,330 @@ def blocks_of(file: GrowingFile, dtype: np.dtype, entries: int | None = None) ->
     for first in range(0, size, most):
         shape = (min(most, size - first),)
         yield first, np.memmap(file.path, dtype, "r", offset=first * dtype.itemsize, shape=shape)
+
+
+# Outcomes of a build with chance --------------------------------------------------------------------------------------
+
+
+MOST_PADDING = (3, 10)
+"""The share of (S, A, K) that may be padding, as a fraction."""
+
+ENTRIES = 1 << 18  # of rows of K, as many as are copied at a time
+
+
+class Part(NamedTuple):
+    """Some rows: the number of the first one, and that of its first outcome; then R rows of N outcomes in all.
+
+    counts (R,); codes (R,), None where probabilities are spelled out; successors (N,).
+    """
+
+    row: int
+    first: int
+    counts: np.ndarray
+    codes: np.ndarray | None
+    successors: np.ndarray
+
+
+@dataclass
+class OutcomeParts:
+    """What the files of a build that goes on hold of outcomes.
+
+    Attributes:
+        folder: where they are. rows: how many, A for each state. most_declared: the most outcomes that a row may have.
+        indices: the file of the finished build that its successors will be in, of INDEX_TYPES.
+        palette: (P, K) uint64, bits of the vectors; None where probabilities are spelled out.
+    """
+
+    folder: Path
+    rows: int
+    num_actions: int
+    most_declared: int
+    indices: str
+    palette: np.ndarray | None
+
+    def parts(self) -> Iterator[Part]:
+        """All rows, some at a time."""
+        for row, first, codes, counts in self._counts():
+            yield self._part(row, first, codes, counts)
+
+    def _counts(self) -> Iterator[tuple[int, int, np.ndarray | None, np.ndarray]]:
+        """(row, first, codes, counts) of each `Part`."""
+        sizes = np.zeros(0, np.int64) if self.palette is None else (self.palette != 0).sum(axis=1)
+        first, step = 0, max(1, ENTRIES // self.most_declared // self.num_actions) * self.num_actions
+        for row in range(0, self.rows, step):
+            rows = min(step, self.rows - row)
+            codes = None
+            if self.palette is None:
+                counts = np.diff(np.fromfile(self.folder / PARTS[OFFSETS], "<i8", rows + 1, offset=8 * row))
+            else:
+                codes = np.fromfile(self.folder / PARTS[CODES], "<u2", rows, offset=2 * row)
+                counts = sizes[codes]
+            yield row, first, codes, counts
+            first += int(counts.sum())
+
+    def _part(self, row: int, first: int, codes: np.ndarray | None, counts: np.ndarray) -> Part:
+        entries = int(counts.sum())
+        dtype = dtype_of(INDEX_TYPES[self.indices])
+        place = first * dtype.itemsize
+        stored = np.fromfile(self.folder / PARTS[self.indices], dtype, entries, offset=place)
+        successors = np.asarray(from_stored(stored))
+        return Part(row, first, counts, codes, successors)
+
+    def likely(self, part: Part) -> np.ndarray:
+        """(N,) uint64, the bits of the probabilities of its outcomes."""
+        if self.palette is None:
+            entries = len(part.successors)
+            return np.fromfile(self.folder / PARTS[PROBABILITIES], "<u8", entries, offset=8 * part.first)
+        assert part.codes is not None
+        vectors = self.palette[part.codes]
+        return vectors[vectors != 0]
+
+    def most(self) -> int:
+        """K, the most possible outcomes of a row."""
+        if self.palette is not None:
+            return int((self.palette != 0).sum(axis=1).max())
+        return max(int(counts.max()) for _, _, _, counts in self._counts())
+
+    def finish(self, written: dict[str, dict[str, Any]]) -> tuple[dict[str, dict[str, Any]], int]:
+        """Write the files of a finished build: name -> what the manifest says of it; and K, the most outcomes of a row.
+
+        Args:
+            written: the same of the files that there are.
+        """
+        most = self.most()
+        successors, index_type = self.indices, INDEX_TYPES[self.indices]
+        num_entries = written[PARTS[successors]]["bytes"] // dtype_of(index_type).itemsize
+        is_dense = MOST_PADDING[1] * (self.rows * most - num_entries) <= MOST_PADDING[0] * self.rows * most
+        dtypes = {successors: index_type}
+        if not is_dense:
+            dtypes[OFFSETS] = "<i8"
+        if self.palette is None:
+            dtypes[PROBABILITIES] = "<f8"
+        else:
+            dtypes |= {CODES: "|u1" if len(self.palette) <= 256 else "<u2", PALETTE: "<f8"}
+        stay = {successors, OFFSETS, PROBABILITIES} if not is_dense else set()
+        stay |= {CODES} if dtypes.get(CODES) == "<u2" else set()
+        stay &= {name for name in dtypes if PARTS[name] in written}
+        files: dict[str, GrowingFile] = {}
+        try:
+            for name in dtypes.keys() - stay:
+                files[name] = GrowingFile(self.folder / name)
+            self._fill(files, dtypes, most, is_dense)
+            for file in files.values():
+                file.sync()
+        finally:
+            for file in files.values():
+                file.close()
+        for name in stay:
+            _link(self.folder / PARTS[name], self.folder / name)
+        return {
+            name: {"dtype": dtype, **files[name].entry()} if name in files else written[PARTS[name]]
+            for name, dtype in dtypes.items()
+        }, most
+
+    def _fill(self, files: dict[str, GrowingFile], dtypes: dict[str, str], most: int, is_dense: bool) -> None:
+        if OFFSETS in files:
+            files[OFFSETS].append(np.zeros(1, np.int64))
+        if self.palette is not None:
+            files[PALETTE].append(self.palette[:, :most])
+        successors = next(iter(dtypes))
+        for part in self.parts():
+            if is_dense:
+                rows = _padded(part.successors, part.counts, most, fill_with_first=True)
+                files[successors].append(as_stored(rows, dtypes[successors]))
+            if OFFSETS in files:
+                files[OFFSETS].append(part.first + np.cumsum(part.counts))
+            if PROBABILITIES in files:
+                files[PROBABILITIES].append(_padded(self.likely(part), part.counts, most, fill_with_first=False))
+            if CODES in files and part.codes is not None:
+                files[CODES].append(part.codes.astype(dtypes[CODES]))
+
+    def of_states(self, states: np.ndarray) -> dict[int, OutcomesOfState]:
+        """The outcomes of some states, ascending."""
+        outcomes = {}
+        for row, first, codes, counts in self._counts():
+            for state in states[
+                (states >= row // self.num_actions) & (states < (row + len(counts)) // self.num_actions)
+            ]:
+                place = int(state) * self.num_actions - row
+                here = slice(place, place + self.num_actions)
+                before = first + int(counts[:place].sum())
+                part = self._part(row + place, before, None if codes is None else codes[here], counts[here])
+                ends = np.cumsum(part.counts)[:-1]
+                likely = np.split(self.likely(part).view(np.float64), ends)
+                outcomes[int(state)] = list(zip(np.split(part.successors, ends), likely, strict=True))
+        return outcomes
+
+
+def _padded(values: np.ndarray, counts: np.ndarray, most: int, *, fill_with_first: bool) -> np.ndarray:
+    out = np.empty((len(counts), most), values.dtype)
+    kernels.padded(values, counts, fill_with_first, out)
+    return out
+
+
+def _link(source: Path, target: Path) -> None:
+    """The same file by another name; a copy, where the file system has no such names."""
+    try:
+        os.link(source, target)
+    except OSError:
+        try:
+            shutil.copyfile(source, target)
+            with open(target, "rb+") as file:
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise cannot_write(target, error) from error
+
+
+_SLOTS = 1 << 17  # of the table of the palette: twice as many as codes
+
+
+class OutcomeJournal(Journal):
+    """See `Journal`.
+
+    Attributes:
+        palette: (capacity, K) uint64, the bits of the vectors found; None where probabilities are spelled out.
+    """
+
+    def __init__(self, path: Path, plan: Plan):
+        super().__init__(path, plan)
+        self._num_actions, self._most = plan.env.num_actions, int(plan.env.outcomes)
+        self.palette: np.ndarray | None = np.zeros((min(256, MOST_CODES), self._most), np.uint64)
+        self._vectors = 0
+        self._table = np.full(_SLOTS, -1, np.int32)
+        self._failure: BaseException | None = None
+
+    def _names(self, arrays: dict[str, Any]) -> tuple[str, ...]:
+        self._indices = successors_name(arrays, PARTS)
+        if PARTS[PROBABILITIES] in arrays:
+            self.palette = None
+        return tuple(self._dtypes())
+
+    @property
+    def _successors_name(self) -> str:
+        return PARTS[self._indices]
+
+    def _dtypes(self) -> dict[str, str]:
+        dtypes = {STATES: "<u8", self._successors_name: INDEX_TYPES[self._indices]}
+        if self.palette is None:
+            return {**dtypes, PARTS[OFFSETS]: "<i8", PARTS[PROBABILITIES]: "<f8", TERMINAL: "|u1"}
+        return {**dtypes, PARTS[CODES]: "<u2", PARTS[PALETTE]: "<f8", TERMINAL: "|u1"}
+
+    def _check_rules(self, position: Position) -> None:
+        """The same, of outcomes; and the palette of a build that goes on."""
+        if self.palette is not None:
+            vectors = np.fromfile(self.path / PARTS[PALETTE], "<u8").reshape(-1, self._most)
+            self._vectors = len(vectors)
+            self.palette = np.zeros((max(len(self.palette), self._vectors), self._most), np.uint64)
+            self.palette[: self._vectors] = vectors
+            kernels.enter(self.palette, self._vectors, self._table)
+        if position.first:
+            outcomes = self._parts(position.first).of_states(states_to_check(position.first))
+            bits = np.memmap(self.path / TERMINAL, "|u1", "r")
+            states = self.stored_states(position.count)
+            check_outcome_rules(self.path, self.plan.env, self.plan.layout, states, outcomes, bits)
+
+    def _parts(self, states: int) -> OutcomeParts:
+        """What the files hold of the first `states` states."""
+        palette = None if self.palette is None else self.palette[: self._vectors]
+        rows = states * self._num_actions
+        return OutcomeParts(self.path, rows, self._num_actions, self._most, self._indices, palette)
+
+    # Appending --------------------------------------------------------------------------------------------------------
+
+    def _write(self, states: np.ndarray, block: Block, at: Position) -> None:
+        if self._failure:  # files have no gaps
+            raise self._failure
+        try:
+            self._write_outcomes(states, block, at)
+        except BaseException as error:
+            self._failure = error
+            raise
+
+    def _write_outcomes(self, states: np.ndarray, block: Block, at: Position) -> None:
+        bits = np.ascontiguousarray(block.probabilities).view(np.uint64)
+        counts = np.empty(len(bits) * self._num_actions, np.int64)
+        following, likely = np.empty(bits.size, self.index_dtype), np.empty(bits.size, np.uint64)
+        size = kernels.possible(block.successors, bits, self._num_actions, following, likely, counts)
+        num_vectors = self._vectors
+        codes = self._encoded(likely[:size], counts)
+        if codes is None and self.palette is not None:
+            self._spell_out(num_vectors)
+        files = self._files
+        files[STATES].append(states)
+        if codes is None:
+            before = files[PARTS[PROBABILITIES]].bytes // 8
+            files[PARTS[OFFSETS]].append(before + np.cumsum(counts))
+            files[PARTS[PROBABILITIES]].append(likely[:size])
+        else:
+            assert self.palette is not None
+            files[PARTS[CODES]].append(codes)
+            files[PARTS[PALETTE]].append(self.palette[num_vectors : self._vectors])
+        self._append_successors(following[:size])
+        files[TERMINAL].append(np.packbits(block.terminal, bitorder="little"))
+        self._written = self._entries(at)
+
+    def _encoded(self, likely: np.ndarray, counts: np.ndarray) -> np.ndarray | None:
+        """(rows,) uint16, the number in the palette of each row's probabilities; None where there are too many."""
+        codes = np.empty(len(counts), np.uint16)
+        row = first = 0
+        while self.palette is not None:
+            arrays = self.palette, self._vectors, self._table, codes
+            row, first, self._vectors = kernels.encode(likely, counts, row, first, *arrays)
+            if row == len(counts):
+                return codes
+            if len(self.palette) >= MOST_CODES:
+                return None
+            larger = np.zeros((min(2 * len(self.palette), MOST_CODES), self._most), np.uint64)
+            larger[: len(self.palette)] = self.palette
+            self.palette = larger
+        return None
+
+    def _spell_out(self, num_vectors: int) -> None:
+        """From codes to probabilities, and where the rows begin.
+
+        num_vectors: vectors of the palette that are in its file.
+        Runs in the thread that writes, between two chunks.
+        """
+        assert self._written is not None
+        self._vectors = num_vectors
+        parts = self._parts(self._written["num_expanded"])
+        for name in (OFFSETS, PROBABILITIES):
+            self._files[PARTS[name]] = GrowingFile(self.path / PARTS[name])  # closed with the others, come what may
+        offsets, probabilities = (self._files[PARTS[name]] for name in (OFFSETS, PROBABILITIES))
+        offsets.append(np.zeros(1, np.int64))
+        for part in parts.parts():
+            offsets.append(part.first + np.cumsum(part.counts))
+            probabilities.append(parts.likely(part))
+        self.palette = None
+        arrays = {name: {"dtype": dtype, **self._files[name].entry()} for name, dtype in self._dtypes().items()}
+        self._written = {**self._written, "arrays": arrays}
+        self.commit(complete=False)
+        for name in (CODES, PALETTE):
+            self._drop(PARTS[name])
+
+    # The end ----------------------------------------------------------------------------------------------------------
+
+    def checkpoint(self, *, complete: bool) -> None:
+        super().checkpoint(complete=False)
+        if not complete:
+            return
+        assert self._written is not None
+        arrays = self._written["arrays"]
+        finished, most = self._parts(self._written["num_expanded"]).finish(arrays)
+        written = {
+            **self._written,
+            "num_outcomes": most,
+            "num_transitions": arrays[self._successors_name]["bytes"] // dtype_of(INDEX_TYPES[self._indices]).itemsize,
+            "arrays": {STATES: arrays[STATES], **finished, TERMINAL: arrays[TERMINAL]},
+        }
+        self.commit(complete=True, written=written)
+        self._written = None  # nothing is left to commit
+        for name in [name for name in self._files if name not in ARRAYS]:
+            self._drop(name)
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove what a process left that was killed between the end of its build and its own."""
+    for name in PARTS.values():
+        with contextlib.suppress(OSError):
+            (folder / name).unlink(missing_ok=True)

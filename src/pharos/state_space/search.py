@@ -17,14 +17,13 @@ import numpy as np
 from pharos.environments import Environment
 from pharos.errors import StateSpaceTooLarge
 from pharos.rules import rules_of
-from pharos.state_space.journal import Journal, Position
+from pharos.state_space.journal import Journal, OutcomeJournal, Position
 from pharos.state_space.manifest import Plan
-from pharos.state_space.outcome_journal import OutcomeJournal
 from pharos.state_space.progress import BuildProgress, Progress
 from pharos.state_space.table import Block, MemoryTable, SpilledTable
 from pharos.system import compiling
 from pharos.system import memory as machine
-from pharos.system.packed_indices import INT32_STATES, INT40_STATES
+from pharos.system.arrays import INT32_STATES, INT40_STATES
 from pharos.system.workers import usable_workers
 
 # States expanded between two looks at the clock; a multiple of 8, so that terminal bits fill whole bytes.

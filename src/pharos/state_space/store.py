@@ -46,8 +46,7 @@ from pharos.state_space.stored import (
     states_to_check,
     stored_outcomes,
 )
-from pharos.system.outcome_rows import OutcomeRows
-from pharos.system.packed_indices import Indices, dtype_of, from_stored
+from pharos.system.arrays import Indices, OutcomeRows, dtype_of, from_stored
 
 if TYPE_CHECKING:
     from pharos.mdp import Dynamics, TabularMDP

@@ -34,8 +34,16 @@ from pharos.state_space.manifest import (
     successors_name,
 )
 from pharos.system import storage
-from pharos.system.outcome_rows import SUM_TOLERANCE, OutcomeCheck, OutcomeRows, OutcomesOfState, WrongOutcomes
-from pharos.system.packed_indices import Indices, dtype_of, from_stored
+from pharos.system.arrays import (
+    SUM_TOLERANCE,
+    Indices,
+    OutcomeCheck,
+    OutcomeRows,
+    OutcomesOfState,
+    WrongOutcomes,
+    dtype_of,
+    from_stored,
+)
 
 SHARDS, SHARD = "shards.json", "shard.json"
 _FIXED, _SHARED, _READ = 0x10, 0x01, 0x01  # MAP_FIXED, MAP_SHARED, PROT_READ

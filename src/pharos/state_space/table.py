@@ -1,15 +1,23 @@
-"""The table of states of a search: in memory beside all states, or on disk. Both number states by `find_or_number`."""
+"""The table of states of a search: in memory beside all states, or on disk. Both number states by `find_or_number`.
 
+kernels/hash_table.py has the layout of the table on disk.
+"""
+
+import contextlib
+import mmap
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from pharos.kernels.hash_table import fill, fill_more, fill_range, insert_missing
+from pharos.kernels import hash_table as kernels
+from pharos.kernels.hash_table import fill, fill_more, fill_range, insert_missing, slots_of
+from pharos.state_space.manifest import cannot_write
 from pharos.system import memory as machine
-from pharos.system.memory import huge_pages, reserved_states, reserved_table
-from pharos.system.packed_indices import INT32_STATES
+from pharos.system.arrays import INT32_STATES
+from pharos.system.memory import huge_pages, mapped_file, reserved_states, reserved_table
 
 LOAD = 0.5  # the table in memory grows beyond this share of used slots
 FULLEST = 0.8  # the same, where memory has no room for a table of twice the size
@@ -176,8 +184,6 @@ class SpilledTable:
         self.appended = count
         likely = np.empty((self.rows if has_chance else 0, branches))
         self._block = Block(np.empty((0, branches), np.int32), np.empty(self.rows, np.uint8), likely)
-        from pharos.state_space.disk_table import DiskTable  # whose kernels few need
-
         self._table = DiskTable(path, num_words, memory // 4, 2 * count)
 
     def fill(self, states: np.ndarray) -> None:
@@ -218,3 +224,92 @@ def rows_of_chunk(memory: int, num_words: int, branches: int, has_chance: bool =
     bytes_of_a_row = branches * candidate + 8 * num_words + 1
     rows = max(memory // 2 // bytes_of_a_row // 1024, 1) * 1024
     return max(8, min(rows, INT32_STATES // branches // 8 * 8))
+
+
+# The table on disk ----------------------------------------------------------------------------------------------------
+
+
+DISK_LOAD = 0.7  # the table on disk grows beyond this share of used slots
+LEAST = 1 << 16  # slots of the smallest table
+_AROUND = 1 << 19  # bytes that the system may bring along with a page (large folios)
+
+
+class DiskTable:
+    """The table, in a file without a name: it is gone with the process, whatever becomes of it.
+
+    Attributes:
+        capacity: states that it can hold before it must grow.
+    """
+
+    def __init__(self, folder: Path, num_words: int, window: int, states: int):
+        """An empty table with room for a number of states, of which about `window` bytes are in this process's memory
+        at a time.
+        """
+        self.folder, self.num_words, self.window = folder, num_words, window
+        slots = LEAST
+        while slots * DISK_LOAD < states:
+            slots *= 2
+        self._open(slots)
+
+    def _open(self, slots: int) -> None:
+        try:
+            self._mapping = mapped_file(self.folder, slots * (self.num_words + 1) * 8)
+        except OSError as error:
+            raise cannot_write(self.folder / "the table of states", error) from error
+        self.entries = np.frombuffer(self._mapping, np.uint64).reshape(slots, self.num_words + 1)
+        self.capacity = int(slots * DISK_LOAD)
+        self._touched = 0
+
+    def take_over(self, table: np.ndarray, states: np.ndarray) -> None:
+        """Fill it from the table in memory."""
+        self._sweep(len(table), lambda low, high: kernels.place_from_memory(self.entries, table, states, low, high))
+
+    def fill(self, states: np.ndarray, first: int) -> None:
+        """Add states (n, W) that are not there yet, with indices first, first + 1, ..."""
+        buckets, order = np.empty(len(states), np.int64), np.empty(len(states), np.int32)
+        slots_of(states, kernels.BUCKETS, buckets)
+        size = kernels.sort_by_bucket(-1 - buckets, 0, order)
+        self._sweep(size, lambda low, high: kernels.place(self.entries, states, order, low, high, first))
+
+    def grow(self, states: int) -> None:
+        """Make room for a number of states."""
+        slots = len(self.entries)
+        while slots * DISK_LOAD < states:
+            slots *= 2
+        if slots == len(self.entries):
+            return
+        old, mapping = self.entries, self._mapping
+        self._open(slots)
+        self._sweep(len(old), lambda low, high: kernels.place_again(self.entries, old, low, high), also=mapping)
+
+    def look_up(self, keys: np.ndarray, indices: np.ndarray, first: int, order: np.ndarray, slots: np.ndarray) -> int:
+        """Find candidates, or enter them as new; returns how many of `order` were looked up."""
+        size = kernels.sort_by_bucket(indices, first, order)
+        self._sweep(size, lambda low, high: kernels.look_up(self.entries, keys, order, low, high, indices, slots))
+        return size
+
+    def settle(self, size: int, indices: np.ndarray, order: np.ndarray, slots: np.ndarray) -> None:
+        """Give what was new its numbers."""
+        self._sweep(size, lambda low, high: kernels.settle(self.entries, order, low, high, indices, slots))
+
+    def _sweep(self, size: int, work: Callable[[int, int], None], also: mmap.mmap | None = None) -> None:
+        """Do work(low, high) for parts of range(size), in order of slots, so that a part touches no more than the
+        window.
+        """
+        each = min(_AROUND, self.entries.nbytes // max(size, 1) + 64)  # bytes that one of them may touch
+        step = max(1, self.window // each)
+        for low in range(0, size, step):
+            high = min(low + step, size)
+            work(low, high)
+            self._touched += (high - low) * each
+            if self._touched >= self.window:
+                for mapping in filter(None, (self._mapping, also)):
+                    _let_go(mapping)
+                self._touched = 0
+
+
+def _let_go(mapping: mmap.mmap) -> None:
+    """Take the pages of the file out of this process's memory; they are written when the system sees fit."""
+    if hasattr(mmap, "MADV_DONTNEED"):
+        with contextlib.suppress(OSError):
+            mapping.madvise(mmap.MADV_DONTNEED)

@@ -28,8 +28,7 @@ from pharos.solvers import ReferenceValues
 from pharos.study.blocks import Run
 from pharos.study.worker import BATCHES
 from pharos.system import storage
-from pharos.system.paths import cache_directory
-from pharos.system.storage import ResultCache
+from pharos.system.storage import ResultCache, cache_directory
 from pharos.training import RunConfig
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from functools import cache
 from pathlib import Path
 
 from pharos.errors import ParameterError
-from pharos.system import paths
-from pharos.system.paths import compiled_folders
+from pharos.system import storage
+from pharos.system.storage import compiled_folders
 
 SMALL = 1 << 16
 """Entries below which rules and kernels are interpreted, as compiling takes longer (benchmarks/startup.py); 0: none."""
@@ -65,7 +65,7 @@ def prepare(kernels: Path) -> None:
         raise ParameterError("NUMBA_DISABLE_JIT is set, and pharos' kernels work compiled alone; unset it")
     if not os.environ.get("NUMBA_CACHE_DIR") and not _can_be_written(kernels / "__pycache__"):
         os.environ["NUMBA_CACHE_DIR"] = str(
-            private_folder(paths.cache_directory()) or paths.temporary_folder("pharos-")
+            private_folder(storage.cache_directory()) or storage.temporary_folder("pharos-")
         )
     _listen()
 

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from pharos.errors import DiskFull, FileFormatError, FolderLocked, ParameterError
-from pharos.system import paths, storage
-from pharos.system.packed_indices import PackedIndices
+from pharos.system import storage
+from pharos.system.arrays import PackedIndices
 
 try:
     import fcntl
@@ -141,7 +141,7 @@ def large_zeros(shape: tuple[int, ...], dtype: DTypeLike, share: float = SHARE) 
     size = math.prod(shape) * dtype.itemsize
     if fits(size, share):
         return np.zeros(shape, dtype)
-    folder = paths.cache_directory()
+    folder = storage.cache_directory()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         return np.frombuffer(mapped_file(folder, size), dtype).reshape(shape)

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from pharos.mdp import ChanceSetting
     from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
     from pharos.training.batch import Progress, train_configs
-    from pharos.training.config import CELL, RunConfig, run_id
     from pharos.training.curve import Curve, Evaluation, RegretCurve, bootstrap_interval, evaluate_agent
     from pharos.training.learners import FailedRun, TaskCache
     from pharos.training.options import ENGINES, Horizon, TrainingOptions
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
         write_table,
     )
     from pharos.training.runs import train, train_config, train_many, train_parts
-    from pharos.training.task import Task, TaskValues
+    from pharos.training.task import CELL, RunConfig, Task, TaskValues, run_id
     from pharos.training.tuning import SPACES, TuningResult, tune
 
 __all__ = [

@@ -25,10 +25,10 @@ from pharos.system import compiling
 from pharos.system.storage import digest_of_json, lock, read_json, remove_leftovers, replace_json
 from pharos.system.wording import in_one_line, many
 from pharos.training import results as _results
-from pharos.training.config import RunConfig
 from pharos.training.curve import values_together
 from pharos.training.learners import FailedRun, Learner, Member, TaskCache, make_learner
 from pharos.training.results import Checkpoint, Record, TrainingResult, clear_run, finished_result
+from pharos.training.task import RunConfig
 
 # What a member is begun anew from, where its batch is halved.
 BEGINNING = ("place", "config", "folder", "task", "hyperparameters", "run", "key")

@@ -22,10 +22,9 @@ from pharos.policies import PolicyLike, deep_policy
 from pharos.state_space import StateSpace
 from pharos.system.wording import in_one_line
 from pharos.training import results
-from pharos.training.config import RunConfig
 from pharos.training.curve import Curve
 from pharos.training.results import Record
-from pharos.training.task import Task, TaskValues
+from pharos.training.task import RunConfig, Task, TaskValues
 
 if TYPE_CHECKING:
     from stable_baselines3.common.buffers import ReplayBuffer

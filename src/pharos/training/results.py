@@ -28,8 +28,7 @@ from pharos.environments import class_called
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, ResultCorrupted, UntrustedCode
 from pharos.system import storage
 from pharos.system.storage import CLAIM, LOCK, check_regular, digest_of_bytes, digest_of_file, read_json, sync
-from pharos.training.config import RunConfig, run_id
-from pharos.training.task import Task
+from pharos.training.task import RunConfig, Task, run_id
 
 if TYPE_CHECKING:
     import pandas as pd

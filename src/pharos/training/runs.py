@@ -29,11 +29,10 @@ from pharos.system.records import split, takes
 from pharos.system.workers import check_guard, end_with_parent, without_interrupts, without_main
 from pharos.training import results as _results
 from pharos.training.batch import Progress, ProgressCallback, TrainingJobs, train_configs
-from pharos.training.config import RunConfig
 from pharos.training.learners import FailedRun, TaskCache
 from pharos.training.options import TrainingOptions
 from pharos.training.results import TrainingResult, finished_result
-from pharos.training.task import Task, TaskValues
+from pharos.training.task import RunConfig, Task, TaskValues
 
 RunProgress = Callable[[int, int, Mapping[str, Any]], None]
 

@@ -37,9 +37,8 @@ from pharos.system import storage
 from pharos.system.wording import many
 from pharos.training import results as _results
 from pharos.training.batch import Progress, train_configs
-from pharos.training.config import RunConfig, run_id
 from pharos.training.learners import FailedRun, TaskCache
-from pharos.training.task import Task
+from pharos.training.task import RunConfig, Task, run_id
 
 if TYPE_CHECKING:
     import optuna

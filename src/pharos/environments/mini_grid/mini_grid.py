@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from pharos.environments.base import Environment
+from pharos.environments.base import Environment, one_of, parameter, store
 from pharos.environments.mini_grid.layouts import COLORS, FLOOR, GOAL, KINDS, LAVA, PLAYER, WALL, Layout
 from pharos.environments.mini_grid.look import LAYERS, LOOK
-from pharos.environments.parameters import one_of, parameter, store
 from pharos.errors import ParameterError
 
 OPEN, CLOSED, LOCKED = range(3)  # doors

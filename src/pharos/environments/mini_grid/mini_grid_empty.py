@@ -10,9 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pharos.environments.base import Environment, Look
+from pharos.environments.base import Environment, Look, parameter
 from pharos.environments.mini_grid.look import LAYERS
-from pharos.environments.parameters import parameter
 
 ROW, COLUMN, DIRECTION = range(3)
 UP, RIGHT, DOWN, LEFT = range(4)

@@ -10,9 +10,8 @@ from functools import cached_property
 
 import numpy as np
 
-from pharos.environments.base import Look
+from pharos.environments.base import Look, parameter
 from pharos.environments.mini_grid.mini_grid_empty import Drawn, Place, RoomGrid
-from pharos.environments.parameters import parameter
 from pharos.errors import ParameterError
 
 

@@ -5,8 +5,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from pharos.environments.base import Environment, Layer, Look
-from pharos.environments.parameters import parameter
+from pharos.environments.base import Environment, Layer, Look, parameter
 from pharos.errors import ParameterError
 
 TOTAL, DEALER, ACE, NATURAL, RESULT = range(5)

@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from pharos.environments.base import Environment, Layer, Look, Scenery
-from pharos.environments.parameters import parameter
+from pharos.environments.base import Environment, Layer, Look, Scenery, parameter
 from pharos.environments.worlds import ARCADE
 
 BALL_ROW, BALL_COLUMN, BALL_RIGHT, BALL_DOWN, PADDLE, BRICKS = range(6)  # bricks follow, row by row

@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from pharos.environments.base import Environment, Layer, Look
-from pharos.environments.parameters import parameter
+from pharos.environments.base import Environment, Layer, Look, parameter
 
 BALL_ROW, BALL_COLUMN, PADDLE = range(3)
 

@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from pharos.environments.base import Environment, Layer, Look
-from pharos.environments.parameters import parameter
+from pharos.environments.base import Environment, Layer, Look, parameter
 
 ROW, COLUMN = range(2)
 UP, RIGHT, DOWN, LEFT = range(4)

@@ -8,8 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pharos.environments.base import Environment, Layer, Look
-from pharos.environments.parameters import one_of, parameter
+from pharos.environments.base import Environment, Layer, Look, one_of, parameter
 
 ROW, COLUMN = range(2)
 UP, RIGHT, DOWN, LEFT, STAY = range(5)

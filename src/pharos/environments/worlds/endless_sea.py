@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from pharos.environments.base import Environment, Look
-from pharos.environments.parameters import parameter, store
+from pharos.environments.base import Environment, Look, parameter, store
 from pharos.environments.worlds.deep_sea import DeepSea
 
 

@@ -5,8 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pharos.environments.base import Environment, Layer, Look, Scenery
-from pharos.environments.parameters import integers, parameter, store
+from pharos.environments.base import Environment, Layer, Look, Scenery, integers, parameter, store
 from pharos.environments.worlds import ARCADE
 
 PLAYER_ROW, PLAYER_TIMER, CARS = range(3)  # positions of the cars follow, then their timers

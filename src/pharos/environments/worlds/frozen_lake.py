@@ -5,8 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pharos.environments.base import Environment, Layer, Look
-from pharos.environments.parameters import parameter, store
+from pharos.environments.base import Environment, Layer, Look, parameter, store
 from pharos.errors import ParameterError
 
 ROW, COLUMN = range(2)

@@ -6,8 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from pharos.environments.base import Environment, Layer, Look
-from pharos.environments.parameters import one_of, parameter
+from pharos.environments.base import Environment, Layer, Look, one_of, parameter
 from pharos.errors import ParameterError
 
 UP, RIGHT, DOWN, LEFT = range(4)

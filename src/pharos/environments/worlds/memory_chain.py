@@ -3,8 +3,7 @@
 import itertools
 from dataclasses import dataclass
 
-from pharos.environments.base import Environment, Layer, Look
-from pharos.environments.parameters import parameter
+from pharos.environments.base import Environment, Layer, Look, parameter
 
 STEP, QUERY, BITS = range(3)  # the bits follow, one number each
 

@@ -5,8 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pharos.environments.base import Environment, Layer, Look
-from pharos.environments.parameters import Kind, one_of, parameter
+from pharos.environments.base import Environment, Kind, Layer, Look, one_of, parameter
 from pharos.errors import ParameterError
 
 # Places of the seven corners that move, by their faces: up, down, left, right, front, back. The eighth, down back left,

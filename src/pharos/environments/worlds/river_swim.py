@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from pharos.environments.base import Environment, Layer, Look
-from pharos.environments.parameters import integers, parameter
+from pharos.environments.base import Environment, Layer, Look, integers, parameter
 from pharos.errors import ParameterError
 
 LEFT, RIGHT = range(2)

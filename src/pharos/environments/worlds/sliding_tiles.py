@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pharos.environments.base import Color, Environment, Layer, Look
-from pharos.environments.parameters import integers, parameter, store
+from pharos.environments.base import Color, Environment, Layer, Look, integers, parameter, store
 from pharos.errors import ParameterError
 
 UP, RIGHT, DOWN, LEFT = range(4)

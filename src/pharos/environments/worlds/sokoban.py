@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pharos.environments.base import Environment, Layer, Look
-from pharos.environments.parameters import parameter, store
+from pharos.environments.base import Environment, Layer, Look, parameter, store
 from pharos.errors import ParameterError
 
 ROW, COLUMN, BOXES = range(3)  # of the player; then a bit for each cell of the floor: whether a box is there
