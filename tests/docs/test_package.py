@@ -159,7 +159,7 @@ def test_an_installation_and_a_home_that_cannot_be_written_to(tmp_path):
     named = subprocess.run(command, env=there | {"PHAROS_CACHE_DIR": str(cache)}, capture_output=True, text=True)
     assert named.returncode == 0 and not named.stderr, named.stderr
     assert list((cache / "compiled").rglob("*.nbi")) and list((cache / "spaces").iterdir())
-    code = "import os, pharos.rules.exploration; from pharos.system import storage; print(storage.cache_directory().parent)"
+    code = "import pharos.rules.exploration; from pharos.system import storage; print(storage.cache_directory().parent)"
     nowhere = subprocess.run([sys.executable, "-c", code], env=there, capture_output=True, text=True)
     assert nowhere.stdout == f"{tmp_path}\n" and "set PHAROS_CACHE_DIR" in nowhere.stderr, nowhere.stderr
     assert not list(tmp_path.glob("pharos-*"))

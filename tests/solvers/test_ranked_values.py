@@ -20,7 +20,7 @@ from pharos.errors import ParameterError, PrecisionError
 from pharos.mdp import BEST, WORST, PolicyTable, TabularMDP
 from pharos.ranks import RankFailed
 from pharos.solvers import evaluate_policy, ranked, uniform_value, value_iteration
-from pharos.solvers.ranked import DistributedOptions, shared_solution
+from pharos.solvers.ranked import shared_solution
 from rank_threads import Killed, fails_at, out_of_order, threads
 from strategies import FEW, deterministic_mdps, hard_mdps, lazy_mdps, outcome_mdps, small_mdps
 
@@ -39,10 +39,11 @@ def chain(num_states=300, gamma=0.9):
 
 
 def solved(mdp, size, *, select=BEST, tolerance=1e-6, horizon=None, disturb=lambda rank: None, cuts=None, **options):
+    options = {"processes": "mpi", "checkpoint": None} | options
     with threads(ranked, size, disturb), pytest.MonkeyPatch.context() as patch:
         if cuts is not None:
             patch.setattr(ranked, "cuts_of", lambda num_rows, ranks: np.array(cuts))
-        return shared_solution(mdp, select, tolerance, horizon, DistributedOptions("mpi", **options))
+        return shared_solution(mdp, select, tolerance, horizon, **options)
 
 
 # The same values ------------------------------------------------------------------------------------------------------
@@ -299,8 +300,9 @@ def dies(backup):
         os.kill(os.getpid(), signal.SIGKILL)
     return sweep(backup)
 ranked.RankedBackup.plain_sweep = dies
-options = ranked.DistributedOptions("mpi", folder / "values", -1.0)
-solution = ranked.shared_solution(chain(20_000), BEST, 1e-6, 80, options, lambda sweeps, _: first.append(sweeps))
+solution = ranked.shared_solution(
+    chain(20_000), BEST, 1e-6, 80, "mpi", folder / "values", lambda sweeps, _: first.append(sweeps), -1.0
+)
 if solution is not None:
     np.save(folder / "x.npy", solution.x)
     (folder / "first.txt").write_text(str(first[0]))

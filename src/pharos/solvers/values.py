@@ -50,7 +50,6 @@ from pharos.solvers.fixed_point import (
     largest_of,
 )
 from pharos.solvers.policy_iteration import chain, chain_values
-from pharos.solvers.ranked import DistributedOptions, shared_solution
 from pharos.solvers.solution import Solution
 from pharos.system import memory
 from pharos.system.compiling import Stopwatch
@@ -185,17 +184,19 @@ def solution_of(  # noqa: PLR0913
     """The values of what is chosen: a fixed point, or those of backward induction where there is a horizon."""
     check_tolerance(tolerance)
     horizon, dtype = checked_horizon(mdp, horizon), checked_dtype(dtype)
-    sharing = DistributedOptions(processes, checkpoint)
-    if dtype == np.float32 and (horizon is not None or sharing.is_wanted):
+    is_shared = is_distributed(processes, checkpoint)
+    if dtype == np.float32 and (horizon is not None or is_shared):
         raise ParameterError("dtype='float32' is for one process and no horizon; expected 'float64' here")
     if not (isinstance(blocks, int | np.integer) and 1 <= blocks <= MOST_BLOCKS):
         raise ParameterError(f"blocks is {blocks!r}; expected a whole number from 1 to {MOST_BLOCKS}")
-    if sharing.is_wanted:
+    if is_shared:
+        from pharos.solvers.ranked import shared_solution  # which few need
+
         if keep_all:
             raise ParameterError("keep_all: several processes keep the last step alone; expected processes=1")
         if values is not None:
             raise ParameterError("values: several processes keep theirs in a folder; expected checkpoint=FOLDER")
-        return shared_solution(mdp, select, tolerance, horizon, sharing, progress)
+        return shared_solution(mdp, select, tolerance, horizon, processes, checkpoint, progress)
     watch = Stopwatch()
     steps = None
     if horizon is None:
@@ -264,6 +265,11 @@ def _in_memory(
         yield x, report
     finally:
         mapped[:] = x
+
+
+def is_distributed(processes: int | str, checkpoint: str | os.PathLike | None) -> bool:
+    """Whether anything else is asked for than one process that keeps nothing (`True` is no number of processes)."""
+    return processes != 1 or processes is True or checkpoint is not None
 
 
 def check_tolerance(tolerance: float) -> None:
@@ -406,8 +412,8 @@ def evaluate_policy(
         policy = policy.policy_table()
     watch = Stopwatch()
     select = PolicyTable.of(mdp, policy)
-    sharing = DistributedOptions(processes, checkpoint)
-    if select.actions is not None and mdp.is_deterministic and horizon is None and not sharing.is_wanted:
+    is_shared = is_distributed(processes, checkpoint)
+    if select.actions is not None and mdp.is_deterministic and horizon is None and not is_shared:
         return _on_its_graph(mdp, select, watch)
     return solution_of(mdp, select, tolerance, horizon=horizon, processes=processes, checkpoint=checkpoint)
 
