@@ -92,8 +92,10 @@ PACKAGES = {  # page of the reference -> (title, module)
     "policies": ("pharos.policies", "pharos.policies"),
     "agents": ("pharos.agents", "pharos.agents"),
     "training": ("pharos.training", "pharos.training"),
+    "benchmark": ("pharos.benchmark", "pharos.benchmark"),
     "leaderboard": ("pharos.leaderboard", "pharos.leaderboard"),
     "study": ("pharos.study", "pharos.study"),
+    "validation": ("pharos.validation", "pharos.validation"),
     "plots": ("pharos.plots", "pharos.plots"),
     "importers": ("pharos.importers", "pharos.importers"),
     "exporters": ("pharos.exporters", "pharos.exporters"),
@@ -356,18 +358,14 @@ def reference() -> dict[str, str]:
     """A page for each package, with an entry for every name that it publishes."""
     pages, lines = {}, ["# API", "", "In the order of the data flow; names are imported from where the page says.", ""]
     shown: dict[str, str] = {}  # where it is defined -> under which name it has its entry
-    pages_of_classes = set(classes().values())
     for page, (title, module_name) in PACKAGES.items():
         module = importlib.import_module(module_name)
         about = (module.__doc__ or "").strip()
-        entries, worlds = [], []
+        entries = []
         for name in published(module):
             value = getattr(module, name)
             home = home_of(value)
             if home is None:
-                continue
-            if value in pages_of_classes:
-                worlds.append(f"[`{name}`](../environments/{value.name}.md)")
                 continue
             if home in shown:
                 entries.append(f"## {title}.{name} {{ .doc-heading }}\n\nThe same as [`{shown[home]}`][{home}].\n")
@@ -375,8 +373,9 @@ def reference() -> dict[str, str]:
             shown[home] = f"{title}.{name}"
             options = f"    options:\n      heading: {title}.{name}\n      toc_label: {name}\n"
             entries.append(f"::: {home}\n{options}")
-        if worlds:
-            about += f"\n\nThe classes, each with a page of its own: {', '.join(worlds)}."
+        if page == "environments":
+            worlds = ", ".join(f"[`{cls.__name__}`](../environments/{name}.md)" for name, cls in classes().items())
+            about += f"\n\nThe classes, each with a page of its own: {worlds}."
         pages[f"api/{page}.md"] = f"# {title}\n\n{about}\n\n" + "\n".join(entries)
         lines.append(f"- [`{title}`]({page}.md): {first_sentence(about)}")
     return {"api/index.md": "\n".join(lines) + "\n", **pages}

@@ -23,40 +23,31 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AgentResults",
-    "Audit",
-    "AxisComparison",
     "AxisScore",
     "BenchmarkScore",
     "BenchmarkTask",
     "BudgetSpent",
     "Commitment",
     "Comparison",
-    "Difference",
-    "Interval",
     "Ladder",
     "Power",
     "Protocol",
     "Submission",
     "Suite",
     "baselines",
-    "benchmark_board",
     "compare",
     "load_suite",
-    "make_audit",
-    "make_commitment",
     "power",
     "read_results",
     "report",
     "run",
     "score",
-    "sealed_copies",
-    "sealed_instances",
-    "season_seed",
     "submit",
     "verify",
 ]
 _shared = """
-    write_suite
+    Audit AxisComparison Difference Interval benchmark_board make_audit make_commitment sealed_copies
+    sealed_instances season_seed write_suite
 """
 
 __getattr__ = lazy.attributes(__name__)

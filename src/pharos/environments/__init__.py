@@ -45,57 +45,35 @@ if TYPE_CHECKING:
         register,
         source_of,
     )
-    from pharos.environments.mini_grid.mini_grid import MiniGrid
-    from pharos.environments.mini_grid.mini_grid_empty import MiniGridEmpty
-    from pharos.environments.mini_grid.mini_grid_rooms import MiniGridRooms
-    from pharos.environments.worlds.blackjack import Blackjack
-    from pharos.environments.worlds.breakout import Breakout
-    from pharos.environments.worlds.catch import Catch
-    from pharos.environments.worlds.cliff_walking import CliffWalking
-    from pharos.environments.worlds.corner_grid import CornerGrid
-    from pharos.environments.worlds.deep_sea import DeepSea
-    from pharos.environments.worlds.discounting_chain import DiscountingChain
-    from pharos.environments.worlds.endless_sea import EndlessSea
-    from pharos.environments.worlds.freeway import Freeway
-    from pharos.environments.worlds.frozen_lake import FrozenLake
-    from pharos.environments.worlds.game_2048 import Game2048
-    from pharos.environments.worlds.memory_chain import MemoryChain
-    from pharos.environments.worlds.pocket_cube import PocketCube
-    from pharos.environments.worlds.river_swim import RiverSwim
-    from pharos.environments.worlds.simple_grid import SimpleGrid
-    from pharos.environments.worlds.sliding_tiles import SlidingTiles
-    from pharos.environments.worlds.sokoban import Sokoban
-    from pharos.environments.worlds.taxi import Taxi
-    from pharos.environments.worlds.umbrella_chain import UmbrellaChain
+    from pharos.environments.mini_grid.mini_grid import MiniGrid as MiniGrid
+    from pharos.environments.mini_grid.mini_grid_empty import MiniGridEmpty as MiniGridEmpty
+    from pharos.environments.mini_grid.mini_grid_rooms import MiniGridRooms as MiniGridRooms
+    from pharos.environments.worlds.blackjack import Blackjack as Blackjack
+    from pharos.environments.worlds.breakout import Breakout as Breakout
+    from pharos.environments.worlds.catch import Catch as Catch
+    from pharos.environments.worlds.cliff_walking import CliffWalking as CliffWalking
+    from pharos.environments.worlds.corner_grid import CornerGrid as CornerGrid
+    from pharos.environments.worlds.deep_sea import DeepSea as DeepSea
+    from pharos.environments.worlds.discounting_chain import DiscountingChain as DiscountingChain
+    from pharos.environments.worlds.endless_sea import EndlessSea as EndlessSea
+    from pharos.environments.worlds.freeway import Freeway as Freeway
+    from pharos.environments.worlds.frozen_lake import FrozenLake as FrozenLake
+    from pharos.environments.worlds.game_2048 import Game2048 as Game2048
+    from pharos.environments.worlds.memory_chain import MemoryChain as MemoryChain
+    from pharos.environments.worlds.pocket_cube import PocketCube as PocketCube
+    from pharos.environments.worlds.river_swim import RiverSwim as RiverSwim
+    from pharos.environments.worlds.simple_grid import SimpleGrid as SimpleGrid
+    from pharos.environments.worlds.sliding_tiles import SlidingTiles as SlidingTiles
+    from pharos.environments.worlds.sokoban import Sokoban as Sokoban
+    from pharos.environments.worlds.taxi import Taxi as Taxi
+    from pharos.environments.worlds.umbrella_chain import UmbrellaChain as UmbrellaChain
 
 __all__ = [
-    "Blackjack",
-    "Breakout",
-    "Catch",
-    "CliffWalking",
-    "CornerGrid",
-    "DeepSea",
-    "DiscountingChain",
-    "EndlessSea",
     "Environment",
-    "Freeway",
-    "FrozenLake",
-    "Game2048",
     "Layer",
     "Look",
-    "MemoryChain",
-    "MiniGrid",
-    "MiniGridEmpty",
-    "MiniGridRooms",
-    "PocketCube",
-    "RiverSwim",
     "Scenery",
-    "SimpleGrid",
-    "SlidingTiles",
-    "Sokoban",
     "State",
-    "Taxi",
-    "UmbrellaChain",
     "classes",
     "list_environments",
     "make",
@@ -103,9 +81,11 @@ __all__ = [
     "register",
 ]
 _shared = """
-    BUILT_IN BuiltIn CELL CELLS Color Components Ground Kind Margin Parameter Shape Sprite VALUED_CELLS as_tuples
-    class_called class_of declared_parameters imported instance_name integers named_instances on_registration one_of
-    source_of start_distribution
+    BUILT_IN Blackjack Breakout BuiltIn CELL CELLS Catch CliffWalking Color Components CornerGrid DeepSea
+    DiscountingChain EndlessSea Freeway FrozenLake Game2048 Ground Kind Margin MemoryChain MiniGrid MiniGridEmpty
+    MiniGridRooms Parameter PocketCube RiverSwim Shape SimpleGrid SlidingTiles Sokoban Sprite Taxi UmbrellaChain
+    VALUED_CELLS as_tuples class_called class_of declared_parameters imported instance_name integers named_instances
+    on_registration one_of source_of start_distribution
 """
 
 __getattr__ = lazy.attributes(__name__)

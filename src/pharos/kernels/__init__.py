@@ -12,6 +12,6 @@ compiling.prepare(Path(__file__).parent)
 from pharos.kernels import outcomes  # noqa: E402  (it loads Numba, which reads where to keep compiled code)
 
 _shared = """
-    batched bellman gaps graph hash_table hitting horizon learning linear_algebra many_searches observation_kernels
+    batched bellman gaps graph hash_table hitting horizon linear_algebra many_searches observation_kernels
     occupancy outcomes partition stepping
 """

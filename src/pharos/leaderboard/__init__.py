@@ -17,13 +17,12 @@ from pharos.leaderboard.entry import (
 from pharos.leaderboard.verification import Check, Verdict, verify
 
 __all__ = [
-    "Verdict",
     "board",
     "read",
     "submit",
     "verify",
 ]
 _shared = """
-    Board Cell Check Claim Entry Ranking check_ending check_values in_file read_sealed reason stored_table write_checked
-    write_page write_sealed
+    Board Cell Check Claim Entry Ranking Verdict check_ending check_values in_file read_sealed reason stored_table
+    write_checked write_page write_sealed
 """
