@@ -352,16 +352,16 @@ def shared_solution(
 
     def program(rank: Rank) -> tuple[float, int, np.ndarray, np.ndarray] | None:
         what = f"{mdp.gamma!r} {mdp.chance} horizon {horizon}"
-        kept = Checkpoint(folder, what, checkpoint_seconds)
+        file = Checkpoint(folder, what, checkpoint_seconds)
         backup = RankedBackup(mdp, select, rank)
         if horizon is None:
-            bound, sweeps = ranked_fixed_point(backup, tolerance, kept, progress)
+            bound, sweeps = ranked_fixed_point(backup, tolerance, file, progress)
             following = x = backup.gathered(backup.x)
         else:
             sweeps = horizon
-            bound, before = ranked_induction(backup, horizon, kept, progress)
+            bound, before = ranked_induction(backup, horizon, file, progress)
             x, following = backup.gathered(backup.x), backup.gathered(before)
-        kept.finish(backup)
+        file.finish(backup)
         return None if x is None or following is None else (bound, sweeps, x, following)
 
     answer = run_spmd(processes, program)
