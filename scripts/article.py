@@ -22,7 +22,7 @@ from pharos.study.blocks import Run
 from pharos.study.specification import parse
 from pharos.study.tables import row_of
 from pharos.training import CELL, RunConfig
-from pharos.validation.cross_validation import class_predictions, holm, resampled_classes
+from pharos.validation.cross_validation import class_predictions, holm, r_squared, resampled_classes
 from pharos.validation.prediction import FILE
 
 ROOT = Path(__file__).parents[1]
@@ -258,13 +258,24 @@ def variance_share(part, cells):
     return shares[0], *np.percentile(shares[1:], [2.5, 97.5])
 
 
+def left_out(cells, predictor):
+    """(regret, prediction, class) of cells, each class predicted by a line through the others."""
+    classes = np.unique(cells["environment"], return_inverse=True)[1]
+    regret = cells["greedy"].to_numpy(float)
+    return regret, class_predictions(cells[[predictor]].to_numpy(float), regret, classes, classes), classes
+
+
 def misses(agent, predictor):
     """Class -> mean of observed less predicted regret, each class predicted by a line through the others."""
-    both = joined(agent)
-    classes = np.unique(both["environment"], return_inverse=True)[1]
-    observed = both["greedy"].to_numpy(float)
-    told = class_predictions(both[[predictor]].to_numpy(float), observed, classes, classes)
-    return pd.Series(observed - told).groupby(both["environment"]).mean().sort_values()
+    regret, prediction, _ = left_out(joined(agent), predictor)
+    return pd.Series(regret - prediction).groupby(joined(agent)["environment"]).mean().sort_values()
+
+
+def without_one_class(agent):
+    """Class -> R2 of the agent's measure on the sealed test without that class."""
+    cells = joined(agent)
+    names = sorted(cells["environment"].unique())
+    return {name: r_squared(*left_out(cells[cells["environment"] != name], PRIMARY[agent])) for name in names}
 
 
 def facts():
@@ -317,9 +328,11 @@ def facts_of_the_sealed_test():
     ]
     spread = cells[cells["agent"] == "dqn"].groupby("instance")["greedy"].agg(np.ptp)
     said.append(f"by more than 0.2 on {(spread > 0.2).sum()} of {len(spread)} MDPs")
-    hanoi = joined("dqn").query("instance == 'games.py:Hanoi(discs=3)'")
-    image = hanoi[hanoi["observation"].map(kind) == "simple_image"].iloc[0]
+    dqn = joined("dqn")
+    is_hanoi = (dqn["instance"] == "games.py:Hanoi(discs=3)") & (dqn["observation"].map(kind) == "simple_image")
+    image = dqn[is_hanoi].iloc[0]
     said.append(f"by its image, {image['greedy']:.2f} for a predicted {image['kernel_regret']:.2f}")
+    said.append(f"without this cell R² is {r_squared(*left_out(dqn[~is_hanoi], 'kernel_regret')):.2f}")
     return said
 
 
@@ -460,6 +473,9 @@ def main():
     for name, table in TABLES.items():
         print(f"{name}\n\n{table()}\n")
     print("phrases\n", *facts(), sep="\n")
+    for agent, predictor in PRIMARY.items():
+        told = ", ".join(f"{name} {value:.2f}" for name, value in without_one_class(agent).items())
+        print(f"\nR² of {agent.upper()} by {predictor}, without one class: {told}")
 
 
 if __name__ == "__main__":
