@@ -144,30 +144,32 @@ def shown(env, state):
 
 HEAD = """# Gallery
 
-Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at its
+Made by `python scripts/gallery.py`. *What agents see*, from the left: the drawing for people, the complex image at its
 natural size and at 84 x 84 pixels, and the planes of the simple image, one for each layer, after some steps of the
-optimal policy; then that policy at play. What agents learnt: [evidence](evidence/agents.md).
+optimal policy.
+
+| class | what agents see | the optimal policy |
+|---|---|---|
 """
 
 
-def section(cls):
-    """The section of a class, its pictures written."""
-    lines = [f"## {cls}"]
+def row(cls):
+    """The row of a class, its pictures written."""
+    seen, moving = [], []
     for name, steps in INSTANCES[cls]:
         env, policy = optimal(name)
         state = drawing.episode(env, policy, env.initial_states()[0][0], steps=steps)[-1][0]
         file = file_of(name, ".png")
         drawing.save_png(file, shown(env, state))
         states = pharos.build(env).num_states
-        about = f"- `{name}`, {states:,} states, after {many(steps, 'step')}:"
-        lines += [f"{about} ![{name}](gallery/{file.name})"]
+        seen.append(f"`{name}`, {states:,} states, after {many(steps, 'step')}: ![{name}](gallery/{file.name})")
     for name in PLAYED[cls].split(", "):
         env, policy = (unturned if cls == "game_2048" else optimal)(name)
         pictures = [render(env, state, "complex_image", size="natural") for state in played(env, policy, cls)]
         file = file_of(name, ".gif")
         drawing.save_gif(file, pictures, frames_per_second=FRAMES_PER_SECOND.get(cls, 12), at_least=160)
-        lines += [f"- The optimal policy of `{name}`: ![{name}](gallery/{file.name})"]
-    return "\n".join(lines) + "\n"
+        moving.append(f"`{name}`: ![{name}](gallery/{file.name})")
+    return f"| **{cls}** | {'<br>'.join(seen)} | {'<br>'.join(moving)} |"
 
 
 def played(env, policy, cls):
@@ -181,13 +183,12 @@ def played(env, policy, cls):
 
 
 def main(chosen) -> None:
-    """Write the sections of the chosen classes anew; of all of them where none is named."""
+    """Write the rows of the chosen classes anew; of all of them where none is named."""
     FOLDER.mkdir(exist_ok=True)
     page = DOCS / "gallery.md"
-    texts = re.split(r"^## (\w+)\n", page.read_text(), flags=re.MULTILINE)[1:] if chosen else []
-    sections = {cls: f"## {cls}\n{text.rstrip()}\n" for cls, text in zip(texts[::2], texts[1::2], strict=True)}
-    sections |= {cls: section(cls) for cls in chosen or INSTANCES}
-    page.write_text("\n".join([HEAD, *(sections[cls] for cls in INSTANCES if cls in sections)]))
+    texts = re.findall(r"^(\| \*\*(\w+)\*\* .*)$", page.read_text(), re.MULTILINE) if chosen else []
+    rows = {cls: text for text, cls in texts} | {cls: row(cls) for cls in chosen or INSTANCES}
+    page.write_text(HEAD + "".join(f"{rows[cls]}\n" for cls in INSTANCES if cls in rows))
 
 
 if __name__ == "__main__":

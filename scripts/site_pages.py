@@ -26,12 +26,13 @@ from pharos.interaction.registration import ids_of
 DOCS = Path(__file__).parents[1] / "docs"
 BOARD = "<!-- The site has the board of baselines here: scripts/site_pages.py. -->"
 MORE = {  # pages that say more of a class
-    **dict.fromkeys(("frozen_lake", "taxi", "cliff_walking", "blackjack"), "toy-text.md"),
-    **dict.fromkeys(("sliding_tiles", "pocket_cube", "sokoban"), "puzzles.md"),
-    **dict.fromkeys(("mini_grid", "mini_grid_empty", "mini_grid_rooms"), "mini-grid.md"),
-    **dict.fromkeys(("river_swim", "deep_sea", "endless_sea", "catch", "memory_chain"), "chains.md"),
-    **dict.fromkeys(("umbrella_chain", "discounting_chain", "corner_grid"), "chains.md"),
-    "game_2048": "game-2048.md",
+    **dict.fromkeys(("frozen_lake", "taxi", "cliff_walking", "blackjack"), "worlds.md#toy-text"),
+    **{"sliding_tiles": "worlds.md#sliding-tiles", "pocket_cube": "worlds.md#pocket-cube"},
+    **{"sokoban": "worlds.md#sokoban", "mini_grid": "worlds.md#minigrid", "river_swim": "worlds.md#river-swim"},
+    **dict.fromkeys(("mini_grid_empty", "mini_grid_rooms"), "worlds.md#colosseums-grids"),
+    **dict.fromkeys(("deep_sea", "catch", "memory_chain", "umbrella_chain", "discounting_chain"), "worlds.md#bsuite"),
+    **dict.fromkeys(("endless_sea", "corner_grid"), "worlds.md#chains-rivers-and-seas"),
+    "game_2048": "worlds.md#2048",
 }
 CHANGES = {  # class -> version of the rules -> what changed
     "breakout": {
@@ -40,12 +41,12 @@ CHANGES = {  # class -> version of the rules -> what changed
     }
 }
 COUNTED = {  # instance -> states, and the page that tells how they were counted, where its values were never computed
-    "sliding_tiles/3x4": (239_500_800, "puzzles.md"),
-    **{f"pocket_cube/{name}": (3_674_160, "puzzles.md") for name in ("half", "quarter", "half-4", "quarter-4")},
-    "game_2048/3x3": (48_713_519, "game-2048.md"),
-    "game_2048/3x3-to-256": (7_270_259, "game-2048.md"),
-    "mini_grid/key-corridor-s5r3": (5_582_592, "mini-grid.md"),
-    "mini_grid/key-corridor-s6r3": (16_844_288, "mini-grid.md"),
+    "sliding_tiles/3x4": (239_500_800, "worlds.md"),
+    **{f"pocket_cube/{name}": (3_674_160, "worlds.md") for name in ("half", "quarter", "half-4", "quarter-4")},
+    "game_2048/3x3": (48_713_519, "worlds.md"),
+    "game_2048/3x3-to-256": (7_270_259, "worlds.md"),
+    "mini_grid/key-corridor-s5r3": (5_582_592, "worlds.md"),
+    "mini_grid/key-corridor-s6r3": (16_844_288, "worlds.md"),
     "freeway/25x13-speed1": (3_001_973, "evidence/paper-grid.md"),
     "breakout/20x10x1-3rows": (923_305_259, "evidence/performance.md"),
     "breakout/30x10x1-3rows": (1_083_934_871, "evidence/performance.md"),
@@ -57,10 +58,10 @@ NOT_COMPUTED = {  # instance -> why its values are not there
     "uniform and the worst policy were not solved",
     "sliding_tiles/3x4": "enumerated once ([302 s of a processor, 5.8 GB of files](../large-runs.md)); not solved",
     "game_2048/3x3": "541,821,326 possible outcomes, 33 minutes to enumerate; undiscounted the optimum is worth "
-    "5,468.49 ([2048](../game-2048.md)); the uniform and the worst policy were not solved",
+    "5,468.49 ([2048](../worlds.md#2048)); the uniform and the worst policy were not solved",
     **{
         f"game_2048/3x3-to-{target}": f"tens of millions of states with up to 16 outcomes; the optimum wins "
-        f"with probability {chance} ([2048](../game-2048.md)); the uniform and the worst policy were not solved"
+        f"with probability {chance} ([2048](../worlds.md#2048)); the uniform and the worst policy were not solved"
         for target, chance in ((512, 0.736774), (1024, 0.011338))
     },
 }
@@ -110,7 +111,7 @@ PACKAGES = {  # page of the reference -> (title, module)
 def environments() -> dict[str, str]:
     """A page for each class, and one that shows them all."""
     stored = json.loads((DOCS / "environments.json").read_text())
-    gallery = sections_of((DOCS / "gallery.md").read_text())
+    gallery = rows_of((DOCS / "gallery.md").read_text())
     pages = {f"environments/{name}.md": page_of(cls, stored, gallery.get(name, "")) for name, cls in classes().items()}
     cards = [card_of(cls, stored, gallery.get(name, "")) for name, cls in classes().items()]
     index = (
@@ -175,10 +176,9 @@ def values_row(name: str, numbers: Mapping) -> str | None:
     return f"| {page_link(name)} | {numbers['num_states']:,} | {numbers['episode_limit']:,} | {' | '.join(texts)} |"
 
 
-def sections_of(text: str) -> dict[str, str]:
-    """Title -> text, of the sections of the gallery."""
-    parts = re.split(r"^## (\w+)\n", text, flags=re.MULTILINE)[1:]
-    return dict(zip(parts[::2], parts[1::2], strict=True))
+def rows_of(text: str) -> dict[str, str]:
+    """Class -> its row, of the gallery."""
+    return {cls: row for row, cls in re.findall(r"^(\| \*\*(\w+)\*\* .*)$", text, re.MULTILINE)}
 
 
 def animations(section: str) -> list[tuple[str, str]]:
@@ -243,7 +243,7 @@ def page_of(cls, stored: Mapping[str, dict], section: str) -> str:
     lines += ["", *instances(cls, stored), "## What agents see", "", observations(section), ""]
     lines += ["## Versions", "", *versions(cls), ""]
     if cls.name in MORE:
-        lines += [f"More of this class, and where its numbers come from: [{MORE[cls.name]}](../{MORE[cls.name]}).", ""]
+        lines += [f"More of this class, and where its numbers come from: [worlds one by one](../{MORE[cls.name]}).", ""]
     return "\n".join(lines)
 
 
@@ -291,16 +291,15 @@ def instances(cls, stored: Mapping[str, dict]) -> list[str]:
 
 def observations(section: str) -> str:
     """The pictures of the gallery: what people and agents see."""
-    text = re.sub(r"^- The optimal policy of .*\n", "", section, flags=re.MULTILINE)
-    text = text.strip().replace("](gallery/", "](../gallery/")
-    if not text.strip():
+    if not section:
         return "The observations of every class: [observations](../observations.md)."
+    pictures = section.split(" | ")[1].replace("](gallery/", "](../gallery/").split("<br>")
     about = (
         "From the left: the drawing for people, the complex image at its natural size and at 84 x 84 pixels, and the "
         "planes of the simple image, one for each layer, named in their order, after some steps of the optimal policy. "
         "[More](../observations.md).\n\n"
     )
-    return about + text
+    return about + "\n".join(f"- {each}" for each in pictures)
 
 
 def versions(cls) -> list[str]:

@@ -5,7 +5,7 @@ change of one digit draws others. Curves of the engine, of tables and of exact a
 other agents, whose libraries differ between processors, the score of the run must lie in the 99 % prediction interval
 of the other seeds of its task.
 
-The source is code, and is executed: in a container without network, see docs/benchmark-seasons.md. It must be read too:
+The source is code, and is executed: in a container without network, see docs/benchmark-rules.md. It must be read too:
 a source that solves the task instead of learning it repeats its curves to the last bit.
 """
 
