@@ -135,7 +135,8 @@ def latex(page):
         parts.insert(sections[-2:][0] if text.startswith(r"\begin{table*}") and sections else len(parts), text)
         place += 1 + used
     joined = "\n\n".join([*parts, r"\end{document}"]) + "\n"
-    return re.sub(r"\n+(\\begin{equation\*}.*?\\end{equation\*})\n+(?=[a-z])", r"\n\1\n", joined, flags=re.DOTALL)
+    joined = re.sub(r"\n+(?=\\begin{equation\*})", "\n", joined)  # a formula belongs to the paragraph before it
+    return re.sub(r"(\\end{equation\*})\n+(?=[a-z])", r"\1\n", joined)
 
 
 def main(out=ROOT / "build" / "article"):
