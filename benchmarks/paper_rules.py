@@ -4,6 +4,7 @@
     python benchmarks/paper_rules.py breakout returns.csv --rows 2 --instances 12x8x3 16x8x3 20x8x3 24x8x3
     python benchmarks/paper_rules.py constants returns.csv
     python benchmarks/paper_rules.py freeway returns.csv
+    python benchmarks/paper_rules.py dqn returns.csv --rows 2 --limits 1500 --variants ours "3 walls"
 
 `returns.csv` has the tables of its appendix C, a row for each mean (environment, instance, randomization, agent,
 observation, mean). Under random or sticky actions, however likely, what is executed is a policy of the rules without
@@ -19,6 +20,9 @@ For each variant and limit of steps:
 `constants`: returns of always left, always stay and always right on 16x8x1, 16x8x3 and 20x8x3, where the paper prints
 2.00 ± 0.00, 2.00 ± 0.00 and 4.00 ± 0.00 for PPO.
 
+`dqn`: DQN with vectors as the paper trains it (the table's hyperparameters, 600 thousand steps), on its instances of 8
+columns under each variant; mean return of the last tenth of training, exploration included, beside the printed mean.
+
 Means are rounded to cents. Breakout: the time-invariant MDP is built and swept, with all limits in one pass. Freeway:
 the cars are a clock, so the few states of each step are searched from the start.
 """
@@ -27,6 +31,7 @@ import argparse
 import csv
 import itertools
 import tempfile
+import time
 from dataclasses import dataclass
 
 import numba
@@ -34,11 +39,14 @@ import numpy as np
 from scipy.stats import spearmanr
 
 import pharos
+from pharos.agents import hyperparameters
+from pharos.agents.batched import BatchRun, ObservationSource, make_batch
 from pharos.environments import make
 from pharos.environments.base import parameter
 from pharos.environments.worlds import breakout as rules
 from pharos.environments.worlds.breakout import Breakout, no_brick_is_left
 from pharos.environments.worlds.freeway import Freeway
+from pharos.training import Task
 
 ROUNDING = 0.005
 EDGE, MINATAR, MIRROR = range(3)
@@ -303,6 +311,40 @@ def return_of_constant(env, action, limit):
     return total
 
 
+def dqn(arguments):
+    """Returns of DQN with vectors under each variant: a program of all instances and seeds."""
+    means, limit = printed(arguments.returns, "breakout"), max(arguments.limits)
+    wanted = {i: name for i, name in enumerate(Breakout.paper_instances) if Breakout.instances[name]["columns"] == 8}
+    wanted = {i: name for i, name in wanted.items() if name in (arguments.instances or wanted.values())}
+    paper, table = [means[i]["none", "DQN", "vector"] for i in wanted], hyperparameters("dqn", "breakout", "vector")
+    columns = {"printed": paper}
+    for variant in arguments.variants or VARIANTS:
+        runs, began = [], time.process_time()
+        for name in wanted.values():
+            env = variant_of(name, brick_rows=arguments.rows, **VARIANTS[variant])
+            task = Task.of(env, observation="vector", horizon=limit)
+            source = ObservationSource.of(task.space, task.sight.observe)
+            runs += [BatchRun(task.mdp, source, limit, table, arguments.steps, seed, seed) for seed in arguments.seeds]
+        batch, late = make_batch("dqn", runs), []
+        batch.learn(
+            [arguments.steps * 9 // 10, arguments.steps],
+            lambda point, batch=batch, late=late: late.append((batch.returns.copy(), batch.episodes.copy())),
+        )
+        (returns, episodes), (all_returns, all_episodes) = late
+        found = (all_returns - returns) / np.maximum(all_episodes - episodes, 1)
+        columns[variant] = found.reshape(len(wanted), -1).mean(axis=1)
+        print(f"{variant}: {(time.process_time() - began) / len(runs):.0f} processor s a run", flush=True)
+        for name, seeds in zip(wanted.values(), found.reshape(len(wanted), -1), strict=True):
+            print("   ", name, " ".join(f"{mean:.2f}" for mean in seeds), flush=True)
+    print("| instance | " + " | ".join(columns) + " |\n" + "|---" * (len(columns) + 1) + "|")
+    for row, name in enumerate(wanted.values()):
+        print(f"| `{name}` | " + " | ".join(f"{column[row]:.2f}" for column in columns.values()) + " |")
+    for variant, column in list(columns.items())[1:]:
+        ratios = np.array(column) / np.array(paper)
+        rank = spearmanr(paper, column)[0]
+        print(f"{variant}: {ratios.min():.2f} to {ratios.max():.2f} of the printed; rank {rank:.2f}")
+
+
 def freeway(arguments):
     means, names = printed(arguments.returns, "freeway"), Freeway.paper_instances
     print("| restart | penalty | limit | impossible | below | share | rank | best | worst |\n" + "|---" * 9 + "|")
@@ -326,15 +368,18 @@ def freeway(arguments):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("environment", choices=("breakout", "constants", "freeway"))
+    parser.add_argument("environment", choices=("breakout", "constants", "freeway", "dqn"))
     parser.add_argument("returns")
     parser.add_argument("--rows", type=int, default=1)
     parser.add_argument("--limits", type=int, nargs="+", default=[250, 500, 1000, 2000])
     parser.add_argument("--instances", nargs="+")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS)
+    parser.add_argument("--steps", type=int, default=600_000, help="of dqn")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1], help="of dqn")
     parser.add_argument("--penalties", type=float, nargs="+", default=[0.1, 0.5, 1.0, 2.0])
     arguments = parser.parse_args()
-    {"breakout": breakout, "constants": constants, "freeway": freeway}[arguments.environment](arguments)
+    commands = {"breakout": breakout, "constants": constants, "freeway": freeway, "dqn": dqn}
+    commands[arguments.environment](arguments)
 
 
 if __name__ == "__main__":
