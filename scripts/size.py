@@ -2,14 +2,19 @@
 
 python scripts/size.py                  this checkout
 python scripts/size.py --root FOLDER    another one, such as an older commit unpacked there
+python scripts/size.py --walk           the files that one state passes from its rules to its regret, in the pharos
+                                        that is imported
 
 A code line is neither blank, nor a comment, nor of a docstring. The limits stand in docs/decisions/size.md.
 """
 
 import argparse
 import ast
+import gc
 import io
 import statistics
+import sys
+import tempfile
 import tokenize
 from collections.abc import Iterator
 from pathlib import Path
@@ -147,10 +152,54 @@ def rows(root: Path) -> dict[str, str]:
     }
 
 
+def walk() -> tuple[list[str], list[str]]:
+    """Return the files of which functions are called or compiled while a lake is built, solved and evaluated; and while
+    Q-learning is trained on it, too. What runs as a file is loaded does not count.
+    """
+    import pharos
+
+    source, passed = Path(pharos.__file__).parent, set()
+
+    def note(frame, event, _):
+        code, above = frame.f_code, frame.f_back
+        if event != "call" or not code.co_filename.startswith(str(source)) or not code.co_flags & 1:
+            return  # a flag of functions, which bodies of modules and classes lack
+        while above is not None and not above.f_code.co_filename.startswith("<frozen importlib"):
+            above = above.f_back
+        if above is None and not code.co_name.startswith("<") and code.co_name != "__getattr__":
+            passed.add(Path(code.co_filename))
+
+    def compiled():
+        from numba.core.dispatcher import Dispatcher
+
+        kernels = [each.py_func for each in gc.get_objects() if isinstance(each, Dispatcher) and each.overloads]
+        files = {Path(kernel.__code__.co_filename) for kernel in kernels}
+        return {path for path in files if path.is_relative_to(source)}
+
+    with tempfile.TemporaryDirectory() as folder:
+        sys.setprofile(note)
+        try:
+            mdp = pharos.build(pharos.make("frozen_lake/8x8"), folder, progress=False).mdp(gamma=0.99)
+            pharos.evaluate_policy(mdp, pharos.value_iteration(mdp).policy)
+            to_values = passed | compiled()
+            pharos.train("q_learning", "frozen_lake/8x8", steps=2000)
+        finally:
+            sys.setprofile(None)
+    both = (to_values, passed | compiled())
+    return tuple(sorted(path.relative_to(source).as_posix() for path in paths) for paths in both)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, default=ROOT)
-    root = parser.parse_args().root.resolve()
+    parser.add_argument("--walk", action="store_true")
+    arguments = parser.parse_args()
+    if arguments.walk:
+        to_values, to_regret = walk()
+        print(f"to values, {len(to_values)} files:", *to_values)
+        print(f"with training, {len(to_regret)} files:", *sorted(set(to_regret) - set(to_values)))
+        return
+    root = arguments.root.resolve()
     print("| package | code lines |\n|---|---|")
     for package, count in lines_by_package(root).items():
         print(f"| {package} | {count:,} |")
