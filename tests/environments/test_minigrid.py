@@ -16,6 +16,7 @@ import pharos
 from command_line import run
 from pharos import hardness, importers
 from pharos.errors import MissingExtra, ParameterError, RuleError, StateSpaceTooLarge
+from pharos.importers import minigrid_recording
 from pharos.mdp.bisimulation import minimize
 
 CORRIDOR = "MiniGrid-KeyCorridorS3R1-v0"
@@ -86,8 +87,7 @@ def test_key_corridor_has_its_published_values(remember):
 @pytest.mark.parametrize("name", SMALL)
 def test_the_table_and_the_environment_agree_at_every_step_of_walks(name):
     env = FullyObsWrapper(gymnasium.make(name, disable_env_checker=True, max_steps=10**6))
-    mdp = importers.minigrid(name, seed=3)
-    grids = importers.minigrid_grids(name, seed=3)
+    mdp, grids, _ = minigrid_recording(name, seed=3)
     assert len(grids) == mdp.num_states
     best = pharos.value_iteration(mdp.with_gamma(0.9).with_horizon(None)).policy
     rng = np.random.default_rng(0)

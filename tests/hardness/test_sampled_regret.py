@@ -12,7 +12,7 @@ from naive import learning as naive_learning
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness import Representation, Sampling, Schedule, sampled_regret
-from pharos.hardness.representation import Exact, Grouped, Identity, Landmarks
+from pharos.hardness.representation import Exact, Identity, Landmarks
 from pharos.hardness.sampled_regret import SampledLearner
 from pharos.mdp import TabularMDP, lazy_actions, paid_outcomes, random_actions, sticky_actions
 
@@ -109,10 +109,10 @@ class Precise(Exact):
 
 def both_walks(mdp, kernel, classes, sampling, *, schedule=SHORT, episode=7, operator=None):
     """Q (C, A) of the first walk, compiled and plain; kernel (S, S), classes (S,)."""
-    learner = SampledLearner(mdp, schedule, sampling, episode)
-    observations = Grouped(np.asarray(classes), learner.numbers[learner.states])
+    learner = SampledLearner(mdp, Representation.of_matrix(kernel, classes), schedule, episode)
+    learner.sampling, observations = sampling, learner.observations
     some, number = observations.representatives, np.zeros(mdp.num_states, np.int64)
-    number[learner.numbers[learner.states]] = observations.groups
+    number[learner.numbers] = observations.groups
     operator = operator or Precise(lambda x, y: kernel[np.ix_(x, y)], some)
     *_, compiled = learner.walk(observations, operator, np.array([0, schedule.steps]), sampling.seed)
     part = kernel[np.ix_(some, some)]
@@ -154,8 +154,8 @@ def test_a_walk_with_a_kernel_is_the_definition(name, is_aliased):
 def test_landmarks_at_all_observations_walk_as_the_kernel_does():
     mdp = random_mdp(7, 3)
     kernel = np.asarray(kernel_of(7), np.float32)
-    learner = SampledLearner(mdp, SHORT, ONCE, 7)
-    observations = Grouped(np.arange(7), learner.numbers[learner.states])
+    learner = SampledLearner(mdp, Representation.of_matrix(kernel), SHORT, 7)
+    learner.sampling, observations = ONCE, learner.observations
     some, looks = observations.representatives, np.array([0, 150])
     exact, approximate = (
         list(learner.walk(observations, each, looks, 0))[-1]

@@ -39,9 +39,5 @@ __all__ = [
     "image",
     "text_drawing",
 ]
-_shared = """
-    INK NIGHT Window check_state color_of colored_text empty_grid enlarged fitting_cell glyph_of ground_of inside
-    planes_of save_gif save_png scenery_of shade shape_of sprite_of sprite_pixels tile
-"""
 
 __getattr__ = lazy.attributes(__name__)

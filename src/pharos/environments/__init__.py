@@ -80,12 +80,5 @@ __all__ = [
     "parameter",
     "register",
 ]
-_shared = """
-    BUILT_IN Blackjack Breakout BuiltIn CELL CELLS Catch CliffWalking Color Components CornerGrid DeepSea
-    DiscountingChain EndlessSea Freeway FrozenLake Game2048 Ground Kind Margin MemoryChain MiniGrid MiniGridEmpty
-    MiniGridRooms Parameter PocketCube RiverSwim Shape SimpleGrid SlidingTiles Sokoban Sprite Taxi UmbrellaChain
-    VALUED_CELLS as_tuples class_called class_of declared_parameters imported instance_name integers named_instances
-    on_registration one_of source_of start_distribution
-"""
 
 __getattr__ = lazy.attributes(__name__)

@@ -17,8 +17,5 @@ if TYPE_CHECKING:
 __all__ = [
     "explore",
 ]
-_shared = """
-    ARROWS Exploration Explorer Learnt Server contents exploration_of keys_of open_browser page write
-"""
 
 __getattr__ = lazy.attributes(__name__)

@@ -87,8 +87,3 @@ __all__ = [
     "stationary_effective_horizon",
     "sum_of_reciprocal_gaps",
 ]
-_shared = """
-    ActionGapRegularity Budget Certificate Covering ExplorationTime GorpBound GorpRuns KernelRegret LearningCurve
-    MixingTime Occupancy Progress Report Result ReturnDistribution SampledRegret Spectral StationaryHorizon chosen
-    discounted_visits return_distribution
-"""

@@ -17,7 +17,6 @@ kernel, without a learner.
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -38,7 +37,6 @@ from pharos.hardness.representation import (
     Schedule,
     descent,
     greedy_policy,
-    operators_of,
 )
 from pharos.hardness.visitation import StandardOccupancy, standard_occupancy
 from pharos.mdp import TabularMDP, require_mdp
@@ -149,61 +147,34 @@ def kernel_regret(
         kernel is 4 C^2 bytes of C different observations; beyond MOST_EXACT of them, landmarks.
     Source: pharos; Sirignano and Spiliopoulos (2019), Cai et al. (2019) for the limit of wide networks.
     """
-    representation.check(mdp.num_states)
-    episode = representation.episode(mdp.horizon if horizon is None else horizon, "kernel_regret")
-    schedule = schedule or Schedule()
-    learner = Learner(mdp, schedule, episode, solution)
-    return regret_in_kernel(mdp, learner, representation, {"schedule": asdict(schedule)}, "max_a d")
+    learner = Learner(mdp, representation, schedule, horizon, solution)
+    return regret_in_kernel(learner, {"schedule": asdict(learner.schedule)})
 
 
-def regret_in_kernel(
-    mdp: TabularMDP,
-    learner: Learner,
-    representation: Representation,
-    settings: Mapping[str, Any],
-    weights_of_steps: str,
-) -> KernelRegret:
+def regret_in_kernel(learner: Learner, settings: Mapping[str, Any]) -> KernelRegret:
     """The regret of a learner with a kernel, by landmarks where there are too many observations, and with a table.
 
     Args:
-        mdp: all of it, also where the learner has the states alone that an episode can meet.
         settings: of the learner, the first of the conventions.
-        weights_of_steps: how d weighs the kernel in the step size.
     """
-    everything = learner.numbers[learner.states]
-    observations = Grouped(representation.classes, everything)
-
-    @cache
-    def weights() -> np.ndarray:
-        standard = standard_occupancy(mdp, learner.schedule.gamma, learner.episode)
-        return observations.sums(standard.states[everything])
 
     def learnt(operator: KernelOperator) -> LearningCurve:
         if learner.schedule.optimizer == "adam":
-            operator.preconditioned(np.maximum(weights(), RAREST * weights().max()))
-        return learner.curve(observations, operator)
+            operator.preconditioned(np.maximum(learner.weights, RAREST * learner.weights.max()))
+        return learner.curve(learner.observations, operator)
 
-    operators, landmarks = operators_of(representation, observations, weights)  # what does not fit is said at once
-    tabular = learner.curve(Grouped(np.arange(mdp.num_states), everything), Identity())
+    operators, landmarks = learner.operators()  # what does not fit is said at once
+    tabular = learner.curve(learner.table, Identity())
     curve, *half = map(learnt, operators)
-    conventions = {
-        **settings,
-        "episode": learner.episode,
-        "gamma": float(mdp.gamma),
-        "horizon": mdp.horizon,
-        "step_size": f"1 / ({MARGIN} largest eigenvalue of K diag({weights_of_steps}))",
-        "clipped": {"greedy": WORST_GREEDY, "played": WORST_PLAYED},
-        **representation.conventions,
-    }
     return KernelRegret(
         curve=curve,
         tabular=tabular,
-        observations=len(observations),
-        states=len(everything),
+        observations=len(learner.observations),
+        states=len(learner.states),
         landmarks=landmarks,
         estimated_error=sum((abs(curve.mean_greedy - each.mean_greedy) for each in half), 0.0),
         estimated_error_played=sum((abs(curve.mean_played - each.mean_played) for each in half), 0.0),
-        conventions=conventions,
+        conventions=learner.conventions(settings, {"greedy": WORST_GREEDY, "played": WORST_PLAYED}),
         name=learner.measure,
     )
 
@@ -260,25 +231,18 @@ def kernel_policy_regret(
     Source: pharos; Sutton et al. (2000) for the gradient, Schulman et al. (2016) for G, Schulman et al. (2017) for the
         objective, Agarwal et al. (2021) for tables.
     """
-    representation.check(mdp.num_states)
-    episode = representation.episode(mdp.horizon if horizon is None else horizon, "kernel_policy_regret")
-    schedule, rollouts = schedule or Schedule(), rollouts or Rollouts()
-    learner = PolicyLearner(mdp, schedule, episode, solution, rollouts)
-    of_schedule = {name: asdict(schedule)[name] for name in ("steps", "gamma", "optimizer")}
-    settings = {"schedule": of_schedule, "rollouts": rollouts.to_dict()}
-    return regret_in_kernel(mdp, learner, representation, settings, "d")
+    learner = PolicyLearner(mdp, representation, schedule, horizon, solution)
+    learner.rollouts = rollouts or Rollouts()
+    of_schedule = {name: getattr(learner.schedule, name) for name in ("steps", "gamma", "optimizer")}
+    return regret_in_kernel(learner, {"schedule": of_schedule, "rollouts": learner.rollouts.to_dict()})
 
 
 class PolicyLearner(Learner):
     """An MDP, and actor-critics on it."""
 
     measure = "kernel_policy_regret"
-
-    def __init__(
-        self, mdp: TabularMDP, schedule: Schedule, episode: int, solution: Solution | None, rollouts: Rollouts
-    ):
-        super().__init__(mdp, schedule, episode, solution)
-        self.rollouts = rollouts
+    step_weights = "d"
+    rollouts: Rollouts
 
     def curve(self, observations: Grouped, apply: KernelOperator) -> LearningCurve:
         logits, values = np.zeros((len(observations), self.mdp.num_actions)), np.zeros((len(observations), 1))
@@ -301,10 +265,10 @@ class PolicyLearner(Learner):
             error = np.divide(goal, weights, out=values.copy(), where=weights > 0) - values
             values = values + descent(apply, weights, error, of_critic, steps)
             largest = apply.largest_eigenvalue(weights, of_actor)
-            gain = visits * self.advantages(memory, policy, v, returns, visits)
+            gain = visits * standardised(returns - v[:, None], visits)
             if largest > 0:
                 pull, up = observations.sums(gain), observations.sums(np.maximum(gain, 0.0))
-                logits = self.ascended(logits, pull, up, apply, 1 / (MARGIN * largest))
+                logits = ascended(logits, pull, up, apply, 1 / (MARGIN * largest), self.rollouts)
         return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))
 
     def _returns(
@@ -319,36 +283,20 @@ class PolicyLearner(Learner):
                 break
         return returns, visits
 
-    def advantages(
-        self, memory: Memory, policy: np.ndarray, v: np.ndarray, returns: np.ndarray, visits: np.ndarray
-    ) -> np.ndarray:
-        """(N, A) by which the policy learns, from returns (N, A) of choices and values v (N,), at visits of sum 1."""
-        return standardised(returns - v[:, None], visits)
-
-    def ascended(
-        self, logits: np.ndarray, pull: np.ndarray, up: np.ndarray, apply: KernelOperator, rate: float
-    ) -> np.ndarray:
-        """(C, A) logits after the gradient steps of a rollout."""
-        return ascended(logits, pull, up, apply, rate, self.rollouts.gradient_steps, self.rollouts.clip_range)
-
 
 def ascended(
-    logits: np.ndarray,
-    pull: np.ndarray,
-    up: np.ndarray,
-    apply: KernelOperator,
-    rate: float,
-    steps: int,
-    clip_range: float | None = None,
+    logits: np.ndarray, pull: np.ndarray, up: np.ndarray, apply: KernelOperator, rate: float, rollouts: Rollouts
 ) -> np.ndarray:
     """Logits (C, A) after gradient steps up the sum of pull(., a) p(a) / pi(a), pi their policy before the first.
 
     Args:
         pull: (C, A) weighted advantages, summed over the states of an observation; up: the positive ones alone.
-        clip_range: where p / pi is that far above 1 the positive ones count no more, that far below the negative ones.
+        rollouts: how many steps; where p / pi is `clip_range` above 1 the positive ones count no more, where it is as
+            far below the negative ones.
     """
-    behaviour, far = np.maximum(softmax(logits), 1e-30), np.inf if clip_range is None else clip_range
-    for _ in range(steps):
+    behaviour = np.maximum(softmax(logits), 1e-30)
+    far = np.inf if rollouts.clip_range is None else rollouts.clip_range
+    for _ in range(rollouts.gradient_steps):
         policy = softmax(logits)
         ratio = policy / behaviour
         counted = np.where(ratio > 1 + far, pull - up, np.where(ratio < 1 - far, up, pull))
@@ -364,10 +312,10 @@ def softmax(logits: np.ndarray) -> np.ndarray:
     return grown / grown.sum(axis=1, keepdims=True)
 
 
-def standardised(advantages: np.ndarray, visits: np.ndarray, noise: float = 0.0) -> np.ndarray:
-    """(N, A) of mean 0 and variance 1 under visits of sum 1, `noise` added to it; 0 where they are all the same."""
+def standardised(advantages: np.ndarray, visits: np.ndarray) -> np.ndarray:
+    """(N, A) of mean 0 and variance 1 under visits of sum 1; 0 where they are all the same."""
     centred = advantages - (visits * advantages).sum()
-    spread = float(np.sqrt((visits * centred**2).sum() + noise))
+    spread = float(np.sqrt((visits * centred**2).sum()))
     return centred / spread if spread > 1e-12 else np.zeros_like(centred)
 
 
@@ -501,8 +449,7 @@ def aliasing_floor(
 def _setting(
     mdp: TabularMDP, representation: Representation, schedule: Schedule | None, horizon: int | None, name: str
 ) -> StandardOccupancy:
-    representation.check(mdp.num_states)
-    episode = representation.episode(mdp.horizon if horizon is None else horizon, name)
+    episode = representation.episode(mdp, horizon, name)
     return standard_occupancy(mdp, (schedule or Schedule()).gamma, episode)
 
 

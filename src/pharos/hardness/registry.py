@@ -12,7 +12,7 @@ from pharos.hardness.diameter import diameter, start_eccentricity_interval
 from pharos.hardness.effective_horizon import effective_horizon, stationary_effective_horizon
 from pharos.hardness.gaps import Gaps, resolved_gaps, solved
 from pharos.hardness.gorp import gorp_bound
-from pharos.hardness.interval import Budget, Certified, Interval, Progress
+from pharos.hardness.interval import Budget, Certified, Progress
 from pharos.hardness.kernel_regret import (
     aliasing_floor,
     kernel_learning_time,
@@ -213,12 +213,6 @@ Outcome = TypeVar("Outcome")
 # Measures of pharos ---------------------------------------------------------------------------------------------------
 
 
-def _diameter(problem: Problem) -> Interval:
-    reporter = problem.interval_reporter("diameter")
-    options: dict[str, Any] = {"restart": problem.restart, "budget": problem.budget, "bounds": problem.folder}
-    return diameter(problem.mdp, progress=reporter, **options)
-
-
 def _start_eccentricity(problem: Problem) -> Certified:
     interval = start_eccentricity_interval(problem.mdp, restart=problem.restart, budget=problem.budget)
     if not interval.exact and math.isinf(interval.upper):
@@ -233,9 +227,24 @@ def _minimal_gap(problem: Problem) -> Certified:
     return result
 
 
+# What several of them have in common
+_VALUES: dict[str, Any] = {"complexity": "estimation", "version": 2, "depends": "values"}
+_REPRESENTATION: dict[str, Any] = {
+    "complexity": "representation",
+    "version": 1,
+    "depends": "representation",
+    "on_request": True,
+}
+
 register(
     "diameter",
-    _diameter,
+    lambda problem: diameter(
+        problem.mdp,
+        restart=problem.restart,
+        budget=problem.budget,
+        progress=problem.interval_reporter("diameter"),
+        bounds=problem.folder,
+    ),
     definition="max over s != s' of min over policies of E[steps from s to s']",
     source="Jaksch, Ortner and Auer (2010), definition 1; the pharos paper, equation 1",
     complexity="visitation",
@@ -256,36 +265,28 @@ register(
     lambda problem: problem.gaps.certified_sum,
     definition="sum of 1 / (V*(s) - Q*(s, a)) over reachable s and actions that are not optimal",
     source="Simchowitz and Jamieson (2019); the pharos paper, equation 2",
-    complexity="estimation",
-    version=2,
-    depends="values",
+    **_VALUES,
 )
 register(
     "sum_of_reciprocal_gaps_regularized",
     lambda problem: problem.gaps.certified_regularized,
     definition="sum of 1 / (V*(s) - Q*(s, a) + 0.1) over all s and a",
     source="Conserva and Rauber (2022), as in Colosseum",
-    complexity="estimation",
-    version=2,
-    depends="values",
+    **_VALUES,
 )
 register(
     "minimal_gap",
     _minimal_gap,
     definition="the smallest V*(s) - Q*(s, a) > 0 over reachable s",
     source="Simchowitz and Jamieson (2019)",
-    complexity="estimation",
-    version=2,
-    depends="values",
+    **_VALUES,
 )
 register(
     "environmental_value_norm",
     lambda problem: certified_value_norm(problem.mdp, problem.solution),
     definition="max over s, a of the standard deviation of V*(s') under p(. | s, a)",
     source="Maillard, Mann and Mannor (2014), definition 1",
-    complexity="estimation",
-    version=2,
-    depends="values",
+    **_VALUES,
 )
 register(
     "effective_horizon",
@@ -310,9 +311,7 @@ register(
     lambda problem: action_gap_regularity(problem.mdp, problem.solution),
     definition="smallest c with P(0 < V*(s) - best Q*(s, a) that is not optimal <= t) <= c t for all t, s uniform",
     source="Farahmand (2011), assumption A1",
-    complexity="estimation",
-    version=2,
-    depends="values",
+    **_VALUES,
     on_request=True,
 )
 register(
@@ -373,82 +372,56 @@ register(
 )
 
 
-def _of_representation(function: Callable[..., Outcome]) -> Callable[[Problem], Outcome]:
-    """A measure of what the agent sees, as a report takes it."""
-
-    def measure(problem: Problem) -> Outcome:
-        representation = problem.seen(function.__name__)
-        return function(problem.mdp, representation, schedule=problem.schedule, horizon=problem.horizon)
-
-    return measure
-
-
-def _of_learner(function: Callable[..., Outcome], problem: Problem, **options: object) -> Outcome:
-    """A measure of an idealised learner."""
-    options |= {"schedule": problem.schedule, "solution": problem.solution, "horizon": problem.horizon}
-    return function(problem.mdp, problem.seen(function.__name__), **options)
+def _seen(function: Callable[..., Outcome], problem: Problem, *options: str) -> Outcome:
+    """A measure of what the agent sees; options: of the problem, beside schedule and horizon."""
+    representation = problem.seen(function.__name__)
+    return function(
+        problem.mdp, representation, **{name: getattr(problem, name) for name in ("schedule", "horizon", *options)}
+    )
 
 
 register(
     "kernel_regret",
-    lambda problem: _of_learner(kernel_regret, problem),
+    lambda problem: _seen(kernel_regret, problem, "solution"),
     definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of expected Q-learning "
     "in the tangent kernel of the agent's network; as played; and both of tabular Q-learning",
     source="pharos; after Sirignano and Spiliopoulos (2019)",
-    complexity="representation",
-    version=1,
-    depends="representation",
-    on_request=True,
+    **_REPRESENTATION,
 )
 register(
     "sampled_regret",
-    lambda problem: _of_learner(sampled_regret, problem, sampling=problem.sampling),
+    lambda problem: _seen(sampled_regret, problem, "solution", "sampling"),
     definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of Q-learning from "
     "drawn transitions in the tangent kernel of the agent's network and in its root; and that of a table",
     source="pharos; after Mnih et al. (2015)",
-    complexity="representation",
-    version=1,
-    depends="representation",
-    on_request=True,
+    **_REPRESENTATION,
 )
 register(
     "kernel_policy_regret",
-    lambda problem: _of_learner(kernel_policy_regret, problem, rollouts=problem.rollouts),
+    lambda problem: _seen(kernel_policy_regret, problem, "solution", "rollouts"),
     definition="mean over learning of (V* - V of the most probable actions) / (V* - V of uniform play) of an expected "
     "actor-critic in the tangent kernel of the agent's network; as played; and both of a table",
     source="pharos; Sutton et al. (2000), Schulman et al. (2016, 2017)",
-    complexity="representation",
-    version=1,
-    depends="representation",
-    on_request=True,
+    **_REPRESENTATION,
 )
 register(
     "kernel_learning_time",
-    _of_representation(kernel_learning_time),
+    lambda problem: _seen(kernel_learning_time, problem),
     definition="time after which gradient flow in the kernel (trace 1) has learnt 90 % of the energy of A* = Q* - V*",
     source="pharos; Jacot, Gabriel and Hongler (2018)",
-    complexity="representation",
-    version=1,
-    depends="representation",
-    on_request=True,
+    **_REPRESENTATION,
 )
 register(
     "kernel_sample_complexity",
-    _of_representation(kernel_sample_complexity),
+    lambda problem: _seen(kernel_sample_complexity, problem),
     definition="samples from which kernel regression explains 90 % of the variance of Q*",
     source="Simon, Dickens, Karkada and DeWeese (2023)",
-    complexity="representation",
-    version=1,
-    depends="representation",
-    on_request=True,
+    **_REPRESENTATION,
 )
 register(
     "aliasing_floor",
-    _of_representation(aliasing_floor),
+    lambda problem: _seen(aliasing_floor, problem),
     definition="E Var(Q* | observation) / Var Q*: what no function of the observation explains",
     source="pharos",
-    complexity="representation",
-    version=1,
-    depends="representation",
-    on_request=True,
+    **_REPRESENTATION,
 )

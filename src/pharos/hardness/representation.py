@@ -8,14 +8,14 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.visitation import Walk, drawn
+from pharos.hardness.visitation import Walk, drawn, standard_occupancy
 from pharos.mdp import TabularMDP, whole_number
 from pharos.solvers import Solution, evaluate_policy, regret_scale, uniform_value, value_iteration
 
@@ -66,16 +66,17 @@ class Representation:
             raise ParameterError(f"classes have shape {numbers.shape}; expected ({len(matrix)},), one for each state")
         return Representation(lambda rows, columns: matrix[np.ix_(rows, columns)], numbers, **options)
 
-    def check(self, num_states: int) -> None:
-        """ParameterError unless it is of as many states."""
-        if len(self.classes) != num_states:
-            raise ParameterError(
-                f"the representation is of {len(self.classes)} states; expected {num_states}, those of the MDP"
-            )
+    def episode(self, mdp: TabularMDP, horizon: int | None, measure: str) -> int:
+        """Steps of an episode: the horizon, else that of the MDP, else the time limit.
 
-    def episode(self, horizon: int | None, measure: str) -> int:
-        """Steps of an episode: the horizon, else the time limit; UndefinedMeasure where there is neither."""
-        steps = self.time_limit if horizon is None else horizon
+        Raises:
+            UndefinedMeasure: there is none. ParameterError: the MDP has another number of states.
+        """
+        if len(self.classes) != mdp.num_states:
+            raise ParameterError(
+                f"the representation is of {len(self.classes)} states; expected {mdp.num_states}, those of the MDP"
+            )
+        steps = next((each for each in (horizon, mdp.horizon, self.time_limit) if each is not None), None)
         if steps is None:
             raise UndefinedMeasure(f"{measure} is defined for episodes of T steps: give a horizon")
         return int(steps)
@@ -276,21 +277,6 @@ class Landmarks(KernelOperator):
         return total
 
 
-def operators_of(
-    representation: Representation, observations: Grouped, weights: Callable[[], np.ndarray]
-) -> tuple[Iterable[KernelOperator], int | None]:
-    """([the kernel over observations], None); or, where they are too many, (it by landmarks, then by half of these; how
-    many landmarks), drawn by weights (C,) of observations, which are asked for then."""
-    observed, landmarks = observations.representatives, representation.landmarks
-    if landmarks is None and len(observed) > MOST_EXACT:
-        landmarks = LANDMARKS
-    if not landmarks or landmarks >= len(observed):
-        return [Exact(representation.kernel, observed)], None
-    chosen = observed[drawn(weights(), landmarks)]
-    parts = (chosen, chosen[: landmarks // 2])
-    return (Landmarks(representation.kernel, observed, some) for some in parts), landmarks  # one at a time
-
-
 @lru_cache(maxsize=16)
 def _sum_of_powers(steps: int) -> np.ndarray:
     """Chebyshev coefficients in u = 1 - 2 x of the sum of (1 - x)^t, t < steps, on [0, 1]."""
@@ -430,16 +416,28 @@ class Learner:
 
     Attributes:
         measure: what is said to be undefined, or estimated.
-        mdp: as given, without states that its horizon keeps out of reach.
-        numbers: (S,) of its states in the MDP as it was given.
-        states: (N,) those that an episode can meet and that are not terminal.
+        step_weights: how d weighs the kernel in the step size, in words.
+        whole: the MDP as given; mdp: without states that its horizon keeps out of reach.
+        states: (N,) those that an episode can meet and that are not terminal; numbers: (N,) in the MDP as given.
+        episode: its steps.
+        observations: the states by what the agent sees; table: each for itself.
     Raises:
         UndefinedMeasure: uniform play is optimal, so that regret has no scale.
     """
 
     measure = "kernel_regret"
+    step_weights = "max_a d"
 
-    def __init__(self, mdp: TabularMDP, schedule: Schedule, episode: int, solution: Solution | None = None):
+    def __init__(
+        self,
+        mdp: TabularMDP,
+        representation: Representation,
+        schedule: Schedule | None = None,
+        horizon: int | None = None,
+        solution: Solution | None = None,
+    ):
+        self.episode = episode = representation.episode(mdp, horizon, self.measure)
+        self.schedule, self.representation = schedule or Schedule(), representation
         solution = solution or value_iteration(mdp)
         uniform = uniform_value(mdp)
         self.optimal = solution.value_at_start
@@ -447,14 +445,17 @@ class Learner:
         self.spread = regret_scale(self.optimal, uniform.value_at_start, error)
         if math.isnan(self.spread):
             raise UndefinedMeasure(f"{self.measure}: uniform play is optimal, so that there is no regret to speak of")
-        self.schedule, self.episode = schedule, episode
-        self.mdp, self.numbers = mdp, np.arange(mdp.num_states)
+        self.whole = self.mdp = mdp
         met = mdp.states_within(episode)
         met[mdp.start_states] = True
         if mdp.horizon is not None and mdp.horizon == episode and not met.all():
-            self.mdp, self.numbers = mdp.within(episode), np.flatnonzero(met)
-            met = np.ones(len(self.numbers), np.bool_)
-        self.states = np.flatnonzero(met & ~np.asarray(self.mdp.terminal))
+            self.mdp, numbers = mdp.within(episode), np.flatnonzero(met)
+            self.states = np.flatnonzero(~np.asarray(self.mdp.terminal))
+            self.numbers = numbers[self.states]
+        else:
+            self.states = self.numbers = np.flatnonzero(met & ~np.asarray(mdp.terminal))
+        self.observations = Grouped(representation.classes, self.numbers)
+        self.table = Grouped(np.arange(mdp.num_states), self.numbers)
         self.visits = OfPolicies(lambda policy: visits_of(self.mdp, self.everywhere(policy), self.episode))
         self.value = OfPolicies(self._value)
 
@@ -479,12 +480,39 @@ class Learner:
             weights = observations.sums(visits / visits.sum())
             total = observations.sums(visits / visits.sum() * target)
             error = np.divide(total, weights, out=values.copy(), where=weights > 0) - values
-            values += self.learnt(apply, weights, error, vector)
+            values += descent(apply, weights, error, vector, schedule.gradient_steps)
         return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))
 
-    def learnt(self, apply: KernelOperator, weights: np.ndarray, error: np.ndarray, vector: np.ndarray) -> np.ndarray:
-        """(C, A): what the gradient steps of a phase add; see `descent`."""
-        return descent(apply, weights, error, vector, self.schedule.gradient_steps)
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """(C,) of observations, at the standard occupancy."""
+        standard = standard_occupancy(self.whole, self.schedule.gamma, self.episode)
+        return self.observations.sums(standard.states[self.numbers])
+
+    def operators(self) -> tuple[Iterable[KernelOperator], int | None]:
+        """([the kernel over observations], None); or, where they are too many, (it by landmarks, then by half of these;
+        how many landmarks), drawn by `weights`."""
+        kernel, observed = self.representation.kernel, self.observations.representatives
+        landmarks = self.representation.landmarks
+        if landmarks is None and len(observed) > MOST_EXACT:
+            landmarks = LANDMARKS
+        if not landmarks or landmarks >= len(observed):
+            return [Exact(kernel, observed)], None
+        chosen = observed[drawn(self.weights, landmarks)]
+        parts = (chosen, chosen[: landmarks // 2])
+        return (Landmarks(kernel, observed, some) for some in parts), landmarks  # one at a time
+
+    def conventions(self, settings: Mapping[str, Any], clipped: Mapping[str, float]) -> dict[str, Any]:
+        """What a regret refers to; settings: of the learner."""
+        return {
+            **settings,
+            "episode": self.episode,
+            "gamma": float(self.whole.gamma),
+            "horizon": self.whole.horizon,
+            "step_size": f"1 / ({MARGIN} largest eigenvalue of K diag({self.step_weights}))",
+            "clipped": clipped,
+            **self.representation.conventions,
+        }
 
     @property
     def is_return(self) -> bool:

@@ -8,6 +8,7 @@ import copy
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,9 +24,7 @@ from pharos.hardness.representation import (
     Representation,
     Schedule,
     greedy_policy,
-    operators_of,
 )
-from pharos.hardness.visitation import standard_occupancy
 from pharos.mdp import TabularMDP, paid_outcomes, require_mdp, whole_number
 from pharos.solvers import Solution
 
@@ -202,36 +201,20 @@ def sampled_regret(
         Beyond MOST_EXACT observations landmarks, whose walks take no longer for more of them. 24 bytes a step.
     Source: pharos; Mnih et al. (2015) for what is drawn.
     """
-    representation.check(mdp.num_states)
-    episode = representation.episode(mdp.horizon if horizon is None else horizon, "sampled_regret")
-    schedule, sampling = schedule or Schedule(), sampling or Sampling()
-    learner = SampledLearner(mdp, schedule, sampling, episode, solution)
-    observations = Grouped(representation.classes, learner.numbers[learner.states])
-    states = Grouped(np.arange(mdp.num_states), learner.numbers[learner.states])
-
-    def weights() -> np.ndarray:
-        standard = standard_occupancy(mdp, learner.schedule.gamma, episode)
-        return observations.sums(standard.states[learner.numbers[learner.states]])
-
-    operators, landmarks = operators_of(representation, observations, weights)
-    (descent, adam), *half = (learner.both(observations, operator) for operator in operators)
+    learner = SampledLearner(mdp, representation, schedule, horizon, solution)
+    learner.sampling = sampling = sampling or Sampling()
+    operators, landmarks = learner.operators()
+    (descent, adam), *half = map(learner.both, operators)
     error = sum((abs(descent.mean + adam.mean - one.mean - other.mean) / 2 for one, other in half), 0.0)
-    of_schedule = {name: value for name, value in asdict(schedule).items() if name != "optimizer"}
-    conventions = {
-        "schedule": of_schedule,
-        "sampling": asdict(sampling),
-        "episode": learner.episode,
-        "gamma": float(mdp.gamma),
-        "horizon": mdp.horizon,
-        "step_size": f"1 / ({MARGIN} largest eigenvalue of K diag(max_a d)), at most what a minibatch bears",
-        "clipped": {"greedy": WORST_GREEDY},
-        **representation.conventions,
-    }
+    of_schedule = {name: value for name, value in asdict(learner.schedule).items() if name != "optimizer"}
+    settings = {"schedule": of_schedule, "sampling": asdict(sampling)}
+    conventions = learner.conventions(settings, {"greedy": WORST_GREEDY})
+    conventions["step_size"] += ", at most what a minibatch bears"
     return SampledRegret(
         descent=descent,
         adam=adam,
-        tabular=learner.curve_of_walks(states, Identity()),
-        observations=len(observations),
+        tabular=learner.curve_of_walks(learner.table, Identity()),
+        observations=len(learner.observations),
         states=len(learner.states),
         landmarks=landmarks,
         estimated_error=error,
@@ -243,24 +226,23 @@ class SampledLearner(Learner):
     """An MDP, and learners that walk on it."""
 
     measure = "sampled_regret"
+    sampling: Sampling
 
-    def __init__(
-        self, mdp: TabularMDP, schedule: Schedule, sampling: Sampling, episode: int, solution: Solution | None = None
-    ):
-        super().__init__(mdp, schedule, episode, solution)
-        self.sampling, self._all = sampling, mdp
-        which, states, rewards, probabilities = paid_outcomes(mdp)
-        offsets = np.searchsorted(which, np.arange(mdp.num_states * mdp.num_actions + 1))
+    @cached_property
+    def outcomes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Where the outcomes of each pair begin; next states, -1 for the end; rewards; cumulative probabilities."""
+        pairs = self.whole.num_states * self.whole.num_actions
+        which, states, rewards, probabilities = paid_outcomes(self.whole)
+        offsets = np.searchsorted(which, np.arange(pairs + 1))
         cumulative = np.cumsum(probabilities)
         begin = np.append(0.0, cumulative)[offsets[:-1]]
         likely = (cumulative - begin[which]) / np.add.reduceat(probabilities, offsets[:-1])[which]
-        ends = np.where(states == mdp.num_states, -1, states)
-        self._outcomes = offsets, ends, np.asarray(rewards, np.float64), likely
-        self._cumulative = np.cumsum(mdp.start_probabilities)
-        self._cumulative[-1] = 1.0
+        ends = np.where(states == self.whole.num_states, -1, states)
+        return offsets, ends, np.asarray(rewards, np.float64), likely
 
-    def both(self, observations: Grouped, operator: KernelOperator) -> tuple[SampledCurve, SampledCurve]:
+    def both(self, operator: KernelOperator) -> tuple[SampledCurve, SampledCurve]:
         """With a kernel, and with its root."""
+        observations = self.observations
         root = copy.copy(operator)  # whose arrays are replaced, not changed
         root.preconditioned(np.full(len(observations), 1 / len(observations)))
         return self.curve_of_walks(observations, operator), self.curve_of_walks(observations, root)
@@ -282,10 +264,10 @@ class SampledLearner(Learner):
         """Yield the learnt values (C, A) of one walk at each of the steps `looks`, ascending."""
         from pharos.kernels import stepping as kernels
 
-        schedule, sampling, mdp = self.schedule, self.sampling, self._all
+        schedule, sampling, mdp = self.schedule, self.sampling, self.whole
         count, num_actions = len(observations), mdp.num_actions
         group = np.full(mdp.num_states, -1, np.int64)
-        group[self.numbers[self.states]] = observations.groups
+        group[self.numbers] = observations.groups
         kernel = operator.parts(count)
         learnt = np.zeros((num_actions, count)), np.zeros((num_actions, kernel[1].shape[1]))
         target = tuple(each.copy() for each in learnt)
@@ -300,6 +282,7 @@ class SampledLearner(Learner):
             *(int(schedule.learning_starts), int(schedule.gradient_steps), int(schedule.period), sampling.batch_size),
         )
         chance = (*mdp.chance.triple[:2], float(mdp.chance.first_chosen))
+        cumulative = np.append(np.cumsum(mdp.start_probabilities[:-1]), 1.0)
         vector, largest_step = np.full((count, 1), count**-0.5), 0.0
         stops = np.unique([*looks, *range(0, schedule.steps, schedule.period)])
         for step, following in zip(stops, [*stops[1:], schedule.steps], strict=True):
@@ -314,8 +297,8 @@ class SampledLearner(Learner):
                 largest = operator.largest_eigenvalue(weights, vector) if step else 0.0
                 largest_step = 1 / (MARGIN * largest) if largest > 0 else math.inf
             kernels.learn(
-                *(self._outcomes, np.asarray(mdp.terminal, np.bool_), group),
-                *(np.asarray(mdp.start_states, np.int64), self._cumulative, (chance[0], chance[1], 0.0, chance[2])),
+                *(self.outcomes, np.asarray(mdp.terminal, np.bool_), group),
+                *(np.asarray(mdp.start_states, np.int64), cumulative, (chance[0], chance[1], 0.0, chance[2])),
                 *(self.episode, kernel, learnt, target, memory, visits, place, word, noise, numbers),
                 *(largest_step, int(following - step)),
             )

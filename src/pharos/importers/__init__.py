@@ -10,7 +10,6 @@ from pharos.importers.gymnasium import (
     gymnasium_outcomes,
     matrices,
     minigrid,
-    minigrid_grids,
     minigrid_recording,
 )
 
@@ -23,11 +22,7 @@ __all__ = [
     "load",
     "matrices",
     "minigrid",
-    "minigrid_grids",
     "save",
     "storm",
     "storm_recording",
 ]
-_shared = """
-    Outcomes has_screens is_folder minigrid_recording
-"""

@@ -17,7 +17,7 @@ import numpy as np
 
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
 from pharos.importers.folder import Outcomes
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, whole_number
 from pharos.system import storage
 
 MINIGRID_STEPS = 100
@@ -113,8 +113,8 @@ def _members(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 def _horizon(path: Path, horizon: int | None) -> int:
     named = horizon_of_name(path)
-    if horizon is not None and (isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1):
-        raise ParameterError(f"horizon is {horizon!r}; expected a whole number of steps, at least 1")
+    if horizon is not None:
+        whole_number(horizon, "horizon", "a whole number of steps, at least 1")
     if named is None and horizon is None:
         raise ParameterError(
             f"{path}: its name does not tell the horizon; give one (`--horizon T`), as its values depend on it"

@@ -11,7 +11,7 @@ import numpy as np
 
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, FolderLocked, ParameterError
-from pharos.mdp import OutcomeTable, TabularMDP
+from pharos.mdp import OutcomeTable, TabularMDP, whole_number
 from pharos.system import mdp_files, storage
 from pharos.system.mdp_files import (
     AGAIN,
@@ -150,9 +150,7 @@ def _description(
             raise ParameterError(f"actions are {actions!r}; expected {mdp.num_actions} names")
         description["actions"] = list(actions)
     if time_limit is not None:
-        if not isinstance(time_limit, int | np.integer) or time_limit < 1:
-            raise ParameterError(f"time_limit is {time_limit!r}; expected a number of steps of at least 1")
-        description["time_limit"] = int(time_limit)
+        description["time_limit"] = whole_number(time_limit, "time_limit", "a number of steps of at least 1")
     if observations is not None:
         shown = np.asarray(observations)
         kind = observed or (IMAGE if shown.ndim == 4 else VECTOR)

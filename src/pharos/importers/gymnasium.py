@@ -258,6 +258,7 @@ def matrices(
 # MiniGrid -------------------------------------------------------------------------------------------------------------
 
 
+MOST_STATES = 1_000_000
 DONE = 6  # the action that most tasks ignore
 _NOT_STATE = frozenset(
     [
@@ -287,7 +288,7 @@ def minigrid(
     actions: Sequence[int] | None = None,
     gamma: float = 1.0,
     horizon: int | None = MINIGRID_STEPS,
-    max_states: int = 1_000_000,
+    max_states: int = MOST_STATES,
     remember_carried: bool = False,
 ) -> TabularMDP:
     """Return the MDP of a MiniGrid environment, by stepping the environment from every state that can be reached.
@@ -321,43 +322,21 @@ def minigrid(
 
 
 def minigrid_recording(
-    env: object,
-    *,
-    seed: int = 0,
-    gamma: float = 1.0,
-    horizon: int | None = MINIGRID_STEPS,
-    max_states: int = 1_000_000,
-    remember_carried: bool = False,
+    env: object, *, seed: int = 0, horizon: int | None = MINIGRID_STEPS, remember_carried: bool = False
 ) -> tuple[TabularMDP, np.ndarray, tuple[str, ...]]:
-    """Return what `minigrid` and `minigrid_grids` give, by one exploration, and the names of the actions.
+    """Return the MDP of `minigrid`, what one sees of each of its states, and the names of its actions.
 
     Args, errors and cost: as of `minigrid`, with all actions.
+    Returns:
+        (MDP, (S, width, height, 3) uint8, names). What one sees is the whole grid as MiniGrid encodes it (type, colour,
+        condition), with the agent where it stands, its direction as condition: the image of MiniGrid's FullyObsWrapper.
+        What is carried is not to be seen.
     """
     driver = _Driver(env, seed, remember_carried)
-    table, rewards = driver.explore(None, max_states)
+    table, rewards = driver.explore(None, MOST_STATES)
     names = tuple(action.name for action in driver.env.actions)[: table.shape[1]]
     grids = np.stack([driver.image(state) for state in driver.snapshots])
-    return TabularMDP.from_arrays(table, rewards, gamma=gamma, horizon=horizon), grids, names
-
-
-def minigrid_grids(
-    env: object,
-    *,
-    seed: int = 0,
-    actions: Sequence[int] | None = None,
-    max_states: int = 1_000_000,
-    remember_carried: bool = False,
-) -> np.ndarray:
-    """Return what one sees of each state of `minigrid` with the same arguments, (S, width, height, 3) uint8.
-
-    The whole grid as MiniGrid encodes it (type, colour, condition), with the agent where it stands, its direction as
-    condition: the image of MiniGrid's FullyObsWrapper. What is carried is not to be seen.
-
-    Args, errors and cost: as of `minigrid`.
-    """
-    driver = _Driver(env, seed, remember_carried)
-    driver.explore(actions, max_states)
-    return np.stack([driver.image(state) for state in driver.snapshots])
+    return TabularMDP.from_arrays(table, rewards, gamma=1.0, horizon=horizon), grids, names
 
 
 class _Driver:

@@ -22,8 +22,5 @@ __all__ = [
     "make_vec",
     "to_gymnax",
 ]
-_shared = """
-    Interaction SB3VecEnv Simulator ids_of register_class
-"""
 
 __getattr__ = lazy.attributes(__name__)

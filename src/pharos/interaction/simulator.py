@@ -4,7 +4,7 @@ Their options (`Interaction`), rules and chance (`Simulator`), observations beyo
 frames before, irrelevant coins), and how rewards are paid (`RewardChannel`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from pharos.environments import Environment, make, start_distribution
 from pharos.errors import ParameterError, RuleError, StateSpaceTooLarge
 from pharos.kernels import stepping
 from pharos.kernels.stepping import Setting
-from pharos.mdp import Chance, ChanceSetting
+from pharos.mdp import Chance, ChanceSetting, whole_number
 from pharos.observations import NO_ACTION, ObservationInContext, Seen, observe
 from pharos.rules import rules_of
 from pharos.system.records import flat, option_names
@@ -165,6 +165,13 @@ def stream_of(seed: int | None, *purpose: int) -> np.ndarray:
     return np.random.SeedSequence(seed, spawn_key=purpose).generate_state(1, np.uint64)
 
 
+def seed_streams(streams: np.ndarray, seeds: Sequence[int | None], *purpose: int) -> None:
+    """Seed the streams (N,) of environments for a purpose; None leaves one as it is."""
+    for i, seed in enumerate(seeds):
+        if seed is not None:
+            streams[i] = stream_of(seed, *purpose)[0]
+
+
 class SimulatedEnv:
     """Base of single and vector environments: properties of their `simulator`."""
 
@@ -246,19 +253,14 @@ def _time_limit(limit: int | str | None, env: Environment) -> int | None:
     steps = env.max_episode_steps if limit == "default" else limit
     if steps is None:
         return None
-    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
-        raise ParameterError(f"time_limit is {limit!r}; expected a number of steps of at least 1, None or 'default'")
-    return int(steps)
+    return whole_number(steps, "time_limit", "a number of steps of at least 1, None or 'default'")
 
 
 def _first_previous(action: int | None, env: Environment) -> int:
     if action is None:
         return NO_ACTION
-    if isinstance(action, bool) or not isinstance(action, int | np.integer) or not 0 <= action < env.num_actions:
-        raise ParameterError(
-            f"initial_previous_action is {action!r}; expected None or an action from 0 to {env.num_actions - 1}"
-        )
-    return int(action)
+    last = env.num_actions - 1
+    return whole_number(action, "initial_previous_action", f"None or an action from 0 to {last}", 0, last)
 
 
 class FrameStack:
@@ -276,11 +278,9 @@ class FrameStack:
             one = self.observation.frame(simulator.start_states[:1])
             self._frames = np.zeros((num_envs, self.observation.frames, *one.shape[1:]), one.dtype)
 
-    def seed(self, seeds: "list[int | None]") -> None:
+    def seed(self, seeds: Sequence[int | None]) -> None:
         """Seed the coins of each environment; None leaves a stream as it is."""
-        for i, seed in enumerate(seeds):
-            if seed is not None:
-                self._rng[i] = stream_of(seed, 2)[0]
+        seed_streams(self._rng, seeds, 2)
 
     def push(self, states: np.ndarray, moves: np.ndarray, begins: np.ndarray) -> None:
         """Environments are in states (N, D) now; (N,) bool: `moves` by a step, `begins` at the start of an episode."""
@@ -341,11 +341,9 @@ class RewardChannel:
         self._steps = np.zeros(num_envs, np.int64)
         self._rng = np.random.SeedSequence().generate_state(num_envs, np.uint64)
 
-    def seed(self, seeds: "list[int | None]") -> None:
+    def seed(self, seeds: Sequence[int | None]) -> None:
         """Seed the noise of each environment; None leaves a stream as it is."""
-        for i, seed in enumerate(seeds):
-            if seed is not None:
-                self._rng[i] = stream_of(seed, 1)[0]
+        seed_streams(self._rng, seeds, 1)
 
     def restart(self, mask: np.ndarray) -> None:
         """Forget what is due in some environments (N,) bool, whose episodes begin."""

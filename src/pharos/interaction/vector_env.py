@@ -23,14 +23,13 @@ from pharos.interaction.simulator import (
     FrameStack,
     Interaction,
     RewardChannel,
-    Rows,
     SimulatedEnv,
     Simulator,
-    stream_of,
+    seed_streams,
 )
 from pharos.kernels import stepping
 from pharos.kernels.stepping import DISABLED, SAME_STEP, Batch, first_outside
-from pharos.mdp import OutcomeTable, rewards_of_outcomes, rewards_of_staying
+from pharos.mdp import OutcomeTable, rewards_of_outcomes, rewards_of_staying, whole_number
 from pharos.observations import NO_ACTION, Index, Seen, in_blocks
 from pharos.system.arrays import as_array
 from pharos.system.records import split
@@ -75,28 +74,24 @@ class Walk(ABC):
         """Places of states (N, D)."""
 
     @abstractmethod
-    def states(self, rows: Rows) -> np.ndarray:
-        """States (n, D) of some environments, a fresh array."""
+    def states(self, places: np.ndarray) -> np.ndarray:
+        """States (n, D) of places (n, ...)."""
 
-    @abstractmethod
-    def final_states(self, rows: np.ndarray) -> np.ndarray:
-        """States (n, D) at the ends of episodes."""
-
-    @abstractmethod
     def vectors(self) -> np.ndarray:
         """Room for the vectors of the next step; without rows where the compiled step does not write them."""
+        return _NO_VECTORS
 
     @abstractmethod
     def step(self, batch: Batch) -> None:
         """Advance every environment."""
 
-    @abstractmethod
+    def seen(self, places: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+        """Observations of places (n, ...)."""
+        return self.simulator.context(self.states(places), previous, elapsed)
+
     def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
         """Observations of the current places."""
-
-    @abstractmethod
-    def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        """Observations at the ends of episodes."""
+        return self.seen(self.current, previous, elapsed)
 
 
 class RulesWalk(Walk):
@@ -127,11 +122,8 @@ class RulesWalk(Walk):
     def places(self, states: np.ndarray) -> np.ndarray:
         return states
 
-    def states(self, rows: Rows) -> np.ndarray:
-        return self.current[rows].copy()
-
-    def final_states(self, rows: np.ndarray) -> np.ndarray:
-        return self.final[rows]
+    def states(self, places: np.ndarray) -> np.ndarray:
+        return places
 
     def restart(self, mask: np.ndarray, rng: np.ndarray, state: object) -> None:
         self._vector = self._vector[:0]
@@ -158,12 +150,7 @@ class RulesWalk(Walk):
             self.simulator.raise_fault(self.current[i], int(batch.executed[i]), component)
 
     def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        if len(self._vector):
-            return self._vector
-        return self.simulator.context(self.current, previous, elapsed)
-
-    def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        return self.simulator.context(self.final[rows], previous, elapsed)
+        return self._vector if len(self._vector) else super().observations(previous, elapsed)
 
 
 class TableWalk(Walk):
@@ -188,14 +175,8 @@ class TableWalk(Walk):
     def places(self, states: np.ndarray) -> np.ndarray:
         return self.space.indices(states)
 
-    def states(self, rows: Rows) -> np.ndarray:
-        return self.space.states(self.current[rows])
-
-    def final_states(self, rows: np.ndarray) -> np.ndarray:
-        return self.space.states(self.final[rows])
-
-    def vectors(self) -> np.ndarray:
-        return _NO_VECTORS  # tables know none
+    def states(self, places: np.ndarray) -> np.ndarray:
+        return self.space.states(places)
 
     def step(self, batch: Batch) -> None:
         self.final_elapsed[:] = batch.elapsed + 1
@@ -207,18 +188,12 @@ class TableWalk(Walk):
 
         in_blocks(run, len(self.current), BLOCK)
 
-    def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        return self._observed(self.current, previous, elapsed)
-
-    def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        return self._observed(self.final[rows], previous, elapsed)
-
-    def _observed(self, index: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+    def seen(self, places: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
         if self._is_index:
-            return index.copy()
+            return places.copy()
         if self._table is not None:
-            return self._table.take(index, axis=0)
-        return self.simulator.context(self.space.states(index), previous, elapsed)
+            return self._table.take(places, axis=0)
+        return super().seen(places, previous, elapsed)
 
 
 def _tables(space: "StateSpace") -> tuple[object, object]:
@@ -281,11 +256,9 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         if max_episode_steps is not None:
             options["time_limit"] = None if max_episode_steps == -1 else max_episode_steps
         interaction, parameters = split(Interaction, options)
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
-            raise ParameterError(f"num_envs is {num_envs!r}; expected an integer of at least 1")
+        self.num_envs = whole_number(num_envs, "num_envs", "an integer of at least 1")
         self._mode = _MODES.index(_checked_mode(autoreset_mode))
         self.simulator = simulator = Simulator(environment, interaction, parameters)
-        self.num_envs = int(num_envs)
         self.metadata = {"autoreset_mode": _MODES[self._mode], "render_modes": ["rgb_array"], "render_fps": 15}
         if render_mode not in (None, "rgb_array"):
             raise ParameterError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
@@ -312,7 +285,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     @property
     def states(self) -> np.ndarray:
         """(N, D) int64, the current states."""
-        return self._walk.states(slice(None))
+        return self._walk.states(self._walk.current).copy()
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """The picture for people of each environment, (H, W, 3) uint8, where render_mode is "rgb_array"; else None."""
@@ -380,7 +353,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         """Observations of the current states; `moves`, `begins` (N,) bool: after a step, at the start of an episode."""
         if self._frame_stack is None:
             return self._walk.observations(self._previous, self._elapsed)
-        states = self.states
+        states = self._walk.states(self._walk.current)
         self._frame_stack.push(states, moves, begins)
         return self._frame_stack.current(states, self._previous, self._elapsed)
 
@@ -402,17 +375,17 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     def _add_final(self, info: dict[str, Any], done: np.ndarray) -> None:
         """The last observations and infos, as Gymnasium's own vector environments give them."""
         rows, executed = np.flatnonzero(done), info["executed_action"]
-        context = executed[rows], self._walk.final_elapsed[rows]
+        context, places = (executed[rows], self._walk.final_elapsed[rows]), self._walk.final[rows]
         if self._frame_stack is None:
-            last = self._walk.final_observations(rows, *context)
+            last = self._walk.seen(places, *context)
         else:
-            last = self._frame_stack.terminal(rows, self._walk.final_states(rows), *context)
+            last = self._frame_stack.terminal(rows, self._walk.states(places), *context)
         final = np.full(self.num_envs, None, object)
         for row, observation in zip(rows, _rows_of(last, len(rows)), strict=True):
             final[row] = observation
         name = self._walk.name
         state = np.zeros_like(self._walk.final)
-        state[rows] = self._walk.final[rows]
+        state[rows] = places
         info["final_obs"], info["_final_obs"] = final, done
         info["final_info"] = {
             name: state,
@@ -432,9 +405,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         if seed is None and self._rng is not None:
             return self._rng
         seed = self._seed if seed is None else seed
-        if seed is None:
-            self._rng = np.random.SeedSequence().generate_state(n, np.uint64)
-            return self._rng
+        seed = [None] * n if seed is None else seed
         seeds: list[int | None] = [seed + i for i in range(n)] if isinstance(seed, int | np.integer) else list(seed)
         if len(seeds) != n:
             raise ParameterError(f"seed has {len(seeds)} entries; expected one integer, or {n}")
@@ -443,9 +414,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         for streams in (self._reward_channel, self._frame_stack):
             if streams is not None:
                 streams.seed(seeds)
-        for i, one in enumerate(seeds):
-            if one is not None:
-                self._rng[i] = stream_of(one)[0]
+        seed_streams(self._rng, seeds)
         return self._rng
 
     def _checked_mask(self, mask: npt.ArrayLike | None) -> np.ndarray:

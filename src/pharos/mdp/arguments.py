@@ -84,9 +84,11 @@ def checked_next_states(next_states: object) -> np.ndarray:
 STEPS = "a whole number of steps, at least 1"
 
 
-def whole_number(value: object, name: str, expected: str = "a whole number, at least 1", least: int = 1) -> int:
-    """The number; ParameterError unless it is whole, and at least that."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+def whole_number(
+    value: object, name: str, expected: str = "a whole number, at least 1", least: int = 1, most: float = math.inf
+) -> int:
+    """The number; ParameterError unless it is whole, and in [least, most]."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
         raise ParameterError(f"{name} is {value!r}; expected {expected}")
     return int(value)
 
@@ -99,9 +101,8 @@ def check_gamma(gamma: object) -> None:
 
 def check_horizon(horizon: object) -> None:
     """ParameterError unless it is a number of steps, or None."""
-    expected = f"{STEPS} and below 2^31, or None"
-    if horizon is not None and whole_number(horizon, "horizon", expected) >= 2**31:
-        raise ParameterError(f"horizon is {horizon!r}; expected {expected}")
+    if horizon is not None:
+        whole_number(horizon, "horizon", f"{STEPS} and below 2^31, or None", most=2**31 - 1)
 
 
 def terminal_states(terminal: npt.ArrayLike | None, default: np.ndarray, allowed: np.ndarray) -> np.ndarray:

@@ -47,10 +47,5 @@ __all__ = [
     "register",
     "representation",
 ]
-_shared = """
-    Aliasing ComplexImage FunctionObservation Hash Index MemorylessLoss NO_ACTION ObservationInContext OneHot
-    OwnObservation RENDERERS Seen SimpleImage Vector counted default_network history_aliasing imported in_blocks
-    names network_inputs observation_of own_observation registered render renderers tangent_kernel title
-"""
 
 __getattr__ = lazy.attributes(__name__)

@@ -26,6 +26,7 @@ from pharos.drawing import (
 )
 from pharos.environments import Environment, Layer, Scenery
 from pharos.errors import ParameterError, UnknownName
+from pharos.mdp import whole_number
 from pharos.observations.observation import Observation, hidden_names, in_blocks, names, observe
 
 
@@ -130,15 +131,14 @@ class Frames(Observation):
         """
         from gymnasium.spaces import Box
 
-        if isinstance(frames, bool) or not isinstance(frames, int) or not 1 <= frames <= MOST:
-            raise ParameterError(f"{self.name} of {self.env}: frames is {frames!r}; expected 1 to {MOST}")
-        self.frames, self.channel_axis = frames, channels
-        if frames > 1:
+        k = whole_number(frames, f"{self.name} of {self.env}: frames", f"1 to {MOST}", most=MOST)
+        self.frames, self.channel_axis = k, channels
+        if k > 1:
             shape = list(self.space.shape or ())
-            shape[channels] *= frames
+            shape[channels] *= k
             if shape[channels] > min(shape):
                 raise ParameterError(
-                    f"{self.name} of {self.env}: {frames} frames of shape {self.space.shape} have {shape[channels]} "
+                    f"{self.name} of {self.env}: {k} frames of shape {self.space.shape} have {shape[channels]} "
                     f"channels, more than rows or columns, which would be taken for them; use fewer, or a larger size"
                 )
             self.space = Box(0, 255, tuple(shape), np.uint8)
@@ -199,8 +199,7 @@ class SimpleImage(Frames):
         planes = each * max(frames, 1) if isinstance(frames, int) else each
         if scale is None:
             scale = -(-planes // min(rows, columns))
-        if isinstance(scale, bool) or not isinstance(scale, int) or scale < 1:
-            raise ParameterError(f"simple_image: scale is {scale!r}; expected an integer of at least 1")
+        scale = whole_number(scale, "simple_image: scale", "an integer of at least 1")
         if planes > min(rows, columns) * scale:
             raise ParameterError(
                 f"simple_image of {env}: {planes} planes ({', '.join(layers)}) "

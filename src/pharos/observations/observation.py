@@ -15,14 +15,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, UnknownName
 from pharos.system import sources
-from pharos.system.sources import Source, is_reference
+from pharos.system.sources import Source
 
 if TYPE_CHECKING:
     import gymnasium
@@ -112,8 +112,8 @@ class FunctionObservation(Observation):
         for state, observation in zip(starts, self(starts), strict=True):
             if not self.space.contains(observation):
                 raise ParameterError(
-                    f"observation {self.name!r} of the start state {tuple(state.tolist())} is {_short(observation)}, "
-                    f"which is not in its space {self.space}"
+                    f"observation {self.name!r} of the start state {tuple(state.tolist())} is "
+                    f"{observation!r:.80}, which is not in its space {self.space}"
                 )
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
@@ -190,11 +190,6 @@ def registered(name: str) -> tuple[Function, object] | None:
     return _registered.get(name)
 
 
-def is_built_in(name: str) -> bool:
-    """Whether the name is that of one of pharos' own observations."""
-    return name in _BUILT_IN
-
-
 def observe(
     env: Environment | str,
     observation: object = "vector",
@@ -217,28 +212,12 @@ def observe(
     env = make(env) if isinstance(env, str) else env
     if not isinstance(env, Environment):
         raise ParameterError(f"env is {env!r}; expected a pharos Environment, or a name such as 'breakout/12x8x1'")
-    if isinstance(observation, Observation):
-        if observation.env != env:
-            raise ParameterError(
-                f"observation {observation.name!r} belongs to {observation.env}; expected one of {env}"
-            )
-        made = observation
-        keywords: list[str] = []
-    elif (own := _own(observation)) is not None:
-        made, keywords = _made(own.make, env, state_space, options)
-    elif isinstance(observation, tuple) and len(observation) == 2 and callable(observation[0]):
-        made, keywords = FunctionObservation(env, *observation), []
-    elif not isinstance(observation, str):
-        raise ParameterError(
-            f"observation is {observation!r}; expected one of {', '.join(names())}, or a pair (function, Gymnasium "
-            "space)"
-        )
-    elif observation in _registered:
-        made, keywords = FunctionObservation(env, *_registered[observation], name=observation), []
-    elif observation in _BUILT_IN:
-        made, keywords = _made(_built_in(observation), env, state_space, options)
+    if not isinstance(observation, Observation):
+        made, keywords = _made(_maker(observation), env, state_space, options)
+    elif observation.env != env:
+        raise ParameterError(f"observation {observation.name!r} belongs to {observation.env}; expected one of {env}")
     else:
-        raise UnknownName("observation", observation, names())
+        made, keywords = observation, []
     for option in options:
         if option not in keywords:
             raise UnknownName(f"option of observation {made.name!r}", option, keywords)
@@ -255,21 +234,25 @@ def _made(
     return make(env, **space, **{name: value for name, value in options.items() if name in keywords}), keywords
 
 
-def _built_in(name: str) -> Callable[..., Observation]:
-    file, _, class_name = _BUILT_IN[name].partition(":")
+def _maker(observation: object) -> Callable[..., Observation]:
+    """Function (env, **options) -> Observation, of a name or a pair (function, Gymnasium space)."""
+    if _is_pair(observation):
+        return partial(_of_function, None, *observation)
+    if (own := own_observation(observation)) is not None:
+        return own.make
+    if not isinstance(observation, str):
+        raise ParameterError(
+            f"observation is {observation!r}; expected one of {', '.join(names())}, or a pair (function, Gymnasium "
+            "space)"
+        )
+    if observation not in _BUILT_IN:
+        raise UnknownName("observation", observation, names())
+    file, _, class_name = _BUILT_IN[observation].partition(":")
     return getattr(importlib.import_module(f"pharos.observations.{file}"), class_name)
 
 
-def _own(observation: object) -> "OwnObservation | None":
-    """The user's own observation, where that is what `observation` names."""
-    if isinstance(observation, OwnObservation):
-        return observation
-    return imported(observation) if is_reference(observation) else None
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
+def _is_pair(value: object) -> TypeGuard[tuple[Function, object]]:
+    return isinstance(value, tuple) and len(value) == 2 and callable(value[0])
 
 
 # Custom ---------------------------------------------------------------------------------------------------------------
@@ -323,21 +306,18 @@ def own_observation(observation: object, folder: str | Path | None = None) -> Ow
     if sources.is_reference(observation):
         return imported(observation, folder)
     if isinstance(observation, str) and (entry := registered(observation)) is not None:
-        function, space = entry
-        make = partial(_of_function, observation, function, space)
-        return OwnObservation(observation, make, sources.source_of(function, observation))
+        source = sources.source_of(entry[0], observation)
+        return OwnObservation(observation, partial(_of_function, observation, *entry), source)
     return None
 
 
 def _observation(source: Source, value: object) -> OwnObservation:
     name = source.attribute
-    if is_built_in(name):
+    if name in _BUILT_IN:
         raise ParameterError(f"{source.name!r}: {name!r} is the name of a built-in observation; choose another name")
     if isinstance(value, type) and issubclass(value, Observation):
         return OwnObservation(name, value, source)
-    if isinstance(value, tuple) and len(value) == 2 and callable(value[0]):
-        return OwnObservation(name, partial(_of_function, name, *value), source)
-    entry = registered(name)
+    entry = value if _is_pair(value) else registered(name)
     if entry is None:
         raise ParameterError(
             f"{source.name!r}: found {value!r}; expected the name of a pair (function, Gymnasium space), of a subclass "
@@ -346,7 +326,7 @@ def _observation(source: Source, value: object) -> OwnObservation:
     return OwnObservation(name, partial(_of_function, name, *entry), source)
 
 
-def _of_function(name: str, function: Function, space: object, env: Environment) -> Observation:
+def _of_function(name: str | None, function: Function, space: object, env: Environment) -> Observation:
     return FunctionObservation(env, function, space, name=name)
 
 

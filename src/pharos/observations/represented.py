@@ -11,6 +11,7 @@ import numpy as np
 
 from pharos.errors import MissingExtra, ParameterError, PharosError
 from pharos.hardness import Representation
+from pharos.mdp import whole_number
 from pharos.observations.networks import Network, check_memory, default_network, network_inputs, tangent_kernel
 from pharos.observations.observation import observe
 from pharos.observations.observation_aliasing import observation_classes
@@ -52,8 +53,8 @@ def representation(
     """
     if space.environment is None:
         raise ParameterError(f"{space}: the class of its environment is not known, so nothing is seen of its states")
-    if landmarks is not None and (isinstance(landmarks, bool) or not isinstance(landmarks, int) or landmarks < 0):
-        raise ParameterError(f"landmarks is {landmarks!r}; expected a whole number, 0 for none, or None")
+    if landmarks is not None:
+        landmarks = whole_number(landmarks, "landmarks", "a whole number, 0 for none, or None", least=0)
     observer = observe(space.environment, observation, state_space=space, **options)
     first = network_inputs(observer, space.states(slice(0, 1)))
     if callable(network) or sources.is_reference(network):

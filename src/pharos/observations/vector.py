@@ -9,6 +9,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
+from pharos.mdp import whole_number
 from pharos.observations.observation import Observation, hidden_names
 
 if TYPE_CHECKING:
@@ -60,13 +61,9 @@ class Vector(Observation):
             hide = [components.names[hide]]
         for name in hidden_names(hide, whose, components.variables, components.names):
             self.scale[components.variables.get(name) or components.names.index(name)] = 0.0
-        if isinstance(irrelevant, bool) or not isinstance(irrelevant, int) or not 0 <= irrelevant <= MOST_IRRELEVANT:
-            raise ParameterError(
-                f"{whose}: irrelevant is {irrelevant!r}; expected 0 to {MOST_IRRELEVANT} entries, so that a policy can "
-                f"be asked about all their values in a state"
-            )
-        self.irrelevant = irrelevant
-        self.names = (*components.names, *(f"irrelevant[{i}]" for i in range(irrelevant)))
+        few = f"0 to {MOST_IRRELEVANT} entries, so that a policy can be asked about all their values in a state"
+        self.irrelevant = whole_number(irrelevant, f"{whose}: irrelevant", few, least=0, most=MOST_IRRELEVANT)
+        self.names = (*components.names, *(f"irrelevant[{i}]" for i in range(self.irrelevant)))
         self.space = Box(0.0, 1.0, (len(self.names),), np.float32)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
@@ -161,6 +158,7 @@ class Index(Observation):
 SPARE = 8  # bits beyond those that write the state
 ROUNDS = 6
 MOST_BITS = 1 << 16
+SEED = "an integer of at least 0"
 FRACTION = 40  # bits of the number that decides whether a state is in the share of `mixed`
 
 
@@ -185,13 +183,11 @@ class Hash(Observation):
         components = env.components
         lengths = np.array([int(size - 1).bit_length() for size in components.size])
         needed = int(lengths.sum())
+        enough = max(2, needed)
+        expected = f"an integer from {enough}, which write the state, to {MOST_BITS}"
         count = needed + SPARE if bits is None else bits
-        if isinstance(count, bool) or not isinstance(count, int) or not max(2, needed) <= count <= MOST_BITS:
-            raise ParameterError(
-                f"hash of {env.name}: bits is {count!r}; expected an integer from {max(2, needed)}, which write the "
-                f"state, to {MOST_BITS}"
-            )
-        _check_seed(seed, f"hash of {env.name}")
+        count = whole_number(count, f"hash of {env.name}: bits", expected, enough, MOST_BITS)
+        whole_number(seed, f"hash of {env.name}: seed", SEED, least=0)
         self.name = "hash"
         self.env = env
         self.names = tuple(f"bit {i}" for i in range(count))
@@ -229,7 +225,7 @@ class Mixed(Observation):
 
         if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 1:
             raise ParameterError(f"mixed of {env.name}: share is {share!r}; expected a number from 0 to 1")
-        _check_seed(seed, f"mixed of {env.name}")
+        whole_number(seed, f"mixed of {env.name}: seed", SEED, least=0)
         components = env.components
         if not (components.size > 1).any():
             raise ParameterError(f"mixed of {env.name}: no component has two values; expected states that differ")
@@ -249,11 +245,6 @@ class Mixed(Observation):
         rows = np.flatnonzero(drawn < self._share)
         out[rows] = self._entry * (2.0 * self._word(states[rows]) - 1)
         return out
-
-
-def _check_seed(seed: int, whose: str) -> None:
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ParameterError(f"{whose}: seed is {seed!r}; expected an integer of at least 0")
 
 
 class Recorded(Observation):

@@ -29,7 +29,3 @@ __all__ = [
     "save",
     "value_map",
 ]
-_shared = """
-    DIAGONAL agent_name color_among label_edges legend_below observation_color panels save_for_page slug states_by_depth
-    thousands unseen_figures
-"""
