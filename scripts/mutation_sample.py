@@ -10,7 +10,7 @@ The first run draws the sample and writes a line of JSON for each fault: where i
 failed. `--again` applies the faults that survived once more, after tests were written: it finds each by its diff, so
 the code that was mutated must be the same (tests may be newer). Faults come from cosmic-ray's operators, all places of
 a file alike; the tests of each file are those named in `TESTED_BY`, and end at the first failure.
-A run past its time limit counts as noticed. docs/testing.md has the results.
+A run past its time limit counts as noticed. CONTRIBUTING.md has the results.
 """
 
 import argparse

@@ -58,10 +58,11 @@ NOT_COMPUTED = {  # instance -> why its values are not there
     "uniform and the worst policy were not solved",
     "sliding_tiles/3x4": "enumerated once ([302 s of a processor, 5.8 GB of files](../large-runs.md)); not solved",
     "game_2048/3x3": "541,821,326 possible outcomes, 33 minutes to enumerate; undiscounted the optimum is worth "
-    "5,468.49 ([2048](../worlds.md#2048)); the uniform and the worst policy were not solved",
+    "5,468.49 ([2048](../evidence/worlds.md#2048)); the uniform and the worst policy were not solved",
     **{
         f"game_2048/3x3-to-{target}": f"tens of millions of states with up to 16 outcomes; the optimum wins "
-        f"with probability {chance} ([2048](../worlds.md#2048)); the uniform and the worst policy were not solved"
+        f"with probability {chance} ([2048](../evidence/worlds.md#2048)); the uniform and the worst policy were not "
+        "solved"
         for target, chance in ((512, 0.736774), (1024, 0.011338))
     },
 }

@@ -262,7 +262,7 @@ def test_boards_that_are_images_of_each_other_have_the_same_value():
 
 @pytest.mark.slow
 def test_three_by_three_reaches_64_with_certainty():
-    """900,000 states. 128 is the first tile of 3x3 that even optimal play can miss: docs/worlds.md."""
+    """900,000 states. 128 is the first tile of 3x3 that even optimal play can miss: docs/evidence/worlds.md."""
     space = pharos.build("game_2048/3x3-to-64", progress=False)
     solution = pharos.value_iteration(space.mdp(gamma=1.0))
     assert abs(solution.value_at_start - 1) <= solution.error_bound

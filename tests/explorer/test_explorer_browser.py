@@ -1,6 +1,6 @@
 """The explorer's page in Chromium without a screen: keys, clicks, wide and narrow, dark and light.
 
-Skipped where there is no Chromium; docs/testing.md says how to get one.
+Skipped where there is no Chromium; CONTRIBUTING.md says how to get one.
 """
 
 import json
@@ -15,7 +15,7 @@ from pharos.mdp import TabularMDP
 
 pytestmark = [
     pytest.mark.long,
-    pytest.mark.skipif(headless.program() is None, reason="there is no Chromium; see docs/testing.md"),
+    pytest.mark.skipif(headless.program() is None, reason="there is no Chromium; see CONTRIBUTING.md"),
 ]
 
 

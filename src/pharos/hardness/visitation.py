@@ -687,7 +687,8 @@ def distribution_mismatch(
     Raises:
         UndefinedMeasure: gamma is 1, or there is a horizon: the optimal policy then depends on the step.
         ParameterError: `solution` is not of this MDP, or an argument is wrong.
-    Cost: two occupancy measures.
+    Cost: two occupancy measures, each of at most ln(1e9) / (1 - gamma) passes over the table; in breadth-first order a
+    tenth of them.
     Source: Kakade and Langford (2002); Agarwal, Kakade, Lee and Mahajan (2021), "On the theory of policy gradient
         methods", section 4.2.
     """
