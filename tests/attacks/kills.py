@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pharos.study.worker import one_thread
+from pharos.system.workers import one_thread
 
 CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link", "os.symlink")
 """What Python reports (`sys.addaudithook`) of a process that changes files, beside files that it opens."""

@@ -31,12 +31,12 @@ def test_a_study_says_before_its_first_run_what_is_missing_at_the_pace_of_finish
 
 
 ENDING = """
-import atexit, time
-from pharos.study import worker
+import atexit, os, time
+from types import SimpleNamespace
+from pharos.system import workers
 
-worker.end_cleanly()
 atexit.register(lambda: (print("ending", flush=True), time.sleep(0.5)))
-worker.is_ending()
+workers._work(lambda _: None, (), SimpleNamespace(), dict(os.environ))
 """
 
 

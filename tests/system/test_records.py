@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 import pharos
+from pharos import study
 from pharos.errors import FileFormatError, ParameterError
 from pharos.interaction import Interaction
 from pharos.mdp import ChanceSetting
@@ -62,6 +63,10 @@ def test_the_signature_of_a_function_shows_the_options_that_it_takes():
     assert (shown["width"].default, shown["length"].default, shown["sticky"].default) == (5, None, 0.0)
     assert "random" in inspect.signature(pharos.train).parameters
     assert inspect.signature(pharos.train_many).parameters["engine"].default == "batched"
+    for function, workers in ((study.run, None), (study.submit, 1), (study.run_on_ray, None)):
+        shown = inspect.signature(function).parameters
+        assert {"shard", "retry_failed", "resume", "timeout", "device"} <= {*shown}
+        assert shown["workers"].default == workers
 
 
 # Test records ---------------------------------------------------------------------------------------------------------

@@ -21,8 +21,8 @@ app = Commands(no_args_is_help=True, help="Run agents on a frozen suite of solve
 
 SuiteName = Annotated[str, typer.Argument(metavar="[SUITE]", help="Name of a suite, or FILE.yaml.")]
 SuiteFile = Annotated[str, typer.Option("--suite", metavar="NAME|FILE")]
-Folder = Annotated[Path, typer.Argument(metavar="DIR")]
-Submitted = Annotated[Path, typer.Argument(metavar="FILE")]
+Folder = Annotated[Path, "DIR"]
+Submitted = Annotated[Path, "FILE"]
 
 
 @app.command("show")
@@ -50,11 +50,11 @@ def run(
     *,
     agent: str,
     out: Path,
-    suite: Annotated[str, typer.Option(metavar="NAME|FILE")] = "v1",
+    suite: Annotated[str, "NAME|FILE"] = "v1",
     hyperparameters: Mapping[str, Any] | None = None,
-    seeds: Annotated[str, typer.Option(metavar="N|A:B|S,...")] = "10",
+    seeds: Annotated[str, "N|A:B|S,..."] = "10",
     quick: bool = False,
-    tasks: Annotated[list[str] | None, typer.Option(metavar="core|AXIS|NAME")] = None,
+    tasks: Annotated[list[str] | None, "core|AXIS|NAME"] = None,
     name: str | None = None,
     workers: Count | None = None,
 ) -> Answer:
@@ -139,7 +139,7 @@ def seal(folder: Folder, *, season: str, beacon: str, suite: SuiteFile = "v1") -
 
 @app.command("report")
 def report(
-    results: Annotated[str, typer.Argument(metavar="RESULTS")],
+    results: Annotated[str, "RESULTS"],
     *,
     out: Annotated[Path, file_ending(".html", ".htm")] = Path("report.html"),
     beside: str | None = None,
@@ -187,7 +187,7 @@ def commit(
 
 @app.command("submit")
 def submit(
-    results: Annotated[Path, typer.Argument(metavar="DIR")],
+    results: Annotated[Path, "DIR"],
     *,
     out: Path | None = None,
     suite: SuiteFile = "v1",
@@ -293,10 +293,10 @@ def audit(
 
 @app.command("board")
 def board(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...")],
+    files: Annotated[list[Path], "FILE..."],
     *,
     out: Path = Path("board.html"),
-    suite: Annotated[list[str] | None, typer.Option(metavar="NAME|FILE")] = None,
+    suite: Annotated[list[str] | None, "NAME|FILE"] = None,
     title: str = "Benchmark",
 ) -> Answer:
     """Verify submissions, and write a page with two lists: audited (FILE.audit.json lies beside), and claimed.
@@ -357,9 +357,7 @@ SuiteOption = Annotated[str | None, typer.Option(metavar="NAME|FILE.yaml", help=
 
 
 @app.command("compare")
-def compare(
-    results: Annotated[list[str], typer.Argument(metavar="A B...")], *, suite: SuiteOption = None, tasks: bool = False
-) -> Answer:
+def compare(results: Annotated[list[str], "A B..."], *, suite: SuiteOption = None, tasks: bool = False) -> Answer:
     """Compare an agent with others: per axis, per task and on the core, with 95 % intervals over seeds.
 
     Args:
@@ -411,7 +409,7 @@ def _print_comparison(comparison: "Comparison", tasks: bool) -> None:
 
 @app.command("power")
 def power(
-    results: Annotated[str, typer.Argument(metavar="RESULTS")],
+    results: Annotated[str, "RESULTS"],
     *,
     suite: SuiteOption = None,
     difference: float | None = None,

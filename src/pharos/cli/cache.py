@@ -45,7 +45,7 @@ def list_() -> Answer:
 
 
 @app.command("clear")
-def clear(environments: Annotated[list[str] | None, typer.Argument(metavar="[ENVIRONMENT]...")] = None) -> Answer:
+def clear(environments: Annotated[list[str] | None, "[ENVIRONMENT]..."] = None) -> Answer:
     """Delete cached state spaces (and, when no name is given, compiled rules). They are made again when needed.
 
     Args:

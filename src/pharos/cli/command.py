@@ -8,8 +8,9 @@
             threads: Of a sweep.
         '''
 
-A parameter is an argument, one after `*` is an option. A parameter that is a dataclass stands for an option of each of
-its fields, and the function gets one object; `Annotated[ChanceSetting, "sticky random"]` has these fields alone.
+A parameter is an argument, one after `*` is an option; `Annotated[Path, "DIR"]` says what stands for its value in help.
+A parameter that is a dataclass stands for an option of each of its fields, and the function gets one object;
+`Annotated[ChanceSetting, "sticky random"]` has these fields alone.
 """
 
 import dataclasses
@@ -126,5 +127,8 @@ def _typed(name: str, hint: object, default: object, text: str | None, is_argume
         info.param_decls = flags or (f"--{flag}/--no-{flag}" if default is True else f"--{flag}",)
     if any(get_origin(part) is Mapping for part in (hint, *get_args(hint))):
         hint, default, info.metavar = Words, None, "NAME=VALUE"
+    for note in notes:
+        if isinstance(note, str):
+            info.metavar = note
     info.default, info.help = default, info.help or text
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=info, annotation=hint)

@@ -31,7 +31,7 @@ IDEALISED = ("kernel_regret", "kernel_policy_regret", "sampled_regret")
 def hardness(
     target: Target,
     *,
-    measures: Annotated[str | None, typer.Option(metavar="A,B")] = None,
+    measures: Annotated[str | None, "A,B"] = None,
     gamma: Discount | None = None,
     horizon: Annotated[int | None, typer.Option(min=1)] = None,
     chance: Chance,
@@ -192,7 +192,7 @@ PREDICTED_OPTIONS = "agent steps hyperparameters sticky random lazy reward_noise
 def predict(
     target: Target,
     *,
-    observation: Annotated[list[str] | None, typer.Option(metavar="NAME[,OPTION=VALUE...]")] = None,
+    observation: Annotated[list[str] | None, "NAME[,OPTION=VALUE...]"] = None,
     network: list[str] | None = None,
     training: Annotated[TrainingOptions, PREDICTED_OPTIONS] = PREDICTED,
     horizon: Count | None = None,

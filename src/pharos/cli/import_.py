@@ -64,7 +64,7 @@ def minigrid(name: str, *, out: Out, seed: int = 0, horizon: Count = 100, rememb
 
 @app.command("gymnasium")
 def gymnasium(
-    name: Annotated[str, typer.Argument(metavar="ID")],
+    name: Annotated[str, "ID"],
     *,
     out: Out,
     option: Mapping[str, Any],

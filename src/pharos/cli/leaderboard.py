@@ -44,7 +44,7 @@ class Limits:
 
 
 def submit(
-    run: Annotated[Path, typer.Argument(metavar="RUN")],
+    run: Annotated[Path, "RUN"],
     *,
     out: Path | None = None,
     name: str = "",
@@ -78,7 +78,7 @@ def submit(
 
 
 def verify(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...")],
+    files: Annotated[list[Path], "FILE..."],
     *,
     limits: Limits,
     trust: Trust = False,
@@ -162,7 +162,7 @@ def _print(verdict: "Verdict") -> None:
 
 
 def board(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER")],
+    folder: Annotated[Path, "FOLDER"],
     *,
     out: Path = Path("board.html"),
     title: str = "Leaderboard",

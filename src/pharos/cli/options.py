@@ -187,7 +187,7 @@ class Building:
         ranks: processes, as `build` takes them.
     """
 
-    memory: Annotated[str | None, typer.Option(metavar="SIZE")] = None
+    memory: Annotated[str | None, "SIZE"] = None
     workers: Count | None = None
     max_states: Count | None = None
     ranks: int | str = field(init=False, default=1)
@@ -207,7 +207,7 @@ class SharedBuilding(Building):
         processes: processes that share the work and the memory, by MPI; under mpiexec: those that it has started.
     """
 
-    processes: Annotated[str, typer.Option(metavar="N|mpi")] = "1"
+    processes: Annotated[str, "N|mpi"] = "1"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ranks", ranks_of(self.processes))

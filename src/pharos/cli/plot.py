@@ -58,8 +58,8 @@ def value(
     gamma: Gamma = None,
     horizon: Horizon = None,
     chance: Annotated[ChanceSetting, "random"],
-    fix: Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE|start")] = None,
-    over: Annotated[str, typer.Option(metavar="NAME,NAME")] = "row,column",
+    fix: Annotated[list[str] | None, "NAME=VALUE|start"] = None,
+    over: Annotated[str, "NAME,NAME"] = "row,column",
     trust: Trust = False,
 ) -> Answer:
     """Draw the values and the actions of a policy over the cells of a grid, or over any two variables.

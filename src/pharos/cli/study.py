@@ -13,10 +13,11 @@ import typer
 
 from pharos.cli.answers import Answer, complain, console, print_table, progress_line, termination
 from pharos.cli.command import Commands
-from pharos.cli.options import Count, Seconds, Trust
+from pharos.cli.options import Count, Trust
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
 from pharos.observations import title
 from pharos.system.wording import many
+from pharos.training import ExecutionOptions
 
 if TYPE_CHECKING:
     from pharos.study import RunLog, Specification, Status
@@ -38,8 +39,8 @@ class Study:
     """
 
     spec: Annotated[str, typer.Argument(metavar="SPEC")]
-    out: Annotated[Path | None, typer.Option(metavar="DIR")] = None
-    environments: Annotated[Path | None, typer.Option(metavar="FILE")] = None
+    out: Annotated[Path | None, "DIR"] = None
+    environments: Annotated[Path | None, "FILE"] = None
     trust: Trust = False
 
     def opened(self) -> "tuple[Specification, Path]":
@@ -99,27 +100,16 @@ def _print(study: "Specification") -> None:
 def run(
     source: Study,
     *,
-    shard: Annotated[str | None, typer.Option(metavar="I/N")] = None,
-    retry_failed: bool = False,
-    resume: bool = False,
-    timeout: Seconds | None = None,
-    workers: Count | None = None,
-    device: str = "cpu",
-    on: Annotated[str, typer.Option(metavar="local|slurm|ray")] = "local",
+    execution: ExecutionOptions,
+    on: Annotated[str, "local|slurm|ray"] = "local",
     shards: Count | None = None,
     slurm: Mapping[str, Any],
     address: str | None = None,
-    log: Annotated[str | None, typer.Option(metavar="tensorboard|wandb")] = None,
+    log: Annotated[str | None, "tensorboard|wandb"] = None,
 ) -> Answer:
     """Execute the runs that are missing. Interrupt it at any time: the same command goes on from there.
 
     Args:
-        shard: Only the I-th of N parts, such as 1/8.
-        retry_failed: Execute failed runs again.
-        resume: Killed runs go on from their last checkpoint; their results may then differ.
-        timeout: Seconds after which a run is ended, and failed.
-        workers: Processes; as many as processors when not given.
-        device: Of batches: cpu or cuda.
         on: Where the runs are executed.
         shards: With --on slurm: jobs of the array; 8 when not given.
         slurm: With --on slurm: timeout_min=600, slurm_partition=cpu, ...
@@ -133,10 +123,9 @@ def run(
     if log is not None and on == "slurm":
         raise ParameterError("--log goes with --on local or ray; write those of a cluster by `pharos study log`")
     opened, place = source.opened()
-    options: dict[str, Any] = {"retry_failed": retry_failed, "resume": resume}
-    timed = {**options, "timeout": timeout}
+    options = vars(execution)
     if on == "slurm":
-        jobs = study.submit(opened, place, shards=shards or 8, parameters=slurm, workers=workers or 1, **timed)
+        jobs = study.submit(opened, place, shards=shards or 8, parameters=slurm, **options)
         names = [str(job.job_id) for job in jobs]
         submitted = f"submitted {len(jobs)} jobs: {', '.join(names)}; `pharos study status` says how far they are"
         return Answer(
@@ -144,17 +133,14 @@ def run(
         )
     logs = None if log is None else study.RunLog(opened, place, log)
     with _progress() as shown, termination():
-        options |= {"shard": shard, "progress": shown if logs is None else _logging(logs, shown)}
-        try:
-            if on == "ray":
-                end = study.run_on_ray(opened, place, address=address, **options)
-            else:
-                options |= {"timeout": timeout, "workers": workers, "device": device}
-                end = study.run(opened, place, foretold=_say, **options)
-        except AllRunsFailed as error:  # the answer says of each why
-            if on == "ray":
-                raise
-            end = error.outcome
+        tell = shown if logs is None else _logging(logs, shown)
+        if on == "ray":
+            end = study.run_on_ray(opened, place, address=address, progress=tell, **options)
+        else:
+            try:
+                end = study.run(opened, place, foretold=_say, progress=tell, **options)
+            except AllRunsFailed as error:  # the answer says of each why
+                end = error.outcome
     if logs is not None:
         logs.update()
     return _answer(end, failed=bool(end.failed))
@@ -191,8 +177,8 @@ def status(source: Study) -> Answer:
 def report(
     source: Study,
     *,
-    to: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
-    predictions: Annotated[list[Path] | None, typer.Option(metavar="FILE")] = None,
+    to: Annotated[Path | None, "DIR"] = None,
+    predictions: Annotated[list[Path] | None, "FILE"] = None,
 ) -> Answer:
     """Make the figures and tables of the finished runs: one HTML file, PNG, PDF, CSV and LaTeX.
 
@@ -220,7 +206,7 @@ def report(
 def log(
     source: Results,
     *,
-    to: Annotated[str, typer.Option(metavar="tensorboard|wandb")],
+    to: Annotated[str, "tensorboard|wandb"],
     project: str | None = None,
     offline: bool = False,
 ) -> Answer:
@@ -248,7 +234,7 @@ def log(
 def predict(
     source: Inputs,
     *,
-    out: Annotated[Path, typer.Option(metavar="FILE")],
+    out: Annotated[Path, "FILE"],
     block: list[int] | None = None,
     agent: list[str] | None = None,
     observation: list[str] | None = None,
@@ -282,7 +268,7 @@ def predict(
 
 
 @app.command("pack")
-def pack(source: Results, *, to: Annotated[Path, typer.Option(metavar="FILE")]) -> Answer:
+def pack(source: Results, *, to: Annotated[Path, "FILE"]) -> Answer:
     """Put the finished runs into one Parquet file, to keep, publish or carry; without what the agents learnt.
 
     Args:
@@ -296,10 +282,10 @@ def pack(source: Results, *, to: Annotated[Path, typer.Option(metavar="FILE")]) 
 
 @app.command("unpack")
 def unpack(
-    file: Annotated[Path, typer.Argument(metavar="FILE")],
+    file: Annotated[Path, "FILE"],
     *,
-    into: Annotated[str | None, typer.Option(metavar="SPEC")] = None,
-    out: Annotated[Path | None, typer.Option(metavar="DIR")] = None,
+    into: Annotated[str | None, "SPEC"] = None,
+    out: Annotated[Path | None, "DIR"] = None,
     trust: Trust = False,
 ) -> Answer:
     """Put packed runs into a study's folder; `pharos study run FOLDER` goes on with those that are missing.

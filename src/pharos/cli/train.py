@@ -34,7 +34,7 @@ def train(
     *,
     training: Annotated[TrainingOptions, f"{OPTIONS} {CHANCE}"],
     seed: Seed = 0,
-    seeds: Annotated[str | None, typer.Option(metavar="A:B|S,...")] = None,
+    seeds: Annotated[str | None, "A:B|S,..."] = None,
     device: str = "cpu",
     out: Path | None = None,
     table: Annotated[Path | None, typer.Option("--hyperparameters", metavar="FILE")] = None,
@@ -219,15 +219,15 @@ TUNED = TrainingOptions(agent="dqn")
 
 
 def tune(
-    targets: Annotated[list[str], typer.Argument(metavar="TARGET...")],
+    targets: Annotated[list[str], "TARGET..."],
     *,
     training: Annotated[TrainingOptions, "agent observation steps engine sticky random"] = TUNED,
     trials: Count = 50,
-    seeds: Annotated[str, typer.Option(metavar="A:B|S,...")] = "1000,1001",
-    search: Annotated[list[str] | None, typer.Option(metavar="NAME=CHOICES")] = None,
+    seeds: Annotated[str, "A:B|S,..."] = "1000,1001",
+    search: Annotated[list[str] | None, "NAME=CHOICES"] = None,
     search_seed: Seed = 0,
     out: Path | None = None,
-    chance: Annotated[list[str] | None, typer.Option(metavar="plain|NAME=P,...")] = None,
+    chance: Annotated[list[str] | None, "plain|NAME=P,..."] = None,
     shortlist_by_prediction: Count = 1,
 ) -> Answer:
     """Search hyperparameters of an agent for one class of environments.

@@ -7,11 +7,11 @@ may be killed, repeated, or followed by another.
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pharos.errors import MissingExtra, ParameterError
-from pharos.study import batches as _batches
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run
 from pharos.study.execution import (
@@ -19,19 +19,20 @@ from pharos.study.execution import (
     BUSY_SECONDS,
     STATUS_SECONDS,
     Execution,
-    Options,
     Status,
     claim,
     opened,
-    processors,
     run,
     shard_of,
     train,
 )
 from pharos.study.specification import Source, specification
+from pharos.system.records import takes
 from pharos.system.wording import in_one_line
+from pharos.training import ExecutionOptions
 
 
+@takes(ExecutionOptions, workers=1)
 def submit(
     source: Source,
     folder: str | os.PathLike | None = None,
@@ -39,11 +40,8 @@ def submit(
     shards: int,
     cluster: str = "slurm",
     parameters: Mapping[str, Any] | None = None,
-    retry_failed: bool = False,
-    resume: bool = False,
-    timeout: float | None = None,
-    workers: int = 1,
     runner: _worker.Runner = train,
+    **options: Any,
 ) -> list[Any]:
     """Submit a study as an array of jobs, each of which executes one of `shards` parts with `workers` processes.
 
@@ -52,6 +50,8 @@ def submit(
         cluster: "slurm"; or "local": all jobs at once on this machine, to try it.
         parameters: of submitit's executor, such as {"timeout_min": 600, "slurm_partition": "cpu",
             "slurm_array_parallelism": 50}.
+        options: of `pharos.training.ExecutionOptions`, as for `run`, with one worker unless told otherwise; each job
+            has a shard of its own.
     Returns:
         submitit's jobs, one for each part in which runs are missing: `job.job_id`, `job.result()` waits. Their logs
         are in the folder `jobs`.
@@ -66,6 +66,7 @@ def submit(
         raise ParameterError(f"cluster is {cluster!r}; expected slurm or local")
     if shards < 1:
         raise ParameterError(f"shards is {shards}; expected at least 1")
+    how = replace(ExecutionOptions(**options), shard=None, workers=options.get("workers") or 1)
     study, place = opened(source, folder)
     place = place.absolute()
     claim(study, place)
@@ -73,15 +74,16 @@ def submit(
         executor = submitit.AutoExecutor(folder=str(place / "jobs"), cluster=cluster)
     except RuntimeError as error:  # there is no sbatch here
         raise ParameterError(f"cannot submit to {cluster}: {error}") from error
-    options = {"cpus_per_task": workers, "timeout_min": 24 * 60, "name": f"pharos-{study.name}"}
-    executor.update_parameters(**{**options, **(parameters or {})})
-    how = {"retry_failed": retry_failed, "resume": resume, "timeout": timeout, "workers": workers, "runner": runner}
+    usual = {"cpus_per_task": how.workers, "timeout_min": 24 * 60, "name": f"pharos-{study.name}"}
+    executor.update_parameters(**{**usual, **(parameters or {})})
     parts = [f"{part}/{shards}" for part in range(1, shards + 1)]
-    parts = [part for part in parts if _has_work(shard_of(study.runs, part), place, retry_failed)]
+    parts = [part for part in parts if _has_work(shard_of(study.runs, part), place, how.retry_failed)]
     if not parts:
         return []
     with executor.batch():
-        return [executor.submit(run_shard, str(place), part, how) for part in parts]
+        return [
+            executor.submit(run_shard, str(place), {**vars(how), "shard": part, "runner": runner}) for part in parts
+        ]
 
 
 def _has_work(runs: Iterable[Run], place: Path, retry_failed: bool) -> bool:
@@ -89,22 +91,21 @@ def _has_work(runs: Iterable[Run], place: Path, retry_failed: bool) -> bool:
     return any(_worker.read_status(place, run.id) not in over for run in runs)
 
 
-def run_shard(folder: str, shard: str, options: dict[str, Any]) -> dict[str, Any]:
+def run_shard(folder: str, options: dict[str, Any]) -> dict[str, Any]:
     """What a job does: its part of the study whose specification stands in the folder."""
-    return run(specification(folder, trust=True), folder, shard=shard, **options).to_dict()
+    return run(specification(folder, trust=True), folder, **options).to_dict()
 
 
+@takes(ExecutionOptions)
 def run_on_ray(
     source: Source,
     folder: str | os.PathLike | None = None,
     *,
     address: str | None = None,
-    shard: str | None = None,
-    retry_failed: bool = False,
-    resume: bool = False,
     progress: Callable[[Status], None] | None = None,
     runner: _worker.Runner = train,
     batch_runner: _worker.BatchRunner | None = None,
+    **options: Any,
 ) -> Status:
     """Execute the runs of a study that are not over on a Ray cluster, one processor a run, or a batch of runs.
 
@@ -112,6 +113,7 @@ def run_on_ray(
         batch_runner: of the runs that the study says are batched, as for `run`.
         folder: of the results, on a disk that all nodes share.
         address: of the cluster; None for the one of this machine or RAY_ADDRESS, or else a new local one.
+        options: as for `run`; Ray decides how many runs are executed at once, and has no timeout.
     Raises:
         MissingExtra: Ray is not installed.
     """
@@ -120,13 +122,8 @@ def run_on_ray(
     except ImportError as error:
         raise MissingExtra("running on Ray", "ray", "ray") from error
     study, place = opened(source, folder)
-    place = place.absolute()
-    claim(study, place)
-    options = Options(
-        retry_failed=retry_failed, resume=resume, workers=processors(), progress=progress, runner=runner,
-        batch_runner=_batches.train_batch if batch_runner is None and runner is train else batch_runner,
-    )  # fmt: skip
-    execution = Execution(study, place, shard_of(study.runs, shard), options)
+    own = replace(ExecutionOptions(**options), workers=None)
+    execution = Execution(study, place.absolute(), own, runner, batch_runner, progress)
     ours = not ray.is_initialized()
     if ours:
         ray.init(address=address, log_to_driver=False, include_dashboard=False if address is None else None)

@@ -8,18 +8,13 @@ What comes before the runs of a study: state spaces are built, and tasks solved,
 
 import contextlib
 import json
-import multiprocessing
 import os
 import shutil
 import socket
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from multiprocessing import connection
-from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +25,13 @@ from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
 from pharos.study.specification import Source
 from pharos.study.status import Forecast, Status, claim, duration, opened, status
-from pharos.study.worker import end_processes, one_thread, processors, ready, worker_context
+from pharos.system.records import takes
 from pharos.system.storage import replace_json
 from pharos.system.wording import in_one_line, many
-from pharos.system.workers import check_guard, end_with_parent, without_interrupts, without_main
+from pharos.system.workers import Workers, one_thread, usable_workers
+from pharos.training import ExecutionOptions
 
-__all__ = ["Execution", "Options", "Status", "claim", "duration", "opened", "processors", "run", "shard_of", "status"]
+__all__ = ["Execution", "Status", "claim", "duration", "opened", "run", "shard_of", "status"]
 
 ATTEMPTS = 3
 STATUS_SECONDS = 2.0
@@ -73,34 +69,23 @@ def shard_of(runs: Sequence[Run], shard: str | tuple[int, int] | None) -> tuple[
     return tuple(runs[part - 1 :: parts])
 
 
-def run(  # noqa: PLR0913
+@takes(ExecutionOptions)
+def run(
     source: Source,
     folder: str | os.PathLike | None = None,
     *,
-    shard: str | tuple[int, int] | None = None,
-    retry_failed: bool = False,
-    resume: bool = False,
-    timeout: float | None = None,
-    workers: int | None = None,
     progress: Callable[[Status], None] | None = None,
     runner: _worker.Runner = train,
     prepare: Callable[[Mapping[str, Any]], Any] | None = None,
     batch_runner: _worker.BatchRunner | None = None,
     foretold: Callable[[Forecast], None] | None = None,
-    device: str = "cpu",
+    **options: Any,
 ) -> Status:
     """Execute the runs of a study that are not over, on this machine.
 
     Args:
         source: YAML file, preset, mapping, Specification, or the folder of a study.
         folder: of the results; None for that folder, or studies/NAME.
-        shard: `i/n`: only the i-th of n parts, for n machines that share the folder.
-        retry_failed: execute failed runs again.
-        resume: let runs that were killed go on from their last checkpoint, for long runs on machines that come and go.
-            A deep agent then ends elsewhere than without the interruption; else killed runs start anew, and results
-            never depend on it.
-        timeout: seconds after which a run is ended, and failed; a batch gets as many for each of its runs.
-        workers: processes; None for as many as there are processors.
         progress: called with a Status every now and then.
         runner: `runner(config, folder)`, a function of a module, which writes run.json and curve.parquet.
         prepare: called with one config of each instance, in a process of its own, before the runs; None: builds state
@@ -108,33 +93,14 @@ def run(  # noqa: PLR0913
         batch_runner: `runner(configs, folders, folder for checkpoints)` of runs that the study says are batched; None:
             the usual one for the usual runner, else each of them alone.
         foretold: called before the first run with how many are to come, and how long they will take.
-        device: where batches are trained, as torch names it: "cpu", "cuda".
+        options: of `pharos.training.ExecutionOptions`: shard, retry_failed, resume, timeout, workers, device.
     Returns:
         The Status at the end. Failed runs do not stop the others.
     Raises:
         ParameterError: the specification or an option is wrong, or the folder holds another study.
         AllRunsFailed: every run has failed; its `outcome` is the Status.
     """
-    study, place = opened(source, folder)
-    runs = shard_of(study.runs, shard)
-    if workers is not None and workers < 1:
-        raise ParameterError(f"workers is {workers}; expected at least 1")
-    claim(study, place)
-    name = "status.json" if shard is None else f"status-{str(shard).replace('/', '-of-')}.json"
-    options = Options(
-        retry_failed=retry_failed,
-        resume=resume,
-        timeout=timeout,
-        workers=workers or processors(),
-        progress=progress,
-        runner=runner,
-        batch_runner=partial(_batches.train_batch, device=device)
-        if batch_runner is None and runner is train
-        else batch_runner,
-        device=device,
-        status_file=name,
-    )
-    execution = Execution(study, place, runs, options)
+    execution = Execution(*opened(source, folder), ExecutionOptions(**options), runner, batch_runner, progress)
     if foretold is not None and execution.pending:
         foretold(execution.forecast())
     if prepare is None and runner is train:
@@ -143,30 +109,28 @@ def run(  # noqa: PLR0913
         execution.prepare(prepare)
     end = execution.run()
     if end.failed and end.failed == end.total:
-        raise AllRunsFailed(place, end.errors, end)
+        raise AllRunsFailed(execution.folder, end.errors, end)
     return end
 
 
-@dataclass(frozen=True, kw_only=True)
-class Options:
-    """How the runs of a study are executed; see `run`."""
-
-    retry_failed: bool = False
-    resume: bool = False
-    timeout: float | None = None
-    workers: int
-    progress: Callable[[Status], None] | None = None
-    runner: _worker.Runner = train
-    batch_runner: _worker.BatchRunner | None = None
-    device: str = "cpu"
-    status_file: str = "status.json"
-
-
 class Execution:
-    """The loop that starts, awaits and counts worker processes."""
+    """The loop that starts, awaits and counts worker processes; arguments as for `run`."""
 
-    def __init__(self, study: Specification, folder: Path, runs: Sequence[Run], options: Options):
-        self.study, self.folder, self.runs, self.options = study, folder, runs, options
+    def __init__(
+        self,
+        study: Specification,
+        folder: Path,
+        options: ExecutionOptions,
+        runner: _worker.Runner = train,
+        batch_runner: _worker.BatchRunner | None = None,
+        progress: Callable[[Status], None] | None = None,
+    ):
+        self.study, self.folder, self.options, self.progress = study, folder, options, progress
+        self.runs, self.num_workers = shard_of(study.runs, options.shard), usable_workers(options.workers)
+        claim(study, folder)
+        if batch_runner is None and runner is train:
+            batch_runner = partial(_batches.train_batch, device=options.device)
+        self.runner, self.batch_runner = runner, batch_runner
         self.began = time.monotonic()
         self.last_report, self.last_listing = -1e9, time.monotonic()
         self.finished: dict[str, float] = {}
@@ -174,19 +138,20 @@ class Execution:
         self.damaged: dict[str, str] = {}
         self.repeated: set[str] = set()
         self.pending: deque[tuple[float, Run]] = deque()
-        self.running: dict[int, tuple[Any, tuple[Run, ...], float]] = {}
+        self.running: dict[str, tuple[tuple[Run, ...], float]] = {}
+        self.workers = Workers("pharos.study.warm" if runner is train else "pharos.study.worker")
         self.batches = _batches.Batches(folder, options.device)
         self.kills: dict[str, int] = defaultdict(int)
         self.lost_servers = 0
         self.seconds_per_step: dict[tuple, tuple[float, int]] = {}
-        for run in runs:
+        for run in self.runs:
             if not self.note(run, options.retry_failed):
                 self.pending.append((0.0, run))
 
     def forecast(self) -> Forecast:
         """How long the runs that are missing will take."""
         steps = sum(run.config["steps"] for _, run in self.pending)
-        return Forecast(len(self.pending), steps, self.options.workers, self._remaining())
+        return Forecast(len(self.pending), steps, self.num_workers, self._remaining())
 
     def prepare(self, prepare: Callable[[Mapping[str, Any]], Any]) -> None:
         """Call `prepare` with one config of each instance that has runs to come; a failure is left to the runs to
@@ -194,16 +159,16 @@ class Execution:
         prepare_instances(prepare, [run for _, run in self.pending], self.report)
 
     def run(self) -> Status:
-        context = worker_context(self.options.runner is train)
+        """Execute what is pending; the Status at the end."""
         try:
-            while self.pending or self.running:
-                if time.monotonic() - self.last_listing >= OTHERS_SECONDS:
-                    self._look_around()
-                self._start(context)
-                self.report()
-                self._await()
+            with self.workers:
+                while self.pending or self.running:
+                    if time.monotonic() - self.last_listing >= OTHERS_SECONDS:
+                        self._look_around()
+                    self._start()
+                    self.report()
+                    self._await()
         except BaseException:
-            end_processes([process for process, _, _ in self.running.values()])
             self.running.clear()
             self.report(final=True)
             raise
@@ -221,9 +186,9 @@ class Execution:
                 if run.id not in there or run.id in self.repeated or not self.note(run)
             )
 
-    def _start(self, context: "_worker.Context") -> None:
+    def _start(self) -> None:
         for _ in range(len(self.pending)):
-            if len(self.running) >= self.options.workers:
+            if not self.pending or len(self.running) >= self.num_workers:
                 return
             due, run = self.pending.popleft()
             if due > time.monotonic():
@@ -233,14 +198,12 @@ class Execution:
                 continue
             unit = self.unit(run)
             try:
-                process = self._worker(context, unit)
+                self._worker(unit)
             except (EOFError, ConnectionError) as error:
                 self._server_lost(error)
                 self.pending.extendleft((due, each) for each in reversed(unit))
                 return
-            self.running[process.sentinel] = (process, unit, time.monotonic())
-            if not self.pending:
-                return
+            self.running[run.id] = (unit, time.monotonic())
 
     def _server_lost(self, error: Exception) -> None:
         """The process that forks workers is gone: wait a little, and the next start begins another."""
@@ -252,48 +215,38 @@ class Execution:
             ) from error
         time.sleep(BUSY_SECONDS)
 
-    def _worker(self, context: "_worker.Context", unit: tuple[Run, ...]) -> BaseProcess:
-        arguments = (*self.job(unit), dict(os.environ))
-        process = context.Process(target=_worker.main, args=arguments, name=unit[0].id)
+    def _worker(self, unit: tuple[Run, ...]) -> None:
         definitions = [each for run in unit for each in run.configuration.definitions]
-        with one_thread(), without_main(self.options.runner, self.options.batch_runner, *definitions):
-            ready(context)
-            process.start()
-        return process
+        with one_thread():
+            self.workers.start(unit[0].id, _worker.main, self.job(unit), (self.runner, self.batch_runner, *definitions))
 
     def unit(self, run: Run) -> tuple[Run, ...]:
         """The runs that are executed by one process with this one; they are taken from `pending`."""
-        return (run,) if self.options.batch_runner is None else self.batches.unit(run, self.pending)
+        return (run,) if self.batch_runner is None else self.batches.unit(run, self.pending)
 
     def job(self, unit: Sequence[Run]) -> Job:
-        """The arguments of `worker.main` for these runs, but for the last."""
-        runner, resume = self.options.batch_runner, True
+        """The arguments of `worker.main` for these runs."""
+        runner, resume = self.batch_runner, True
         if runner is None or unit[0].engine != "batched":
-            runner, resume = partial(_worker.run_alone, self.options.runner), self.options.resume
+            runner, resume = partial(_worker.run_alone, self.runner), self.options.resume
         ids = [run.id for run in unit]
         configs, again = [dict(run.config) for run in unit], self.repeated.intersection(ids)
         return runner, configs, ids, self.folder.absolute(), again, resume
 
     def _await(self) -> None:
-        waiting = BUSY_SECONDS if self.pending and len(self.running) < self.options.workers else STATUS_SECONDS / 2
         if not self.running:
             time.sleep(BUSY_SECONDS)
             return
-        for sentinel in connection.wait(list(self.running), waiting):
-            process, unit, _ = self.running.pop(sentinel)  # type: ignore[arg-type]
-            process.join()
-            code = process.exitcode
-            process.close()
-            self._ended(unit, code)
-        if self.options.timeout is not None:
-            for process, unit, started in self.running.values():
-                if time.monotonic() - started > self.options.timeout * len(unit):
-                    self.kills.update({run.id: ATTEMPTS for run in unit})
-                    process.kill()
+        waiting = BUSY_SECONDS if self.pending and len(self.running) < self.num_workers else STATUS_SECONDS / 2
+        for id, code in self.workers.events(waiting):
+            self._ended(self.running.pop(id)[0], code)
+        for id, (unit, started) in self.running.items():
+            if self.options.timeout is not None and time.monotonic() - started > self.options.timeout * len(unit):
+                self.kills.update({run.id: ATTEMPTS for run in unit})
+                self.workers.kill(id)
 
     def _ended(self, unit: tuple[Run, ...], code: int) -> None:
         """A process is over: what it has not left behind is done again."""
-        check_guard(code)
         if code == _worker.EXIT_BUSY:
             left = list(unit)
         else:
@@ -368,10 +321,10 @@ class Execution:
         pace = {kind: seconds / steps for kind, (seconds, steps) in self.seconds_per_step.items()}
         usual = sum(pace.values()) / len(pace)
         seconds = sum(run.config["steps"] * pace.get(run.kind, usual) for _, run in self.pending)
-        for _, unit, started in self.running.values():
+        for unit, started in self.running.values():
             needed = sum(run.config["steps"] * pace.get(run.kind, usual) for run in unit)
             seconds += max(0.0, needed - (time.monotonic() - started))
-        return seconds / self.options.workers
+        return seconds / self.num_workers
 
     def report(self, preparing: str = "", *, final: bool = False) -> Status:
         now = Status(
@@ -380,19 +333,20 @@ class Execution:
             total=len(self.runs),
             finished=len(self.finished),
             failed=len(self.errors),
-            running=sum(len(unit) for _, unit, _ in self.running.values()),
+            running=sum(len(unit) for unit, _ in self.running.values()),
             errors=dict(self.errors),
             elapsed=time.monotonic() - self.began,
             remaining=self._remaining(),
             preparing=preparing,
             damaged=dict(self.damaged),
         )
-        if self.options.progress is not None:
-            self.options.progress(now)
+        if self.progress is not None:
+            self.progress(now)
         if final or time.monotonic() - self.last_report > STATUS_SECONDS:
             self.last_report = time.monotonic()
             record = {**now.to_dict(), "updated": time.time(), "process": os.getpid(), "host": socket.gethostname()}
-            replace_json(self.folder / self.options.status_file, record, durable=False)
+            part = "" if self.options.shard is None else f"-{str(self.options.shard).replace('/', '-of-')}"
+            replace_json(self.folder / f"status{part}.json", record, durable=False)
         return now
 
 
@@ -421,60 +375,37 @@ def prepare_instance(config: Mapping[str, Any]) -> None:
 def prepare_instances(
     prepare: Callable[[Mapping[str, Any]], Any], runs: Iterable[Run], tell: Callable[[str], Any]
 ) -> None:
-    """Call `prepare` with one config of each instance of the runs, and `tell` what it is at; failures are not told."""
+    """Call `prepare` with one config of each instance of the runs, and `tell` what it is at; failures are not told.
+
+    A process of their own prepares them one after the other; where it dies, another goes on with the next.
+    """
     instances: dict[str, Run] = {}
     for run in runs:
         config = run.config
         key = json.dumps([config[name] for name in ("environment", "parameters", "chance", "gamma", "horizon")])
         instances.setdefault(key, run)
-    todo = list(instances.values())
-    while todo:
-        del todo[: _prepare(prepare, todo, len(instances), tell)]
-
-
-def _prepare(
-    prepare: Callable[[Mapping[str, Any]], Any], todo: Sequence[Run], total: int, tell: Callable[[str], Any]
-) -> int:
-    """Prepare instances in a process of their own; how many are done, the one at which it died included."""
-    context = multiprocessing.get_context("spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_prepare_all, args=(prepare, [run.config for run in todo], sender))
-    with without_main(prepare, *(each for run in todo for each in run.configuration.definitions)), without_interrupts():
-        process.start()
-    sender.close()
-    done, waits_for = 0, ""
-    try:
-        while done < len(todo):
-            run = todo[done]
-            number = total - len(todo) + done + 1
-            tell(f"preparing {run.instance}, {run.chance} ({number} of {total}){waits_for}")
-            if receiver.poll(POLL_SECONDS):
-                message = receiver.recv()
-                waits_for = f"; {message}" if message else ""
-                done += not message
-    except EOFError:
-        done += 1
-    except BaseException:
-        end_processes([process])
-        raise
-    finally:
-        receiver.close()
-    process.join()
-    check_guard(process.exitcode)
-    return done
+    todo, waits_for = deque(instances.values()), ""
+    with Workers() as workers:
+        while todo:
+            if not workers:
+                definitions = [prepare, *(each for run in todo for each in run.configuration.definitions)]
+                workers.start("", _prepare_all, (prepare, [run.config for run in todo]), definitions)
+            number, run = len(instances) - len(todo) + 1, todo[0]
+            tell(f"preparing {run.instance}, {run.chance} ({number} of {len(instances)}){waits_for}")
+            for _, said in workers.events(POLL_SECONDS):
+                waits_for = f"; {said}" if isinstance(said, str) and said else ""
+                if not waits_for and todo:  # one is prepared, or its process has died
+                    todo.popleft()
 
 
 def _prepare_all(
-    prepare: Callable[[Mapping[str, Any]], Any], configs: Iterable[Mapping[str, Any]], sender: Connection
+    prepare: Callable[[Mapping[str, Any]], Any], configs: Iterable[Mapping[str, Any]], send: Callable[[str], None]
 ) -> None:
     """Prepare instances one after the other; send "" after each, and why where it waits."""
-    _worker.end_cleanly()
-    end_with_parent()
     for config in configs:
         with contextlib.suppress(Exception):  # the runs of this instance will fail with the same error, and say so
-            unless_locked(prepare, config, sender.send)
-        sender.send("")
-    _worker.is_ending()
+            unless_locked(prepare, config, send)
+        send("")
 
 
 def unless_locked(

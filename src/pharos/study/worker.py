@@ -6,40 +6,27 @@
 
 A process that is killed leaves a folder in `partial`, which the next attempt throws away, unless its result is
 complete, or unless it is to be resumed: then the runner finds there what it wrote before.
-
-The processes of workers: how they are made, and how they end.
 """
 
 import contextlib
-import multiprocessing
 import os
 import shutil
-import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from multiprocessing.process import BaseProcess
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any
 
 from pharos import training
 from pharos.errors import FileFormatError, FolderLocked
 from pharos.system import storage
 from pharos.system.wording import in_one_line
-from pharos.system.workers import end_with_parent, without_interrupts
-
-if TYPE_CHECKING:
-    from multiprocessing.context import ForkServerContext, SpawnContext
-
-    Context: TypeAlias = ForkServerContext | SpawnContext
 
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 EXIT_BUSY = 75
-TERMINATION_SECONDS = 5.0
 # Seconds in a record that no run can take: ten thousand years
 LONGEST = 3e11
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 BATCHES = "batches"
 
@@ -226,10 +213,10 @@ def main(
     folder: Path,
     again: Container[str],
     resume: bool,
-    environment: Mapping[str, str],
+    _: object,
 ) -> None:
-    """The body of a worker process; see `begin` for `environment`."""
-    begin(environment)
+    """The body of a worker process."""
+    use_one_thread()
     try:
         ends = attempt(runner, configs, ids, folder, again=again, resume=resume)
     except OSError as error:  # a full disk, on which not even the log can say so
@@ -238,96 +225,9 @@ def main(
         sys.exit(EXIT_BUSY)
 
 
-def begin(environment: Mapping[str, str]) -> None:
-    """What a worker process begins with: it ends with the one that started it, leaves interrupts to it, uses one
-    thread.
-
-    `environment` holds the variables of that process now, which may not be those of when workers began to be forked.
-    """
-    threads = {
-        name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ
-    }  # Numba refuses that they change
-    os.environ.clear()
-    os.environ.update({**environment, **threads})
-    end_cleanly()
-    end_with_parent()
-    use_one_thread()
-
-
-def end_cleanly() -> None:
-    """Leave interrupts to the process that started this one; on SIGTERM, end by way of what has to be given back.
-
-    A process that SIGTERM kills leaves its semaphores behind, of which Python then warns.
-    """
-
-    def leave(*_: object) -> None:
-        sys.exit(128 + signal.SIGTERM)
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, leave)
-
-
-def is_ending() -> None:
-    """Ignore SIGTERM from now on: this process ends by itself, and an exception among what is given back is printed."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-
-
 def use_one_thread() -> None:
     """One thread for PyTorch, if it is loaded, and for Numba; a process per run keeps the processors busy."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
     if "numba" in sys.modules:
         sys.modules["numba"].set_num_threads(1)
-
-
-# Processes ------------------------------------------------------------------------------------------------------------
-
-
-def processors() -> int:
-    """The processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """What starts here, and whatever it forks, uses one thread, unless the user's variables say otherwise.
-
-    Numba reads its variable when it is loaded, which is before any line of the new process.
-    """
-    added = [name for name in THREAD_VARIABLES if name not in os.environ]
-    os.environ.update(dict.fromkeys(added, "1"))
-    try:
-        yield
-    finally:
-        for name in added:
-            del os.environ[name]
-
-
-def end_processes(processes: Sequence[BaseProcess]) -> None:
-    """End processes cleanly; at once those that take too long."""
-    for process in processes:
-        process.terminate()
-    latest = time.monotonic() + TERMINATION_SECONDS
-    for process in processes:
-        process.join(max(0.0, latest - time.monotonic()))
-        if process.is_alive():
-            process.kill()
-            process.join()
-
-
-def worker_context(warm: bool) -> "Context":
-    """Processes are forked from one that has loaded everything; where the system cannot do that, started anew."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["pharos.study.warm" if warm else "pharos.study.worker"])
-    return context
-
-
-def ready(context: "Context") -> None:
-    """See to it that the process which forks workers is there; it loads much, and leaves interrupts to this one."""
-    if context.get_start_method() == "forkserver":
-        from multiprocessing import forkserver
-
-        with without_interrupts():
-            forkserver.ensure_running()

@@ -1,4 +1,4 @@
-"""Processes that work for this one: how many there may be, and what they import."""
+"""Processes that work for this one: how many there may be, how they begin and end, and what they import."""
 
 import contextlib
 import multiprocessing
@@ -7,13 +7,18 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from multiprocessing import connection
+from multiprocessing.context import ForkServerContext, SpawnContext
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 from pharos.errors import ParameterError
 
 PARENT_GONE = 76  # the exit status of a worker that nobody waits for
 CLEAN_SECONDS = 2.0  # until it ends at once
+TERMINATION_SECONDS = 5.0
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 def usable_workers(workers: int | None) -> int:
@@ -23,6 +28,151 @@ def usable_workers(workers: int | None) -> int:
     if workers < 1:
         raise ParameterError(f"workers is {workers}; expected at least 1")
     return int(workers)
+
+
+class Workers:
+    """Processes that work for this one, each under a key: what they send, and how they end.
+
+    They leave interrupts to this one, and end with it, however it goes; those that still run where the block ends are
+    ended.
+
+    Args:
+        preload: a module that one process loads, from which the others are forked, where the system can do that; None:
+            each begins anew.
+    """
+
+    def __init__(self, preload: str | None = None):
+        self._context: ForkServerContext | SpawnContext = multiprocessing.get_context("spawn")
+        if preload is not None and "forkserver" in multiprocessing.get_all_start_methods():
+            self._context = multiprocessing.get_context("forkserver")
+            self._context.set_forkserver_preload([preload])
+        self._running: dict[str, tuple[BaseProcess, connection.Connection]] = {}
+
+    def __len__(self) -> int:
+        return len(self._running)
+
+    def __enter__(self) -> "Workers":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End processes cleanly; at once those that take too long."""
+        processes = [process for process, _ in self._running.values()]
+        self._running.clear()
+        for process in processes:
+            process.terminate()
+        latest = time.monotonic() + TERMINATION_SECONDS
+        for process in processes:
+            process.join(max(0.0, latest - time.monotonic()))
+            if process.is_alive():
+                process.kill()
+                process.join()
+
+    def start(
+        self, key: str, function: Callable[..., None], arguments: Sequence[Any], definitions: Sequence[object] = ()
+    ) -> None:
+        """Start a process that calls function(*arguments, send), where `send(message)` makes an event here.
+
+        Args:
+            definitions: classes and functions that it needs; see `without_main`.
+        Raises:
+            EOFError, ConnectionError: the process from which it is to be forked is gone.
+        """
+        receiver, sender = self._context.Pipe(duplex=False)
+        process = self._context.Process(target=_work, args=(function, arguments, sender, dict(os.environ)), name=key)
+        with without_main(*definitions):
+            if isinstance(self._context, ForkServerContext):
+                from multiprocessing import forkserver
+
+                with without_interrupts():  # it loads much
+                    forkserver.ensure_running()
+                process.start()
+            else:
+                with without_interrupts():
+                    process.start()
+        sender.close()
+        self._running[key] = process, receiver
+
+    def events(self, seconds: float | None = None) -> Iterator[tuple[str, Any]]:
+        """What happens next, or within so many seconds: (key, a message), or (key, exit code) of a process that ended.
+
+        Raises:
+            ParameterError: a process has imported a script without a guard.
+        """
+        alive = {process.sentinel: key for key, (process, _) in self._running.items()}
+        receivers = [receiver for _, receiver in self._running.values() if not receiver.closed]
+        ready = connection.wait([*alive, *receivers], seconds)
+        for sentinel, key in alive.items():
+            process, receiver = self._running[key]
+            try:
+                while not receiver.closed and receiver.poll():
+                    yield key, receiver.recv()
+            except EOFError:
+                receiver.close()
+            if sentinel in ready:
+                del self._running[key]
+                process.join()
+                code = process.exitcode
+                process.close()
+                check_guard(code)
+                yield key, code
+
+    def kill(self, key: str) -> None:
+        """Kill a process; its end is an event."""
+        self._running[key][0].kill()
+
+
+def _work(
+    function: Callable[..., None],
+    arguments: Sequence[Any],
+    sender: connection.Connection,
+    environment: Mapping[str, str],
+) -> None:
+    """The body of a process; `environment` are the variables of the one that started it, now.
+
+    They may not be those of when processes began to be forked; Numba refuses that the numbers of threads change.
+    """
+    threads = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
+    os.environ.clear()
+    os.environ.update({**environment, **threads})
+    end_cleanly()
+    end_with_parent()
+
+    def send(message: object) -> None:
+        try:
+            sender.send(message)
+        except OSError:  # nobody listens any more
+            sys.exit(1)
+
+    function(*arguments, send)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends by itself: an exception in what is given back is printed
+
+
+def end_cleanly() -> None:
+    """Leave interrupts to the process that started this one; on SIGTERM, end by way of what has to be given back.
+
+    A process that SIGTERM kills leaves its semaphores behind, of which Python then warns.
+    """
+
+    def leave(*_: object) -> None:
+        sys.exit(128 + signal.SIGTERM)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, leave)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """What starts here, and whatever it forks, uses one thread, unless the user's variables say otherwise.
+
+    Numba reads its variable when it is loaded, which is before any line of the new process.
+    """
+    added = [name for name in THREAD_VARIABLES if name not in os.environ]
+    os.environ.update(dict.fromkeys(added, "1"))
+    try:
+        yield
+    finally:
+        for name in added:
+            del os.environ[name]
 
 
 NO_GUARD = 78
@@ -78,9 +228,7 @@ def without_interrupts() -> Iterator[None]:
 def end_with_parent() -> None:
     """End this process when the one that started it is gone, however it went: cleanly, and if that takes long, at
     once."""
-    from multiprocessing import connection, parent_process
-
-    parent = parent_process()
+    parent = multiprocessing.parent_process()
     if parent is None:
         return
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pharos.training.batch import Progress, train_configs
     from pharos.training.curve import Curve, Evaluation, RegretCurve, bootstrap_interval, evaluate_agent
     from pharos.training.learners import FailedRun, TaskCache
-    from pharos.training.options import ENGINES, Horizon, TrainingOptions
+    from pharos.training.options import ENGINES, ExecutionOptions, Horizon, TrainingOptions
     from pharos.training.results import (
         TrainingResult,
         check_agent,
@@ -55,9 +55,9 @@ __all__ = [
     "tune",
 ]
 _shared = """
-    CELL Curve ENGINES FailedRun Horizon Progress SPACES TaskCache TaskValues TuningResult bootstrap_interval
-    check_agent clear_run digest_of_curve read_curve read_curve_table read_record read_rows read_table run_id
-    train_parts versions write_curve write_policy write_record write_table
+    CELL Curve ENGINES ExecutionOptions FailedRun Horizon Progress SPACES TaskCache TaskValues TuningResult
+    bootstrap_interval check_agent clear_run digest_of_curve read_curve read_curve_table read_record read_rows
+    read_table run_id train_parts versions write_curve write_policy write_record write_table
 """
 
 __getattr__ = lazy.attributes(__name__)

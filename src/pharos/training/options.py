@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 from pharos.environments import Environment, parameter
 from pharos.errors import ParameterError
@@ -81,3 +81,26 @@ class TrainingOptions:
     horizon: int | str | None = "limit"
     evaluation_interval: int | None = parameter(None, kind=int, low=1)
     engine: str = "sb3"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExecutionOptions:
+    """How the runs of a study are executed.
+
+    Attributes:
+        shard: only the I-th of N parts, such as 1/8. So N machines share a folder.
+        retry_failed: execute failed runs again.
+        resume: killed runs go on from their last checkpoint; their results may then differ. That is for long runs on
+            machines that come and go: a deep agent then ends elsewhere than without the interruption. Else killed runs
+            start anew, and results never depend on it.
+        timeout: seconds after which a run is ended, and failed. A batch gets as many for each of its runs.
+        workers: processes; as many as processors when not given.
+        device: of batches: cpu or cuda. As torch names it.
+    """
+
+    shard: Annotated[str | None, "I/N"] = None
+    retry_failed: bool = False
+    resume: bool = False
+    timeout: float | None = parameter(None, kind=float, low=0)
+    workers: int | None = parameter(None, kind=int, low=1)
+    device: str = "cpu"

@@ -9,15 +9,10 @@ evaluations is lost (or the last ten seconds, where intervals are shorter). With
 same curve file.
 """
 
-import multiprocessing
 import os
-import signal
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from multiprocessing import connection
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
@@ -26,7 +21,7 @@ from pharos.environments import Environment
 from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, PharosError
 from pharos.observations import own_observation
 from pharos.system.records import split, takes
-from pharos.system.workers import check_guard, end_with_parent, without_interrupts, without_main
+from pharos.system.workers import Workers
 from pharos.training import results as _results
 from pharos.training.batch import Progress, ProgressCallback, TrainingJobs, train_configs
 from pharos.training.learners import FailedRun, TaskCache
@@ -222,57 +217,31 @@ def train_parts(
     progress: ProgressCallback | None,
 ) -> list[TrainingResult | FailedRun]:
     """As `train_configs`, each part in a process of its own, which ends with this one."""
-    context = multiprocessing.get_context("spawn")
-    processes: list[SpawnProcess] = []
-    places: dict[connection.Connection, tuple[int, Sequence[int]]] = {}
     done, finished, failed = [0] * len(parts), [0] * len(parts), [0] * len(parts)
     total = sum(config.steps for config in configs)
-    try:
+    with Workers() as workers:
         for number, part in enumerate(parts):
-            receiver, sender = context.Pipe(duplex=False)
             entries = [(configs[place].to_dict(), folders[place]) for place in part]
-            process = context.Process(target=_train_part, args=(entries, checkpoints, device, sender), daemon=True)
-            with without_main(*configs[0].definitions), without_interrupts():
-                process.start()
-            sender.close()
-            processes.append(process)
-            places[receiver] = (number, part)
-        while places:
-            for ready in connection.wait(list(places)):
-                receiver = cast(connection.Connection, ready)
-                number, part = places[receiver]
-                try:
-                    now: Progress = receiver.recv()
-                except EOFError:
-                    del places[receiver]
-                    continue
+            workers.start(str(number), _train_part, (entries, checkpoints, device), configs[0].definitions)
+        while workers:
+            for key, now in workers.events():
+                if not isinstance(now, Progress):
+                    continue  # it has ended
+                number = int(key)
                 done[number], finished[number], failed[number] = now.done, now.finished, now.failed
                 if progress is not None:
-                    rows = {part[place]: row for place, row in now.rows.items()}
+                    rows = {parts[number][place]: row for place, row in now.rows.items()}
                     progress(Progress(sum(done), total, rows, sum(finished), sum(failed)))
-    finally:
-        for process in processes:
-            if places:
-                process.terminate()
-            process.join()
-    for process in processes:
-        check_guard(process.exitcode)
     return [_end(config, folder) for config, folder in zip(configs, folders, strict=True)]
 
 
 def _train_part(
-    entries: Sequence[tuple[dict[str, Any], Path]], checkpoints: Path | None, device: str, sender: connection.Connection
+    entries: Sequence[tuple[dict[str, Any], Path]],
+    checkpoints: Path | None,
+    device: str,
+    tell: ProgressCallback,
 ) -> None:
-    """What a process does: it tells how far it is, and ends when nobody listens; interrupts are for the first one."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
-
-    def tell(now: Progress) -> None:
-        try:
-            sender.send(now)
-        except OSError:
-            sys.exit(1)
-
+    """What a process does: it tells how far it is."""
     configs, folders = zip(*entries, strict=True)
     members = TaskCache(trust=True, device=device)  # of code that the process which started this one has imported
     train_configs(configs, folders, checkpoints=checkpoints, progress=tell, members=members)
