@@ -1,6 +1,5 @@
 """pharos submit, verify, board: entries of a leaderboard, and what is true of them."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,31 +15,13 @@ from pharos.cli.answers import (
     progress_line,
     size_text,
 )
-from pharos.cli.options import Count, Trust
+from pharos.cli.options import Trust
 from pharos.errors import ParameterError
+from pharos.leaderboard import Limits
 from pharos.system.wording import in_words, many
 
 if TYPE_CHECKING:
     from pharos.leaderboard import Verdict
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Limits of a verification.
-
-    Attributes:
-        tolerance: how far an exact number may be from the claimed one, relative to V*.
-        max_states: refuse state spaces larger than this.
-        max_reached: values of policies that reach more states are estimated.
-        max_horizon: refuse entries with more steps than this.
-        max_seconds: refuse entries that take longer, each.
-    """
-
-    tolerance: Annotated[float, typer.Option(min=0)] = 1e-6
-    max_states: Count = 10_000_000
-    max_reached: Count = 100_000
-    max_horizon: Count = 100_000
-    max_seconds: Annotated[float, typer.Option(min=1)] = 600.0
 
 
 def submit(

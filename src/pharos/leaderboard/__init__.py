@@ -1,20 +1,29 @@
-"""Entries of a leaderboard: what a run has learnt and what it claims, in one file that anybody can verify."""
+"""Entries of a leaderboard: what a run has learnt and what it claims, in one file that anybody can verify.
 
-from pharos.leaderboard.board import Board, Cell, Ranking, board, reason, write_page
-from pharos.leaderboard.entry import (
-    Claim,
-    Entry,
-    check_ending,
-    check_values,
-    in_file,
-    read,
-    read_sealed,
-    stored_table,
-    submit,
-    write_checked,
-    write_sealed,
-)
-from pharos.leaderboard.verification import Check, Verdict, verify
+A file is loaded when something in it is first used: the command line needs `Limits` alone to show its help.
+"""
+
+from typing import TYPE_CHECKING
+
+from pharos.system import lazy
+
+if TYPE_CHECKING:
+    from pharos.leaderboard.entry import (
+        Claim,
+        Entry,
+        check_ending,
+        check_values,
+        in_file,
+        read,
+        read_sealed,
+        stored_table,
+        submit,
+        write_checked,
+        write_sealed,
+    )
+    from pharos.leaderboard.limits import Limits
+    from pharos.leaderboard.page import Board, Cell, Ranking, board, reason, write_page
+    from pharos.leaderboard.verification import Check, Verdict, verify
 
 __all__ = [
     "board",
@@ -23,6 +32,8 @@ __all__ = [
     "verify",
 ]
 _shared = """
-    Board Cell Check Claim Entry Ranking Verdict check_ending check_values in_file read_sealed reason stored_table
+    Board Cell Check Claim Entry Limits Ranking Verdict check_ending check_values in_file read_sealed reason stored_table
     write_checked write_page write_sealed
 """
+
+__getattr__ = lazy.attributes(__name__)

@@ -103,19 +103,8 @@ class Entry:
 
 def write(entry: Entry, file: str | os.PathLike) -> None:
     """Replace a file by an entry, in one step; the same entry gives the same bytes."""
-    record = {
-        "format": FORMAT,
-        "name": entry.name,
-        "author": entry.author,
-        "note": entry.note,
-        "id": entry.id,
-        "config": entry.config.to_dict(),
-        "hyperparameters": dict(entry.hyperparameters),
-        "versions": dict(entry.versions),
-        "rules_version": entry.rules_version,
-        "claim": asdict(entry.claim),
-        "training": dict(entry.training),
-    }
+    said = {name: value for name, value in vars(entry).items() if name != _ARRAYS}
+    record = {**said, "format": FORMAT, "id": entry.id, "config": entry.config.to_dict(), "claim": asdict(entry.claim)}
     write_sealed(file, record, entry.arrays)
 
 

@@ -23,12 +23,14 @@ from pharos.agents import AGENTS, algorithm, extractor, make_model
 from pharos.environments import BUILT_IN
 from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, TimeLimit, UntrustedCode
 from pharos.leaderboard.entry import LARGEST_FILE, LONGEST_TEXT, POLICY, Claim, Entry, read
+from pharos.leaderboard.limits import Limits
 from pharos.observations import names as observation_names
 from pharos.observations import observe
 from pharos.policies import PolicyLike, deep_policy
 from pharos.state_space import build
 from pharos.system import storage
 from pharos.system.memory import available_memory
+from pharos.system.records import takes
 from pharos.system.sources import is_reference
 from pharos.training import ReferenceValues, RunConfig, Task, TaskValues, evaluate_agent, regret
 
@@ -137,11 +139,10 @@ def _check_sizes(entry: Entry, task: Task, hyperparameters: dict[str, Any]) -> N
     if type(features) is not int or features < 1:
         raise FileFormatError(f"its features_dim is {str(features)[:40]}; expected a whole number of at least 1")
     layers = 0
-    for arch in (hyperparameters.get("net_arch", []), kwargs.get("net_arch", [])):
-        for each in arch.values() if isinstance(arch, dict) else [arch]:
-            if not isinstance(each, list) or not all(type(width) is int and width >= 1 for width in each):
-                raise FileFormatError(f"its net_arch is {str(arch)[:80]}; expected widths of layers")
-            layers += len(each)
+    for widths in _architectures(hyperparameters):
+        if not isinstance(widths, list) or not all(type(width) is int and width >= 1 for width in widths):
+            raise FileFormatError(f"its net_arch is {str(widths)[:80]}; expected widths of layers")
+        layers += len(widths)
     if layers > 2 * len(entry.arrays) + 8:
         raise FileFormatError(f"its hyperparameters ask for {layers:,} layers that its network does not have")
     space = {"state_space": task.space} if task.observation == "index" else {}
@@ -149,6 +150,13 @@ def _check_sizes(entry: Entry, task: Task, hyperparameters: dict[str, Any]) -> N
     size = math.prod(observation.space.shape or (1,))
     if size > LARGEST_OBSERVATION:
         raise FileFormatError(f"its observations have {size:,} entries; expected at most {LARGEST_OBSERVATION:,}")
+
+
+def _architectures(hyperparameters: Mapping[str, Any]) -> Iterator[Any]:
+    """The widths of layers that hyperparameters ask for, of each part of the network, as they say them."""
+    for options in (hyperparameters, hyperparameters.get("policy_kwargs", {})):
+        architecture = options.get("net_arch", [])
+        yield from architecture.values() if isinstance(architecture, dict) else [architecture]
 
 
 def _check_arrays(entry: Entry, env: "VecEnv", hyperparameters: dict[str, Any]) -> None:
@@ -164,9 +172,8 @@ def _check_arrays(entry: Entry, env: "VecEnv", hyperparameters: dict[str, Any]) 
             env.observation_space, **kwargs.get("features_extractor_kwargs", {})
         )
     expected = {tuple(each.shape) for each in features.state_dict().values()}
-    for arch in (hyperparameters.get("net_arch", []), kwargs.get("net_arch", [])):
-        for layers in arch.values() if isinstance(arch, dict) else [arch]:
-            expected |= {(after, before) for before, after in itertools.pairwise((features.features_dim, *layers))}
+    for widths in _architectures(hyperparameters):
+        expected |= {(after, before) for before, after in itertools.pairwise((features.features_dim, *widths))}
     shapes = {array.shape for array in entry.arrays.values() if array.dtype == np.float32}
     if missing := sorted(expected - shapes):
         raise FileFormatError(f"its hyperparameters ask for layers {missing[:3]} that its network does not have")
@@ -178,11 +185,6 @@ def _check_arrays(entry: Entry, env: "VecEnv", hyperparameters: dict[str, Any]) 
 # Verification ---------------------------------------------------------------------------------------------------------
 
 
-TOLERANCE = 1e-6
-MAX_STATES = 10_000_000
-REACHED = 100_000
-MAX_HORIZON = 100_000
-MAX_SECONDS = 600.0
 SMALLEST_CHANCE = 1e-12
 SHARE_OF_MEMORY = 0.9
 SEED = 1
@@ -255,16 +257,13 @@ class Verdict:
         return self.entry.claim.exact and not self.exact
 
 
+@takes(Limits)
 def verify(
     file: str | os.PathLike,
     *,
     trust: bool = False,
-    tolerance: float = TOLERANCE,
-    max_states: int = MAX_STATES,
-    max_reached: int = REACHED,
-    max_horizon: int = MAX_HORIZON,
-    max_seconds: float = MAX_SECONDS,
     values: MutableMapping[str, TaskValues] | None = None,
+    **options: Any,
 ) -> Verdict:
     """Compute the value and the regret of an entry's policy again, and compare them with its claim.
 
@@ -276,30 +275,24 @@ def verify(
     Args:
         trust: whether code that the entry names may be imported: an environment, observation or agent that is no part
             of pharos or Stable-Baselines3. It comes from this machine; no file of an entry holds any.
-        tolerance: how far exact numbers may be apart, for rounding of networks on another processor; times V* where
-            that is larger than 1.
-
-        Cost only:
-        max_states: StateSpaceTooLarge beyond. A table says itself how many states there are.
-        max_reached: up to so many reached states a value is exact.
-        max_horizon: of values, in steps.
-        max_seconds: by the clock, for all of it; counted in the main thread alone, and not on Windows.
         values: filled with the values of each task, for the entries that follow.
+        options: of `Limits`: tolerance; beyond max_states, max_horizon or max_seconds an entry is refused, and beyond
+            max_reached states that its policy reaches the value is estimated.
     Raises:
         ParameterError: there is no such file. FileFormatError: it is no entry, or not one of this version of the rules.
         ResultCorrupted: it was cut short or changed. UntrustedCode: it names code, and is not trusted.
         StateSpaceTooLarge: it has more states. TimeLimit: it takes longer.
     """
-    began, path = time.perf_counter(), Path(file)
+    began, path, limits = time.perf_counter(), Path(file), Limits(**options)
     entry = read(path)
     for name, steps in (("horizon", entry.config.horizon or 0), ("reward_delay", entry.config.chance.reward_delay)):
-        if steps > max_horizon:
-            raise FileFormatError(f"{path}: its {name} is {steps:,} steps; expected at most {max_horizon:,}")
+        if steps > limits.max_horizon:
+            raise FileFormatError(f"{path}: its {name} is {steps:,} steps; expected at most {limits.max_horizon:,}")
     try:
-        with _time_limit(max_seconds), _memory_limit():
-            task = _task(entry, trust, max_states, values)
+        with _time_limit(limits.max_seconds), _memory_limit():
+            task = _task(entry, trust, limits.max_states, values)
             policy = policy_of(entry, task, trust=trust)
-            evaluation = evaluate_agent(policy, task, max_states=max_reached, seed=SEED)
+            evaluation = evaluate_agent(policy, task, max_states=limits.max_reached, seed=SEED)
             reference, range_of_returns = task.reference, task.return_range
     except (TimeLimit, UntrustedCode, StateSpaceTooLarge) as error:
         raise type(error)(f"{path}: {str(error)[:LONGEST_TEXT]}") from None
@@ -310,7 +303,7 @@ def verify(
             raise
         raise FileFormatError(f"{path}: asks for more memory than there is: {error}") from None
     claim = entry.claim
-    slack = tolerance * max(1.0, abs(reference.optimal)) + reference.error_bound
+    slack = limits.tolerance * max(1.0, abs(reference.optimal)) + reference.error_bound
     apart = slack + evaluation.error_bound + (min(claim.error_bound, slack) if claim.exact else claim.error_bound)
     lost, spread = regret(evaluation.value, reference), reference.spread()
     checks = (
@@ -334,13 +327,8 @@ def verify(
         checks,
         time.perf_counter() - began,
         _objections(claim, reference, spread if math.isfinite(spread) else float(np.ptp(range_of_returns)), slack),
-        {
-            "states": max_states,
-            "reached": max_reached,
-            "horizon": max_horizon,
-            "seconds": max_seconds,
-            "bytes": LARGEST_FILE,
-        },
+        {name: getattr(limits, f"max_{name}") for name in ("states", "reached", "horizon", "seconds")}
+        | {"bytes": LARGEST_FILE},
     )
 
 

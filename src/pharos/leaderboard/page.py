@@ -11,25 +11,18 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
 from pharos.environments import instance_name
 from pharos.errors import ParameterError
 from pharos.leaderboard.entry import SUFFIX, Entry
-from pharos.leaderboard.verification import (
-    MAX_HORIZON,
-    MAX_SECONDS,
-    MAX_STATES,
-    REACHED,
-    TOLERANCE,
-    Verdict,
-    task_key,
-    verify,
-)
+from pharos.leaderboard.limits import Limits
+from pharos.leaderboard.verification import Verdict, task_key, verify
 from pharos.observations import title as observation_title
 from pharos.system import storage
+from pharos.system.records import takes
 from pharos.system.wording import in_one_line, in_words, templates
 from pharos.training import TaskValues
 
@@ -112,18 +105,15 @@ COLUMNS = (
 )
 
 
+@takes(Limits)
 def board(
     folder: str | os.PathLike,
     out: str | os.PathLike,
     *,
     title: str = "Leaderboard",
     trust: bool = False,
-    tolerance: float = TOLERANCE,
-    max_states: int = MAX_STATES,
-    max_reached: int = REACHED,
-    max_horizon: int = MAX_HORIZON,
-    max_seconds: float = MAX_SECONDS,
     progress: Progress | None = None,
+    **options: Any,
 ) -> Board[Verdict]:
     """Verify every entry in a folder, and write a page that ranks them; entries of one task share its solution.
 
@@ -131,8 +121,8 @@ def board(
         folder: entries, *.safetensors, in it and below.
         out: the page, one self-contained file of HTML.
         title: of the page.
-        trust, tolerance, max_states, max_reached, max_horizon, max_seconds: as for `verify`, for each entry.
         progress: called with how many entries are done, how many there are, and the next one.
+        trust, options: as for `verify`, for each entry.
     Returns:
         What holds and what was refused; those refused stand at the end of the page, with the reason.
     Raises:
@@ -146,16 +136,7 @@ def board(
     made, values = Board[Verdict](Path(out)), dict[str, TaskValues]()
 
     def judged(path: Path) -> tuple[Verdict, str]:
-        verdict = verify(
-            path,
-            trust=trust,
-            tolerance=tolerance,
-            max_states=max_states,
-            max_reached=max_reached,
-            max_horizon=max_horizon,
-            max_seconds=max_seconds,
-            values=values,
-        )
+        verdict = verify(path, trust=trust, values=values, **options)
         return verdict, "" if verdict.holds else why_not(verdict)
 
     made.judge([(path.relative_to(place).as_posix(), path) for path in files], judged, progress)
