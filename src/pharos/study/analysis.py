@@ -6,14 +6,21 @@ What the paper printed, as tables: the returns of its appendix C and the fits of
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.errors import ParameterError
 from pharos.study.blocks import Run
-from pharos.study.regression import MEASURES, Fit, aggregate_r_squared, fit, leave_one_class_out_r_squared
+from pharos.study.regression import (
+    MEASURES,
+    Fit,
+    aggregate_r_squared,
+    fit,
+    fit_models,
+    leave_one_class_out_r_squared,
+)
 from pharos.study.statistics import mean_of_means, stratified_interval
 from pharos.study.tables import paper_instance
 from pharos.training import bootstrap_interval
@@ -87,47 +94,21 @@ def models(
     if len(rows) == 0:
         notes.append(f"no cell of {agent} has all measures: there are no models")
         return Models(regret, [], notes, None, None, None, agent=agent)
-    fits = _fits(rows, used, notes)
-    outside, is_fitted = None, any(part.model == "single" for part in fits)
-    try:
-        if is_fitted:
-            outside = leave_one_class_out_r_squared(rows, measures=used)
-    except ParameterError as error:
-        notes.append(str(error))
+    fits, more = fit_models(rows, used)
+    notes += more
+    outside = alone = None
+    if any(part.model == "single" for part in fits):
+        alone = fit(rows.reset_index(drop=True), "single", "all", ["observation", "environment"]).r_squared
+        try:
+            outside = leave_one_class_out_r_squared(rows, used)
+        except ParameterError as error:
+            notes.append(str(error))
     together = (_together(fits, "representation"), _together(fits, "class"))
-    alone = _class_alone(rows) if is_fitted else None
     return Models(regret, fits, notes, *together, outside, alone, agent)
 
 
 def _has_positive(rows: "pd.DataFrame", measure: str) -> bool:
     return measure in rows and bool((np.isfinite(rows[measure].to_numpy(float)) & (rows[measure] > 0)).any())
-
-
-def _fits(rows: "pd.DataFrame", measures: Sequence[str], notes: list[str]) -> list[Fit]:
-    """The models that there are enough rows for; a note for each other."""
-    kinds: list[tuple[str, str, Any, list[str]]] = [("single", "all", rows, ["observation", "environment"])]
-    for observation, part in rows.groupby("observation", sort=True):
-        kinds.append(("representation", str(observation), part, ["environment"]))
-    for environment, part in rows.groupby("environment", sort=True):
-        kinds.append(("class", str(environment), part, ["observation"]))
-    fits: list[Fit] = []
-    for model, subset, part, dummies in kinds:
-        try:
-            fits.append(fit(part.reset_index(drop=True), model, subset, [*dummies, *measures]))
-        except ParameterError as error:
-            notes.append(str(error))
-            continue
-        if dropped := fits[-1].dropped:
-            notes.append(
-                f"the {model} model of {subset} leaves out {', '.join(dropped)}: constant, or a combination of the "
-                f"others"
-            )
-    return fits
-
-
-def _class_alone(rows: "pd.DataFrame") -> float:
-    """R2 of class and representation, without measures."""
-    return fit(rows.reset_index(drop=True), "single", "all", ["observation", "environment"]).r_squared
 
 
 def _together(fits: Sequence[Fit], model: str) -> float | None:

@@ -64,25 +64,32 @@ class Fit:
     design: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
 
 
-def fit_models(data: "pd.DataFrame", *, measures: Sequence[str] = MEASURES) -> list[Fit]:
+def fit_models(rows: "pd.DataFrame", measures: Sequence[str] = MEASURES) -> tuple[list[Fit], list[str]]:
     """The single model (equation 7), one model a representation (8), one model a class (9).
 
-    A representation or class whose regrets are all the same has no model.
-
-    Raises:
-        ParameterError: a column is missing, a measure is not positive (its logarithm is needed), there are too few
-            rows, or all regrets are the same.
+    Returns:
+        The models that there are enough rows for, and a line for each other and for predictors that are left out.
     """
-    checked = _checked(data, measures)
-    fits = [fit(checked, "single", "all", ["observation", "environment", *measures])]
+    kinds: list[tuple[str, str, pd.DataFrame, list[str]]] = [("single", "all", rows, ["observation", "environment"])]
     for model, column, other in (
         ("representation", "observation", "environment"),
         ("class", "environment", "observation"),
     ):
-        for name, rows in checked.groupby(column, sort=True):
-            if np.ptp(rows["regret"]) > 0:
-                fits.append(fit(rows, model, str(name), [other, *measures]))
-    return fits
+        kinds += [(model, str(name), part, [other]) for name, part in rows.groupby(column, sort=True)]
+    fits: list[Fit] = []
+    notes: list[str] = []
+    for model, subset, part, dummies in kinds:
+        try:
+            fits.append(fit(part.reset_index(drop=True), model, subset, [*dummies, *measures]))
+        except ParameterError as error:
+            notes.append(str(error))
+            continue
+        if dropped := fits[-1].dropped:
+            notes.append(
+                f"the {model} model of {subset} leaves out {', '.join(dropped)}: constant, or a combination of the "
+                f"others"
+            )
+    return fits, notes
 
 
 def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]) -> Fit:
@@ -171,45 +178,26 @@ def aggregate_r_squared(fits: Sequence[Fit]) -> float:
     return r_squared(actual, actual - np.concatenate([fit.fitted for fit in fits]))
 
 
-def leave_one_class_out_r_squared(data: "pd.DataFrame", *, measures: Sequence[str] = MEASURES) -> float:
+def leave_one_class_out_r_squared(rows: "pd.DataFrame", measures: Sequence[str] = MEASURES) -> float:
     """R2 of predictions for each class by a model fitted on the others (representation and measures only).
 
     Returns:
         NaN where all regrets are the same.
     Raises:
-        ParameterError: a column is missing, a measure is not positive, or there is one class alone.
+        ParameterError: there is one class alone.
     """
     import statsmodels.formula.api as smf
 
-    checked = _checked(data, measures)
-    predicted = np.empty(len(checked))
-    for environment in checked["environment"].unique():
-        inside = (checked["environment"] == environment).to_numpy()
+    predicted = np.empty(len(rows))
+    for environment in rows["environment"].unique():
+        inside = (rows["environment"] == environment).to_numpy()
         if inside.all():
             raise ParameterError(f"leaving one class out needs at least two classes; found only {environment!r}")
-        terms, _, _ = _independent(checked[~inside], ["observation", *measures])
-        result = smf.ols("regret ~ " + (" + ".join(terms) or "1"), checked[~inside]).fit()
-        predicted[inside] = result.predict(checked[inside])
-    actual = checked["regret"].to_numpy(float)
+        terms, _, _ = _independent(rows[~inside], ["observation", *measures])
+        result = smf.ols("regret ~ " + (" + ".join(terms) or "1"), rows[~inside]).fit()
+        predicted[inside] = result.predict(rows[inside])
+    actual = rows["regret"].to_numpy(float)
     return r_squared(actual, actual - predicted)
-
-
-def _checked(data: "pd.DataFrame", measures: Sequence[str]) -> "pd.DataFrame":
-    for column in ("environment", "observation", "regret", *measures):
-        if column not in data.columns:
-            raise ParameterError(
-                f"the study's table has no column {column!r}; found {', '.join(map(str, data.columns))}"
-            )
-    for column in ("regret", *measures):
-        values = data[column].to_numpy(float)
-        if not np.isfinite(values).all():
-            raise ParameterError(
-                f"column {column!r} has {int((~np.isfinite(values)).sum())} values that are not finite"
-            )
-    for column in measures:
-        if (data[column] <= 0).any():
-            raise ParameterError(f"column {column!r} has values <= 0; the models take its logarithm")
-    return data.reset_index(drop=True)
 
 
 def _independent(rows: "pd.DataFrame", predictors: Sequence[str]) -> tuple[list[str], int, list[str]]:

@@ -85,21 +85,6 @@ def stratified_interval(
     return Estimate(float(statistic(*arrays, axis=-1)), float(lower), float(upper), confidence)
 
 
-def performance_profile(tasks: Sequence[np.ndarray], thresholds: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Return the share of runs whose score exceeds each threshold: the run-score distribution of section 4.2.
-
-        F(tau) = mean over tasks of the share of the task's runs with a score above tau
-
-    Args:
-        tasks: for each task the scores of its runs along `axis`.
-        thresholds: (T,) values of tau.
-    Returns:
-        (..., T), for each entry of the other axes.
-    """
-    shares = [(np.moveaxis(task, axis, -1)[..., None, :] > thresholds[:, None]).mean(axis=-1) for task in tasks]
-    return np.mean(shares, axis=0)
-
-
 def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], axis: int = -1) -> Any:
     """Return how probable it is that a run of ours scores higher than one of theirs on a task drawn at random.
 
@@ -127,6 +112,8 @@ IMPROVEMENT_COLUMNS = ["environment", "ours", "theirs", "tasks", "probability", 
 def profiles(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame":
     """The performance profile of each agent and observation on each class, with 95 % stratified bootstrap intervals.
 
+        F(tau) = mean over tasks of the share of the task's runs with a score above tau   (section 4.2)
+
     Args:
         runs: as from `table`.
     Returns:
@@ -149,7 +136,7 @@ def profiles(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame":
                     "agent": agent,
                     "observation": observation,
                     "score": THRESHOLDS,
-                    "share": performance_profile(tasks, THRESHOLDS),
+                    "share": mean_of_means(*above),
                     "lower": lower,
                     "upper": upper,
                     "tasks": len(tasks),
