@@ -110,29 +110,31 @@ def progress_line(what: str, *, logged: bool = False) -> Iterator[Callable[[str]
 
 
 @contextlib.contextmanager
-def progress_bar(what: str, total: int, before: str = "") -> Iterator[Callable[[int, str], None]]:
-    """A bar on standard error, on a terminal: call it with how much is done and a text. Nothing is shown elsewhere.
+def progress_bar(what: str, total: int, before: str = "") -> Iterator[Callable[..., None]]:
+    """A bar on standard error, on a terminal: call it with how much is done, a text, and the total where that changes.
+
+    Nothing is shown elsewhere.
 
     Args:
         before: what happens until the first call.
     """
     screen = console(stderr=True)
     if not screen.is_terminal:
-        yield lambda _done, _text: None
+        yield lambda _done, _text, _total=None: None
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"), TimeRemainingColumn())
     with Progress(*columns, console=screen, transient=True) as bar:
         task = bar.add_task(what, total=total, text=before)
-        yield lambda done, text: bar.update(task, completed=done, text=text)
+        yield lambda done, text, total=None: bar.update(task, completed=done, text=text, total=total)
 
 
 @contextlib.contextmanager
 def counted_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
     """A bar that is called with how many of how many are done, and the name of the next one."""
     with progress_bar(what, 1) as show:
-        yield lambda done, total, text: show(done, f"{done} of {total}: {text}")
+        yield lambda done, total, text: show(done, f"{done} of {total}: {text}", total)
 
 
 def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:

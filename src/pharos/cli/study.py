@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, complain, console, print_table, progress_line, termination
+from pharos.cli.answers import Answer, complain, console, print_table, progress_bar, progress_line, termination
 from pharos.cli.command import Commands
 from pharos.cli.options import Count, Trust
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
@@ -132,8 +132,7 @@ def run(
             {"jobs": names}, submitted if jobs else "nothing is missing; `pharos study report` shows the results"
         )
     logs = None if log is None else study.RunLog(opened, place, log)
-    with _progress() as shown, termination():
-        tell = shown if logs is None else _logging(logs, shown)
+    with _progress(logs) as tell, termination():
         if on == "ray":
             end = study.run_on_ray(opened, place, address=address, progress=tell, **options)
         else:
@@ -144,20 +143,6 @@ def run(
     if logs is not None:
         logs.update()
     return _answer(end, failed=bool(end.failed))
-
-
-def _logging(logs: "RunLog", progress: "Callable[[Status], None]") -> "Callable[[Status], None]":
-    """Progress that also writes the curves of runs that have finished, every LINE_SECONDS at most."""
-    written = time.monotonic()
-
-    def tell(status: "Status") -> None:
-        nonlocal written
-        progress(status)
-        if time.monotonic() - written > LINE_SECONDS:
-            logs.update()
-            written = time.monotonic()
-
-    return tell
 
 
 def _say(forecast: object) -> None:
@@ -320,30 +305,22 @@ def _answer(status: "Status", failed: bool = False) -> Answer:
 
 
 @contextlib.contextmanager
-def _progress() -> "Iterator[Callable[[Status], None]]":
-    """A bar on a terminal; elsewhere a line on standard error now and then."""
-    if not sys.stderr.isatty():
-        last_line = time.monotonic()
+def _progress(logs: "RunLog | None") -> "Iterator[Callable[[Status], None]]":
+    """A bar on a terminal, elsewhere a line on standard error every LINE_SECONDS; as often curves are written."""
+    with progress_bar("runs", 1) as show:
+        latest = time.monotonic()
 
-        def say(status: "Status") -> None:
-            nonlocal last_line
-            if time.monotonic() - last_line > LINE_SECONDS:
-                last_line = time.monotonic()
-                complain(status)
+        def tell(status: "Status") -> None:
+            nonlocal latest
+            show(status.finished + status.failed, str(status), status.total)
+            if time.monotonic() - latest > LINE_SECONDS:
+                if not sys.stderr.isatty():
+                    complain(status)
+                if logs is not None:
+                    logs.update()
+                latest = time.monotonic()
 
-        yield say
-        return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    with Progress(
-        BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=console(stderr=True)
-    ) as bar:
-        task = bar.add_task("", total=None)
-
-        def show(status: "Status") -> None:
-            bar.update(task, total=status.total, completed=status.finished + status.failed, description=str(status))
-
-        yield show
+        yield tell
 
 
 def _steps(study: "Specification") -> int:

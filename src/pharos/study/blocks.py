@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +17,7 @@ from pharos.system.sources import is_reference
 from pharos.training import ENGINES, ChanceSetting, Horizon, RunConfig
 
 try:
+    import yaml  # noqa: F401  (first of all here: what is missing is told once, for all files of the package)
     from pydantic import (
         BaseModel,
         BeforeValidator,
@@ -294,54 +296,46 @@ class Specification(_Part):
 
     def runs_of(self, block: Block) -> Iterator[Run]:
         """The runs of one block."""
-        steps = block.steps or self.steps
-        evaluations = block.evaluations or self.evaluations
-        gamma = self.gamma if block.gamma is None else block.gamma
-        horizon = self.horizon if block.horizon is None else block.horizon
-        for environment in block.environments:
-            for chance in block.chance:
-                for agent in block.agents:
-                    engine = self.engine_of(block, agent)
-                    agent_from = agent_source(agent, self.folder, check=False)
-                    observations: Sequence[ObservationEntry] = environment.observations or block.observations
-                    if agent_kind(agent).is_tabular:
-                        observations = [ObservationEntry(name=TABULAR_OBSERVATION)]
-                    for observation in observations:
-                        sources = {
-                            "environment": source_of(type(environment.instance)),
-                            "observation": None if observation.own is None else observation.own.source,
-                            "agent": agent_from,
-                        }
-                        observation_name = str(observation.own or observation.name)
-                        for seed in block.seeds or self.seeds:
-                            yield Run(
-                                RunConfig(
-                                    environment=environment.instance.name,
-                                    parameters=_jsonable(environment.instance.parameters),
-                                    chance=chance,
-                                    observation=observation_name,
-                                    observation_options=dict(observation.options),
-                                    agent=agent if agent_from is None else agent_from.name,
-                                    hyperparameters=self._hyperparameters(
-                                        block, agent, environment.instance.name, observation_name
-                                    ),
-                                    steps=steps,
-                                    seed=seed,
-                                    gamma=gamma,
-                                    horizon=Horizon.of(horizon).steps(environment.instance),
-                                    evaluation_interval=max(1, steps // evaluations),
-                                    engine=engine,
-                                    sources={part: source for part, source in sources.items() if source is not None},
-                                ),
-                                environment.label,
-                                engine,
-                                environment.counts_as,
-                                block.setting,
-                            )
+        names = ("steps", "evaluations", "gamma", "horizon", "seeds")
+        steps, evaluations, gamma, horizon, seeds = (self.said(block, name) for name in names)
+        for environment, chance, agent in product(block.environments, block.chance, block.agents):
+            instance, agent_from = environment.instance, agent_source(agent, self.folder, check=False)
+            observations: Sequence[ObservationEntry] = environment.observations or block.observations
+            if agent_kind(agent).is_tabular:
+                observations = [ObservationEntry(name=TABULAR_OBSERVATION)]
+            for observation, seed in product(observations, seeds):
+                sources = {
+                    "environment": source_of(type(instance)),
+                    "observation": None if observation.own is None else observation.own.source,
+                    "agent": agent_from,
+                }
+                observation_name, engine = str(observation.own or observation.name), self.engine_of(block, agent)
+                config = RunConfig(
+                    environment=instance.name,
+                    parameters=_jsonable(instance.parameters),
+                    chance=chance,
+                    observation=observation_name,
+                    observation_options=dict(observation.options),
+                    agent=agent if agent_from is None else agent_from.name,
+                    hyperparameters=self._hyperparameters(block, agent, instance.name, observation_name),
+                    steps=steps,
+                    seed=seed,
+                    gamma=gamma,
+                    horizon=Horizon.of(horizon).steps(instance),
+                    evaluation_interval=max(1, steps // evaluations),
+                    engine=engine,
+                    sources={part: source for part, source in sources.items() if source is not None},
+                )
+                yield Run(config, environment.label, engine, environment.counts_as, block.setting)
+
+    def said(self, block: Block, name: str) -> Any:
+        """What a block says, or else the study."""
+        own = getattr(block, name)
+        return getattr(self, name) if own is None else own
 
     def engine_of(self, block: Block, agent: str) -> str:
         """What trains an agent of a block: "sb3" or "batched"."""
-        said = self.engine if block.engine is None else block.engine
+        said = self.said(block, "engine")
         return said if isinstance(said, str) else said.get(agent, "sb3")
 
     def _hyperparameters(self, block: Block, agent: str, environment: str, observation: str) -> dict[str, Any]:

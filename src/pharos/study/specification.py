@@ -30,9 +30,10 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import BaseModel, ValidationError
 
 from pharos.agents import AGENTS, BATCHED, agent_source, is_known
-from pharos.errors import MissingExtra, ParameterError, UnknownName, UntrustedCode
+from pharos.errors import ParameterError, UnknownName, UntrustedCode
 from pharos.study.blocks import (
     MOST_RUNS,
     Block,
@@ -120,13 +121,6 @@ def _check_keys(node: "yaml.Node", name: str) -> None:
         lines[key.value] = line
 
 
-try:
-    import yaml
-    from pydantic import BaseModel, ValidationError
-except ImportError as error:
-    raise MissingExtra("a study", str(error.name), "study") from error
-
-
 STUDIES = "studies"
 GIVEN = "given"
 STUDY_FILE = "study.yaml"
@@ -203,13 +197,7 @@ def given_environments(file: str | os.PathLike, *, trust: bool = False) -> list[
         ParameterError: it is no such list. UntrustedCode: it names code, and is not trusted.
     """
     path = Path(file)
-    text = _text_of(path)
-    try:
-        entries = yaml.load(text, Loader)
-    except yaml.YAMLError as error:
-        raise ParameterError(f"{path}: {getattr(error, 'problem', None) or 'this is no YAML'}") from error
-    except (ValueError, RecursionError, OverflowError) as error:
-        raise ParameterError(f"{path}: {' '.join(str(error).split())}") from error
+    _, entries = _nodes_and_data(_text_of(path), str(path))
     if not isinstance(entries, list) or not entries or not all(isinstance(each, str | dict) for each in entries):
         raise ParameterError(
             f"{path}: expected a list of environments, such as `- taxi/5x5` and `- {{name: taxi, ...}}`"
@@ -251,8 +239,8 @@ def _studies_here() -> list[str]:
 def study_name(file: Path) -> str | None:
     """The name in a YAML file of a study, which is not looked at otherwise; None where there is none."""
     try:
-        data = yaml.load(_text_of(file), Loader)
-    except (yaml.YAMLError, ParameterError, ValueError, RecursionError, OverflowError):
+        _, data = _nodes_and_data(_text_of(file), str(file))
+    except ParameterError:
         return None
     name = data.get("name") if isinstance(data, dict) else None
     return name if isinstance(name, str) else None
@@ -288,12 +276,21 @@ def parse(
         trust: whether they may be imported.
         entries: the environments of blocks that say `environments: given`.
     """
+    root, data = _nodes_and_data(text, name)
+    if root is None:
+        raise ParameterError(f"{name}: is empty; expected a mapping with name and blocks")
+    if not isinstance(data, dict):
+        raise ParameterError(f"{name}:1: found {type(data).__name__}; expected a mapping with name and blocks")
+    return _validated(data, name, root, folder or Path.cwd(), trust, entries)
+
+
+def _nodes_and_data(text: str, name: str) -> tuple["yaml.Node | None", Any]:
+    """The root of a text in YAML, and what it says; None for an empty one."""
     try:
         root = yaml.compose(text, Loader)
-        if root is None:
-            raise ParameterError(f"{name}: is empty; expected a mapping with name and blocks")
-        check_nodes(root, name)
-        data = yaml.load(text, Loader)
+        if root is not None:
+            check_nodes(root, name)
+        return root, yaml.load(text, Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = f"{name}:{mark.line + 1}" if mark is not None else name
@@ -305,9 +302,6 @@ def parse(
         raise
     except (ValueError, OverflowError) as error:  # numbers and dates that Python cannot hold
         raise ParameterError(f"{name}: {' '.join(str(error).split())}") from error
-    if not isinstance(data, dict):
-        raise ParameterError(f"{name}:1: found {type(data).__name__}; expected a mapping with name and blocks")
-    return _validated(data, name, root, folder or Path.cwd(), trust, entries)
 
 
 def _validated(
@@ -377,7 +371,7 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
             yield ("defaults", agent), str(UnknownName("agent", agent, AGENTS))
     for i, block in enumerate(specification.blocks):
         kinds = len(block.environments) * len(block.chance) * len(block.agents) * len(block.observations)
-        number += kinds * len(block.seeds or specification.seeds)
+        number += kinds * len(specification.said(block, "seeds"))
         if number > MOST_RUNS:
             yield ("blocks", i), f"{number:,} runs up to here; a study has at most {MOST_RUNS:,}"
             return
@@ -386,10 +380,9 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
                 _ = entry.instance
             except ParameterError as error:
                 yield ("blocks", i, "environments", j), str(error)
-        gamma = specification.gamma if block.gamma is None else block.gamma
-        if (block.horizon or specification.horizon) == "none" and gamma == 1:
+        if specification.said(block, "horizon") == "none" and specification.said(block, "gamma") == 1:
             yield ("blocks", i), "gamma is 1 and horizon is none, so values may be infinite; expected a gamma below 1"
-        said = specification.engine if block.engine is None else block.engine
+        said = specification.said(block, "engine")
         for agent in said if isinstance(said, dict) else ():
             if not _is_agent(agent):
                 where: Loc = ("engine",) if block.engine is None else ("blocks", i, "engine")
