@@ -115,7 +115,7 @@ def test_a_reader_points_at_curves_hides_lines_and_sorts_tables(tmp_path):
     )
     drawn = {"regret": {"light": b"light", "dark": b"dark", "curves": curves.to_json().encode()}}
     data = pd.DataFrame({"agent": ["a10", "a9", "a1"], "iqm": ["≈ 0.5", "1,234", "–"]})
-    sections = [Section.of("Regret", "regret", figure=image(drawn, "regret", "caption"), table=table(data))]
+    sections = [Section("Regret", "regret", figure=image(drawn, "regret", "caption"), table=table(data))]
     page = render("a study", "", sections)
     used = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page).replace("</body>", USED + "</body>")
     (tmp_path / "used.html").write_text(used)

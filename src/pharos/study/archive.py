@@ -75,10 +75,7 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
     for field in pa.unify_schemas([curve.schema for curve in curves]):
         lists = [curve.column(field.name).to_pylist() if field.name in curve.column_names else None for curve in curves]
         columns[field.name] = pa.array(lists, pa.list_(field.type))
-    described = study.model_dump(mode="json", exclude_unset=True)
-    if "folder" in described:
-        described["folder"] = "."
-    text = yaml.safe_dump(described, sort_keys=False, width=120)
+    text = study.to_yaml(folder=".")
     runs = zip(ids, records, curves, strict=True)
     digests = {"study": storage.digest_of_json(text), "runs": {id: _digest(id, *rest) for id, *rest in runs}}
     metadata = {_STUDY: text.encode(), _FORMAT: str(FORMAT).encode(), _DIGESTS: json.dumps(digests).encode()}

@@ -127,13 +127,14 @@ class Batches:
 
     def look(self) -> None:
         """Which batches have checkpoints: their runs stay together."""
-        self.stored = {id: ids for ids in self._stored_ids() for id in ids}
+        self.stored = {id: ids for ids in self._checkpoints().values() for id in ids}
 
-    def _stored_ids(self) -> list[frozenset[str]]:
-        batches = []
+    def _checkpoints(self) -> dict[Path, frozenset[str]]:
+        """Folder -> ids of the runs of the batch."""
+        batches = {}
         for file in self.folder.glob("*/batch.json"):
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                batches.append(frozenset(storage.read_json(file)["ids"]))
+                batches[file.parent] = frozenset(storage.read_json(file)["ids"])
         return batches
 
     def unit(self, run: Run, pending: "deque[tuple[float, Run]]") -> tuple[Run, ...]:
@@ -205,18 +206,12 @@ class Batches:
 
     def halve(self, unit: Sequence[Run]) -> None:
         """The process of this batch was killed too often: its runs go on in halves, from the beginning."""
-        for run in unit:
-            self.most[run.id] = max(1, len(unit) // 2)
-        self.forget(unit)
-
-    def forget(self, unit: Sequence[Run]) -> None:
-        """Remove the checkpoints in which these runs are."""
         ids = {run.id for run in unit}
-        for file in self.folder.glob("*/batch.json"):
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                if ids & set(storage.read_json(file)["ids"]):
-                    shutil.rmtree(file.parent, ignore_errors=True)
-        self.stored = {id: others for id, others in self.stored.items() if not others & ids}
+        self.most |= dict.fromkeys(ids, max(1, len(unit) // 2))
+        for folder, others in self._checkpoints().items():
+            if ids & others:
+                shutil.rmtree(folder, ignore_errors=True)
+        self.look()
 
 
 def most_states(environment: Environment) -> float:

@@ -17,7 +17,7 @@ from pharos.system.sources import is_reference
 from pharos.training import ENGINES, ChanceSetting, Horizon, RunConfig
 
 try:
-    import yaml  # noqa: F401  (first of all here: what is missing is told once, for all files of the package)
+    import yaml
     from pydantic import (
         BaseModel,
         BeforeValidator,
@@ -293,6 +293,12 @@ class Specification(_Part):
             replace(run, observation=run._title(whole=True)) if run.observation in shared else run
             for run in runs.values()
         )
+
+    def to_yaml(self, **changes: object) -> str:
+        """As a YAML file says it; with other values for what it says."""
+        said = self.model_dump(mode="json", exclude_unset=True)
+        said |= {name: value for name, value in changes.items() if name in said}
+        return yaml.safe_dump(said, sort_keys=False, width=120)
 
     def runs_of(self, block: Block) -> Iterator[Run]:
         """The runs of one block."""

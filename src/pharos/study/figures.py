@@ -359,23 +359,29 @@ def returns_table(cells: "pd.DataFrame", environment: str) -> str:
     """
     import pandas as pd
 
-    part = cells[cells["environment"] == environment]
-    rows: dict[tuple[str, str], dict[tuple[str, str], str]] = {}
-    for row in part.to_dict("records"):
-        kind = row["chance"] if "," in row["chance"] else CHANCES.get(row["chance"].split()[0], row["chance"])
-        name = rf"{{\small {latex_text(row['instance'])}}}"
-        entries = rows.setdefault((name, latex_text(kind)), {})
-        entries[row["agent"], row["observation"]] = _entry(row["return"], row["return_deviation"])
-    keys = sorted({(row.agent, row.observation) for row in part.itertuples()}, key=lambda key: (key[0] != "ppo", *key))
+    wide = wide_returns(cells, environment, lambda row: _entry(row["return"], row["return_deviation"])).fillna("--")
+    keys = list(wide)
     titles = [(latex_text(agent_name(agent)), latex_text(in_words(name))) for agent, name in keys]
     if {key for key in keys if key[1] != TABULAR_OBSERVATION} == set(COLUMNS):
         keys, titles = list(COLUMNS), [(TITLES[agent], TITLES[name]) for agent, name in COLUMNS]
-    columns = pd.MultiIndex.from_tuples(titles)
-    index = pd.MultiIndex.from_tuples(list(rows), names=["instance", "randomization"])
-    data = [[entries.get(column, "--") for column in keys] for entries in rows.values()]
-    return _latex(
-        pd.DataFrame(data, index, columns), "ll" + "c" * len(keys), multirow_align="c", clines="skip-last;data"
-    )
+    rows = []
+    for instance, chance in wide.index:
+        kind = chance if "," in chance else CHANCES.get(chance.split()[0], chance)
+        rows.append((rf"{{\small {latex_text(instance)}}}", latex_text(kind)))
+    index = pd.MultiIndex.from_tuples(rows, names=["instance", "randomization"])
+    data = pd.DataFrame(wide[keys].to_numpy(), index, pd.MultiIndex.from_tuples(titles))
+    return _latex(data, "ll" + "c" * len(keys), multirow_align="c", clines="skip-last;data")
+
+
+def wide_returns(cells: "pd.DataFrame", environment: str, text: Callable[[Mapping[str, Any]], str]) -> "pd.DataFrame":
+    """The text of each cell of a class: a row for each instance and kind of chance, a column for each agent and
+    observation, those of PPO first.
+    """
+    part = cells[cells["environment"] == environment]
+    texts = part.assign(text=[text(row) for row in part.to_dict("records")])
+    wide = texts.pivot(index=["instance", "chance"], columns=["agent", "observation"], values="text")
+    rows = list(dict.fromkeys(zip(part["instance"], part["chance"], strict=True)))
+    return wide.loc[rows, sorted(wide, key=lambda key: (key[0] != "ppo", *key))]
 
 
 def hardness_table(measured: "pd.DataFrame") -> str:

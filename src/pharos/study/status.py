@@ -187,10 +187,7 @@ def claim(study: Specification, folder: Path) -> None:
         name = study_name(file)
         if name is not None and name != study.name:
             raise ParameterError(f"{folder}: holds the study {name!r}, not {study.name!r}; choose another --out")
-    import yaml
-
-    text = yaml.safe_dump(study.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=120)
-    replace_file(file, text, devices=False)
+    replace_file(file, study.to_yaml(), devices=False)
 
 
 # Custom code ----------------------------------------------------------------------------------------------------------

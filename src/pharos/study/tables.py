@@ -346,25 +346,23 @@ def build_mdp(
 
 def _number(value: Mapping[str, Any] | float | None, exact: bool) -> dict[str, Any]:
     """A measure as one positive number: itself, or the geometric mean of an interval with a finite upper end."""
-    measure: dict[str, Any]
-    if not isinstance(value, Mapping):
-        number = None if value is None else float(value)
-        measure = {"value": number, "lower": number, "upper": number, "exact": exact}
-    elif value.get("lower") is not None and (value.get("upper") is not None or not value.get("exact", exact)):
-        lower, upper = value["lower"], value.get("upper")
-        finite = upper is not None and np.isfinite(upper)
-        number = lower if value.get("exact") else float(np.sqrt(lower * upper)) if finite else None
-        measure = {"value": number, "lower": lower, "upper": upper, "exact": bool(value.get("exact", exact))}
-        if number is None:
-            measure["why"] = f"only a lower bound of {lower:g} is proven within the budget"
+    said = value if isinstance(value, Mapping) else {"value": value}
+    exact = bool(said.get("exact", exact))
+    lower, upper, number = said.get("lower"), said.get("upper"), said.get("value")
+    why = "it is infinite or undefined"
+    if lower is None or (upper is None and exact):
+        lower = upper = number = None if number is None else float(number)
+    elif said.get("exact"):
+        number = lower
+    elif upper is not None and np.isfinite(upper):
+        number = float(np.sqrt(lower * upper))
     else:
-        number = None if value.get("value") is None else float(value["value"])
-        measure = {"value": number, "lower": number, "upper": number, "exact": bool(value.get("exact", exact))}
-    if measure["value"] is not None and not np.isfinite(measure["value"]):
-        measure = {"value": None, "why": "it is infinite"}
-    elif measure["value"] is None:
-        measure.setdefault("why", "it is infinite or undefined")
-    return measure
+        number, why = None, f"only a lower bound of {lower:g} is proven within the budget"
+    if number is not None and not np.isfinite(number):
+        return {"value": None, "why": "it is infinite"}
+    return {"value": number, "lower": lower, "upper": upper, "exact": exact} | (
+        {} if number is not None else {"why": why}
+    )
 
 
 # The paper's instances ------------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ def models_section(results: Results, figures: Figures, left_out: list[str]) -> S
     if not results.has_models:
         left_out.append(f"Hardness and regret: {results.models[0].notes[0]}.")
         return None
-    return Section.of(
+    return Section(
         "Hardness and regret", "models", parts=[_models_of(models, results, figures) for models in results.models]
     )
 
@@ -113,7 +113,7 @@ def agreement_section(results: Results, figures: Figures, left_out: list[str]) -
     if results.comparison is not None:
         text += "; the paper prints 0.81 for DQN and PPO, and the returns that it prints in appendix C give "
         text += f"{paper_agreement():.2f}"
-    return Section.of(
+    return Section(
         "Agreement of agents",
         "agreement",
         text=text + ".",
@@ -161,7 +161,7 @@ def unseen_section(
             rows = rows.sort_values("baseline", ascending=False, kind="stable")
             if len(rows):
                 parts.append(_part(str(agent), str(outcome), rows, figures))
-    return Section.of(
+    return Section(
         "Unseen classes",
         "unseen",
         text=_text(judgement),

@@ -7,8 +7,8 @@ nothing.
 import base64
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,18 +22,11 @@ Figures = Mapping[str, Mapping[str, bytes] | None]
 SHORT = 30
 
 
-@dataclass(frozen=True)
 class Section:
-    """A section of the page: its title, the template that prints it, and what that needs, by name."""
+    """A section of the page: its title, and the context for `template`.html.j2, which prints it."""
 
-    title: str
-    template: str
-    context: Mapping[str, Any] = field(default_factory=dict)
-
-    @staticmethod
-    def of(title: str, template: str, **context: object) -> "Section":
-        """The section that `template`.html.j2 prints with this context."""
-        return Section(title, f"{template}.html.j2", context)
+    def __init__(self, title: str, template: str, **context: object):
+        self.title, self.template, self.context = title, f"{template}.html.j2", context
 
     @property
     def anchor(self) -> str:

@@ -4,7 +4,7 @@ import io
 import platform
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from pharos.environments import start_distribution
 from pharos.errors import PharosError
 from pharos.plots import agent_name, slug
 from pharos.study.analysis import IMAGE, VECTOR
-from pharos.study.figures import label, pairs_of, representations_figure, returns_table
+from pharos.study.figures import label, pairs_of, representations_figure, returns_table, wide_returns
 from pharos.study.report.model_sections import agreement_section, models_section
 from pharos.study.report.page import Figures, Section, data_url, image, table
 from pharos.study.report.results import Results
@@ -78,7 +78,7 @@ def _summary(results: Results) -> Section:
     )
     errors = [f"{count} × {error}" for error, count in Counter(now.errors.values()).items()]
     damaged = list({**now.damaged, **results.damaged}.values())
-    return Section.of("Summary", "summary", lines=lines, missing=missing, errors=errors, damaged=damaged)
+    return Section("Summary", "summary", lines=lines, missing=missing, errors=errors, damaged=damaged)
 
 
 def _estimated(runs: "pd.DataFrame") -> str | None:
@@ -103,7 +103,7 @@ def _findings(results: Results) -> Section | None:
     if len(decided) == 0:
         return None
     counts = "; ".join(f"{number} x {verdict}" for verdict, number in decided["verdict"].value_counts().items())
-    return Section.of(
+    return Section(
         "Findings of the paper",
         "findings",
         counts=f"{len(decided)} of {len(results.findings)} can be looked at here: {counts}.",
@@ -130,7 +130,7 @@ def _regret(results: Results, figures: Figures) -> Section:
         ],
     )
     columns = ["environment", "agent", "observation", "tasks", "runs", "iqm", "interval"]
-    return Section.of(
+    return Section(
         "Regret",
         "regret",
         figure=image(
@@ -158,7 +158,7 @@ def _profiles(results: Results, figures: Figures) -> Section | None:
             for low, high in zip(results.improvements["lower"], results.improvements["upper"], strict=True)
         ]
     ).drop(columns=["lower", "upper"])
-    return Section.of(
+    return Section(
         "Profiles",
         "regret",
         figure=image(
@@ -207,7 +207,7 @@ def _representations(results: Results, figures: Figures, left_out: list[str]) ->
             "The paper finds the image harder in simple grid and frozen lake, "
             "the vector harder in freeway and breakout."
         )
-    return Section.of("Vector against image", "representations", parts=parts, paper=paper)
+    return Section("Vector against image", "representations", parts=parts, paper=paper)
 
 
 def _aliasing(results: Results) -> Section | None:
@@ -219,7 +219,7 @@ def _aliasing(results: Results) -> Section | None:
         index=["instance", "observation"], columns="agent", values="normalized_regret"
     ).rename(columns=lambda agent: f"regret of {agent_name(agent)}")
     shown = shown.merge(regrets.reset_index(), on=["instance", "observation"], how="left")
-    return Section.of(
+    return Section(
         "States that share an observation",
         "aliasing",
         text="These observations do not tell every state: an agent that remembers nothing cannot act differently in "
@@ -238,7 +238,7 @@ def _hardness(results: Results) -> Section:
     complete = ""
     if len(counted) and not (counted["share"] > 0).any():
         complete = "No two states share an observation, on any instance and for any observation that was counted."
-    return Section.of(
+    return Section(
         "Hardness of the instances",
         "hardness",
         table=table(
@@ -254,27 +254,15 @@ def _returns(results: Results) -> Section:
     """Returns of each class, and in LaTeX below."""
     parts = []
     for environment in dict.fromkeys(results.cells["environment"]):
-        part = results.cells[results.cells["environment"] == environment]
+        wide = wide_returns(results.cells, environment, _return).fillna("")
+        wide.columns = [label(*key) for key in wide]
         latex = returns_table(results.cells, environment)
-        parts.append({"title": in_words(environment), "table": table(_wide_returns(part)), "latex": latex})
-    return Section.of("Returns", "returns", parts=parts)
+        parts.append({"title": in_words(environment), "table": table(wide.reset_index()), "latex": latex})
+    return Section("Returns", "returns", parts=parts)
 
 
-def _wide_returns(part: "pd.DataFrame") -> "pd.DataFrame":
-    import pandas as pd
-
-    lines: dict[tuple[str, str], dict[str, Any]] = {}
-    columns = sorted(
-        {(row.agent, row.observation) for row in part.itertuples()}, key=lambda key: (key[0] != "ppo", *key)
-    )
-    for row in part.to_dict("records"):
-        line = lines.setdefault(
-            (row["instance"], row["chance"]), {"instance": row["instance"], "chance": row["chance"]}
-        )
-        deviation = f" ± {row['return_deviation']:.2f}" if row["seeds"] > 1 else ""
-        line[label(row["agent"], row["observation"])] = f"{row['return']:.2f}{deviation}"
-    names = [label(*key) for key in columns]
-    return pd.DataFrame(list(lines.values()), columns=["instance", "chance", *names]).fillna("")
+def _return(row: Mapping[str, Any]) -> str:
+    return f"{row['return']:.2f}" + (f" ± {row['return_deviation']:.2f}" if row["seeds"] > 1 else "")
 
 
 def _beside(results: Results) -> Section | None:
@@ -296,7 +284,7 @@ def _beside(results: Results) -> Section | None:
         "expected."
     )
     caption = "R² and correlation: printed, ours, and the difference, for both kinds of regret."
-    return Section.of(
+    return Section(
         "Beside the paper",
         "beside",
         regressions=table(fits, caption) if len(fits) else None,
@@ -308,7 +296,7 @@ def _beside(results: Results) -> Section | None:
 
 def _instances(study: Specification) -> Section | None:
     pictures = [{"name": name, "data": data_url(png)} for name, png in _pictures(study).items()]
-    return Section.of("Instances", "instances", pictures=pictures) if pictures else None
+    return Section("Instances", "instances", pictures=pictures) if pictures else None
 
 
 def _pictures(study: Specification) -> dict[str, bytes]:
@@ -343,15 +331,13 @@ def _each_instance(results: Results, figures: Figures) -> Section:
         drawn = image(figures, f"regret_by_task_{slug(environment)}", caption)
         parts.append({"title": f"{in_words(environment)}, each kind of chance and each seed", "figure": drawn})
     text = "Cumulative regret on each instance, all kinds of chance together."
-    return Section.of("Each instance", "each_instance", figure=image(figures, "regret_by_instance", text), parts=parts)
+    return Section("Each instance", "each_instance", figure=image(figures, "regret_by_instance", text), parts=parts)
 
 
 def _made(results: Results, left_out: Sequence[str]) -> Section:
-    import yaml
-
     import pharos
 
     made = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
     facts = f"pharos {pharos.__version__}, Python {platform.python_version()}, {made} UTC"
-    text = yaml.safe_dump(results.study.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=100)
-    return Section.of("How it was made", "made", facts=facts, left_out=list(left_out), specification=text)
+    text = results.study.to_yaml()
+    return Section("How it was made", "made", facts=facts, left_out=list(left_out), specification=text)
