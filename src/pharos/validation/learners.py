@@ -12,7 +12,7 @@ from pharos.errors import ParameterError, PharosError
 from pharos.training import RunConfig
 
 if TYPE_CHECKING:
-    from pharos.hardness import Rollouts, Sampling, Schedule
+    from pharos.hardness import Result, Rollouts, Sampling, Schedule
     from pharos.mdp import TabularMDP
     from pharos.training import Task
 
@@ -68,7 +68,7 @@ def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
         if config["agent"] in ACTOR_CRITICS:
             row |= _of_policy(config, task.mdp, options)
         if config["agent"] == "dqn":
-            row |= _of_walks(config, task.mdp, options)
+            row |= _of_walks(_sampled(config, task.mdp, options).value)
     except PharosError as error:
         return {**row, "notes": str(error)}
     row |= {"num_states": float(task.mdp.num_states), "network": f"{name}, {initialisation}"}
@@ -106,17 +106,31 @@ def _options(task: "Task", network: Network, initialisation: str, landmarks: int
     return {"horizon": task.time_limit, "representation": features}
 
 
-def _of_walks(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
-    """SAMPLED_PREDICTORS, of the learner that draws what the agent draws."""
+def _sampled(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
+    """The regret of the learner that draws what a DQN draws."""
     from pharos.hardness import report
 
     name = "sampled_regret"
-    value = report(mdp, [name], schedule=schedule_of(config), sampling=sampling_of(config), **options)[name].value
-    numbers = dict.fromkeys(SAMPLED_PREDICTORS, math.nan)
-    if value is not None:
-        parts = (value["value"], value.get("deviation", math.nan), value["descent"], value["adam"], value["tabular"])
-        numbers |= dict(zip(SAMPLED_PREDICTORS, parts, strict=True))
-    return numbers
+    return report(mdp, [name], schedule=schedule_of(config), sampling=sampling_of(config), **options)[name]
+
+
+def _actor_critic(
+    config: Mapping[str, Any], mdp: "TabularMDP", rollouts: "Rollouts", options: Mapping[str, Any]
+) -> "Result":
+    """The regret of the idealised actor-critic with the steps and the discount of an agent."""
+    from pharos.hardness import Schedule, report
+
+    name = "kernel_policy_regret"
+    schedule = Schedule(steps=config["steps"], gamma=config["hyperparameters"].get("gamma", Schedule.gamma))
+    return report(mdp, [name], schedule=schedule, rollouts=rollouts, **options)[name]
+
+
+def _of_walks(value: Mapping[str, Any] | None) -> dict[str, Any]:
+    """SAMPLED_PREDICTORS, of the learner that draws what the agent draws."""
+    if value is None:
+        return dict.fromkeys(SAMPLED_PREDICTORS, math.nan)
+    parts = (value["value"], value.get("deviation", math.nan), value["descent"], value["adam"], value["tabular"])
+    return dict(zip(SAMPLED_PREDICTORS, parts, strict=True))
 
 
 def sampling_of(config: Mapping[str, Any]) -> "Sampling":
@@ -128,22 +142,23 @@ def sampling_of(config: Mapping[str, Any]) -> "Sampling":
     return Sampling(reward_noise=float(noise), **sizes)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PrimaryRegret:
     """The predictor that stands for an agent.
 
     Attributes:
         network: its name.
-        value: normalised regret, 0 optimal and 1 uniform play. deviation: of one walk; NaN where nothing is drawn.
+        value: normalised regret of the learnt policies, a mean over training: 0 optimal, 1 uniform play.
+        deviation: standard deviation of one walk of the idealised learner; NaN where nothing is drawn.
         tabular: of the same learner with a table of the states in the place of the network.
         note: what is random in it, and what half of the landmarks change where they stand for the kernel.
     """
 
     network: str
     value: float
-    deviation: float
     tabular: float
-    note: str
+    deviation: float
+    note: str = ""
 
 
 def primary_regret(
@@ -162,7 +177,6 @@ def primary_regret(
         UndefinedMeasure: no policy beats uniform play.
     """
     from pharos.errors import UndefinedMeasure
-    from pharos.hardness import report
 
     agent = config["agent"]
     own_network, initialisation = network_of(config, task)
@@ -171,21 +185,18 @@ def primary_regret(
         name = f"{network}+tanh" if isinstance(network, str) and agent != "dqn" and _is_named(network) else network
     options = _options(task, name, initialisation, landmarks)
     if agent == "dqn":
-        measure = "sampled_regret"
-        options |= {"schedule": schedule_of(config), "sampling": sampling_of(config)}
+        result = _sampled(config, task.mdp, options)
     else:
-        measure, (rollouts, clip_range) = "kernel_policy_regret", rollouts_of(config)
-        options |= {"schedule": _steps_and_discount(config), "rollouts": replace(rollouts, clip_range=clip_range)}
-    result = report(task.mdp, [measure], **options)[measure]
-    if result.value is None:
-        raise UndefinedMeasure(result.undefined or f"{measure} is undefined")
+        result = _actor_critic(config, task.mdp, rollouts_of(config), options)
     value = result.value
+    if value is None:
+        raise UndefinedMeasure(result.undefined or f"{result.name} is undefined")
     return PrimaryRegret(
-        str(options["representation"].conventions["network"]),
-        value["value"] if agent == "dqn" else _evaluated(value),
-        value.get("deviation", math.nan),
-        value["tabular"],
-        result.certificate.note or "",
+        network=str(options["representation"].conventions["network"]),
+        value=value["value"] if agent == "dqn" else _evaluated(value),
+        deviation=value.get("deviation", math.nan),
+        tabular=value["tabular"],
+        note=result.certificate.note or "",
     )
 
 
@@ -196,24 +207,11 @@ def _is_named(network: str) -> bool:
     return not is_reference(network) and "+tanh" not in network
 
 
-def _steps_and_discount(config: Mapping[str, Any]) -> "Schedule":
-    from pharos.hardness import Schedule
-
-    return Schedule(steps=config["steps"], gamma=config["hyperparameters"].get("gamma", Schedule.gamma))
-
-
 def _of_policy(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
     """POLICY_PREDICTORS and POLICY_CURVES, of the idealised actor-critic with the rollouts and steps of the agent."""
-    from pharos.hardness import report
-
-    name, (rollouts, clip_range) = "kernel_policy_regret", rollouts_of(config)
-    schedule = _steps_and_discount(config)
-
-    def learnt(rollouts: "Rollouts") -> Any:
-        return report(mdp, [name], schedule=schedule, rollouts=rollouts, **options)[name].value
-
-    regret = learnt(rollouts)
-    clipped = None if clip_range is None else learnt(replace(rollouts, clip_range=clip_range))
+    rollouts = rollouts_of(config)
+    regret = _actor_critic(config, mdp, replace(rollouts, clip_range=None), options).value
+    clipped = None if rollouts.clip_range is None else _actor_critic(config, mdp, rollouts, options).value
     row = {**dict.fromkeys(POLICY_PREDICTORS, math.nan), **dict.fromkeys(POLICY_CURVES, "")}
     if regret is not None:
         numbers = (regret["value"], regret["played"], regret["tabular"], _evaluated(regret))
@@ -224,17 +222,16 @@ def _of_policy(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[st
     return row
 
 
-def rollouts_of(config: Mapping[str, Any]) -> tuple["Rollouts", float | None]:
-    """Rollouts of an actor-critic without clipping, and the clip range of its agent."""
+def rollouts_of(config: Mapping[str, Any]) -> "Rollouts":
+    """Rollouts of an actor-critic, with the clipping of its agent."""
     from pharos.hardness import Rollouts
 
     hyperparameters = {**ACTOR_CRITICS[config["agent"]], **config["hyperparameters"]}
     steps = int(hyperparameters["n_steps"]) * int(hyperparameters.get("n_envs", 1))
     minibatches = math.ceil(steps / int(hyperparameters["batch_size"])) if hyperparameters.get("batch_size") else 1
     gradient_steps = minibatches * int(hyperparameters.get("n_epochs", 1))
-    return Rollouts(
-        steps=steps, gradient_steps=gradient_steps, gae_lambda=hyperparameters["gae_lambda"]
-    ), hyperparameters["clip_range"]
+    shared = {name: hyperparameters[name] for name in ("gae_lambda", "clip_range")}
+    return Rollouts(steps=steps, gradient_steps=gradient_steps, **shared)
 
 
 def _evaluated(regret: Mapping[str, Any]) -> float:

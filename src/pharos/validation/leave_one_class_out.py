@@ -18,7 +18,7 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.training import CELL
 from pharos.validation import cross_validation as _held_out
-from pharos.validation.cross_validation import percentiles
+from pharos.validation.cross_validation import BLOCK, percentiles
 from pharos.validation.learners import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS
 
 if TYPE_CHECKING:
@@ -420,7 +420,6 @@ def mixed_fit(x: np.ndarray, y: np.ndarray, classes: np.ndarray, mdps: np.ndarra
 # Within mdps ----------------------------------------------------------------------------------------------------------
 
 
-BLOCK = 250  # permutations at a time
 CLEAR = 0.05  # difference of an outcome between two observations of one MDP that counts
 
 

@@ -26,7 +26,14 @@ from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCo
 from pharos.system.storage import plain
 from pharos.system.wording import many
 from pharos.training import CELL
-from pharos.validation.learners import POLICY_CURVES, PREDICTORS, PRIMARY, primary_regret, rollouts_of
+from pharos.validation.learners import (
+    POLICY_CURVES,
+    PREDICTORS,
+    PRIMARY,
+    PrimaryRegret,
+    primary_regret,
+    rollouts_of,
+)
 from pharos.validation.leave_one_class_out import Pairs
 
 if TYPE_CHECKING:
@@ -131,27 +138,18 @@ MOST_STATES = 100_000
 """States beyond which a prediction is refused: its walks evaluate a policy of all states 31 times each."""
 
 
-@dataclass(frozen=True)
-class PredictedRegret:
+@dataclass(frozen=True, kw_only=True)
+class PredictedRegret(PrimaryRegret):
     """Predicted regret of an agent with one network behind one observation.
 
     Attributes:
-        observation: what the agent sees, with its options. network: name of the network.
-        value: normalised regret of the learnt policies, a mean over training: 0 optimal, 1 uniform play.
+        observation: what the agent sees, with its options.
         low, high: ends of the interval that held LEVEL of the published cells, at least 0.
-        tabular: of the same learner with a table of the states in the place of the network.
-        deviation: standard deviation of one walk of the idealised learner; NaN where nothing is drawn.
-        note: what is random or approximate in the value.
     """
 
     observation: str
-    network: str
-    value: float
     low: float
     high: float
-    tabular: float
-    deviation: float
-    note: str = ""
 
     @property
     def label(self) -> str:
@@ -407,7 +405,7 @@ def _check_steps(config: Mapping[str, Any]) -> None:
     if config["agent"] == "dqn":
         min_steps, what = int(hyperparameters.get("learning_starts", 0)) + 1, "learning begins"
     else:
-        min_steps, what = rollouts_of(config)[0].steps, "the first rollout ends"
+        min_steps, what = rollouts_of(config).steps, "the first rollout ends"
     if steps < min_steps:
         raise ParameterError(
             f"steps is {steps}, but {what} after {min_steps - 1:,} steps; expected at least {min_steps:,}"
