@@ -247,34 +247,30 @@ class Execution:
 
     def _ended(self, unit: tuple[Run, ...], code: int) -> None:
         """A process is over: what it has not left behind is done again."""
-        if code == _worker.EXIT_BUSY:
-            left = list(unit)
-        else:
-            left = [run for run in unit if not self.note(run)]
-            if code == SERVER_LOST and left and self.lost_servers < LOST_SERVERS:
-                self.lost_servers += 1  # the worker may well live: the next attempt waits for it
-            elif code == 0 and unit[0].engine == "batched":
-                pass  # another process is at them
-            else:
-                self._killed([run for run in unit if not self.note(run, code != 0 and run.id in self.repeated)], code)
-                return
-        self.pending.extend((time.monotonic() + BUSY_SECONDS, run) for run in left)
+        is_killed = code not in (0, _worker.EXIT_BUSY)
+        left = [run for run in unit if not self.note(run, is_killed and run.id in self.repeated)]
+        if code == SERVER_LOST and left and self.lost_servers < LOST_SERVERS:
+            self.lost_servers += 1  # the worker may well live: the next attempt waits for it
+        elif is_killed or (code == 0 and unit[0].engine != "batched"):
+            self._killed(left, code)
+            return
+        self.pending.extend((time.monotonic() + BUSY_SECONDS, run) for run in left)  # another process is at them
 
     def _killed(self, unit: Sequence[Run], code: int) -> None:
         """Without results: again, up to ATTEMPTS times; then a batch is halved, and a run has failed."""
         for run in unit:
             self.kills[run.id] += 1
-        if all(self.kills[run.id] < ATTEMPTS for run in unit):
+        most = max((self.kills[run.id] for run in unit), default=0)
+        if most < ATTEMPTS:
             self.batches.look()
-            self.pending.extend((0.0, run) for run in unit)
-            return
-        if len(unit) > 1 and all(self.kills[run.id] <= ATTEMPTS for run in unit):
+        elif len(unit) > 1 and most == ATTEMPTS:
             self.batches.halve(unit)
             self.kills.update({run.id: 0 for run in unit})
-            self.pending.extend((0.0, run) for run in unit)
+        else:
+            for run in unit:
+                self._give_up(run, code)
             return
-        for run in unit:
-            self._give_up(run, code)
+        self.pending.extend((0.0, run) for run in unit)
 
     def _give_up(self, run: Run, code: int) -> None:
         """A run has failed: its process was killed too often, or took too long."""

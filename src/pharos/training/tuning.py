@@ -18,9 +18,10 @@ import inspect
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -227,6 +228,7 @@ class _Search:
     search_seed: int
     engine: str
     shortlist: int
+    members: TaskCache = field(default_factory=TaskCache)
 
     @cached_property
     def observation_name(self) -> str:
@@ -282,12 +284,21 @@ class _Search:
 
     def score(self, trial: "optuna.Trial", pruned: type[Exception]) -> float:
         """The mean normalised regret of evaluations after the first, over all runs; `pruned` is raised on the way."""
-        chosen = self.proposal(trial)
+        hyperparameters = {**self.table, **self.proposal(trial)}
+        interval = max(1, self.steps // EVALUATIONS)
         configs: list[RunConfig] = []
         regrets: list[float] = []
-        for task, options in self._runs(chosen):
-            config = RunConfig.of_task(task, self.agent, **options, engine=self.engine)
-            self._members.adopt(config, task)
+        for seed, task in product(self.seeds, self.tasks):
+            config = RunConfig.of_task(
+                task,
+                self.agent,
+                steps=self.steps,
+                seed=seed,
+                evaluation_interval=interval,
+                hyperparameters=hyperparameters,
+                engine=self.engine,
+            )
+            self.members.adopt(config, task)
             configs.append(config)
 
         def progress(now: Progress) -> None:
@@ -297,22 +308,10 @@ class _Search:
                 raise pruned
 
         for group in [configs] if self.engine == "batched" else [[config] for config in configs]:
-            for end in train_configs(group, progress=progress, members=self._members):
+            for end in train_configs(group, progress=progress, members=self.members):
                 if isinstance(end, FailedRun):
                     raise end.exception
         return sum(regrets) / len(regrets)
-
-    def _runs(self, chosen: Mapping[str, Any]) -> Iterator[tuple[Task, dict[str, Any]]]:
-        """(task, options of its run) with some hyperparameters: all tasks for one seed after the other."""
-        interval = max(1, self.steps // EVALUATIONS)
-        for seed in self.seeds:
-            for task in self.tasks:
-                options = {"steps": self.steps, "seed": seed, "evaluation_interval": interval}
-                yield task, {**options, "hyperparameters": {**self.table, **chosen}}
-
-    @cached_property
-    def _members(self) -> TaskCache:
-        return TaskCache()
 
 
 def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dict[str, tuple[Any, ...]]:

@@ -243,79 +243,71 @@ def _part(agent: str, outcome: str, rows: "pd.DataFrame", figures: Figures) -> d
     }
 
 
-def _left_out(rows: "pd.DataFrame") -> Table:
-    import pandas as pd
-
-    shown = pd.DataFrame(
-        {
-            "predictor": [_name(row) for row in rows.to_dict("records")],
-            "cells": rows["cells"],
-            "classes": rows["classes"],
-            "R²": _with_interval(rows, "r_squared"),
-            "rho": _with_interval(rows, "rho"),
-            "floor of rho": rows["floor_rho"],
-            "p": [_p(value) for value in rows["p_rho_holm"]],
-            "R² of MDPs": rows["r_squared_mdp"],
-            "calibration": rows["calibration"],
-            "ceiling of R²": rows["ceiling"],
-        }
-    )
+def _left_out(rows: "pd.DataFrame") -> Table | None:
+    columns = {
+        "cells": rows["cells"],
+        "classes": rows["classes"],
+        "R²": _with_interval(rows, "r_squared"),
+        "rho": _with_interval(rows, "rho"),
+        "floor of rho": rows["floor_rho"],
+        "p": _p_values(rows, "p_rho_holm"),
+        "R² of MDPs": rows["r_squared_mdp"],
+        "calibration": rows["calibration"],
+        "ceiling of R²": rows["ceiling"],
+    }
     caption = (
         "Classes left out one by one (R² of MDPs: instances one by one): R², Spearman's rho, with 95 % intervals; "
         "calibration: slope of the outcome on what was predicted, 1 is perfect."
     )
-    return table(shown, caption, digits=2)
+    return _of_predictors(rows, columns, caption)
 
 
 def _within(rows: "pd.DataFrame") -> Table | None:
-    import pandas as pd
-
     rows = rows[(rows["pairs"] > 0) & rows["p_agreement"].notna() | rows["agreement_lower"].notna()]
-    if not len(rows):
-        return None
-    shown = pd.DataFrame(
-        {
-            "predictor": [_name(row) for row in rows.to_dict("records")],
-            "pairs": rows["pairs"],
-            "rightly ordered": _with_interval(rows, "agreement"),
-            "ceiling": rows["agreement_ceiling"],
-            "p": [_p(value) for value in rows["p_agreement_holm"]],
-            "image and vector": rows["image_pairs"],
-            "rightly ordered of these": rows["image_agreement"],
-            "rho within a class": rows["rho_within"],
-        }
-    )
+    columns = {
+        "pairs": rows["pairs"],
+        "rightly ordered": _with_interval(rows, "agreement"),
+        "ceiling": rows["agreement_ceiling"],
+        "p": _p_values(rows, "p_agreement_holm"),
+        "image and vector": rows["image_pairs"],
+        "rightly ordered of these": rows["image_agreement"],
+        "rho within a class": rows["rho_within"],
+    }
     caption = (
         "Pairs of observations of one MDP whose outcomes differ by more than 0.05, and the share that is ordered "
         "rightly. Tabular measures have no opinion, 0.5. Ceiling: what noise over seeds leaves. p: observations change "
         "names, in all MDPs of a class alike."
     )
-    return table(shown, caption, digits=2)
+    return _of_predictors(rows, columns, caption)
 
 
 def _mixed(rows: "pd.DataFrame") -> Table | None:
-    import pandas as pd
-
     rows = rows[rows["slope"].notna()]
-    if not len(rows):
-        return None
-    shown = pd.DataFrame(
-        {
-            "predictor": [_name(row) for row in rows.to_dict("records")],
-            "slope": rows["slope"],
-            "error": rows["slope_error"],
-            "p": [_p(value) for value in rows["p_slope_holm"]],
-            "classes' share": rows["class_share"],
-            "MDPs' share": rows["mdp_share"],
-            "rho given tabular measures": _with_interval(rows, "given_tabular"),
-            "rho given the tabular learner": _with_interval(rows, "given_tabular_regret"),
-        }
-    )
+    columns = {
+        "slope": rows["slope"],
+        "error": rows["slope_error"],
+        "p": _p_values(rows, "p_slope_holm"),
+        "classes' share": rows["class_share"],
+        "MDPs' share": rows["mdp_share"],
+        "rho given tabular measures": _with_interval(rows, "given_tabular"),
+        "rho given the tabular learner": _with_interval(rows, "given_tabular_regret"),
+    }
     caption = (
         "Mixed models: slope of the standardised predictor, with random intercepts of classes and of MDPs, and their "
         "shares of the variance that is left. Partial rank correlations, 95 % intervals over classes."
     )
-    return table(shown, caption, digits=2)
+    return _of_predictors(rows, columns, caption)
+
+
+def _of_predictors(rows: "pd.DataFrame", columns: Mapping[str, Any], caption: str) -> Table | None:
+    """A row for each predictor; None where there is none."""
+    import pandas as pd
+
+    if not len(rows):
+        return None
+    return table(
+        pd.DataFrame({"predictor": [_name(row) for row in rows.to_dict("records")], **columns}), caption, digits=2
+    )
 
 
 def _name(row: Mapping[str, Any]) -> str:
@@ -333,5 +325,5 @@ def _with_interval(rows: "pd.DataFrame", name: str) -> list[str]:
     return texts
 
 
-def _p(value: float) -> str:
-    return "–" if not np.isfinite(value) else "< 0.001" if value < 0.001 else f"{value:.3f}"
+def _p_values(rows: "pd.DataFrame", name: str) -> list[str]:
+    return ["–" if not np.isfinite(p) else "< 0.001" if p < 0.001 else f"{p:.3f}" for p in rows[name]]
