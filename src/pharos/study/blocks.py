@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pharos.agents import TABULAR_OBSERVATION, agent_kind, agent_source, hyperparameters
-from pharos.environments import as_tuples, imported, make, source_of
+from pharos.environments import Environment, as_tuples, imported, make, source_of
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.observations import OwnObservation, names, own_observation, title
 from pharos.study.regression import MEASURES
@@ -171,7 +171,7 @@ class EnvironmentEntry(_Part):
         self._folder = (context or {}).get("folder") if is_reference(self.name) else None
 
     @cached_property
-    def instance(self) -> Any:
+    def instance(self) -> Environment:
         name = imported(self.name, self._folder).name if is_reference(self.name) else self.name
         return make(name, **{name: as_tuples(value) for name, value in self.parameters.items()})
 
@@ -228,7 +228,7 @@ def _engines(value: object) -> object:
     return value
 
 
-def _horizon(value: Any) -> Any:
+def _horizon(value: Horizon | int | str | None) -> int | str:
     return Horizon.of(value).value
 
 
@@ -361,5 +361,5 @@ def registered() -> list[str]:
     return list(measures())
 
 
-def _jsonable(value: object) -> Any:
+def _jsonable(value: Mapping[str, Any]) -> dict[str, Any]:
     return json.loads(json.dumps(value))

@@ -24,6 +24,7 @@ from pharos.system.wording import many
 
 if TYPE_CHECKING:
     import pandas as pd
+    from statsmodels.regression.linear_model import RegressionResultsWrapper
 
 MEASURES = ("effective_horizon", "sum_of_reciprocal_gaps", "diameter")
 
@@ -225,7 +226,7 @@ def _independent(rows: "pd.DataFrame", predictors: Sequence[str]) -> tuple[list[
     return terms, len(columns), dropped
 
 
-def _coefficients(result: Any, rows: "pd.DataFrame", tasks: Sequence[str]) -> "pd.DataFrame":
+def _coefficients(result: "RegressionResultsWrapper", rows: "pd.DataFrame", tasks: Sequence[str]) -> "pd.DataFrame":
     """Estimates of least squares with standard errors that count a task once; see the head of this file."""
     import pandas as pd
     from scipy import stats
@@ -248,7 +249,9 @@ def _coefficients(result: Any, rows: "pd.DataFrame", tasks: Sequence[str]) -> "p
     return table
 
 
-def _strata(result: Any, rows: "pd.DataFrame", groups: np.ndarray) -> tuple["pd.Series", "pd.Series"] | None:
+def _strata(
+    result: "RegressionResultsWrapper", rows: "pd.DataFrame", groups: np.ndarray
+) -> tuple["pd.Series", "pd.Series"] | None:
     """Standard errors and degrees of freedom from the strata between and within tasks.
 
     None where tasks differ in their observations, or there are too few tasks.

@@ -85,7 +85,7 @@ def stratified_interval(
     return Estimate(float(statistic(*arrays, axis=-1)), float(lower), float(upper), confidence)
 
 
-def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], axis: int = -1) -> Any:
+def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], axis: int = -1) -> np.ndarray:
     """Return how probable it is that a run of ours scores higher than one of theirs on a task drawn at random.
 
         P(X > Y) = mean over tasks of the mean over pairs of runs of 1 where x > y, 1/2 where x = y   (section 4.3)
@@ -167,7 +167,7 @@ def improvements(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame
                 continue
             samples = [scores[task] for scores in (ours, theirs) for task in tasks]
 
-            def improvement(*drawn: np.ndarray, axis: int = -1, number: int = len(tasks)) -> Any:
+            def improvement(*drawn: np.ndarray, axis: int = -1, number: int = len(tasks)) -> np.ndarray:
                 return probability_of_improvement(drawn[:number], drawn[number:], axis)
 
             lower, upper = bootstrap_interval(samples, improvement, resamples=resamples)
