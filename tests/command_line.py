@@ -23,6 +23,14 @@ def answer(*words):
     return json.loads(done.stdout)
 
 
+def usage_error(*words):
+    """The one line with which a command is refused as bad usage."""
+    done = run(*words)
+    assert (done.exit_code, done.stdout) == (2, ""), done.output
+    assert done.stderr.count("\n") == 1
+    return done.stderr
+
+
 def process(*words, environment=None, **options):
     """What a command does as a process of its own, with more variables in its environment: `returncode`, `stdout`,
     `stderr`."""

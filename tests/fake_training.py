@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from pharos import study
 from pharos.study import run_id, worker
 
 SIZES = {"simple_grid": 16, "frozen_lake": 30, "freeway": 400, "breakout": 900}
@@ -72,6 +73,15 @@ def train(config, folder):
     if log := os.environ.get("PHAROS_FAKE_LOG"):
         with open(log, "a") as file:
             file.write(f"{id}\n")
+
+
+def specification(name="fake", **given):
+    """A study of one block: Q-learning on a lake, unless told otherwise; entries of the study or of its block."""
+    whole = {
+        key: given.pop(key) for key in ("steps", "evaluations", "hardness", "engine", "description") if key in given
+    }
+    block = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], **given}
+    return study.specification({"name": name, **whole, "blocks": [block]})
 
 
 def attempt(run, folder):

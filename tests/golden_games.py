@@ -13,12 +13,10 @@ from pharos.drawing import text_drawing
 FOLDER = Path(__file__).with_name("golden")
 
 # name of the file -> (environment, parameters, actions by their first letters, or as a list)
+WALL = {"height": 5, "columns": 3, "brick_rows": 1, "extra_paddle_width": 1}
+PAID = {"height": 3, "penalties": "0,2:-0.5", "rewards": "1,1:0.1"}
 GAMES = {
-    "simple_grid_penalty_then_goal": (
-        "simple_grid",
-        {"height": 3, "penalties": "0,2:-0.5", "rewards": "1,1:0.1"},
-        "lurrurdldr",
-    ),
+    "simple_grid_penalty_then_goal": ("simple_grid", PAID, "lurrurdldr"),
     "simple_grid_decoy": ("simple_grid/4x4-decoy", {}, "rrddd"),
     "frozen_lake_goal": ("frozen_lake/4x4", {}, "ddrrdr"),
     "frozen_lake_hole": ("frozen_lake/4x4", {}, "urrdl"),
@@ -37,16 +35,8 @@ GAMES = {
         {"height": 8, "columns": 5, "brick_rows": 2},
         "srrlllssssrrrrsslllssrrss" + "s" * 20,
     ),
-    "breakout_wall_comes_back": (
-        "breakout",
-        {"height": 5, "columns": 3, "brick_rows": 1, "extra_paddle_width": 1},
-        "s" * 24,
-    ),
-    "breakout_cleared_without_respawn": (
-        "breakout",
-        {"height": 5, "columns": 3, "brick_rows": 1, "extra_paddle_width": 1, "respawn": False},
-        "s" * 24,
-    ),
+    "breakout_wall_comes_back": ("breakout", WALL, "s" * 24),
+    "breakout_cleared_without_respawn": ("breakout", {**WALL, "respawn": False}, "s" * 24),
     "sliding_tiles_solved": ("sliding_tiles", {"rows": 2, "columns": 3, "start": "1,0,3,4,2,5"}, "udr"),
     "sliding_tiles_against_the_edge": ("sliding_tiles/3x3", {}, "drulluur"),
     "pocket_cube_solved": ("pocket_cube", {"scramble": "F' U2 R"}, ["R'", "U2", "F"]),

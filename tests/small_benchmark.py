@@ -12,16 +12,10 @@ RUNGS = tuple(f"noise-{level:g}" for level in LEVELS)
 
 
 def small_suite(digest=DIGEST, core=CORE, rungs=RUNGS):
-    ladder = tuple(
-        BenchmarkTask(name, "", axis="noise", level=level) for name, level in zip(rungs, LEVELS, strict=True)
-    )
-    return Suite(
-        "small",
-        Protocol(),
-        tuple(BenchmarkTask(name, "") for name in core),
-        (Ladder("noise", "sd", "of rewards", ladder),),
-        digest,
-    )
+    levels = zip(rungs, LEVELS, strict=True)
+    ladder = tuple(BenchmarkTask(name, "", axis="noise", level=level) for name, level in levels)
+    tasks = tuple(BenchmarkTask(name, "") for name in core)
+    return Suite("small", Protocol(), tasks, (Ladder("noise", "sd", "of rewards", ladder),), digest)
 
 
 def results(curves, agent="agent", digest=DIGEST, evaluations=3):

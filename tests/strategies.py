@@ -4,6 +4,7 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -14,6 +15,11 @@ probabilities = st.sampled_from([0.0, 0.1, 0.25, 0.5, 1.0])
 gammas = st.sampled_from([0.0, 0.5, 0.9, 0.99])
 gammas_near_1 = st.sampled_from([0.9, 0.999, 0.9998, 1 - 1e-5, 1 - 1e-7])
 rewards_of_games = st.sampled_from([-1.0, 0.0, 0.1, 0.5, 1.0])
+
+
+def examples(count: int, /, *arguments, **named):
+    """Return a decorator: the property is tested on so many examples that strategies draw, however long each takes."""
+    return lambda test: settings(max_examples=count, deadline=None)(given(*arguments, **named)(test))
 
 
 @st.composite

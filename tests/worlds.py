@@ -1,5 +1,6 @@
 """Small environments for tests: a row of cells to derive others from, and random tables dressed as environments."""
 
+import inspect
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -30,6 +31,33 @@ class Row(Environment):
 
     def reward(self, state, action, next_state):
         return 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corridor(Row):
+    """A row whose last cell ends the episode and pays 1."""
+
+    length: int = 5
+
+    name = "corridor"
+
+    def is_terminal(self, state):
+        return state[0] == self.length - 1
+
+    def reward(self, state, action, next_state):
+        return 1.0 if next_state[0] == self.length - 1 else 0.0
+
+
+def random_states(env: Environment, number: int, seed: int = 0) -> np.ndarray:
+    """(N, D) whatever values the variables can have."""
+    components = env.components
+    return components.low + np.random.default_rng(seed).integers(0, components.size, (number, len(components)))
+
+
+def code_of(*classes: type) -> str:
+    """The text of a file that defines these classes, as a user would write it."""
+    imports = "from dataclasses import dataclass\n\nfrom pharos.environments import Environment\n"
+    return "\n\n".join([imports, *map(inspect.getsource, classes)])
 
 
 @dataclass(frozen=True, kw_only=True)

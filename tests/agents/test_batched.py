@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pharos.agents.batched import BatchRun, ObservationSource, group_key, make_batch, supports
+from batched_runs import difference, learned, outcome, runs_of
+from pharos.agents.batched import group_key, make_batch, supports
 from pharos.agents.batched.arithmetic import TensorArithmetic
 from pharos.agents.batched.runs import lane_width, lane_widths
 from pharos.environments import make
@@ -20,13 +21,7 @@ DQN = {"learning_rate": 0.01, "buffer_size": 60, "learning_starts": 20, "batch_s
 
 PPO = {"n_envs": 2, "n_steps": 8, "batch_size": 12, "n_epochs": 2, "net_arch": [7], "target_kl": 0.01}
 AGENTS = {"dqn": DQN, "ppo": PPO}
-
-
-def runs_of(task, hyperparameters, number=3, steps=120):
-    source = ObservationSource.of(task.space, task.sight.observe)
-    return [
-        BatchRun(task.mdp, source, task.time_limit, hyperparameters, steps, i, 2**40 + 977 * i) for i in range(number)
-    ]
+PI = (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344, 0xA4093822, 0x299F31D0)  # its digits
 
 
 @pytest.fixture(scope="module")
@@ -34,37 +29,19 @@ def grid():
     return Task.of(make("simple_grid"), sticky=0.2, random=0.1)
 
 
-def outcome(batch, i):
-    """All that a run leaves behind, as bytes."""
-    parts = [value.tobytes() for value in batch.parameters(i).values()]
-    return b"".join([*parts, batch.episodes[i].tobytes(), batch.returns[i].tobytes()])
-
-
-def learned(agent, runs, points=(60, 120)):
-    batch = make_batch(agent, runs)
-    batch.learn(points, lambda point: None)
-    return batch
-
-
 @pytest.mark.parametrize(
     ("counter", "key", "words"),
     [
         ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
         ((0xFFFFFFFF,) * 4, (0xFFFFFFFF,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
-        (
-            (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
-            (0xA4093822, 0x299F31D0),
-            (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
-        ),
+        (PI[:4], PI[4:], (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1)),
     ],
 )
 def test_philox_gives_the_known_answers_of_random123(counter, key, words):
     from numba import njit
 
-    answer = njit(lambda c, k: philox(c[0], c[1], c[2], c[3], k))(
-        tuple(map(np.uint64, counter)), np.uint64(key[0] | key[1] << 32)
-    )
-    assert tuple(map(int, answer)) == words
+    answer = njit(lambda c, k: philox(c[0], c[1], c[2], c[3], k))
+    assert tuple(map(int, answer(tuple(map(np.uint64, counter)), np.uint64(key[0] | key[1] << 32)))) == words
 
 
 @pytest.mark.parametrize("agent", AGENTS)
@@ -140,21 +117,17 @@ def test_tensor_operations_compute_what_the_compiled_loops_do(grid, agent):
     for batch in (compiled, tensors):
         batch.learn([60], lambda point: None)
     for i in range(3):
-        mine, other = compiled.parameters(i), tensors.parameters(i)
-        assert max(np.abs(mine[name] - other[name]).max() for name in mine) <= 1e-5
+        assert difference(compiled.parameters(i), tensors.parameters(i)) <= 1e-5
 
 
 @pytest.mark.parametrize("agent", AGENTS)
 def test_networks_are_on_the_device_that_is_asked_for(grid, agent):
     """Here the processor by the name that devices have, so that no other is needed."""
-    other, usual = (make_batch(agent, runs_of(grid, AGENTS[agent], 1), device=name) for name in ("cpu:0", "cpu"))
+    other, usual = (learned(agent, runs_of(grid, AGENTS[agent], 1), [60], device=name) for name in ("cpu:0", "cpu"))
     (lane,) = other.lanes
     assert lane.device == "cpu:0"
     assert isinstance(lane.arithmetic, TensorArithmetic)
-    for batch in (other, usual):
-        batch.learn([60], lambda point: None)
-    mine, theirs = other.parameters(0), usual.parameters(0)
-    assert max(np.abs(mine[name] - theirs[name]).max() for name in mine) <= 1e-5
+    assert difference(other.parameters(0), usual.parameters(0)) <= 1e-5
 
 
 @pytest.mark.long
@@ -170,8 +143,4 @@ def test_policies_that_walk_together_are_worth_what_they_are_alone():
         assert (one.exact, one.states) == (other.exact, other.states)
     assert len({one.value for one in together}) > 1
     assert all(map(is_walk, mdps)) and not is_walk(random_actions(mdps[0], 0.1))
-    assert not is_walk(lazy_actions(mdps[0], 0.1)) and not is_walk(make_slippery())
-
-
-def make_slippery():
-    return Task.of(make("frozen_lake", slippery=True)).mdp
+    assert not is_walk(lazy_actions(mdps[0], 0.1)) and not is_walk(Task.of(make("frozen_lake", slippery=True)).mdp)

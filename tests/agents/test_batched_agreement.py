@@ -5,8 +5,9 @@ import pytest
 import torch
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
 
+from batched_runs import runs_of
 from pharos.agents import make_model
-from pharos.agents.batched import BatchRun, ObservationSource, make_batch
+from pharos.agents.batched import make_batch
 from pharos.environments import make
 from pharos.interaction import make_sb3_vec
 from pharos.kernels import batched as rollouts
@@ -17,10 +18,8 @@ DQN = {"learning_rate": 0.001, "buffer_size": 200, "learning_starts": 40, "batch
        "target_update_interval": 20, "net_arch": [24], "max_grad_norm": 0.05}  # fmt: skip
 
 
-def batch_of(agent, task, hyperparameters, number=2, steps=10_000):
-    source = ObservationSource.of(task.space, task.sight.observe)
-    run = [BatchRun(task.mdp, source, task.time_limit, hyperparameters, steps, i, 31 * i) for i in range(number)]
-    return make_batch(agent, run)
+def batch_of(agent, task, hyperparameters):
+    return make_batch(agent, runs_of(task, hyperparameters, 2, steps=10_000))
 
 
 def model_of(agent, task, hyperparameters):

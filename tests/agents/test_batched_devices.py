@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from pharos.agents.batched import BatchRun, ObservationSource, arithmetic, group_key, make_batch, networks
+from batched_runs import difference, learned, runs_of
+from pharos.agents.batched import arithmetic, group_key, make_batch, networks
 from pharos.agents.batched import lane as lanes
 from pharos.agents.batched.arithmetic import CudaGraph, PinnedBuffer
 from pharos.environments import make
@@ -23,37 +24,29 @@ PPO = {"n_envs": 2, "n_steps": 8, "batch_size": 12, "n_epochs": 2, "net_arch": [
 AGENTS = {"dqn": DQN, "ppo": PPO}
 
 
-def runs_of(agent, observation, sizes, number=2):
-    runs = []
-    for size in sizes:
-        task = Task.of(make("simple_grid", height=size, width=size), observation=observation)
-        source = ObservationSource.of(task.space, task.sight.observe)
-        runs += [
-            BatchRun(task.mdp, source, task.time_limit, AGENTS[agent], 120, i, 2**40 + 977 * i + size)
-            for i in range(number)
-        ]
-    return runs
-
-
-def learned(agent, runs, device=ELSEWHERE):
-    batch = make_batch(agent, runs, device=device)
-    batch.learn([60, 120], lambda point: None)
-    return batch
+def grids(agent, observation, sizes, number=2):
+    """Runs on grids of these sizes, one after another."""
+    tasks = [Task.of(make("simple_grid", height=size, width=size), observation=observation) for size in sizes]
+    return [
+        run
+        for task, size in zip(tasks, sizes, strict=True)
+        for run in runs_of(task, AGENTS[agent], number, apart=2**40 + size)
+    ]
 
 
 @pytest.mark.parametrize("observation", ["one_hot", "simple_image"])
 @pytest.mark.parametrize("agent", AGENTS)
 def test_runs_that_see_more_or_less_share_a_lane_and_learn_what_they_learn_alone(agent, observation):
-    runs = runs_of(agent, observation, (4, 6))
-    batch = learned(agent, runs)
+    runs = grids(agent, observation, (4, 6))
+    batch = learned(agent, runs, device=ELSEWHERE)
     (lane,) = batch.lanes
     assert len({sight.shape for sight in lane.seen.sights}) == 2
     for first in (0, 2):
-        alone = learned(agent, runs[first : first + 2], "cpu")
+        alone = learned(agent, runs[first : first + 2])
         for i in (0, 1):
             mine, theirs = batch.parameters(first + i), alone.parameters(i)
             assert {name: each.shape for name, each in mine.items()} == {name: x.shape for name, x in theirs.items()}
-            assert max(np.abs(mine[name] - theirs[name]).max() for name in mine) <= 1e-4
+            assert difference(mine, theirs) <= 1e-4
             assert (batch.episodes[first + i], batch.returns[first + i]) == (alone.episodes[i], alone.returns[i])
             seen = runs[first].observe.at(np.arange(16))
             answers = (each.action_probabilities(seen) for each in (batch.policy(first + i), alone.policy(i)))
@@ -62,7 +55,7 @@ def test_runs_that_see_more_or_less_share_a_lane_and_learn_what_they_learn_alone
 
 def test_what_a_run_has_not_stays_zero():
     """Weights of inputs that only the others of a lane have."""
-    batch = learned("dqn", runs_of("dqn", "simple_image", (4, 6)))
+    batch = learned("dqn", grids("dqn", "simple_image", (4, 6)), device=ELSEWHERE)
     (lane,) = batch.lanes
     weights = lane.values["q_net.features_extractor.layers.1.weight"]
     assert weights.shape[1] == 36 * 16
@@ -70,7 +63,7 @@ def test_what_a_run_has_not_stays_zero():
 
 
 def test_shapes_share_a_lane_elsewhere_and_not_on_the_processor():
-    near, far = runs_of("dqn", "simple_image", (4, 6), 1), runs_of("dqn", "simple_image", (4, 9), 1)
+    near, far = (grids("dqn", "simple_image", (4, size), 1) for size in (6, 9))
     assert len({group_key("dqn", run, "cuda") for run in near}) == 1
     assert len({group_key("dqn", run, "cuda") for run in far}) == len({group_key("dqn", run) for run in near}) == 2
     with pytest.raises(ParameterError, match="2 groups"):
@@ -79,9 +72,9 @@ def test_shapes_share_a_lane_elsewhere_and_not_on_the_processor():
 
 @pytest.mark.parametrize("agent", AGENTS)
 def test_a_batch_elsewhere_goes_on_from_its_state_bit_for_bit(agent):
-    runs = runs_of(agent, "one_hot", (4, 5))
-    whole, first, second = learned(agent, runs), *(make_batch(agent, runs, device=ELSEWHERE) for _ in range(2))
-    first.learn([60], lambda point: None)
+    runs = grids(agent, "one_hot", (4, 5))
+    whole, first = (learned(agent, runs, points, device=ELSEWHERE) for points in ((60, 120), (60,)))
+    second = make_batch(agent, runs, device=ELSEWHERE)
     second.restore(first.state())
     second.learn([120], lambda point: None)
     for i in range(len(runs)):
@@ -171,7 +164,7 @@ def test_observations_that_do_not_fit_on_the_device_are_counted(monkeypatch):
     monkeypatch.setattr(lanes, "is_gpu", lambda device: True)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (1 << 12, 1 << 30))
     with pytest.raises(MemoryError, match="of 52 states take 0 MiB on cpu:0, more than 50%"):
-        make_batch("dqn", runs_of("dqn", "simple_image", (4, 6), 1), device=ELSEWHERE)
+        make_batch("dqn", grids("dqn", "simple_image", (4, 6), 1), device=ELSEWHERE)
 
 
 CODE = """

@@ -11,8 +11,21 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 import pharos
+from batched_runs import (
+    RUN,
+    Killed,
+    assert_same_rollouts,
+    bytes_of,
+    difference,
+    drawn_rows,
+    kill_at,
+    learned,
+    outcome,
+    runs_of,
+    updates_of,
+)
 from pharos.agents import make_model
-from pharos.agents.batched import BatchRun, ObservationSource, group_key, make_batch
+from pharos.agents.batched import ObservationSource, group_key, make_batch
 from pharos.agents.batched import lane as lanes
 from pharos.errors import ParameterError
 from pharos.interaction import make_sb3_vec
@@ -31,19 +44,12 @@ DQN_OPTIONS = {"learning_rate": 0.01, "buffer_size": 60, "learning_starts": 20, 
                "n_envs": 2, "target_update_interval": 10, "net_arch": [12], "n_steps": 2}  # fmt: skip
 PPO_OPTIONS = {"n_envs": 3, "n_steps": 16, "batch_size": 24, "n_epochs": 2, "net_arch": [6], "gamma": 0.9}
 AGENTS = {"dqn": DQN_OPTIONS, "ppo": PPO_OPTIONS}
-RUN, LIMIT = 1, 9
+LIMIT = 9
 
 
 def task_of(sight="small", **options):
     name, seen = SIGHTS[sight]
     return Task(BREAKOUT, observation=name, observation_options=seen, horizon=LIMIT, **options)
-
-
-def runs_of(task, hyperparameters, number=3, steps=120):
-    source = ObservationSource.of(task.space, task.sight.observe)
-    return [
-        BatchRun(task.mdp, source, task.time_limit, hyperparameters, steps, i, 2**40 + 977 * i) for i in range(number)
-    ]
 
 
 class Scripted(VecEnvWrapper):
@@ -110,10 +116,7 @@ def test_dqn_learns_from_the_frames_that_stable_baselines3_keeps(sight, n_steps,
     batch = (states, nexts, actions, rewards, factors)
     gammas = lane.own["gamma"]
     batched.sample_histories(lane.keys, 7, 0, place, memory.size, gammas, n_steps, memory.memory, batch)
-    words = np.zeros((lane.width, size, 4), np.uint32)
-    batched.words(lane.keys, batched.SAMPLE, 7, words)
-    drawn = (((words[RUN, :, k].astype(np.uint64) * n) >> 32) for k, n in ((0, memory.size), (1, lane.copies)))
-    rows, copies = (each.astype(np.int64) for each in drawn)
+    rows, copies = drawn_rows(lane, size, memory.size)
     assert set(rows.tolist()) == set(range(memory.size)), "all of the memory is among them"
     monkeypatch.setattr(np.random, "randint", lambda *_, **__: copies)
     theirs = buffer._get_samples((lane.calls - memory.size + rows) % memory.size)
@@ -131,14 +134,8 @@ def test_ppo_gathers_the_frames_and_values_that_stable_baselines3_gathers(sight,
     task, total = task_of(sight), 4 * 48
     lane, env, flags = recorded("ppo", task, PPO_OPTIONS, total)
     monkeypatch.setattr(lane, "learn_minibatch", lambda minibatch, is_active: is_active)
-    names, ours, theirs = ("states", "rewards", "kept_values", "begins", "advantages"), [], []
-    update = lane.update
-
-    def keep():
-        update()
-        ours.append({name: getattr(lane, name)[RUN].copy() for name in names})
-
-    monkeypatch.setattr(lane, "update", keep)
+    ours = updates_of(lane, ("states", "rewards", "kept_values", "begins", "advantages"), monkeypatch)
+    theirs = []
     lane.advance(total)
     assert flags == {0, batched.DONE, batched.DONE | batched.TIMEOUT}
     model = make_model(PPO, env, PPO_OPTIONS, seed=0)
@@ -154,21 +151,8 @@ def test_ppo_gathers_the_frames_and_values_that_stable_baselines3_gathers(sight,
         seen = source.at(mine["states"].reshape(steps * copies, -1))
         assert (channels_first(seen, tuple(shape)).reshape(their["observations"].shape) == their["observations"]).all()
         assert (their["episode_starts"] == mine["begins"]).all()
-        for name, counterpart in (("rewards", "rewards"), ("values", "kept_values"), ("advantages", "advantages")):
-            # of order 1 in float32: sums of a thousand products, in the order that the processor's library takes
-            assert np.abs(their[name] - mine[counterpart]).max() <= 1e-5, name
-
-
-def outcome(batch, i):
-    """All that a run leaves behind, as bytes."""
-    parts = [value.tobytes() for value in batch.parameters(i).values()]
-    return b"".join([*parts, batch.episodes[i].tobytes(), batch.returns[i].tobytes()])
-
-
-def learned(agent, runs, points=(60, 120), **options):
-    batch = make_batch(agent, runs, **options)
-    batch.learn(points, lambda point: None)
-    return batch
+        # of order 1 in float32: sums of a thousand products, in the order that the processor's library takes
+        assert_same_rollouts(mine, their, 1e-5)
 
 
 @pytest.mark.long
@@ -211,8 +195,7 @@ def test_frames_elsewhere_are_those_of_the_processor(agent):
     for first, last in ((0, 2), (2, 5)):
         usual = learned(agent, runs[first:last])
         for i in range(last - first):
-            mine, theirs = elsewhere.parameters(first + i), usual.parameters(i)
-            assert max(np.abs(mine[name] - theirs[name]).max() for name in mine) <= 1e-4
+            assert difference(elsewhere.parameters(first + i), usual.parameters(i)) <= 1e-4
 
 
 @pytest.mark.long
@@ -275,37 +258,21 @@ def test_policies_of_frames_that_walk_together_are_worth_what_they_are_alone():
     assert len({(each.value, each.states) for each in together}) > 1
 
 
-class Killed(BaseException):
-    pass
-
-
-def bytes_of(folder):
-    return [(folder / name).read_bytes() for name in ("curve.parquet", "agent/parameters.pt", "agent/model.json")]
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("agent", "chance"), [("dqn", {}), ("dqn", {"random": 0.1}), ("ppo", {})])
 def test_runs_with_frames_are_measured_exactly_kept_and_resumed(agent, chance, tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.import_module("pharos.training.results"), "CHECKPOINT_SECONDS", 0.0)
-    small = (
-        {"learning_starts": 50, "buffer_size": 100}
-        if agent == "dqn"
-        else {"n_steps": 32, "n_envs": 2, "batch_size": 32}
-    )
+    small = {"dqn": {"learning_starts": 50, "buffer_size": 100}, "ppo": {"n_steps": 32, "n_envs": 2, "batch_size": 32}}
     name, seen = SIGHTS["small"]
-    options = {"steps": 400, "evaluation_interval": 100, "hyperparameters": small, "horizon": LIMIT,
+    options = {"steps": 400, "evaluation_interval": 100, "hyperparameters": small[agent], "horizon": LIMIT,
                "observation": name, "observation_options": seen, **chance}  # fmt: skip
 
     def many(out, seeds, **more):
         return train_many(agent, BREAKOUT, seeds=seeds, out=tmp_path / out, **options, **more)
 
-    def kill(now):
-        if now.done >= 2 * 200:
-            raise Killed
-
     whole = many("whole", (0, 1, 2))
     with pytest.raises(Killed):
-        many("killed", (0, 1), progress=kill)
+        many("killed", (0, 1), progress=kill_at(2 * 200))
     ends = many("killed", (0, 1))
     for seed, end in enumerate(ends):
         folder = tmp_path / "killed" / f"seed-{seed}"

@@ -11,12 +11,13 @@ import torch
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.vec_env import VecEnv
 
+from batched_runs import RUN, assert_same_rollouts, drawn_rows, updates_of
 from pharos.agents import make_model
 from pharos.agents.batched import BatchRun, make_batch
 from pharos.kernels import batched
 from pharos.mdp import TabularMDP
 
-STATES, ACTIONS, RUN = 9, 3, 1
+STATES, ACTIONS = 9, 3
 
 
 class OneHots:
@@ -169,12 +170,10 @@ def assert_same_minibatch(lane, model, monkeypatch):
     rewards, factors = (np.zeros((lane.width, size), np.float32) for _ in range(2))
     batch, place, steps = (states, nexts, actions, rewards, factors), lane.calls % memory.size, lane.shared["n_steps"]
     batched.sample(lane.keys, 7, 0, place, filled, lane.own["gamma"], int(steps), memory.memory, batch)
-    words = np.zeros((lane.width, size, 4), np.uint32)
-    batched.words(lane.keys, batched.SAMPLE, 7, words)
-    rows, copies = ((words[RUN, :, k].astype(np.uint64) * n) >> 32 for k, n in ((0, filled), (1, lane.copies)))
+    rows, copies = drawn_rows(lane, size, filled)
     assert {place, (place - 1) % filled} & set(rows.tolist()), "the ends of the memory are among them"
-    monkeypatch.setattr(np.random, "randint", lambda *_, **__: copies.astype(np.int64))
-    theirs = model.replay_buffer._get_samples(rows.astype(np.int64))
+    monkeypatch.setattr(np.random, "randint", lambda *_, **__: copies)
+    theirs = model.replay_buffer._get_samples(rows)
     discounts = model.gamma if theirs.discounts is None else theirs.discounts.numpy()[:, 0]
     assert (theirs.observations.numpy().argmax(axis=1) == states[RUN]).all()
     assert (theirs.actions.numpy()[:, 0] == actions[RUN]).all()
@@ -189,15 +188,8 @@ def test_ppo_gathers_what_stable_baselines3_gathers(table, monkeypatch):
     total = 3 * 48 - 5  # the last rollout goes on beyond it
     lane = lane_of("ppo", table, hyperparameters, total)
     monkeypatch.setattr(lane, "learn_minibatch", lambda minibatch, is_active: is_active)
-    ours, theirs = [], []
     names = ("rewards", "kept_values", "begins", "advantages", "states", "actions_taken", "log_probabilities")
-    update = lane.update
-
-    def keep():
-        update()
-        ours.append({name: getattr(lane, name)[RUN].copy() for name in names})
-
-    monkeypatch.setattr(lane, "update", keep)
+    ours, theirs = updates_of(lane, names, monkeypatch), []
     env = recorded(lane, total)
     model = make_model(PPO, env, hyperparameters, seed=0)
     model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in lane.stored(RUN).items()})
@@ -213,11 +205,9 @@ def test_ppo_gathers_what_stable_baselines3_gathers(table, monkeypatch):
     for mine, their in zip(ours, theirs, strict=True):
         assert (their["observations"].argmax(axis=2) == mine["states"]).all()
         assert (their["episode_starts"] == mine["begins"]).all()
-        for name, counterpart in (("rewards", "rewards"), ("values", "kept_values"), ("advantages", "advantages")):
-            assert np.abs(their[name] - mine[counterpart]).max() <= 1e-6, name
+        assert_same_rollouts(mine, their, 1e-6)
         assert np.abs(their["returns"] - mine["advantages"] - mine["kept_values"]).max() <= 1e-6
-        seen, actions = (
-            torch.from_numpy(part) for part in (OneHots().at(mine["states"].ravel()), mine["actions_taken"].ravel())
-        )
+        parts = (OneHots().at(mine["states"].ravel()), mine["actions_taken"].ravel())
+        seen, actions = map(torch.from_numpy, parts)
         _, log_p, _ = model.policy.evaluate_actions(seen, actions)
         assert np.abs(log_p.detach().numpy() - mine["log_probabilities"].ravel()).max() <= 1e-6

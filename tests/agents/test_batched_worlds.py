@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from pharos.agents.batched import BatchRun, ObservationSource, make_batch
+from batched_runs import learned, outcome, runs_of
+from pharos.agents.batched import BatchRun, ObservationSource
 from pharos.agents.batched import lane as lanes
 from pharos.agents.batched.lane import BatchedEpisodes
 from pharos.environments import make
@@ -72,10 +73,9 @@ def test_episodes_are_as_likely_as_the_mdp_says(slippery, chance):
         assert (executed_after == executed_after * np.eye(2)).all()
         return
     c = mdp.chance
-    for previous in range(2):
-        for chosen in range(2):
-            likely = c.chosen * np.eye(2)[chosen] + c.previous * np.eye(2)[previous] + c.uniform / 2
-            assert within(executed_after[previous, chosen], likely)
+    for previous, chosen in np.ndindex(2, 2):
+        likely = c.chosen * np.eye(2)[chosen] + c.previous * np.eye(2)[previous] + c.uniform / 2
+        assert within(executed_after[previous, chosen], likely)
 
 
 def test_lazy_actions_stay_as_often_as_they_should_and_pay_what_staying_pays(slippery):
@@ -99,16 +99,9 @@ def test_lazy_actions_stay_as_often_as_they_should_and_pay_what_staying_pays(sli
 
 def test_pay_is_late_and_noisy_as_elsewhere_and_returns_are_of_what_is_earned(slippery):
     mdp, *_, rewards = slippery
-    ways = (
-        {},
-        {"reward_delay": 1},
-        {"reward_delay": 3},
-        {"reward_noise": 2.0},
-        {"reward_delay": 3, "reward_noise": 2.0},
-    )
-    runs = [
-        run for way in ways for run in runs_on(mdp, 8, outcome_rewards=rewards.ravel(), chance=ChanceSetting(**way))
-    ]
+    late, noisy = {"reward_delay": 3}, {"reward_noise": 2.0}
+    ways = [ChanceSetting(**way) for way in ({}, {"reward_delay": 1}, late, noisy, late | noisy)]
+    runs = [run for way in ways for run in runs_on(mdp, 8, outcome_rewards=rewards.ravel(), chance=way)]
     worlds = BatchedEpisodes(runs, np.array([run.key for run in runs], np.uint64), 5)
     payments = [RewardChannel(ChanceSetting(reward_delay=delay), 40) for delay in (1, 3)]
     rng, noise = np.random.default_rng(4), []
@@ -147,10 +140,9 @@ def test_returns_are_counted_until_the_end_of_the_training_alone(slippery):
     assert np.abs(worlds.returns - sums).max() <= 1e-12
 
 
-def learned(runs):
-    batch = make_batch("dqn", runs)
-    batch.learn([60], lambda point: None)
-    return [b"".join(value.tobytes() for value in batch.parameters(i).values()) for i in range(len(runs))]
+def outcomes(runs):
+    batch = learned("dqn", runs, [60])
+    return [outcome(batch, i) for i in range(len(runs))]
 
 
 @pytest.fixture(scope="module")
@@ -169,14 +161,13 @@ def mixed():
 
 
 def test_runs_of_several_instances_learn_as_they_do_alone(mixed):
-    assert learned(mixed) == [learned([run])[0] for run in mixed]
+    assert outcomes(mixed) == [outcomes([run])[0] for run in mixed]
 
 
 @pytest.mark.parametrize("observation", ("vector", "simple_image"))
 def test_observations_that_fit_no_table_change_nothing(monkeypatch, observation):
     task = Task.of(make("frozen_lake/4x4"), observation=observation)
-    source = ObservationSource.of(task.space, task.sight.observe)
-    runs = [BatchRun(task.mdp, source, 20, DQN, 60, i, i) for i in range(2)]
-    in_table = learned(runs)
+    runs = runs_of(task, DQN, 2, 60)
+    in_table = outcomes(runs)
     monkeypatch.setattr(lanes, "LARGEST_TABLE", 0)
-    assert in_table == learned(runs)
+    assert in_table == outcomes(runs)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
@@ -10,12 +9,12 @@ from naive.learning import q_learning
 from pharos.agents import QLearning
 from pharos.errors import ParameterError, UnknownName
 from pharos.mdp import random_actions, sticky_actions
-from strategies import FEW, deterministic_mdps, general_mdps, outcome_mdps, probabilities
+from strategies import FEW, deterministic_mdps, examples, general_mdps, outcome_mdps, probabilities
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
-@given(
+@examples(
+    60,
     st.one_of(deterministic_mdps(), outcome_mdps(FEW), general_mdps()),
     probabilities,
     probabilities,

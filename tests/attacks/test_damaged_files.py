@@ -220,28 +220,18 @@ def test_changes_with_right_checksums(kind, tmp_path, count):
 
 # Runs ----------------------------------------------------------------------------------------------------------------
 
+SMALL = {"n_steps": 16, "n_envs": 2, "batch_size": 16, "net_arch": [8]}
 AGENTS = {
     "q_learning": {"agent": "q_learning"},
     "dqn": {"agent": "dqn", "hyperparameters": {"learning_starts": 20, "buffer_size": 200, "net_arch": [8]}},
-    "ppo": {
-        "agent": "ppo",
-        "engine": "batched",
-        "hyperparameters": {"n_steps": 16, "n_envs": 2, "batch_size": 16, "net_arch": [8]},
-    },
+    "ppo": {"agent": "ppo", "engine": "batched", "hyperparameters": SMALL},
 }
 
 
 def train(name, folder, seed=0, **options):
     """A short run."""
-    return pharos.train(
-        environment="frozen_lake/4x4",
-        steps=128,
-        evaluation_interval=32,
-        seed=seed,
-        out=folder,
-        **AGENTS[name],
-        **options,
-    )
+    options |= {"steps": 128, "evaluation_interval": 32, "seed": seed, "out": folder}
+    return pharos.train(environment="frozen_lake/4x4", **AGENTS[name], **options)
 
 
 @pytest.mark.parametrize("name", AGENTS)

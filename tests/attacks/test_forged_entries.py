@@ -37,25 +37,9 @@ pytestmark = pytest.mark.long
 
 LIMITS = {"max_seconds": 3.0, "max_states": 20_000, "max_horizon": 5_000}
 HUGE = 10**400
-ODD = (
-    None,
-    True,
-    "",
-    "x",
-    "1",
-    [],
-    [1.0],
-    {},
-    {"a": 1},
-    float("nan"),
-    float("inf"),
-    -1,
-    -0.5,
-    2**31,
-    2**63,
-    1e300,
-    HUGE,
-)
+NUMBERS = (float("nan"), float("inf"), -1, -0.5, 2**31, 2**63, 1e300, HUGE)
+ODD = (None, True, "", "x", "1", [], [1.0], {}, {"a": 1}, *NUMBERS)
+ELSEWHERE = ("evil.py:Two", "os:system", "../x", "/etc/passwd", "imported")
 TEXTS = {
     "right to left": "left\u202eright",
     "isolate": "a\u2066b",
@@ -213,23 +197,8 @@ def settings(content: Content) -> Iterator[Forgery]:
         "horizon": (0, 1, 5.0, 4_999, 5_001, 10**9, 10**30, config["horizon"]),
         "steps": (0, 1, 2**62, 10**30, 5.0),
         "seed": (7, 2**70, -5),
-        "environment": (
-            "frozen_lake",
-            "simple_grid/3x3",
-            "evil.py:Two",
-            "os:system",
-            "../x",
-            "/etc/passwd",
-            "imported",
-        ),
-        "agent": (
-            "dqn",
-            "sarsa",
-            "stable_baselines3:DQN",
-            "stable_baselines3.common.utils:os",
-            "evil.py:Agent",
-            "os:x",
-        ),
+        "environment": ("frozen_lake", "simple_grid/3x3", *ELSEWHERE),
+        "agent": ("dqn", "sarsa", "stable_baselines3:DQN", "stable_baselines3.common.utils:os", *ELSEWHERE),
         "observation": ("index", "vector", "recorded", "evil.py:see", "os:listdir", "simple_image"),
         "engine": ("batched", "sb3", "x"),
         "evaluation_interval": (0, 10**30),
@@ -251,11 +220,7 @@ def settings(content: Content) -> Iterator[Forgery]:
             {name: [value] * 1000 for name, value in config["parameters"].items()},
         ),
         "observation_options": ({"size": 10**9}, {"frames": 10**6}, {"hide": ["row"] * 1000}, {"x": HUGE}),
-        "hyperparameters": (
-            {"net_arch": [10**6, 10**6]},
-            {"policy_kwargs": {"activation_fn": "os:system"}},
-            {"x": "y"},
-        ),
+        "hyperparameters": ({"net_arch": [10**6] * 2}, {"policy_kwargs": {"activation_fn": "os:system"}}, {"x": "y"}),
     }
     for name, values in spellings.items():
         odd = ODD if name in ("gamma", "horizon", "steps", "chance", "parameters") else ODD[:8]
@@ -274,17 +239,8 @@ def descriptions(content: Content) -> Iterator[Forgery]:
     """What is shown beside the numbers, and what describes the file."""
     for (kind, text), name in itertools.product(TEXTS.items(), ("name", "author", "note")):
         yield f"{name} {kind}", edited(content, (name,), text)
-    for name in (
-        "name",
-        "author",
-        "versions",
-        "training",
-        "rules_version",
-        "format",
-        "id",
-        "hyperparameters",
-        "arrays",
-    ):
+    described = ("rules_version", "format", "id", "hyperparameters", "arrays")
+    for name in ("name", "author", "versions", "training", *described):
         for value in (*ODD[:8], HUGE):
             yield f"{name} {str(value)[:20]}", edited(content, (name,), value)
     for kind, text in TEXTS.items():

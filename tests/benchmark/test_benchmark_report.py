@@ -42,11 +42,7 @@ def rungs(axis, levels):
 SUITE = Suite(
     "small",
     Protocol(steps=1000, evaluations=5, seeds=10),
-    (
-        task("easy", dqn=0.1, ppo=0.2, table=0.1),
-        task("hard", dqn=0.1, ppo=0.8, table=0.3),
-        task("odd", table=0.1),
-    ),
+    (task("easy", dqn=0.1, ppo=0.2, table=0.1), task("hard", dqn=0.1, ppo=0.8, table=0.3), task("odd", table=0.1)),
     (
         Ladder("exploration", "bits", "episodes that random play needs", rungs("exploration", (6, 8, 10, 24))),
         Ladder("credit", "steps", "steps between a choice and its consequence", rungs("credit", (8, 16, 32))),
@@ -57,7 +53,7 @@ SUITE = Suite(
 
 
 def results(agent, regrets, seeds=10, spread=0.05, **record):
-    """Results of so much regret on each task, and runs that differ a little."""
+    """Results of so much regret on each task, at all points or at each, and runs that differ a little."""
     noise = spread * np.linspace(-1, 1, seeds)[:, None]
     curves = {name: np.full((seeds, 5), regret) + noise for name, regret in regrets.items()}
     return AgentResults(agent, SUITE.name, SUITE.digest, tuple(range(seeds)), curves, record)
@@ -283,9 +279,7 @@ CORE = ("easy", "hard", "odd")
 
 def learner(agent, curves, seeds=4, spread=0.01):
     """Results on the core: a curve of regret for each task, and runs that differ a little."""
-    noise = spread * np.linspace(-1, 1, seeds)[:, None]
-    own = {name: np.array(curve) + noise for name, curve in zip(CORE, curves, strict=False)}
-    return AgentResults(agent, SUITE.name, SUITE.digest, tuple(range(seeds)), own)
+    return results(agent, dict(zip(CORE, curves, strict=False)), seeds, spread)
 
 
 LATE = ((3.0, 1.5, 1.2, 0.9, 0.1), (1.0, 1.0, 1.0, 1.0, 0.2), (0.9, 0.5, 0.4, 0.2, 0.1))
@@ -350,9 +344,8 @@ def test_core_tasks_stand_beside_the_baseline_of_the_same_kind(agent, other):
 
 
 def test_names_of_tasks_show_what_the_task_is(contents):
-    own = BenchmarkTask(
-        "x", "deep_sea", {"size": 8}, "hash", observation_options={"bits": 64}, chance={"random": 0.1}, digest="x"
-    )
+    options = {"observation_options": {"bits": 64}, "chance": {"random": 0.1}}
+    own = BenchmarkTask("x", "deep_sea", {"size": 8}, "hash", **options, digest="x")
     assert description(own) == "deep_sea, size 8; observation hash (bits 64); chance random 0.1"
     assert description(task("y")) == "deep_sea; observation vector; no chance added"
     text = page(contents)
@@ -365,9 +358,7 @@ def test_without_ladders_the_sentence_begins_with_the_core_and_its_place():
     suite = Suite("small", SUITE.protocol, tuple(four), (), "d1")
 
     def of(agent, *regrets, seeds=10):
-        noise = 0.05 * np.linspace(-1, 1, seeds)[:, None]
-        curves = {each.name: np.full((seeds, 5), x) + noise for each, x in zip(four, regrets, strict=False)}
-        return AgentResults(agent, "small", "d1", tuple(range(seeds)), curves)
+        return results(agent, dict(zip("abcd", regrets, strict=False)), seeds)
 
     beside = [of("dqn", 0.2, 0.2, 0.2, 0.2), of("ppo", 0.9, 0.9), of("x", 0.41, 0.6, 0.7, 0.3), of("y", 0.5, seeds=1)]
     text = sentence(contents_of(of("mine", 0.4, 0.6, 0.7, 0.3), beside=beside, suite=suite))

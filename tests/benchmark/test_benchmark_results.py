@@ -7,6 +7,7 @@ import pytest
 
 from pharos.benchmark.results import AgentResults, baselines
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
+from refusals import refusal
 
 
 def made(**changes):
@@ -59,8 +60,7 @@ def test_a_file_that_promises_more_than_it_has_is_refused(tmp_path):
     with pytest.raises(ResultCorrupted):
         AgentResults.read(file)
     file.write_bytes((1 << 50).to_bytes(8, "little") + header)
-    with pytest.raises(FileFormatError, match="header would have"):
-        AgentResults.read(file)
+    assert "header would have" in refusal(FileFormatError, AgentResults.read, file)
 
 
 @pytest.mark.parametrize(
@@ -68,14 +68,13 @@ def test_a_file_that_promises_more_than_it_has_is_refused(tmp_path):
     [
         ({"seeds": ()}, "at least one"),
         ({"seeds": (1, 1)}, "each once"),
-        ({"curves": {"sea": np.zeros((3, 2))}}, r"shape \(3, 2\); expected \(2 seeds"),
+        ({"curves": {"sea": np.zeros((3, 2))}}, "shape (3, 2); expected (2 seeds"),
         ({"curves": {"sea": np.zeros((2, 2)), "catch": np.zeros((2, 3))}}, "as many evaluations"),
         ({"curves": {"sea": np.array([[1.0], [np.nan]])}}, "sea hold NaN"),
     ],
 )
 def test_results_that_cannot_be_are_refused(changes, said):
-    with pytest.raises(ParameterError, match=said):
-        made(**changes)
+    assert said in refusal(ParameterError, made, **changes)
 
 
 def test_results_that_are_nowhere(tmp_path):
@@ -85,6 +84,5 @@ def test_results_that_are_nowhere(tmp_path):
     run = tmp_path / "interrupted" / "runs" / "sea" / "seed-0"
     run.mkdir(parents=True)
     (run / "curve.parquet").touch()
-    with pytest.raises(ParameterError, match=r"1 so far: the same command goes on"):
-        AgentResults.read(tmp_path / "interrupted")
+    assert "1 so far: the same command goes on" in refusal(ParameterError, AgentResults.read, tmp_path / "interrupted")
     assert baselines("no such suite") == ()

@@ -9,7 +9,8 @@ import pharos
 from pharos import benchmark
 from pharos.benchmark import BenchmarkTask, Protocol, Suite
 from pharos.benchmark.jax_agents import compiled_curves
-from pharos.benchmark.suite import digest_of_suite, digest_of_task
+from pharos.benchmark.sealed import frozen
+from pharos.benchmark.suite import digest_of_suite
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.training import Task, evaluate_agent
 
@@ -126,14 +127,9 @@ def test_what_is_in_no_table_is_refused(options, message):
 def test_snapshots_without_a_common_axis_are_refused(jax):
     task = Task.of(GRID)
     for snapshots in ((np.zeros(2), np.zeros(3)), np.float32(1)):
+        learn = lambda *_, each=snapshots: (None, jax.tree.map(jax.numpy.asarray, each))  # noqa: E731
         with pytest.raises(ParameterError, match="expected one number of at least 1"):
-            compiled_curves(
-                lambda *_, each=snapshots: (None, jax.tree.map(jax.numpy.asarray, each)),
-                task,
-                steps=3,
-                evaluations=3,
-                seeds=[0],
-            )
+            compiled_curves(learn, task, steps=3, evaluations=3, seeds=[0])
 
 
 @pytest.mark.slow
@@ -162,8 +158,5 @@ def test_a_suite_is_run_and_goes_on(jax, tmp_path):
 
 def _suite(protocol):
     task = BenchmarkTask("grid", "simple_grid", {"height": 4, "width": 4}, "one_hot")
-    solved = task.training_task(protocol)
-    values = {"value_optimal": solved.reference.optimal, "value_uniform": solved.reference.uniform}
-    made = replace(task, digest=digest_of_task(solved), **values)
-    suite = Suite("one", protocol, (made,), (), "", {})
+    suite = Suite("one", protocol, (frozen(task, protocol),), (), "", {})
     return replace(suite, digest=digest_of_suite(suite))

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -14,6 +13,7 @@ from pharos.benchmark import score
 from pharos.benchmark.scores import Interval, frontier, interquartile_interval, mean_interval
 from pharos.errors import ParameterError
 from small_benchmark import CORE, LEVELS, RUNGS, constant, drawn, results, small_suite
+from strategies import examples
 
 SUITE = small_suite()
 REGRETS = st.lists(st.lists(st.floats(0, 1), min_size=3, max_size=3), min_size=4, max_size=4)
@@ -86,8 +86,7 @@ def test_below_random_is_what_the_whole_interval_says():
     assert score(replace(agent, curves=curves), SUITE).below_random == ("core-a",)
 
 
-@settings(max_examples=50, deadline=None)
-@given(REGRETS)
+@examples(50, REGRETS)
 def test_frontier_is_that_of_plain_python_within_its_interval(regrets):
     found = frontier(np.array(LEVELS), [np.array(own) for own in regrets])
     level, censored = naive.crossing(LEVELS, [naive.mean(own) for own in regrets])
@@ -96,8 +95,7 @@ def test_frontier_is_that_of_plain_python_within_its_interval(regrets):
     assert found.low <= found.value <= found.high
 
 
-@settings(max_examples=50, deadline=None)
-@given(REGRETS, st.integers(0, 3), st.floats(0, 1))
+@examples(50, REGRETS, st.integers(0, 3), st.floats(0, 1))
 def test_less_regret_on_any_rung_moves_the_frontier_no_nearer(regrets, rung, share):
     levels, arrays = np.array(LEVELS), [np.array(own) for own in regrets]
     before = frontier(levels, arrays)

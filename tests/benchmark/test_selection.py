@@ -48,10 +48,8 @@ def test_features_are_ranks_with_ties_and_unknown_values(select):
 def test_the_farthest_of_few_candidates_comes_next(select):
     def row(name, dqn, states):
         places = {"environment": name, "parameters": "{}", "chance": "{}", "exploration_time": 1.0, "table": 0.0}
-        return {**places, "name": name, "observation": "vector", "dqn": dqn, "ppo": 0.5, "num_states": states} | {
-            "dqn_seconds": None,
-            "ppo_seconds": None,
-        }
+        learners = {"dqn": dqn, "ppo": 0.5, "dqn_seconds": None, "ppo_seconds": None}
+        return {**places, **learners, "name": name, "observation": "vector", "num_states": states}
 
     rows = [row("a", 0.1, 10), row("b", 0.2, 20), row("c", 0.3, 30), row("d", 0.4, 40), row("e", 0.5, 50)]
     rows.append(row("solved", 0.05, 10) | {"ppo": 0.05})

@@ -12,32 +12,23 @@ import time
 
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
 import command_line
 from pharos import TabularMDP, build, hardness, importers
-from pharos.cli import answers, app
+from pharos.cli import answers
 from pharos.cli.options import parse_parameters, parse_size, parse_value
 from pharos.cli.render import Game
 from pharos.environments import classes, make, named_instances
 from pharos.errors import ParameterError
+from refusals import failing
+from worlds import Corridor, Row, code_of
 
 ENTRIES = ["State", "Start", "Actions", "Chance", "Reward", "Ends", "Limit", "Ours", "Source"]
-BUILD_KEYS = set(
-    [
-        "environment",
-        "parameters",
-        "num_states",
-        "num_actions",
-        "num_terminal_states",
-        "depth",
-        "seconds",
-        "states_per_second",
-        "peak_memory_bytes",
-        "bytes_on_disk",
-        "folder",
-    ]
-)
+BUILD_KEYS = {
+    *("environment", "parameters", "num_states", "num_actions", "num_terminal_states", "depth"),
+    *("seconds", "states_per_second", "peak_memory_bytes", "bytes_on_disk", "folder"),
+}
+GRID = ("build", "simple_grid", "height=3", "width=5")
 
 
 @pytest.fixture(scope="session")
@@ -228,15 +219,13 @@ def test_a_progress_bar_says_what_happens_before_anything_is_counted(monkeypatch
 
 @pytest.mark.slow
 def test_build_answers_with_the_keys_of_its_contract(answer, tmp_path):
-    built = answer(
-        "build", "simple_grid", "height=3", "width=5", "--out", tmp_path / "grid", "--memory", "1GiB", "--workers", 1
-    )
+    built = answer(*GRID, "--out", tmp_path / "grid", "--memory", "1GiB", "--workers", 1)
     assert set(built) >= BUILD_KEYS
     assert (built["num_states"], built["num_actions"], built["num_terminal_states"], built["depth"]) == (15, 4, 1, 6)
     assert built["parameters"]["width"] == 5
     assert built["folder"] == str(tmp_path / "grid")
     assert built["bytes_on_disk"] == sum(file.stat().st_size for file in (tmp_path / "grid").iterdir())
-    again = answer("build", "simple_grid", "height=3", "width=5", "--out", tmp_path / "grid")
+    again = answer(*GRID, "--out", tmp_path / "grid")
     assert (built["found"], again["found"]) == (False, True)
 
 
@@ -249,25 +238,7 @@ def test_a_built_folder_is_a_target(answer, tmp_path):
 
 @pytest.mark.slow
 def test_a_users_own_class_is_a_target(answer, tmp_path, monkeypatch):
-    (tmp_path / "corridor_of_mine.py").write_text(
-        "from dataclasses import dataclass\n"
-        "from pharos import Environment\n"
-        "@dataclass(frozen=True, kw_only=True)\n"
-        "class Corridor(Environment):\n"
-        "    length: int = 5\n"
-        "    name = 'corridor'\n"
-        "    actions = ('left', 'right')\n"
-        "    def variables(self):\n"
-        "        return {'cell': range(self.length)}\n"
-        "    def initial_state(self):\n"
-        "        return (0,)\n"
-        "    def transition(self, state, action, out):\n"
-        "        out[0] = min(max(state[0] + 2 * action - 1, 0), self.length - 1)\n"
-        "    def is_terminal(self, state):\n"
-        "        return state[0] == self.length - 1\n"
-        "    def reward(self, state, action, next_state):\n"
-        "        return 1.0 if next_state[0] == self.length - 1 else 0.0\n"
-    )
+    (tmp_path / "corridor_of_mine.py").write_text(code_of(Row, Corridor))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     built = answer("build", "corridor_of_mine:Corridor", "length=9")
@@ -341,9 +312,8 @@ def test_with_a_horizon_values_are_undiscounted_unless_told_otherwise(answer):
 def test_solving_a_folder_is_solving_its_environment(answer, tmp_path):
     answer("build", "breakout", "height=7", "columns=3", "--out", tmp_path / "court")
     options = ("--sticky", 0.25, "--random", 0.1)
-    solved = [
-        answer("solve", *target, *options) for target in (["breakout", "height=7", "columns=3"], [tmp_path / "court"])
-    ]
+    targets = (["breakout", "height=7", "columns=3"], [tmp_path / "court"])
+    solved = [answer("solve", *target, *options) for target in targets]
     for key in SOLVE_KEYS - {"seconds"}:
         assert solved[0][key] == solved[1][key]
     assert solved[0]["value_at_start"] < answer("solve", tmp_path / "court")["value_at_start"]
@@ -375,15 +345,8 @@ def test_solve_speaks_to_people(pharos):
 def test_render_writes_pictures_and_episodes(answer, tmp_path):
     from PIL import Image
 
-    state = answer(
-        "render",
-        "breakout",
-        "height=8",
-        "--state",
-        "5,1,0,1,3,1,1,1,1,1,1,1,1,0,1,1,1,1,1,1,1",
-        "--out",
-        tmp_path / "a.png",
-    )
+    words = ("--state", "5,1,0,1,3,1,1,1,1,1,1,1,1,0,1,1,1,1,1,1,1", "--out", tmp_path / "a.png")
+    state = answer("render", "breakout", "height=8", *words)
     assert state["state"][:5] == [5, 1, 0, 1, 3]
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.format == "PNG" and min(picture.size) > 200
@@ -440,11 +403,7 @@ def test_bad_usage_is_one_line_and_exit_code_2(failure, words, said):
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (
-            ["build", "simple_grid", "height=4000000000", "width=4000000000"],
-            1,
-            "a number is too large: array is too big",
-        ),
+        (["build", "simple_grid", "height=4000000000", "width=4000000000"], 1, "too large: array is too big"),
         (["build", "freeway", f"num_cars={10**30}"], 1, "a number is too large"),
         (["build", "simple_grid", f"penalties=0,1:-{10**400}"], 2, "expected ((row, column), value)"),
         (["train", "frozen_lake/4x4", "--agent", "q_learning", "--steps", 10**24], 2, "of 64 bits"),
@@ -466,32 +425,18 @@ def test_what_fails_is_one_line_and_exit_code_1(failure, tmp_path):
     assert "no state space there" in line
 
 
-def test_an_interrupted_command_says_so_and_exits_with_130(failure, monkeypatch):
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("pharos.state_space.build", interrupted)
-    code, line = failure("build", "simple_grid")
-    assert code == 130
-    assert "interrupted" in line
-
-
-def test_a_file_that_ends_too_early_is_no_interruption(failure, monkeypatch):
-    def cut_short(*_, **__):
-        raise EOFError("Ran out of input")
-
-    monkeypatch.setattr("pharos.state_space.build", cut_short)
-    code, line = failure("build", "simple_grid")
-    assert code == 1
-    assert "a file ended too early (Ran out of input); if it is compiled code, delete " in line
-
-
-def test_a_full_or_forbidden_disk_is_one_line(failure, monkeypatch):
-    def forbidden(*_, **__):
-        raise PermissionError(13, "Permission denied", "/somewhere")
-
-    monkeypatch.setattr("pharos.state_space.build", forbidden)
-    assert failure("build", "simple_grid") == (1, "pharos: /somewhere: Permission denied\n")
+@pytest.mark.parametrize(
+    ("raised", "code", "said"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (EOFError("Ran out of input"), 1, "a file ended too early (Ran out of input); if it is compiled code, delete "),
+        (PermissionError(13, "Permission denied", "/somewhere"), 1, "pharos: /somewhere: Permission denied\n"),
+    ],
+)
+def test_what_ends_a_build_is_one_line_with_its_exit_code(failure, monkeypatch, raised, code, said):
+    monkeypatch.setattr("pharos.state_space.build", failing(raised))
+    found, line = failure("build", "simple_grid")
+    assert found == code and said in line
 
 
 # As a process --------------------------------------------------------------------------------------------------------
@@ -533,48 +478,30 @@ def test_a_solve_that_is_terminated_says_that_the_same_command_goes_on(cache, tm
 
 @pytest.mark.slow
 def test_what_the_environment_lacks_or_forbids_is_a_line(cache):
-    for words, added in (
-        ("solve frozen_lake/4x4", "NUMBA_DISABLE_JIT=1"),
-        ("solve frozen_lake/4x4", "NUMBA_NUM_THREADS=0"),
-    ):
-        name, value = added.split("=")
-        done = command_line.process(*words.split(), environment={"PHAROS_CACHE_DIR": cache, name: value})
+    for name, value in (("NUMBA_DISABLE_JIT", 1), ("NUMBA_NUM_THREADS", 0)):
+        done = command_line.process("solve", "frozen_lake/4x4", environment={"PHAROS_CACHE_DIR": cache, name: value})
         assert done.returncode == 2 and done.stderr.count("\n") == 1 and "NUMBA_" in done.stderr, done.stderr
-    closed = f"{sys.executable} -m pharos list >&-"
-    done = subprocess.run(closed, shell=True, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    closed = f"{sys.executable} -m pharos play frozen_lake/4x4 <&-"
-    done = subprocess.run(closed, shell=True, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
-    assert (
-        done.returncode == 1
-        and done.stderr.startswith("pharos: play needs a terminal")
-        and done.stderr.count("\n") == 1
-    )
+    for words, code, said in (("list >&-", 0, ""), ("play frozen_lake/4x4 <&-", 1, "pharos: play needs a terminal")):
+        line = f"{sys.executable} -m pharos {words}"
+        done = subprocess.run(line, shell=True, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
+        assert done.returncode == done.stderr.count("\n") == code and done.stderr.startswith(said)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [["list"], ["--help"], ["list", "--json"]])
 def test_help_and_list_load_nothing_heavy(words):
-    script = (
-        "import sys\n"
-        "from pharos.cli import app\n"
-        "try:\n"
-        f"    app({words!r})\n"
-        "finally:\n"
-        "    heavy = {'numba', 'scipy.stats', 'pandas', 'matplotlib', 'torch'} & set(sys.modules)\n"
-        "    assert not heavy, heavy\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600)
+    heavy = ("numba", "scipy.stats", "pandas", "matplotlib", "torch")
+    code = f"import atexit, os, sys; from pharos.cli import app; heavy = {heavy!r}; "
+    code += f"atexit.register(lambda: os._exit(9) if {{*heavy}} & {{*sys.modules}} else None); app({words!r})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow
 def test_a_build_with_chance_says_how_many_outcomes_there_are(pharos, tmp_path):
-    done = pharos("build", "frozen_lake", "slippery=true", "--out", str(tmp_path / "space"))
-    assert done.exit_code == 0, done.stderr
-    assert "outcomes     at most 3 of an action, 152 in all" in done.stdout
-    again = pharos("build", "frozen_lake", "slippery=true", "--out", str(tmp_path / "space"), "--json")
-    assert json.loads(again.stdout)["num_transitions"] == 152 == 11 * 4 * 3 + 5 * 4
+    words = ("build", "frozen_lake", "slippery=true", "--out", tmp_path / "space")
+    assert "outcomes     at most 3 of an action, 152 in all" in pharos(*words).stdout
+    assert command_line.answer(*words)["num_transitions"] == 152 == 11 * 4 * 3 + 5 * 4
 
 
 def test_a_game_that_is_played_draws_the_outcomes_of_chance_in_the_rules(monkeypatch):
@@ -607,13 +534,12 @@ def test_hardness_tells_how_many_gaps_are_ties_and_at_which_tolerance(pharos):
 
 def test_check_says_whether_there_is_anything_to_learn(tmp_path, monkeypatch):
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path / "cache"))
-    said = CliRunner().invoke(app, ["check", "river_swim", "length=5"])
+    said = command_line.run("check", "river_swim", "length=5")
     assert said.exit_code == 0
     assert "keeps the contract in all 5 states" in said.stdout and "by uniform play" in said.stdout
-    importers.save(TabularMDP.from_arrays([[1, 1], [0, 0]], [[1.0, 1.0], [0.0, 0.0]], gamma=0.9,
-                                                        horizon=4), tmp_path / "flat")  # fmt: skip
-    answer = json.loads(CliRunner().invoke(app, ["check", str(tmp_path / "flat"), "--json"]).stdout)
+    flat = TabularMDP.from_arrays([[1, 1], [0, 0]], [[1.0, 1.0], [0.0, 0.0]], gamma=0.9, horizon=4)
+    answer = command_line.answer("check", importers.save(flat, tmp_path / "flat"))
     assert answer["complete"] and answer["values"]["optimal"] == answer["values"]["uniform"]
     assert any("no policy beats uniform play" in note for note in answer["notes"])
-    sample = json.loads(CliRunner().invoke(app, ["check", "river_swim", "--max-states", "3", "--json"]).stdout)
+    sample = command_line.answer("check", "river_swim", "--max-states", 3)
     assert sample["values"] is None and not sample["complete"]

@@ -1,35 +1,20 @@
 """pharos plot, and pharos evaluate of what runs have learnt: files, answers, and what bad input gets."""
 
-import json
-
 import numpy as np
 import pytest
 from PIL import Image
 
 import pharos
-from command_line import run
+from command_line import answer, run
 from pharos.training import Task, load_agent, read_record, train
-
-
-def answer(*words):
-    done = run(*words, "--json")
-    assert done.exit_code == 0, done.output
-    return json.loads(done.stdout)
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     place = tmp_path_factory.mktemp("runs")
     for agent, seed, steps in (("q_learning", 0, 4000), ("q_learning", 1, 4000), ("ppo", 0, 256)):
-        train(
-            agent,
-            "frozen_lake/4x4",
-            steps=steps,
-            evaluation_interval=steps // 4,
-            seed=seed,
-            random=0.1,
-            out=place / f"{agent}-{seed}",
-        )
+        options = {"evaluation_interval": steps // 4, "random": 0.1, "out": place / f"{agent}-{seed}"}
+        train(agent, "frozen_lake/4x4", steps=steps, seed=seed, **options)
     return {path.name: path for path in place.iterdir()}
 
 
@@ -75,9 +60,8 @@ def test_values_of_any_policy_are_drawn(folders, tmp_path, policy):
     if policy == "table":
         given = tmp_path / "policy.npy"
         np.save(given, np.full((16, 4), 0.25))
-    found = answer(
-        "plot", "value", "frozen_lake/4x4", "--policy", folders.get(policy, given), "--out", tmp_path / "v.png"
-    )
+    words = ("--policy", folders.get(policy, given), "--out", tmp_path / "v.png")
+    found = answer("plot", "value", "frozen_lake/4x4", *words)
     if policy in ("uniform", "table"):
         task = Task.of("frozen_lake/4x4", gamma=0.99, horizon=None)
         assert found["value_at_start"] == pytest.approx(task.uniform.value_at_start, abs=2e-6)

@@ -15,10 +15,8 @@ def run(*words):
 @pytest.mark.slow
 def test_train_answers_in_json_and_writes_a_plot(tmp_path):
     out = tmp_path / "run"
-    done = run(
-        "simple_grid", "height=3", "--steps", 3000, "--out", out, "--set", "initial_q=2.0", "--json", "--sticky", 0.1
-    )
-    answer = json.loads(done.stdout)
+    words = ("--steps", 3000, "--out", out, "--set", "initial_q=2.0", "--sticky", 0.1)
+    answer = command_line.answer("train", "simple_grid", "height=3", *words)
     assert answer["config"]["agent"] == "q_learning"
     assert answer["config"]["hyperparameters"] == {"initial_q": 2.0}
     assert answer["value_optimal"] >= answer["final_value"]
@@ -35,9 +33,8 @@ def test_train_prints_a_table_for_people():
 
 
 def test_wrong_words_are_usage_errors(tmp_path):
-    assert run("simple_grid", "--agent", "dqm").exit_code == 2
-    assert run("simple_grid", "--set", "learning_rate").exit_code == 2
-    assert run("simple_grid", "--steps", 0).exit_code == 2
+    for words in (("--agent", "dqm"), ("--set", "learning_rate"), ("--steps", 0)):
+        assert run("simple_grid", *words).exit_code == 2
 
 
 def test_many_seeds_leave_a_folder_each_and_one_table(tmp_path):

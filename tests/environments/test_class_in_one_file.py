@@ -1,5 +1,6 @@
 """A class of environments in one file has everything: looks, named instances, Gymnasium ids, hyperparameters."""
 
+import dataclasses
 import importlib
 import itertools
 import sys
@@ -97,11 +98,8 @@ def corridor(tmp_path, monkeypatch):
 
 def test_its_named_instances_are_made_by_name(corridor):
     assert pharos.make("corridor/short") == type(corridor)(length=3)
-    assert [name for name in pharos.list_environments() if name.startswith("corridor")] == [
-        "corridor",
-        "corridor/short",
-        "corridor/long",
-    ]
+    names = [name for name in pharos.list_environments() if name.startswith("corridor")]
+    assert names == ["corridor", "corridor/short", "corridor/long"]
 
 
 @pytest.mark.slow
@@ -158,8 +156,6 @@ def test_it_keeps_the_contract(corridor):
 
 
 def test_a_ground_or_shape_that_nobody_paints_is_named(corridor):
-    import dataclasses
-
     cls = type(corridor)
     lost = dataclasses.replace(cls.look, ground="rood")
     with pytest.raises(UnknownName, match="unknown ground 'rood'; did you mean 'road'"):
@@ -177,8 +173,6 @@ def test_the_list_says_what_the_classes_say():
 
 
 def test_the_conformance_kit_names_a_ground_or_shape_that_nobody_paints(corridor):
-    import dataclasses
-
     cls = type(corridor)
 
     def lost(**attributes):

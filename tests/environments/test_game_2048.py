@@ -6,11 +6,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
-from pharos.errors import ParameterError
+from strategies import examples
 
 pytestmark = pytest.mark.long  # with each class compiled and walked through in full
 
@@ -151,8 +150,7 @@ def boards(draw):
     return rows, columns, draw(st.tuples(*[tile] * (rows * columns)))
 
 
-@given(boards(), st.booleans(), st.sampled_from([None, 8, 16]))
-@settings(max_examples=150, deadline=None)
+@examples(150, boards(), st.booleans(), st.sampled_from([None, 8, 16]))
 def test_every_outcome_is_that_of_the_twin(drawn, canonical, target):
     rows, columns, state = drawn
     target = target if rows * columns > 2 else None
@@ -280,21 +278,3 @@ def test_starts_are_two_tiles_as_they_appear():
     expected = starts(2, 3)
     assert law.keys() == expected.keys()
     assert all(law[board] == pytest.approx(float(p), abs=1e-15) for board, p in expected.items())
-
-
-@pytest.mark.parametrize(
-    ("parameters", "words"),
-    [
-        ({"rows": 1, "columns": 1}, "are 1 cells; expected 2 to 16"),
-        ({"rows": 3, "columns": 6}, "are 18 cells; expected 2 to 16"),
-        ({"target": 48}, "expected a power of two up to 1024"),
-        ({"target": 2048}, "the largest tile on 9 cells"),
-        ({"target": 4}, "target=4; expected an integer of at least 8"),
-        ({"objective": "target"}, "add target=64"),
-        ({"objective": "points"}, "expected score or target"),
-    ],
-)
-def test_a_wrong_parameter_is_named_with_what_was_expected(parameters, words):
-    with pytest.raises(ParameterError) as error:
-        pharos.make("game_2048", **parameters)
-    assert words in str(error.value)

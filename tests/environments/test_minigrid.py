@@ -18,6 +18,7 @@ from pharos import hardness, importers
 from pharos.errors import MissingExtra, ParameterError, RuleError, StateSpaceTooLarge
 from pharos.importers import minigrid_recording
 from pharos.mdp.bisimulation import minimize
+from refusals import refusal
 
 CORRIDOR = "MiniGrid-KeyCorridorS3R1-v0"
 PUBLISHED = Path(__file__).parents[1] / "data" / "bridge" / "key-corridor-s3r1.npz"
@@ -127,12 +128,9 @@ def test_an_environment_that_was_made_is_taken_as_it_is():
 def test_what_cannot_be_imported_is_refused_in_one_line():
     with pytest.raises(RuleError, match="draws random numbers in state 0"):
         importers.minigrid("MiniGrid-Dynamic-Obstacles-5x5-v0")
-    with pytest.raises(StateSpaceTooLarge, match="max_states=20"):
-        importers.minigrid(CORRIDOR, max_states=20)
-    with pytest.raises(ParameterError, match="cannot make it"):
-        importers.minigrid("MiniGrid-KeyCorridorS3R9-v0")
-    with pytest.raises(ParameterError, match="is no environment of MiniGrid"):
-        importers.minigrid("FrozenLake-v1")
+    assert "max_states=20" in refusal(StateSpaceTooLarge, importers.minigrid, CORRIDOR, max_states=20)
+    assert "cannot make it" in refusal(ParameterError, importers.minigrid, "MiniGrid-KeyCorridorS3R9-v0")
+    assert "is no environment of MiniGrid" in refusal(ParameterError, importers.minigrid, "FrozenLake-v1")
     for actions in ([], [0, 0], [7], [-1]):
         with pytest.raises(ParameterError, match="expected different ones from 0 to 6"):
             importers.minigrid(CORRIDOR, actions=actions)
@@ -140,8 +138,7 @@ def test_what_cannot_be_imported_is_refused_in_one_line():
 
 def test_without_the_package_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "minigrid", None)
-    with pytest.raises(MissingExtra, match=r"pharos-rl\[minigrid\]"):
-        importers.minigrid(CORRIDOR)
+    assert "pharos-rl[minigrid]" in refusal(MissingExtra, importers.minigrid, CORRIDOR)
 
 
 @pytest.mark.slow

@@ -4,14 +4,13 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
 from naive import environments as naive
 from pharos.drawing import text_drawing
-from pharos.errors import ParameterError
 from solution_lengths import solution_lengths
+from strategies import examples
 
 pytestmark = pytest.mark.long  # with each class compiled and walked through in full
 
@@ -24,8 +23,7 @@ COUNTS = {
 }
 
 
-@given(st.lists(st.sampled_from(["U", "U2", "U'", "R", "R2", "R'", "F", "F2", "F'"]), max_size=25))
-@settings(max_examples=100, deadline=None)
+@examples(100, st.lists(st.sampled_from(["U", "U2", "U'", "R", "R2", "R'", "F", "F2", "F'"]), max_size=25))
 def test_its_net_is_that_of_stickers_turned_in_space(turns):
     env, state, twin = pharos.make("pocket_cube"), SOLVED, naive.PocketCube()
     assert text_drawing(env, state) == twin.net()
@@ -75,25 +73,6 @@ def test_a_position_takes_one_word():
     from pharos.rules import layout_of
 
     assert layout_of(pharos.make("pocket_cube").components).num_words == 1
-
-
-@pytest.mark.parametrize(
-    ("parameters", "words"),
-    [
-        ({"metric": "third"}, "metric='third'; expected half or quarter"),
-        ({"scramble": "U D"}, "scramble='U D'; expected turns, each one of U U2 U' R"),
-        ({"scramble": 3}, "scramble=3; expected turns"),
-        ({"scramble": ""}, "scramble=''; expected turns"),
-        ({"scramble": "U R R' U'"}, "leads to the solved cube"),
-        ({"scramble": "U", "seed": 1}, "scramble was given with seed"),
-        ({"seed": -1}, "seed=-1"),
-    ],
-)
-def test_a_wrong_parameter_is_named_with_what_was_expected(parameters, words):
-    with pytest.raises(ParameterError) as error:
-        pharos.make("pocket_cube", **parameters)
-    assert words in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_quarter_turns_may_be_scrambled_by_half_turns():

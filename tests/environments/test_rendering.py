@@ -7,22 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pharos import Layer, make
+from pharos import Layer, drawing, make
 from pharos.cli.render import Game
-from pharos.drawing import (
-    SHAPES,
-    colored_text,
-    episode,
-    human,
-    image,
-    planes_of,
-    save_gif,
-    save_png,
-    shade,
-    text_drawing,
-)
+from pharos.drawing import SHAPES, episode, human, planes_of, shade, text_drawing
 from pharos.errors import ParameterError, UnknownName
 from pharos.observations import RENDERERS, render
+from refusals import refusal
 from worlds import Row
 
 ENVIRONMENTS = ["simple_grid/6x6-decoy", "frozen_lake/8x8", "freeway/16x7-speed2", "breakout/12x8x3"]
@@ -84,7 +74,7 @@ def test_cars_look_where_they_go():
 def test_text_is_the_drawing_of_the_environment():
     env = make("frozen_lake")
     assert text_drawing(env, (0, 0)) == "A...\n.O.O\n...O\nO..G"
-    assert colored_text(env, (0, 0)).plain.replace(" ", "") == text_drawing(env, (0, 0))
+    assert drawing.colored_text(env, (0, 0)).plain.replace(" ", "") == text_drawing(env, (0, 0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,39 +207,32 @@ def test_images_that_agents_see_are_drawn_for_people(name):
         assert ((planes[:, left : left + columns, 0] > 0) == (plane > 0)).all()
     assert render(env, state, "complex_image").shape == (84, 84, 3)
     assert render(env, state, "complex_image", size=(60, 90), grey=True).shape == (60, 90, 3)
-    with pytest.raises(ParameterError, match="no image"):
-        render(env, state, "vector")
-    with pytest.raises(UnknownName, match="option of observation"):
-        render(env, state, "complex_image", colour=1)
-    with pytest.raises(ParameterError, match="takes no options"):
-        render(env, state, "human", size=3)
+    assert "no image" in refusal(ParameterError, render, env, state, "vector")
+    assert "option of observation" in refusal(UnknownName, render, env, state, "complex_image", colour=1)
+    assert "takes no options" in refusal(ParameterError, render, env, state, "human", size=3)
 
 
 def test_what_cannot_be_drawn_is_said():
-    with pytest.raises(UnknownName, match="did you mean 'human'"):
-        render(Lamp(), (0,), "humen")
-    with pytest.raises(ParameterError, match="light = 3; expected 0 to 2"):
-        human(Lamp(), (3,))
-    with pytest.raises(ParameterError, match="2 components; expected 1"):
-        human(Lamp(), (0, 0))
-    with pytest.raises(ParameterError, match=r"must define grid\(\)"):
-        human(Row(), (0,))
+    assert "did you mean 'human'" in refusal(UnknownName, render, Lamp(), (0,), "humen")
+    assert "light = 3; expected 0 to 2" in refusal(ParameterError, human, Lamp(), (3,))
+    assert "2 components; expected 1" in refusal(ParameterError, human, Lamp(), (0, 0))
+    assert "must define grid()" in refusal(ParameterError, human, Row(), (0,))
 
 
 def test_png_holds_the_picture_and_a_caption_below(tmp_path):
     picture = human(make("simple_grid"), (1, 2))
-    with Image.open(save_png(tmp_path / "a.png", picture)) as read:
+    with Image.open(drawing.save_png(tmp_path / "a.png", picture)) as read:
         np.testing.assert_array_equal(np.asarray(read), picture)
-    with Image.open(save_png(tmp_path / "b.png", picture, caption="step 3")) as read:
+    with Image.open(drawing.save_png(tmp_path / "b.png", picture, caption="step 3")) as read:
         written = np.asarray(read)
     np.testing.assert_array_equal(written[: len(picture)], picture)
     assert written[len(picture) :].max() > 200
-    assert image(picture).size == (picture.shape[1], picture.shape[0])
+    assert drawing.image(picture).size == (picture.shape[1], picture.shape[0])
 
 
 def test_small_pictures_are_enlarged_by_a_whole_factor(tmp_path):
     small = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
-    with Image.open(save_png(tmp_path / "a.png", small, at_least=10)) as read:
+    with Image.open(drawing.save_png(tmp_path / "a.png", small, at_least=10)) as read:
         np.testing.assert_array_equal(np.asarray(read), small.repeat(4, axis=0).repeat(4, axis=1))
 
 
@@ -257,7 +240,7 @@ def test_gif_has_the_frames_their_time_and_their_colours(tmp_path):
     env = make("frozen_lake")
     states = [(0, 0), (1, 0), (2, 0), (2, 1)]
     pictures = [human(env, state) for state in states]
-    with Image.open(save_gif(tmp_path / "a.gif", pictures, frames_per_second=10)) as read:
+    with Image.open(drawing.save_gif(tmp_path / "a.gif", pictures, frames_per_second=10)) as read:
         assert read.n_frames == 4
         assert read.info["loop"] == 0
         for number, picture in enumerate(pictures):

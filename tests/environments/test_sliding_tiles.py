@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
@@ -12,7 +11,9 @@ from naive import environments as naive
 from pharos.drawing import text_drawing
 from pharos.errors import ParameterError
 from pharos.observations import render
+from refusals import refusal
 from solution_lengths import solution_lengths
+from strategies import examples
 
 # Positions that need 0, 1, 2, ... moves, blank in a corner when solved: sequences of the On-Line Encyclopedia of
 # Integer Sequences, by H. Pfoertner (2003) and others; 2x2 by hand.
@@ -43,8 +44,7 @@ def trays(draw):
     return {"rows": rows, "columns": columns, "seed": draw(st.integers(0, 1000))}
 
 
-@given(trays(), st.lists(st.sampled_from(["up", "right", "down", "left"]), max_size=60))
-@settings(max_examples=100, deadline=None)
+@examples(100, trays(), st.lists(st.sampled_from(["up", "right", "down", "left"]), max_size=60))
 def test_tiles_slide_like_those_of_its_twin(parameters, actions):
     env = pharos.make("sliding_tiles", **parameters)
     state = tuple(env.initial_state())
@@ -99,8 +99,7 @@ def test_exactly_the_positions_that_can_be_solved_are_taken_as_a_start():
         if tiles in positions and tiles != (1, 2, 3, 0):
             assert pharos.make("sliding_tiles/2x2", start=tiles).initial_state() == tiles
         else:
-            with pytest.raises(ParameterError, match="SlidingTiles: start="):
-                pharos.make("sliding_tiles/2x2", start=tiles)
+            assert "SlidingTiles: start=" in refusal(ParameterError, pharos.make, "sliding_tiles/2x2", start=tiles)
 
 
 @pytest.mark.parametrize("tray", sorted(COUNTS))
@@ -147,22 +146,3 @@ def test_no_two_positions_share_an_image():
     large = pharos.make("sliding_tiles", rows=6, columns=6)
     assert len(np.unique(render(large, large.initial_state(), "simple_image"))) > 3
     assert len(set(text_drawing(large, large.initial_state()))) == 36 + 1
-
-
-@pytest.mark.parametrize(
-    ("parameters", "words"),
-    [
-        ({"rows": 1}, "rows=1; expected an integer of at least 2"),
-        ({"rows": 6, "columns": 7}, "42 cells; expected at most 36"),
-        ({"start": (1, 2, 3)}, "expected each of 0 to 8 once"),
-        ({"start": (1, 2, 3, 4, 5, 6, 7, 8, 0)}, "not in order"),
-        ({"start": (2, 1, 3, 4, 5, 6, 7, 8, 0)}, "cannot be solved; exchange two of its tiles"),
-        ({"start": "8,6,x"}, "expected integers"),
-        ({"start": (8, 6, 7, 2, 5, 4, 3, 0, 1), "seed": 1}, "start was given with seed"),
-    ],
-)
-def test_a_wrong_parameter_is_named_with_what_was_expected(parameters, words):
-    with pytest.raises(ParameterError) as error:
-        pharos.make("sliding_tiles", **parameters)
-    assert words in str(error.value)
-    assert "\n" not in str(error.value)

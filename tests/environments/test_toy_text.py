@@ -9,7 +9,6 @@ import pytest
 import pharos
 from pharos.environments import start_distribution
 from pharos.environments.worlds.blackjack import HIT, LOST, PLAYING, STICK, WON
-from pharos.errors import ParameterError
 
 
 def outcomes_of(env, state, action):
@@ -260,24 +259,3 @@ def test_starts_of_blackjack_are_two_cards_and_the_dealers():
     assert sum(p for state, p in law.items() if state[3]) == pytest.approx(2 * 4 / 13**2)
     assert sum(p for state, p in law.items() if state[0] == 4) == pytest.approx(1 / 13**2)
     assert sum(p for state, p in law.items() if state[1] == 10) == pytest.approx(4 / 13)
-
-
-@pytest.mark.parametrize(
-    ("name", "parameters", "words"),
-    [
-        ("cliff_walking", {"width": 2}, "width=2; expected an integer of at least 3"),
-        ("cliff_walking", {"is_slippery": True}, "write slippery=true"),
-        ("taxi", {"landmarks": "0,0"}, "expected 2 to 9 cells"),
-        ("taxi", {"landmarks": "0,0; 0,0"}, "each another one"),
-        ("taxi", {"walls": "0,5"}, "inside 5 x 5"),
-        ("taxi", {"walls": 3}, "expected cells"),
-        ("taxi", {"is_rainy": True}, "write rainy=true"),
-        ("taxi", {"rainy_probability": 1.5}, "expected a finite number from 0 to 1"),
-        ("blackjack", {"sab": 3}, "expected True or False"),
-        ("blackjack", {"natural": True}, "add sab=false"),
-    ],
-)
-def test_a_wrong_parameter_is_named_with_what_was_expected(name, parameters, words):
-    with pytest.raises(ParameterError) as error:
-        pharos.make(name, **parameters)
-    assert words in str(error.value)

@@ -20,6 +20,7 @@ from pharos.explorer.launch import MOST_CONNECTIONS
 from pharos.explorer.pages import contents, heat_map, quantities, quantity
 from pharos.explorer.states import NumberedStates, axes_of
 from pharos.mdp import TabularMDP
+from refusals import failing
 
 TOLERANCE = 1e-6  # of values, as value_iteration promises
 
@@ -220,11 +221,8 @@ def test_a_space_that_does_not_fit_into_a_page_is_refused_in_one_line(monkeypatc
 
 
 def test_an_environment_without_a_drawing_is_shown_without_one(lake):
-    class Undrawn(type(lake.env)):
-        def draw(self, state, planes):
-            raise RuntimeError("no\npicture")
-
-    pictures = Pictures(Undrawn(), (0, 0))
+    undrawn = type("Undrawn", (type(lake.env),), {"draw": failing(RuntimeError("no\npicture"))})
+    pictures = Pictures(undrawn(), (0, 0))
     assert pictures.fault == "There is no drawing: no picture"
     assert pictures.of((0, 0)) == {"fault": "There is no drawing: no picture"}
 

@@ -1,14 +1,13 @@
 """Observations that several states share: how many there are, and what they cost an agent without memory."""
 
 import itertools
-import json
 
 import numpy as np
 import pytest
 from gymnasium import spaces
 
 import pharos
-from command_line import run
+from command_line import answer, usage_error
 from pharos.errors import ParameterError
 from pharos.observations import aliasing, memoryless_loss, observation_classes, observe
 
@@ -36,14 +35,8 @@ def test_states_that_share_an_image_are_counted(breakout):
     assert len(set(zip(found.tolist(), classes.tolist(), strict=True))) == len(counts) == found.max() + 1
 
 
-def answer(folder, *words):
-    result = run("observations", str(folder), *map(str, words), "--json")
-    assert (result.exit_code, result.stderr) == (0, ""), result.output
-    return json.loads(result.stdout)
-
-
 def test_the_command_line_counts_them_for_each_observation(breakout):
-    told = answer(breakout.folder)
+    told = answer("observations", breakout.folder)
     assert told["num_states"] == 1658
     entries = {entry["observation"]: entry for entry in told["observations"] if not entry["options"]}
     assert [entries[name]["num_sharing"] for name in ("vector", "one_hot", "index")] == [0, 0, 0]
@@ -55,9 +48,8 @@ def test_the_command_line_counts_them_for_each_observation(breakout):
         assert 0 <= entry["loss"]["lower"] <= entry["loss"]["upper"] <= 1e-6
         assert entry["num_sharing"] == (0 if entry["options"] else entries[entry["observation"]]["num_sharing"])
     assert sum(entry["options"] == {"motion": True} for entry in told["observations"]) == 2
-    (one,) = answer(breakout.folder, "--budget", 0, "--observation", "simple_image", "--option", "scale=2")[
-        "observations"
-    ]
+    words = ("--budget", 0, "--observation", "simple_image", "--option", "scale=2")
+    (one,) = answer("observations", breakout.folder, *words)["observations"]
     assert (one["options"], one["shape"], one["num_sharing"]) == ({"scale": 2}, [3, 14, 8], 1037)
     assert one["loss"] is None
 
@@ -66,11 +58,9 @@ def test_an_observation_of_ones_own_is_counted_too(breakout):
     from pharos.observations import register
 
     register("ball_row", lambda env, states: states[:, 0], spaces.Discrete(7))
-    (rows,) = answer(breakout.folder, "--observation", "ball_row")["observations"]
+    (rows,) = answer("observations", breakout.folder, "--observation", "ball_row")["observations"]
     assert (rows["num_observations"], rows["share"], rows["shape"]) == (7, 1.0, [])
-    result = run("observations", str(breakout.folder), "--option", "scale=2")
-    assert result.exit_code == 2
-    assert "--option goes with --observation" in result.stderr
+    assert "--option goes with --observation" in usage_error("observations", breakout.folder, "--option", "scale=2")
 
 
 @pytest.mark.parametrize("seed", range(12))

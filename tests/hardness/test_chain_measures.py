@@ -6,15 +6,16 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_diameter import ring
 
 import pharos
-from naive.mdp import augmented
+from naive.mdp import absorbing, augmented, is_over
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
-from strategies import small_mdps
+from refusals import refusal
+from strategies import examples, small_mdps
 
 _occupancy = importlib.import_module("pharos.hardness.visitation")
 
@@ -23,7 +24,7 @@ def chain_of(mdp, restart=True):
     """(P of uniform play over the nodes that can be reached, their states): the end is state S."""
     P, _, start = augmented(mdp)
     width = mdp.num_actions + 1
-    ended = [n for n in range(len(P)) if n == len(P) - 1 or mdp.terminal[n // width]]
+    ended = np.flatnonzero(is_over(mdp))
     for n in ended:
         P[n] = start if restart else np.eye(len(P))[n]
     for n in ended[:-1]:  # what has ended does not remember the previous action
@@ -70,8 +71,7 @@ def lump(chain, nodes, mdp):
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
-@given(small_mdps(max_states=5, max_actions=2), st.booleans())
+@examples(150, small_mdps(max_states=5, max_actions=2), st.booleans())
 def test_the_mixing_time_is_that_of_powers_of_the_matrix(mdp, restart):
     chain, nodes = chain_of(mdp, restart)
     if not mdp.is_sticky:
@@ -87,16 +87,10 @@ def test_the_mixing_time_is_that_of_powers_of_the_matrix(mdp, restart):
 
 @pytest.mark.parametrize("length", [3, 4, 7])
 def test_a_ring_has_its_length_as_period_and_the_lazy_ring_mixes_the_later_the_longer_it_is(length):
-    following = (np.arange(length) + 1) % length
-    ring = TabularMDP.from_arrays(following[:, None], np.zeros((length, 1)))
-    assert hardness.mixing_time(ring).period == length
-    assert math.isinf(hardness.mixing_time(ring).value)
-    times = [hardness.mixing_time(ring, lazy=True).value]
-    longer = (np.arange(2 * length) + 1) % (2 * length)
-    times.append(
-        hardness.mixing_time(TabularMDP.from_arrays(longer[:, None], np.zeros((2 * length, 1))), lazy=True).value
-    )
-    assert times[0] < times[1] < math.inf
+    found = hardness.mixing_time(ring(length))
+    assert found.period == length and math.isinf(found.value)
+    short, long = (hardness.mixing_time(ring(each), lazy=True).value for each in (length, 2 * length))
+    assert short < long < math.inf
 
 
 @pytest.mark.parametrize("p", [0.05, 0.2, 0.5])
@@ -115,14 +109,11 @@ def test_several_recurrent_classes_never_mix():
 
 
 @pytest.mark.long
-@settings(max_examples=100, deadline=None)
-@given(small_mdps(max_states=5, max_actions=3))
+@examples(100, small_mdps(max_states=5, max_actions=3))
 def test_the_mismatch_contains_the_largest_ratio_of_visits(mdp):
     solution = pharos.value_iteration(mdp, 1e-9)
-    P, _, start = augmented(mdp)
+    P, _, start = absorbing(mdp)
     width = mdp.num_actions + 1
-    for n in np.flatnonzero(np.append(np.repeat(np.asarray(mdp.terminal), width), True)):
-        P[n] = np.eye(len(P))[n]  # terminal states and the end are never left
     choice = np.append(np.repeat(np.asarray(solution.policy), width), 0)
     if np.asarray(solution.policy).ndim == 2:
         choice = np.append(np.asarray(solution.policy).ravel(), 0)
@@ -185,8 +176,7 @@ def test_the_mismatch_counts_states_that_are_met_after_all_that_is_worth_a_step(
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
-@given(small_mdps(max_states=6, max_actions=3), st.integers(0, 2**32 - 1))
+@examples(100, small_mdps(max_states=6, max_actions=3), st.integers(0, 2**32 - 1))
 def test_support_is_where_the_walk_may_be(mdp, seed):
     """Without chance each state is met within S steps, under sticky actions each pair within S A."""
     random = np.random.default_rng(seed)
@@ -196,11 +186,10 @@ def test_support_is_where_the_walk_may_be(mdp, seed):
     assert (_occupancy.support_with_ends(mdp, policy)[:-1] & live == (walk.largest.sum(axis=1) > 0)).all()
     P, _, start = augmented(mdp)  # of terminal states and the end: what executed actions lead to
     width = mdp.num_actions + 1
-    over = np.append(np.repeat(np.asarray(mdp.terminal), width), True)
     chain = P[np.arange(len(P)), np.append(np.repeat(policy, width), 0)]
     met = start > 0
     for _ in range(len(P)):
-        met = met | ((chain[met & ~over] > 0).any(axis=0))
+        met = met | ((chain[met & ~is_over(mdp)] > 0).any(axis=0))
     states = np.append(met[:-1].reshape(mdp.num_states, width).any(axis=1), met[-1])
     assert (_occupancy.support_with_ends(mdp, policy) == states).all()
 
@@ -214,8 +203,7 @@ def test_the_mismatch_of_the_optimal_policy_with_itself_is_one():
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
-@given(small_mdps(max_states=5, max_actions=3), st.sampled_from([0.0, 0.5, 1.0, 2.0]))
+@examples(100, small_mdps(max_states=5, max_actions=3), st.sampled_from([0.0, 0.5, 1.0, 2.0]))
 def test_the_action_gap_is_as_regular_as_all_gaps_say(mdp, zeta):
     solution = pharos.value_iteration(mdp, 1e-9)
     found = hardness.action_gap_regularity(mdp, solution, zeta=zeta)
@@ -251,11 +239,8 @@ def test_they_are_part_of_a_report_when_asked_for():
 @pytest.mark.slow
 def test_what_is_not_defined_says_why():
     mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp(gamma=1.0)
-    with pytest.raises(UndefinedMeasure, match="gamma < 1"):
-        hardness.distribution_mismatch(mdp)
-    with pytest.raises(ParameterError, match="epsilon"):
-        hardness.mixing_time(mdp, epsilon=0.7)
-    with pytest.raises(ParameterError, match="zeta"):
-        hardness.action_gap_regularity(mdp.with_horizon(5), zeta=-1.0)
+    assert "gamma < 1" in refusal(UndefinedMeasure, hardness.distribution_mismatch, mdp)
+    assert "epsilon" in refusal(ParameterError, hardness.mixing_time, mdp, epsilon=0.7)
+    assert "zeta" in refusal(ParameterError, hardness.action_gap_regularity, mdp.with_horizon(5), zeta=-1.0)
     with pytest.raises(UndefinedMeasure, match="4096"):
         hardness.mixing_time(random_actions(pharos.build(pharos.make("freeway/20x5-speed1")).mdp(), 0.1))

@@ -8,20 +8,11 @@ import itertools
 
 import numpy as np
 import pytest
+from test_colosseum_grids import assert_episodic_diameter, mdp_of
 
 import pharos
-from naive.colosseum import (
-    STOPS,
-    diameter,
-    diameter_in_place,
-    episodic_diameter,
-    farthest,
-    law,
-    order_of_discovery,
-    within_ulps,
-)
-from pharos import TabularMDP, hardness
-from pharos.hardness.diameter import colosseum_diameter
+from naive.colosseum import diameter, diameter_in_place, law, order_of_discovery, within_ulps
+from pharos import hardness
 
 pytestmark = pytest.mark.long  # with each class compiled
 
@@ -81,29 +72,12 @@ def made(family, size, p_lazy, p_rand, n):
     return pharos.make("corner_grid", size=size, p_lazy=p_lazy, p_rand=p_rand, n_starting_states=n)
 
 
-def some(published):
-    """The quick rows first; slow are large ones."""
-    quick = {"DeepSea": 19, "RiverSwim": 100, "SimpleGrid": 15}
-    slow = pytest.mark.slow
-    return [pytest.param(row, id=str(row), marks=() if row[1] <= quick[row[0]] else slow) for row in published]
-
-
-def mdp_of(P, rho):
-    rewards = np.zeros((P.shape[1], P.shape[0] // P.shape[1]))
-    return TabularMDP.from_matrices(P, rewards, initial=rho, gamma=1.0)
-
-
-@pytest.mark.parametrize("row", some(EPISODIC))
+@pytest.mark.parametrize("row", EPISODIC, ids=str)
 def test_episodic_diameters_are_those_of_colosseum(row):
-    env, printed = made(*row), EPISODIC[row]
-    _, P, rho = law(env)
-    horizon, targets = env.max_episode_steps, farthest(P, rho)
-    exact = colosseum_diameter(mdp_of(P, rho), horizon=horizon)
-    assert any(within_ulps(episodic_diameter(P, rho, horizon, targets, stop, np.float32), printed) for stop in STOPS)
-    assert episodic_diameter(P, rho, horizon, targets, 1e-8, np.float64) == pytest.approx(exact, rel=1e-7)
+    assert_episodic_diameter(made(*row), EPISODIC[row], stop=1e-8)
 
 
-@pytest.mark.parametrize("row", some(CONTINUOUS))
+@pytest.mark.parametrize("row", CONTINUOUS, ids=str)
 def test_diameters_without_episodes_are_those_of_colosseum(row):
     """Up to 270,000 numbers in its tables, Colosseum changes values in place, in the order in which it found the
     states; that depends on the order of the start states, which it shuffles.
@@ -111,7 +85,7 @@ def test_diameters_without_episodes_are_those_of_colosseum(row):
     family, size, p_lazy, p_rand, n = row
     env, printed = made(*row), CONTINUOUS[row]
     states, P, rho = law(env)
-    exact = hardness.diameter(mdp_of(P, rho))
+    exact = hardness.diameter(mdp_of(P, rho, gamma=1.0))
     assert exact.exact and exact.lower * (1 + 1e-7) >= printed
     if len(states) ** 2 * env.num_actions > 270_000:
         assert within_ulps(diameter(P, np.arange(len(states))), printed)

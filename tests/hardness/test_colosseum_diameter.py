@@ -4,14 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import sparse
 
-from naive.colosseum import STOPS, episodic_diameter, within_ulps
 from pharos import TabularMDP
 from pharos.errors import ParameterError
 from pharos.hardness.diameter import colosseum_diameter
+from strategies import examples
 
 
 def deep_sea(size):
@@ -34,35 +32,6 @@ def test_deep_sea_has_the_published_diameter():
     assert colosseum_diameter(deep_sea(5), horizon=5) == pytest.approx(5.0)
 
 
-# size, p_lazy, p_rand -> printed for the episodic RiverSwim, with seed 0; all of them: test_colosseum_chains.py.
-RIVERS = {
-    (10, 0.1715, 0.0): 54.36714172363281,
-    (10, 0.0, 0.0001): 10.004501342773438,
-    (10, 0.0, 0.0858): 14.838109016418457,
-    (10, 0.0, 0.5143): 145.160888671875,
-    (40, 0.0, 0.0): 40.0,
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("river", RIVERS)
-def test_rivers_have_their_published_diameters(river):
-    """Left or right along a row of states, from its left end; episodes are as long as the row."""
-    size, p_lazy, p_rand = river
-    table = np.array([[max(i - 1, 0), min(i + 1, size - 1)] for i in range(size)])
-    P = np.zeros((size, 2, size))
-    for i, action, taken in np.ndindex(size, 2, 2):
-        P[i, action, table[i, taken]] += (1 - p_lazy) * ((1 - p_rand) * (action == taken) + p_rand / 2)
-        P[i, action, i] += p_lazy / 2
-    exact = colosseum_diameter(TabularMDP.from_matrices(P, np.zeros((size, 2))), horizon=size)
-    rows, start = sparse.csr_matrix(P.reshape(-1, size)), np.eye(size)[0]
-    stopped = [episodic_diameter(rows, start, size, np.array([size - 1]), stop, np.float32) for stop in STOPS]
-    assert any(within_ulps(found, RIVERS[river]) for found in stopped)
-    assert RIVERS[river] <= exact * (1 + 1e-7)
-    converged = episodic_diameter(rows, start, size, np.array([size - 1]), 1e-9, np.float64)
-    assert exact == pytest.approx(converged, rel=1e-6)
-
-
 def by_iteration(P, start, horizon):
     size = len(P)
     largest = 0.0
@@ -82,8 +51,7 @@ def by_iteration(P, start, horizon):
     return largest
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(1, 2), st.integers(2, 5))
+@examples(30, st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(1, 2), st.integers(2, 5))
 def test_it_is_that_of_the_time_augmented_chain(seed, size, num_actions, horizon):
     rng = np.random.default_rng(seed)
     P = 0.7 * rng.dirichlet(np.ones(size), (size, num_actions)) + 0.3 / size  # so that iteration converges

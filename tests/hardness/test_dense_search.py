@@ -3,7 +3,6 @@ eccentricities."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
@@ -12,6 +11,7 @@ from pharos import TabularMDP, hardness
 from pharos.hardness.sum_sweep import Graph
 from pharos.kernels import many_searches
 from solution_lengths import solution_lengths
+from strategies import examples
 
 
 @st.composite
@@ -27,8 +27,7 @@ def graphs(draw):
 
 
 @pytest.mark.slow
-@given(graphs())
-@settings(max_examples=60, deadline=None)
+@examples(60, graphs())
 def test_the_largest_distance_to_each_source_is_found(drawn):
     graph, distance = drawn
     sources = np.arange(graph.num_nodes, dtype=graph.dtype)
@@ -39,8 +38,7 @@ def test_the_largest_distance_to_each_source_is_found(drawn):
     np.testing.assert_array_equal(largest, np.where(np.isfinite(distance), distance, 0).max(axis=0))
 
 
-@given(graphs(), st.integers(0, 2**32 - 1))
-@settings(max_examples=60, deadline=None)
+@examples(60, graphs(), st.integers(0, 2**32 - 1))
 def test_bounds_that_follow_along_edges_hold_and_are_the_least_of_all_paths(drawn, seed):
     """From exact values of a few nodes: in(v) <= in(u) + d(u, v) and out(v) <= d(v, u) + out(u), and no less."""
     graph, distance = drawn
@@ -57,8 +55,7 @@ def test_bounds_that_follow_along_edges_hold_and_are_the_least_of_all_paths(draw
 
 
 @pytest.mark.slow
-@given(graphs(), st.integers(1, 20))
-@settings(max_examples=50, deadline=None)
+@examples(50, graphs(), st.integers(1, 20))
 def test_nodes_that_are_spread_out_are_no_successors_of_those_before(drawn, limit):
     graph, distance = drawn
     order = np.arange(graph.num_nodes, dtype=graph.dtype)[::-1].copy()

@@ -6,7 +6,6 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from naive.hardness import distances
@@ -17,6 +16,7 @@ from pharos.hardness.interval import BudgetClock
 from pharos.hardness.sum_sweep import Graph
 from pharos.kernels import graph as kernels
 from pharos.system import compiling
+from strategies import examples
 
 
 @st.composite
@@ -35,20 +35,17 @@ def deterministic_mdps(draw, max_states=24, ends=True):
     return TabularMDP.from_arrays(table, np.zeros(table.shape), initial=int(rng.integers(num_states)))
 
 
-@settings(max_examples=150, deadline=None)
-@given(deterministic_mdps(), st.booleans())
+@examples(150, deterministic_mdps(), st.booleans())
 def test_the_diameter_is_the_largest_distance_between_any_two_states(mdp, restart):
     d = distances(mdp, restart=restart)
     found = hardness.diameter(mdp, restart=restart)
-    assert found.exact
-    assert found.counted
+    assert found.exact and found.counted
     assert found.lower == found.upper == d.max()
     assert found.unreachable_pairs == np.isinf(d).sum()
     assert found.finite_part == d[np.isfinite(d)].max()
 
 
-@settings(max_examples=60, deadline=None)
-@given(deterministic_mdps(), st.booleans())
+@examples(60, deterministic_mdps(), st.booleans())
 def test_the_start_eccentricity_is_the_largest_distance_from_the_start(mdp, restart):
     d = distances(mdp, restart=restart)
     assert hardness.start_eccentricity(mdp, restart=restart) == d[mdp.initial].max()
@@ -63,8 +60,7 @@ def strongly_connected(rng, num_states, num_actions):
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 3), st.integers(0, 40))
+@examples(60, st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 3), st.integers(0, 40))
 def test_every_budget_gives_an_interval_that_holds_the_diameter_and_larger_budgets_narrower_ones(
     seed, size, num_actions, most
 ):
@@ -80,10 +76,14 @@ def test_every_budget_gives_an_interval_that_holds_the_diameter_and_larger_budge
     assert width == 0
 
 
+def ring(length, starts=0):
+    table = ((np.arange(length) + 1) % length)[:, None]
+    return TabularMDP.from_arrays(table, np.zeros((length, 1)), initial=starts)
+
+
 @pytest.mark.parametrize("size", [1, 2, 5, 100])
 def test_a_ring_has_diameter_one_less_than_its_states(size):
-    table = ((np.arange(size) + 1) % size)[:, None]
-    assert hardness.diameter(TabularMDP.from_arrays(table, np.zeros(table.shape))).upper == size - 1
+    assert hardness.diameter(ring(size)).upper == size - 1
 
 
 @pytest.mark.parametrize("size", [2, 5, 100])
@@ -118,18 +118,13 @@ def test_the_default_budget_is_not_spent_on_counting_the_pairs_of_an_infinite_di
 
 
 def test_the_implicit_end_is_a_state_on_the_way_back_to_the_start():
-    mdp = TabularMDP.from_arrays(
-        [[1], [2], [-1]], [[0], [0], [1]]
-    )  # a reward: state 2 is not terminal, its action ends
+    """A reward: state 2 is not terminal, its action ends."""
+    mdp = TabularMDP.from_arrays([[1], [2], [-1]], [[0], [0], [1]])
     assert hardness.diameter(mdp).upper == 3  # 0 -> 1 -> 2 -> end, and 1 -> 2 -> end -> 0
 
 
 def test_a_general_mdp_without_chance_is_the_deterministic_one():
-    table = np.array([[1, 0], [2, 0], [0, 2]])
-    P = np.zeros((3, 2, 3))
-    for s in range(3):
-        for a in range(2):
-            P[s, a, table[s, a]] = 1
+    P = np.eye(3)[[[1, 0], [2, 0], [0, 2]]]
     assert hardness.diameter(TabularMDP.from_matrices(P, np.zeros((3, 2)))).upper == 2
 
 
@@ -177,24 +172,18 @@ def clocked(period, rows, blocked, ending=None):
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(8, 60), st.integers(1, 9), st.floats(0, 0.6))
+@examples(60, st.integers(0, 2**32 - 1), st.integers(8, 60), st.integers(1, 9), st.floats(0, 0.6))
 def test_clocked_spaces_have_the_largest_distance_too(seed, period, rows, density):
-    rng = np.random.default_rng(seed)
-    blocked = rng.random((period, rows)) < density
+    blocked = np.random.default_rng(seed).random((period, rows)) < density
     blocked[:, 0] = False
     mdp = clocked(period, rows, blocked)
-    d = distances(mdp)
     found = hardness.diameter(mdp)
-    assert found.exact
-    assert found.upper == d.max()
+    assert found.exact and found.upper == distances(mdp).max()
 
 
 def test_a_clock_with_layers_of_many_words_is_followed():
     period, rows = 300, 90
-    blocked = np.zeros((period, rows), bool)
-    mdp = clocked(period, rows, blocked)
-    found = hardness.diameter(mdp)
+    found = hardness.diameter(clocked(period, rows, np.zeros((period, rows), bool)))
     assert "clock" in found.method
     # the walker crosses 89 rows in 89 steps, and misses the other end one step before
     assert (found.lower, found.upper) == (period + rows - 2, period + rows - 2)
@@ -209,8 +198,9 @@ def test_following_a_clock_may_read_each_entry_of_the_table_200_times(monkeypatc
 
 
 @pytest.mark.long
-@settings(max_examples=150, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(3, 40), st.integers(2, 9), st.floats(0, 0.6), st.sampled_from([1, 8]))
+@examples(
+    150, st.integers(0, 2**32 - 1), st.integers(3, 40), st.integers(2, 9), st.floats(0, 0.6), st.sampled_from([1, 8])
+)
 def test_a_clock_that_restarts_hide_gives_the_largest_distance_to_every_target(seed, period, rows, density, words):
     rng = np.random.default_rng(seed)
     blocked = rng.random((period, rows)) < density
@@ -254,11 +244,6 @@ def test_a_graph_takes_four_bytes_a_node():
 # Start eccentricity ---------------------------------------------------------------------------------------------------
 
 
-def ring(length, starts):
-    table = ((np.arange(length) + 1) % length)[:, None]
-    return TabularMDP.from_arrays(table, np.zeros((length, 1)), initial=starts)
-
-
 def test_every_start_state_counts_where_a_state_is_out_of_reach_of_one():
     """From state 9 nothing is reached."""
     table = np.append(np.arange(1, 10), 9)[:, None]
@@ -275,8 +260,7 @@ def test_the_distance_from_several_start_states_is_its_mean():
     assert hardness.start_eccentricity(random_actions(ring(10, [0, 5]), 0.5)) == pytest.approx(6.5, rel=1e-6)
 
 
-@settings(max_examples=100, deadline=None)
-@given(deterministic_mdps(), st.data())
+@examples(100, deterministic_mdps(), st.data())
 def test_the_start_eccentricity_is_the_largest_mean_distance(mdp, data):
     starts = data.draw(st.lists(st.integers(0, mdp.num_states - 1), min_size=1, max_size=4))
     mdp = mdp.with_initial(starts)

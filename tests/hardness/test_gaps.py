@@ -6,7 +6,6 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
@@ -15,14 +14,13 @@ from pharos import hardness
 from pharos.errors import ParameterError, PrecisionError
 from pharos.hardness.gaps import resolved_gaps, same_outcomes
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
-from strategies import deterministic_mdps, small_mdps
+from strategies import deterministic_mdps, examples, small_mdps
 
 TOLERANCE = 1e-7
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
-@given(small_mdps())
+@examples(150, small_mdps())
 def test_gaps_are_those_of_the_explicit_matrices(mdp):
     result = hardness.gaps(mdp, pharos.value_iteration(mdp, 1e-9), tie_tolerance=TOLERANCE)
     positive, regularized = naive_gaps(mdp, TOLERANCE)
@@ -39,8 +37,7 @@ def test_gaps_are_those_of_the_explicit_matrices(mdp):
 
 
 @pytest.mark.slow
-@settings(max_examples=80, deadline=None)
-@given(small_mdps(), st.integers(1, 4))
+@examples(80, small_mdps(), st.integers(1, 4))
 def test_gaps_with_a_horizon_are_those_of_every_step(mdp, horizon):
     mdp = mdp.with_horizon(horizon)
     result = hardness.gaps(mdp, tie_tolerance=TOLERANCE)
@@ -50,8 +47,7 @@ def test_gaps_with_a_horizon_are_those_of_every_step(mdp, horizon):
     assert math.isclose(result.regularized, regularized, rel_tol=1e-6)
 
 
-@settings(max_examples=50, deadline=None)
-@given(deterministic_mdps(), st.sampled_from([0.5, 2.0, 8.0]))
+@examples(50, deterministic_mdps(), st.sampled_from([0.5, 2.0, 8.0]))
 def test_scaling_rewards_scales_gaps(mdp, scale):
     gaps = hardness.gaps(mdp, tie_tolerance=TOLERANCE)
     scaled = hardness.gaps(mdp.with_rewards(mdp.rewards * scale), tie_tolerance=TOLERANCE * scale)
@@ -59,8 +55,7 @@ def test_scaling_rewards_scales_gaps(mdp, scale):
     assert math.isclose(scaled.sum_of_reciprocals * scale, gaps.sum_of_reciprocals, rel_tol=1e-6)
 
 
-@settings(max_examples=50, deadline=None)
-@given(deterministic_mdps(), st.sampled_from([0.25, 0.5]))
+@examples(50, deterministic_mdps(), st.sampled_from([0.25, 0.5]))
 def test_random_actions_shrink_what_a_choice_is_worth(mdp, p):
     """With gamma = 0 a gap is the difference of rewards, times the probability that the choice is executed."""
     mdp = mdp.with_gamma(0.0)
@@ -191,8 +186,7 @@ tiny = st.sampled_from([0.0, 1.0, 1.0 + 2.0**-40, 2.0**-30, 2.0**-38, 2.0**-45, 
 
 
 @pytest.mark.slow
-@settings(max_examples=300, deadline=None)
-@given(deterministic_mdps(rewards=tiny), st.sampled_from([0.0, 0.5, 0.99, 1 - 2.0**-13, 1 - 2.0**-20]))
+@examples(300, deterministic_mdps(rewards=tiny), st.sampled_from([0.0, 0.5, 0.99, 1 - 2.0**-13, 1 - 2.0**-20]))
 def test_intervals_of_gaps_hold_the_exact_fractions(mdp, gamma):
     """Gaps below 1e-9, values of 1e12 and more, gamma near 1."""
     mdp = mdp.with_gamma(gamma)

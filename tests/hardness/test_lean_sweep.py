@@ -5,7 +5,6 @@ import importlib
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_diameter import deterministic_mdps
 
@@ -14,6 +13,7 @@ from pharos import TabularMDP, hardness
 from pharos.errors import FileFormatError
 from pharos.hardness.sum_sweep import Graph
 from pharos.system import memory
+from strategies import examples
 
 sweeps = importlib.import_module("pharos.hardness.diameter")
 pytestmark = pytest.mark.long
@@ -24,8 +24,7 @@ def no_memory(monkeypatch):
     monkeypatch.setattr(sweeps, "available_memory", lambda: 0)
 
 
-@settings(max_examples=150, deadline=None)
-@given(deterministic_mdps(), st.booleans())
+@examples(150, deterministic_mdps(), st.booleans())
 def test_the_diameter_is_the_largest_distance_between_any_two_states(mdp, restart):
     d = distances(mdp, restart=restart)
     with pytest.MonkeyPatch.context() as patch:
@@ -39,8 +38,7 @@ def test_the_diameter_is_the_largest_distance_between_any_two_states(mdp, restar
         assert 1 <= found.unreachable_pairs <= np.isinf(d).sum() and not found.counted
 
 
-@settings(max_examples=100, deadline=None)
-@given(deterministic_mdps(), st.booleans(), st.sampled_from([np.int16, np.int32]), st.booleans())
+@examples(100, deterministic_mdps(), st.booleans(), st.sampled_from([np.int16, np.int32]), st.booleans())
 def test_sweeps_give_the_distances_of_searches(mdp, restart, dtype, is_mapped):
     plain = Graph.of(mdp, restart)
     graph = sweeps.LeanGraph(plain, dtype)
@@ -87,8 +85,7 @@ def test_an_interval_is_proven_within_the_budget(no_memory):
     assert found.lower <= distances(mdp).max() <= found.upper
 
 
-@settings(max_examples=60, deadline=None)
-@given(deterministic_mdps(), st.booleans(), st.integers(1, 3), st.integers(0, 2**32))
+@examples(60, deterministic_mdps(), st.booleans(), st.integers(1, 3), st.integers(0, 2**32))
 def test_a_diameter_goes_on_from_kept_bounds_wherever_it_was_stopped(tmp_path_factory, mdp, restart, searches, seed):
     d = distances(mdp, restart=restart)
     folder = tmp_path_factory.mktemp("bounds")

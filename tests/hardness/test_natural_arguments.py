@@ -6,6 +6,7 @@ import pytest
 import pharos
 from pharos import exporters, hardness, solvers
 from pharos.errors import ParameterError
+from refusals import refusal
 
 ENV = pharos.make("frozen_lake/4x4")
 
@@ -34,14 +35,12 @@ FUNCTIONS = [
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_what_is_no_mdp_is_answered_with_what_to_write(function, space):
     for value, remedy in (
-        ("frozen_lake/4x4", r"write pharos\.build\('frozen_lake/4x4'\)\.mdp\(gamma=0\.99\)"),
-        (ENV, r"write pharos\.build\(env\)\.mdp\(gamma=0\.99\)"),
-        (space, r"write space\.mdp\(gamma=0\.99\)"),
-        (3, r"write pharos\.build\(env\)\.mdp\(gamma=0\.99\), or TabularMDP\.from_arrays"),
+        ("frozen_lake/4x4", "write pharos.build('frozen_lake/4x4').mdp(gamma=0.99)"),
+        (ENV, "write pharos.build(env).mdp(gamma=0.99)"),
+        (space, "write space.mdp(gamma=0.99)"),
+        (3, "write pharos.build(env).mdp(gamma=0.99), or TabularMDP.from_arrays"),
     ):
-        with pytest.raises(ParameterError, match=remedy) as error:
-            function(value)
-        assert "\n" not in str(error.value)
+        assert remedy in refusal(ParameterError, function, value)
 
 
 def test_names_stand_for_environments(space):
@@ -49,9 +48,7 @@ def test_names_stand_for_environments(space):
     assert pharos.observe("breakout/12x8x1", "vector").env == pharos.make("breakout/12x8x1")
     with pytest.raises(ParameterError, match="unknown environment 'frozen_lak/4x4'; did you mean"):
         pharos.build("frozen_lak/4x4")
-    with pytest.raises(ParameterError, match=r"expected an Environment: write pharos\.make"):
-        pharos.build(3)
+    assert "expected an Environment: write pharos.make" in refusal(ParameterError, pharos.build, 3)
     with pytest.raises(ParameterError, match=r"expected a name, such as 'frozen_lake/4x4': write FrozenLake\(\)"):
         pharos.make(type(ENV))
-    with pytest.raises(ParameterError, match="expected a name, such as"):
-        pharos.make(ENV)
+    assert "expected a name, such as" in refusal(ParameterError, pharos.make, ENV)

@@ -2,15 +2,16 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
-from naive.mdp import augmented
+from naive import mdp as naive_mdp
+from naive.mdp import augmented, is_over
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.visitation import occupancy
 from pharos.mdp import random_actions, sticky_actions
-from strategies import small_mdps
+from refusals import refusal
+from strategies import examples, small_mdps
 
 
 def policies(mdp, data):
@@ -35,29 +36,22 @@ def explicit(mdp, policy, steps):
     out."""
     P, _, start = augmented(mdp)
     size, actions = mdp.num_states, mdp.num_actions
-    over = np.append(np.repeat(mdp.terminal, actions + 1), True)
     flat = np.vstack([policy.reshape(-1, actions), np.full((1, actions), 1 / actions)])
     chain = np.einsum("ia,iaj->ij", flat, P)
-    now, found = start * ~over, []
+    now, found = start * ~is_over(mdp), []
     for _ in range(steps):
         d = now[:-1].reshape(size, actions + 1)
         chosen = (d[:, :, None] * policy).sum(axis=1)
         executed = np.zeros((size, actions))
-        for s in range(size):
-            for b in range(actions + 1):
-                c = mdp.chance
-                weights = (c.first_chosen, c.first_uniform) if b == actions else (c.chosen, c.uniform)
-                for x in range(actions):
-                    p = weights[0] * policy[s, b, x] + weights[1] / actions + (c.previous if x == b else 0.0)
-                    executed[s, x] += d[s, b] * p
+        for s, b in np.ndindex(size, actions + 1):
+            executed[s] += d[s, b] * policy[s, b] @ naive_mdp.executed(mdp, b)
         found.append((d, chosen, executed))
-        now = (now @ chain) * ~over
+        now = (now @ chain) * ~is_over(mdp)
     return found
 
 
 @pytest.mark.slow
-@settings(max_examples=120, deadline=None)
-@given(small_mdps(), st.integers(1, 6), st.data())
+@examples(120, small_mdps(), st.integers(1, 6), st.data())
 def test_each_step_is_that_of_the_explicit_matrices(mdp, steps, data):
     policy, rows = policies(mdp, data)
     expected = explicit(mdp, rows, steps)
@@ -71,8 +65,7 @@ def test_each_step_is_that_of_the_explicit_matrices(mdp, steps, data):
 
 
 @pytest.mark.slow
-@settings(max_examples=120, deadline=None)
-@given(small_mdps(), st.integers(1, 8) | st.none(), st.data())
+@examples(120, small_mdps(), st.integers(1, 8) | st.none(), st.data())
 def test_the_expected_return_is_the_reward_of_what_is_executed(mdp, horizon, data):
     policy, _ = policies(mdp, data)
     found = occupancy(mdp, policy, horizon=horizon, executed=True)
@@ -82,8 +75,7 @@ def test_the_expected_return_is_the_reward_of_what_is_executed(mdp, horizon, dat
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
-@given(small_mdps(), st.data())
+@examples(60, small_mdps(), st.data())
 def test_chance_does_not_change_how_often_a_state_is_visited_by_actions_chosen_or_executed(mdp, data):
     policy, _ = policies(mdp, data)
     chosen, executed = (occupancy(mdp, policy, executed=each) for each in (False, True))
@@ -103,13 +95,8 @@ def test_uniform_play_on_a_lake_is_the_same_with_random_actions():
 
 def test_what_has_no_finite_answer_is_told():
     mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp(gamma=1.0)
-    with pytest.raises(UndefinedMeasure, match="visits may be infinite"):
-        occupancy(mdp)
-    with pytest.raises(ParameterError, match="give a horizon"):
-        occupancy(mdp.with_gamma(0.9), keep_all=True)
-    with pytest.raises(ParameterError, match="whole number"):
-        occupancy(mdp, horizon=0)
-    with pytest.raises(ParameterError, match="above 0"):
-        occupancy(mdp.with_gamma(0.9), tolerance=0)
-    with pytest.raises(ParameterError, match="expected"):
-        occupancy(sticky_actions(mdp, 0.5), np.zeros((3, 2)), horizon=4)
+    assert "visits may be infinite" in refusal(UndefinedMeasure, occupancy, mdp)
+    assert "give a horizon" in refusal(ParameterError, occupancy, mdp.with_gamma(0.9), keep_all=True)
+    assert "whole number" in refusal(ParameterError, occupancy, mdp, horizon=0)
+    assert "above 0" in refusal(ParameterError, occupancy, mdp.with_gamma(0.9), tolerance=0)
+    assert "expected" in refusal(ParameterError, occupancy, sticky_actions(mdp, 0.5), np.zeros((3, 2)), horizon=4)

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_kernel_measures import chain, kernel_of, random_mdp
+from test_kernel_measures import chain, kernel_of, random_mdp, walk
 
 import pharos
+from naive.mdp import executed, matrix_of
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness import Representation, Rollouts, Schedule, kernel_policy_regret, kernel_regret, representation
@@ -20,44 +21,20 @@ SHORT = Schedule(steps=700, gamma=0.9)
 
 def plain_actor_critic(mdp, kernel, schedule, rollouts, ascend=None, descend=None):
     """The definition, node by node (state, previous action; A: none): (greedy, played, episodes) of each rollout."""
-    S, A, T = mdp.num_states, mdp.num_actions, mdp.horizon
-    P = np.asarray(mdp.dynamics.matrix().todense())[:, :S].reshape(S, A, S)
-    r, live, chance = mdp.rewards, ~np.asarray(mdp.terminal), mdp.chance
-
-    def executed(b):
-        """(A chosen, A executed)."""
-        if b == A:
-            return np.eye(A) * chance.first_chosen + chance.first_uniform / A
-        joint = np.eye(A) * chance.chosen + chance.uniform / A
-        joint[:, b] += chance.previous
-        return joint
-
-    def walk(policy):
-        """(visits (S, A + 1), expected return)."""
-        mass, visits, value = np.zeros((S, A + 1)), np.zeros((S, A + 1)), 0.0
-        np.add.at(mass[:, A], mdp.start_states, mdp.start_probabilities)
-        for _ in range(T):
-            after = np.zeros((S, A + 1))
-            for s in np.flatnonzero(live):
-                for b in range(A + 1):
-                    visits[s, b] += mass[s, b]
-                    for x, p in enumerate(mass[s, b] * policy[s] @ executed(b)):
-                        value += p * r[s, x]
-                        after[:, x] += p * P[s, x]
-            mass = after
-        return visits, value
+    S, A, P, live = mdp.num_states, mdp.num_actions, matrix_of(mdp), ~np.asarray(mdp.terminal)
 
     def softmax(z):
         return np.exp(z) / np.exp(z).sum(axis=1, keepdims=True)
 
     optimal = pharos.value_iteration(mdp).value_at_start
-    uniform = walk(np.full((S, A), 1 / A))[1]
+    uniform = walk(mdp, np.full((S, A), 1 / A))[1]
     z, v, rows = np.zeros((S, A)), np.zeros(S), []
     for _ in range(0, schedule.steps, rollouts.steps):
         pi = softmax(z)
         best = (z >= z.max(axis=1, keepdims=True) - 1e-6 * np.abs(z).max(axis=1, keepdims=True)).astype(float)
-        visits, value = walk(pi)
-        of_greedy = walk(best / best.sum(axis=1, keepdims=True))[1]
+        visits, value = walk(mdp, pi)
+        visits = visits.sum(axis=2)
+        of_greedy = walk(mdp, best / best.sum(axis=1, keepdims=True))[1]
         regrets = [(optimal - each) / (optimal - uniform) for each in (of_greedy, value)]
         rows.append((*regrets, rollouts.steps / visits.sum()))
         # returns: a linear system in G, of which a state's previous actions are averaged by visits
@@ -65,9 +42,9 @@ def plain_actor_critic(mdp, kernel, schedule, rollouts, ascend=None, descend=Non
         joint = np.zeros((S, A, A))
         for s in np.flatnonzero(live):
             share = visits[s] / d[s] if d[s] > 0 else np.eye(A + 1)[A]
-            joint[s] = sum(share[b] * executed(b) for b in range(A + 1))
+            joint[s] = sum(share[b] * executed(mdp, b) for b in range(A + 1))
         gamma, mix = schedule.gamma, rollouts.gae_lambda
-        reward = np.einsum("sax,sx->sa", joint, r)
+        reward = np.einsum("sax,sx->sa", joint, mdp.rewards)
         to = np.einsum("sax,sxt->sat", joint, P * live)
         following = mix * gamma * np.einsum("sat,tb->satb", to, pi).reshape(S * A, S * A)
         base = reward + gamma * (1 - mix) * to @ v

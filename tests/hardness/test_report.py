@@ -13,14 +13,10 @@ from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
 from pharos.hardness import registry as _registry
 from pharos.mdp import TabularMDP
 from pharos.system import storage
+from refusals import failing, refusal
 
-MEASURES = {
-    "diameter",
-    "start_eccentricity",
-    "sum_of_reciprocal_gaps",
-    "sum_of_reciprocal_gaps_regularized",
-    "minimal_gap",
-}
+SUM = "sum_of_reciprocal_gaps"
+MEASURES = {"diameter", "start_eccentricity", SUM, f"{SUM}_regularized", "minimal_gap"}
 
 
 @pytest.fixture(autouse=True)
@@ -41,6 +37,10 @@ def corridor(length=5):
 
 def grid():
     return pharos.build(pharos.make("simple_grid", height=3, width=4)).mdp()
+
+
+def values(report):
+    return {name: result.value for name, result in report.results.items()}
 
 
 def test_a_report_holds_the_values_of_the_functions():
@@ -69,10 +69,8 @@ def test_a_report_is_plain_json_even_where_a_value_is_infinite():
 def test_measures_are_chosen_by_name():
     assert list(hardness.report(corridor(), "minimal_gap, diameter").results) == ["minimal_gap", "diameter"]
     assert list(hardness.report(corridor(), ["diameter"]).results) == ["diameter"]
-    with pytest.raises(UnknownName, match="did you mean 'diameter'"):
-        hardness.report(corridor(), "diametre")
-    with pytest.raises(ParameterError, match="at least one"):
-        hardness.report(corridor(), [])
+    assert "did you mean 'diameter'" in refusal(UnknownName, hardness.report, corridor(), "diametre")
+    assert "at least one" in refusal(ParameterError, hardness.report, corridor(), [])
 
 
 def test_a_users_measure_is_one_line():
@@ -87,13 +85,11 @@ def test_a_users_measure_is_one_line():
 
 
 def test_an_undefined_measure_says_why_and_the_others_are_there():
-    def never(problem):
-        raise UndefinedMeasure("never is defined for nothing: give up")
-
-    hardness.register("never", never, definition="nothing")
+    why = "never is defined for nothing: give up"
+    hardness.register("never", failing(UndefinedMeasure(why)), definition="nothing")
     report = hardness.report(corridor(), "never,diameter")
     assert report["never"].value is None
-    assert report.to_dict()["undefined"] == {"never": "never is defined for nothing: give up"}
+    assert report.to_dict()["undefined"] == {"never": why}
     assert report["diameter"].value["exact"]
     assert "--" in report.to_latex()
 
@@ -104,25 +100,19 @@ def test_results_are_kept_beside_the_space_with_what_they_depend_on():
     assert not any(result.kept for result in first.results.values())
     again = hardness.report(grid())
     assert {name for name, result in again.results.items() if result.kept} >= MEASURES
-    assert {n: r.value for n, r in again.results.items() if r.kept} == {
-        n: r.value for n, r in first.results.items() if again[n].kept
-    }
+    kept = {name for name, result in again.results.items() if result.kept}
+    assert all(values(again)[name] == values(first)[name] for name in kept)
     other = hardness.report(mdp.with_gamma(0.5))
     assert other["diameter"].kept
     assert not other["minimal_gap"].kept
-    assert not hardness.report(mdp.with_rewards(mdp.rewards * 2))["minimal_gap"].kept
-    assert not hardness.report(pharos.sticky_actions(mdp, 0.25), "minimal_gap")["minimal_gap"].kept
+    for each in (mdp.with_rewards(mdp.rewards * 2), pharos.sticky_actions(mdp, 0.25)):
+        assert not hardness.report(each, "minimal_gap")["minimal_gap"].kept
     assert not hardness.report(mdp, "diameter", restart=False)["diameter"].kept
     assert not hardness.report(mdp, "diameter", keep=False)["diameter"].kept
 
 
 def test_an_interval_is_computed_anew_with_a_larger_budget():
-    mdp = grid()
-
-    def squeezed(problem):
-        spent = problem.budget.seconds
-        return hardness.Interval(0.0, 100 / spent, exact=False)
-
+    mdp, squeezed = grid(), lambda problem: hardness.Interval(0.0, 100 / problem.budget.seconds, exact=False)
     hardness.register("squeezed", squeezed, definition="", version=1)
     assert hardness.report(mdp, "squeezed", budget=10)["squeezed"].value["upper"] == 10
     assert hardness.report(mdp, "squeezed", budget=5)["squeezed"].kept
@@ -144,8 +134,7 @@ def test_a_spoilt_file_of_kept_results_is_replaced(text):
 
 def test_a_horizon_must_be_a_number_of_steps():
     for horizon in (0, -1, 2.5, True, 2**31):
-        with pytest.raises(ParameterError, match="whole number of steps"):
-            hardness.report(corridor(), horizon=horizon)
+        assert "whole number of steps" in refusal(ParameterError, hardness.report, corridor(), horizon=horizon)
 
 
 def run(*words):
@@ -173,9 +162,7 @@ def test_the_command_prints_a_table_with_sources_or_latex():
 
 
 def test_the_command_refuses_unknown_measures_before_it_builds():
-    result = run("breakout", "--measures", "diametr")
-    assert result.exit_code == 2
-    assert result.stdout == ""
+    command_line.usage_error("hardness", "breakout", "--measures", "diametr")
 
 
 # What is proven -------------------------------------------------------------------------------------------------------
@@ -303,20 +290,19 @@ def test_entries_that_were_swapped_are_measured_anew():
     edited(mdp.folder / "hardness.json", swap)
     with pytest.warns(UserWarning, match="not as pharos wrote it"):
         again = hardness.report(mdp, names)
-    assert {n: r.value for n, r in again.results.items()} == {n: r.value for n, r in first.results.items()}
+    assert values(again) == values(first)
 
 
 def test_a_file_that_was_cut_short_is_measured_anew_with_one_line():
     mdp = grid()
-    expected = {n: r.value for n, r in hardness.report(mdp).results.items()}
+    expected = values(hardness.report(mdp))
     path = mdp.folder / "hardness.json"
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.warns(UserWarning, match="it is measured anew") as caught:
         again = hardness.report(mdp)
     assert len(caught) == 1
-    assert {n: r.value for n, r in again.results.items()} == expected
+    assert values(again) == expected
 
 
 def test_an_interval_with_its_ends_the_wrong_way_round_is_never_made():
-    with pytest.raises(ValueError, match="must not exceed"):
-        hardness.Interval(2147483647.0, 176.0, exact=True)
+    assert "must not exceed" in refusal(ValueError, hardness.Interval, 2147483647.0, 176.0, exact=True)

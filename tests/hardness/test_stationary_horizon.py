@@ -4,25 +4,22 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_effective_horizon import lock
 
 import pharos
-from naive.mdp import augmented, optimal_values, values_of
+from naive.mdp import absorbing, optimal_values, values_of
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.mdp import TabularMDP
-from strategies import small_mdps
+from strategies import examples, small_mdps
 
 TIE, SLACK = 1e-6, 1e-8
 
 
 def analysis(mdp, steps):
     """k_min, window, H by loops over dictionaries, on explicit matrices."""
-    P, R, start = augmented(mdp)
-    width, gamma = mdp.num_actions + 1, mdp.gamma
-    for n in np.flatnonzero(np.append(np.repeat(mdp.terminal, width), True)):
-        P[n], R[n] = np.eye(len(P))[n], 0.0
+    (P, R, start), gamma = absorbing(mdp), mdp.gamma
     uniform = np.full(R.shape, 1 / R.shape[1])
     explored = R + gamma * P @ values_of(P, R, gamma, uniform)
     best = R + gamma * P @ optimal_values(P, R, gamma)
@@ -70,8 +67,7 @@ def analysis(mdp, steps):
 
 
 @pytest.mark.slow
-@settings(max_examples=120, deadline=None)
-@given(small_mdps(max_states=4, max_actions=2), st.integers(1, 8))
+@examples(120, small_mdps(max_states=4, max_actions=2), st.integers(1, 8))
 def test_it_is_what_its_definition_says(mdp, steps):
     found = hardness.stationary_effective_horizon(mdp, steps=steps, tie_tolerance=TIE)
     k_min, window, value, lists = analysis(mdp, steps)
@@ -97,8 +93,7 @@ def layered(draw):
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
-@given(layered())
+@examples(100, layered())
 def test_where_each_state_has_one_depth_it_is_the_time_indexed_one(case):
     following, rewards, steps = case
     near = TabularMDP.from_arrays(following, rewards, gamma=1 - 1e-9)
@@ -112,13 +107,7 @@ def test_where_each_state_has_one_depth_it_is_the_time_indexed_one(case):
 
 def test_to_open_a_combination_lock_one_must_see_all_of_it():
     for length in (2, 4, 6, 8):
-        states = np.arange(length)
-        lock = TabularMDP.from_arrays(
-            np.stack([np.append(states[1:], -1), np.zeros(length, int)], axis=1),
-            np.stack([(states == length - 1) * 1.0, np.zeros(length)], axis=1),
-            gamma=0.95,
-        )
-        found = hardness.stationary_effective_horizon(lock, steps=100)
+        found = hardness.stationary_effective_horizon(lock(length).with_gamma(0.95), steps=100)
         assert found.effective_planning_window == length
         assert found.k_min <= length
 

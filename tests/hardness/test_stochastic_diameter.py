@@ -6,7 +6,6 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
@@ -18,7 +17,7 @@ from pharos.hardness.interval import Budget, BudgetClock
 from pharos.hardness.stochastic_diameter import HubBounds, _Diameter
 from pharos.kernels import hitting
 from pharos.mdp import ExpandedMDP, TabularMDP, random_actions, sticky_actions
-from strategies import deterministic_mdps, general_mdps, outcome_mdps
+from strategies import deterministic_mdps, examples, general_mdps, outcome_mdps
 
 some = st.sampled_from([0.0, 0.25, 0.5])
 
@@ -32,8 +31,7 @@ def chancy_mdps(draw):
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
-@given(chancy_mdps(), st.booleans())
+@examples(60, chancy_mdps(), st.booleans())
 def test_diameters_are_those_of_the_explicit_matrices(mdp, restart):
     if mdp.is_deterministic and len(mdp.start_states) == 1:
         mdp = random_actions(mdp, 0.25)
@@ -58,16 +56,14 @@ def test_results_do_not_depend_on_the_number_of_threads(workers, monkeypatch):
     assert (found.lower, found.upper, found.searches) == (expected.lower, expected.upper, expected.searches)
 
 
-@settings(max_examples=40, deadline=None)
-@given(chancy_mdps(), st.booleans())
+@examples(40, chancy_mdps(), st.booleans())
 def test_start_eccentricities_are_those_of_the_explicit_matrices(mdp, restart):
     mdp = random_actions(mdp, 0.25)
     expected = naive_hitting.start_eccentricity(mdp, restart)
     assert hardness.start_eccentricity(mdp, restart=restart) == pytest.approx(expected, rel=1e-5)
 
 
-@settings(max_examples=30, deadline=None)
-@given(chancy_mdps(), st.integers(0, 5))
+@examples(30, chancy_mdps(), st.integers(0, 5))
 def test_the_interval_holds_the_value_for_every_budget(mdp, searches):
     mdp = random_actions(mdp, 0.25)
     expected, _ = naive_hitting.diameter(mdp, True)
@@ -88,8 +84,7 @@ def largest_times(mdp):
     return np.unique(state[nodes]), largest
 
 
-@settings(max_examples=30, deadline=None)
-@given(chancy_mdps())
+@examples(30, chancy_mdps())
 def test_bounds_from_a_hub_hold_for_every_target(mdp):
     mdp = random_actions(mdp, 0.25)
     states, largest = largest_times(mdp)
@@ -103,8 +98,7 @@ def test_bounds_from_a_hub_hold_for_every_target(mdp):
 
 
 @pytest.mark.long
-@settings(max_examples=150, deadline=None)
-@given(chancy_mdps(), st.sampled_from([0.05, 0.25]))
+@examples(150, chancy_mdps(), st.sampled_from([0.05, 0.25]))
 def test_bounds_through_the_nodes_around_a_target_hold_and_never_grow(mdp, chance):
     mdp = random_actions(mdp, chance)
     states, largest = largest_times(mdp)
@@ -146,8 +140,7 @@ def test_a_few_long_ways_bound_the_targets_that_a_slip_leads_far_away_from():
     assert found.lower / 1.3 < little.lower <= found.upper and found.lower <= little.upper < 1.3 * found.upper
 
 
-@settings(max_examples=30, deadline=None)
-@given(chancy_mdps())
+@examples(30, chancy_mdps())
 def test_spaces_too_large_for_a_look_at_each_target_have_the_same_diameter(mdp):
     mdp = random_actions(mdp, 0.25)
     expected, _ = naive_hitting.diameter(mdp, True)
@@ -348,8 +341,7 @@ def rare_rows(draw, max_states=4, max_actions=2):
 
 
 @pytest.mark.long
-@settings(max_examples=150, deadline=None)
-@given(rare_rows())
+@examples(150, rare_rows())
 def test_intervals_hold_the_hitting_times_of_exact_fractions(rows):
     """Probabilities are exact in binary, down to 2^-50, so hitting times go up to 1e45."""
     num_states, num_actions = len(rows), len(rows[0])

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
@@ -10,6 +9,7 @@ from naive.hardness import distances
 from pharos import TabularMDP, hardness
 from pharos.hardness.sum_sweep import orbits
 from pharos.kernels import graph
+from strategies import examples
 from without_end import without_end
 
 pytestmark = pytest.mark.long  # with each class compiled
@@ -32,15 +32,13 @@ def covers(draw):
     return renamed
 
 
-@given(covers(), st.booleans())
-@settings(max_examples=100, deadline=None)
+@examples(100, covers(), st.booleans())
 def test_the_diameter_is_the_largest_distance_with_symmetries_and_with_broken_ones(table, restart):
     mdp = TabularMDP.from_arrays(table, np.zeros(table.shape))
     assert hardness.diameter(mdp, restart=restart).upper == distances(mdp, restart=restart).max()
 
 
-@given(covers(), st.integers(0, 2**32 - 1))
-@settings(max_examples=100, deadline=None)
+@examples(100, covers(), st.integers(0, 2**32 - 1))
 def test_a_map_is_found_exactly_where_there_is_one_and_keeps_every_step(table, seed):
     size = len(table)
     s, t = np.random.default_rng(seed).integers(0, size, 2)

@@ -2,20 +2,21 @@
 
 import json
 import pickle
+import re
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import xxhash
-from hypothesis import given, settings
 
 import pharos
 from command_line import run
 from pharos import exporters, hardness, importers
 from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
-from strategies import small_mdps
+from refusals import refusal
+from strategies import examples, small_mdps
 
 BRIDGE = Path(__file__).parents[1] / "data" / "bridge"
 CORRIDOR = BRIDGE / "key-corridor-s3r1.npz"
@@ -50,8 +51,7 @@ def test_horizons_are_told_by_names(tmp_path, name, horizon):
     file = tmp_path / f"{name}.npz"
     np.savez(file, transitions=np.array([[-1, 0]]), rewards=np.array([[1.0, 0.0]]))
     if horizon is None:
-        with pytest.raises(ParameterError, match="does not tell the horizon"):
-            importers.bridge(file)
+        assert "does not tell the horizon" in refusal(ParameterError, importers.bridge, file)
         assert importers.bridge(file, horizon=7).horizon == 7
         inside = tmp_path / "MiniGrid-X" / "consolidated.npz"
         inside.parent.mkdir()
@@ -78,9 +78,8 @@ def test_horizons_are_told_by_names(tmp_path, name, horizon):
 def test_spoilt_files_of_bridge_are_refused_in_one_line(tmp_path, members, message):
     file = tmp_path / "spoilt.npz"
     np.savez(file, **members)
-    with pytest.raises(FileFormatError, match=message) as caught:
-        importers.bridge(file, horizon=5)
-    assert str(file) in str(caught.value) and "\n" not in str(caught.value)
+    said = refusal(FileFormatError, importers.bridge, file, horizon=5)
+    assert message in said and str(file) in said
 
 
 def test_what_is_no_npz_is_refused_and_never_run(tmp_path):
@@ -92,8 +91,7 @@ def test_what_is_no_npz_is_refused_and_never_run(tmp_path):
     (tmp_path / "text.npz").write_text("hello")
     (tmp_path / "cut.npz").write_bytes(CORRIDOR.read_bytes()[:5000])
     for name in ("pickle", "text", "cut"):
-        with pytest.raises(FileFormatError, match="cannot be read"):
-            importers.bridge(tmp_path / f"{name}.npz", horizon=5)
+        assert "cannot be read" in refusal(FileFormatError, importers.bridge, tmp_path / f"{name}.npz", horizon=5)
     assert not (tmp_path / "exploded").exists()
 
 
@@ -103,8 +101,7 @@ def test_screens_come_one_a_state(tmp_path):
     np.savez(file, transitions=np.zeros((3, 1), int), screens=screens, screen_mapping=np.array([1, 0, 1]))
     assert (importers.bridge_screens(file) == screens[[1, 0, 1]]).all()
     np.savez(file, transitions=np.zeros((3, 1), int), screens=screens, screen_mapping=np.array([1, 0, 2]))
-    with pytest.raises(FileFormatError, match="names a screen that is not there"):
-        importers.bridge_screens(file)
+    assert "names a screen that is not there" in refusal(FileFormatError, importers.bridge_screens, file)
 
 
 @pytest.mark.slow
@@ -161,18 +158,15 @@ def _sweep(table, v):
     ],
 )
 def test_spoilt_tables_are_refused(table, message):
-    with pytest.raises(FileFormatError, match=message):
-        importers.gymnasium(table)
+    assert message in refusal(FileFormatError, importers.gymnasium, table)
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
-@given(small_mdps())
+@examples(50, small_mdps())
 def test_folders_give_back_what_was_saved(tmp_path_factory, mdp):
     folder = tmp_path_factory.mktemp("mdp") / "kept"
     if mdp.is_sticky or mdp.is_random:
-        with pytest.raises(ParameterError, match="without sticky or random actions"):
-            importers.save(mdp, folder)
+        assert "without sticky or random actions" in refusal(ParameterError, importers.save, mdp, folder)
         return
     importers.save(mdp, folder)
     same(importers.load(folder), mdp)
@@ -183,15 +177,12 @@ def test_folders_that_were_changed_are_refused(tmp_path):
     folder = importers.save(mdp, tmp_path / "kept")
     rewards = np.load(folder / "rewards.npy")
     np.save(folder / "rewards.npy", rewards + 1)
-    with pytest.raises(FileFormatError, match=r"rewards\.npy was changed"):
-        importers.load(folder)
+    assert "rewards.npy was changed" in refusal(FileFormatError, importers.load, folder)
     (folder / "rewards.npy").unlink()
-    with pytest.raises(FileFormatError, match="no such file"):
-        importers.load(folder)
+    assert "no such file" in refusal(FileFormatError, importers.load, folder)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").write_text("years of work")
-    with pytest.raises(ParameterError, match="holds no imported MDP"):
-        importers.save(mdp, tmp_path / "other")
+    assert "holds no imported MDP" in refusal(ParameterError, importers.save, mdp, tmp_path / "other")
 
 
 @pytest.mark.slow
@@ -221,16 +212,13 @@ def test_bridge_files_come_back(tmp_path):
     moved = mdp.with_initial(5)
     back = importers.bridge(exporters.bridge(moved, tmp_path / "moved_200_fs1.npz"))
     assert pharos.value_iteration(back).value_at_start == pharos.value_iteration(moved).value_at_start
-    with pytest.raises(ParameterError, match="deterministic"):
-        exporters.bridge(random_actions(mdp, 0.1), tmp_path / "x.npz")
+    assert "deterministic" in refusal(ParameterError, exporters.bridge, random_actions(mdp, 0.1), tmp_path / "x.npz")
 
 
-@settings(max_examples=60, deadline=None)
-@given(small_mdps())
+@examples(60, small_mdps())
 def test_tables_come_back_with_the_same_values(mdp):
     if mdp.is_sticky:
-        with pytest.raises(ParameterError, match="sticky"):
-            exporters.gym_p(mdp)
+        assert "sticky" in refusal(ParameterError, exporters.gym_p, mdp)
         return
     table = exporters.gym_p(mdp)
     back = importers.gymnasium(table, gamma=mdp.gamma)
@@ -258,8 +246,7 @@ def read_drn(path):
     return start, rows
 
 
-@settings(max_examples=40, deadline=None)
-@given(small_mdps())
+@examples(40, small_mdps())
 def test_storms_format_says_the_same_values(tmp_path_factory, mdp):
     if mdp.is_sticky:
         return
@@ -337,9 +324,8 @@ def test_folders_of_older_versions_are_read(imported):
         ({"format_version": 2}, "expected .*, observations"),
     ):
         path.write_text(json.dumps(manifest | changes))
-        with pytest.raises(FileFormatError, match=message) as caught:
-            importers.load(imported)
-        assert str(imported) in str(caught.value) and "\n" not in str(caught.value)
+        said = refusal(FileFormatError, importers.load, imported)
+        assert re.search(message, said) and str(imported) in said
 
 
 def resealed(folder):
@@ -372,9 +358,7 @@ def resealed(folder):
 def test_arrays_with_right_checksums_and_wrong_content_are_refused(name, array, imported):
     np.save(imported / f"{name}.npy", array)
     resealed(imported)
-    with pytest.raises(FileFormatError) as caught:
-        importers.load(imported)
-    assert str(imported) in str(caught.value) and "\n" not in str(caught.value)
+    assert str(imported) in refusal(FileFormatError, importers.load, imported)
 
 
 @pytest.mark.parametrize(
@@ -392,9 +376,7 @@ def test_matrices_with_right_checksums_and_wrong_content_are_refused(name, chang
     folder = importers.save(importers.matrices(np.full((3, 2, 3), 1 / 3), np.ones((3, 2))), tmp_path / "imported")
     np.save(folder / f"{name}.npy", change(np.load(folder / f"{name}.npy")))
     resealed(folder)
-    with pytest.raises(FileFormatError) as caught:
-        importers.load(folder)
-    assert "\n" not in str(caught.value)
+    refusal(FileFormatError, importers.load, folder)
 
 
 def test_an_array_header_that_promises_more_than_there_is_ends_in_one_line(imported):
@@ -403,9 +385,7 @@ def test_an_array_header_that_promises_more_than_there_is_ends_in_one_line(impor
     for data in (path.read_bytes(), path.read_bytes()[:40], b"", b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16):
         path.write_bytes(data)
         resealed(imported)
-        with pytest.raises(FileFormatError, match=r"rewards\.npy: cannot be read") as caught:
-            importers.load(imported)
-        assert "\n" not in str(caught.value)
+        assert "rewards.npy: cannot be read" in refusal(FileFormatError, importers.load, imported)
 
 
 @pytest.mark.slow
@@ -430,8 +410,7 @@ def test_no_bit_of_a_compressed_file_of_bridge_ends_in_a_traceback(tmp_path):
 def test_a_name_with_a_horizon_beyond_reason_is_refused_at_once(tmp_path):
     file = tmp_path / "a_1000000000_fs3.npz"
     np.savez(file, transitions=np.array([[-1, 0]]), rewards=np.array([[1.0, 0.0]]))
-    with pytest.raises(ParameterError, match="its name says 1000000000 steps; expected at most 100000"):
-        importers.bridge(file)
+    assert "its name says 1000000000 steps; expected at most 100000" in refusal(ParameterError, importers.bridge, file)
 
 
 class Fickle(gymnasium.Env):
@@ -478,8 +457,7 @@ def test_an_environment_that_is_imported_is_left_as_it_was():
 def test_a_start_that_is_no_distribution_is_refused(start):
     env = Fickle()
     env.initial_state_distrib = start
-    with pytest.raises(FileFormatError, match="initial_state_distrib is no distribution"):
-        importers.gymnasium(env)
+    assert "initial_state_distrib is no distribution" in refusal(FileFormatError, importers.gymnasium, env)
 
 
 # A table is no environment -------------------------------------------------------------------------------------------

@@ -1,6 +1,5 @@
 """Exports, images and policies are replaced in one step: on a full disk the older file of the name is still there."""
 
-import multiprocessing
 import os
 import resource
 import signal
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 import pharos
+from children import exit_code
 from pharos import drawing, exporters, hardness, importers
 from pharos.cli.evaluate import save
 from pharos.errors import FileFormatError
@@ -17,8 +17,6 @@ from pharos.mdp import TabularMDP
 from pharos.plots import save as save_figure
 from pharos.system.storage import replace_file
 from pharos.training import load_agent, read_rows
-
-fork = multiprocessing.get_context("fork")
 
 
 def mdp():
@@ -69,10 +67,7 @@ def test_a_full_disk_leaves_the_older_file(name, tmp_path):
     WRITERS[name](tmp_path / name)
     assert (tmp_path / name).stat().st_size > 1000
     (tmp_path / name).write_text("older")
-    process = fork.Process(target=_write_with_little_disk, args=(name, tmp_path))
-    process.start()
-    process.join()
-    assert process.exitcode == 7
+    assert exit_code(_write_with_little_disk, name, tmp_path) == 7
     assert (tmp_path / name).read_text() == "older"
     assert [path.name for path in tmp_path.iterdir()] == [name]
 

@@ -28,9 +28,8 @@ BOTH = {"sticky": 0.3, "random": 0.2}
 
 @pytest.fixture(scope="module")
 def spaces(tmp_path_factory):
-    return {
-        name: pharos.build(env, tmp_path_factory.mktemp(name) / "space", progress=False) for name, env in WORLDS.items()
-    }
+    folder = tmp_path_factory.mktemp("spaces")
+    return {name: pharos.build(env, folder / name, progress=False) for name, env in WORLDS.items()}
 
 
 def played(env, actions) -> list[tuple]:
@@ -94,11 +93,8 @@ def test_what_is_paid_and_said_is_of_the_outcome_that_was_drawn(name):
         _, rewards, terminated, truncated, info = vec.step(rng.integers(env.num_actions, size=50))
         for i, state in enumerate(map(tuple, before)):
             action, after = int(info["executed_action"][i]), tuple(info["state"][i].tolist())
-            likely = {
-                env.probability(state, action, k)
-                for k in range(env.outcomes)
-                if env.probability(state, action, k) > 0 and env.next_state(state, action, k) == after
-            }
+            possible = ((env.probability(state, action, k), k) for k in range(env.outcomes))
+            likely = {p for p, k in possible if p > 0 and env.next_state(state, action, k) == after}
             assert info["prob"][i] in likely
             assert rewards[i] == env.reward(state, action, after)
             assert terminated[i] == env.is_terminal(after)

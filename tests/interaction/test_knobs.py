@@ -17,13 +17,14 @@ from naive.learning import paid as paid_of
 from pharos.agents import QLearning
 from pharos.agents.batched import BatchRun
 from pharos.agents.batched.lane import BatchedEpisodes
-from pharos.environments import Environment, Layer
+from pharos.environments import Layer
 from pharos.interaction import GymEnv, VectorEnv
 from pharos.mdp import ChanceSetting, rewards_of_staying
 from pharos.policies.policy import TableAnswers
 from pharos.policies.value import estimate
 from pharos.rules.stepping import InterpretedStepping
 from pharos.training import Task, evaluate_agent
+from worlds import Row
 
 LEVEL = 1e-4  # probability that a right implementation fails
 KNOBS = {
@@ -39,27 +40,20 @@ HORIZON = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ring(Environment):
+class Ring(Row):
     """Four cells in a ring, numbered as a search meets them: an action goes on, one time in four a cell further."""
+
+    length: int = 4
 
     name = "ring_of_knobs"
     actions = ("one", "two", "three")
     outcomes = 2
-
-    def variables(self):
-        return {"cell": range(4)}
-
-    def initial_state(self):
-        return (0,)
 
     def probability(self, state, action, outcome):
         return 0.75 if outcome == 0 else 0.25
 
     def transition(self, state, action, outcome, out):
         out[0] = (state[0] + action + 1 + outcome) % 4
-
-    def is_terminal(self, state):
-        return False
 
     layers = {"agent": Layer("A", (0, 0, 255))}
 

@@ -13,6 +13,7 @@ import pharos
 from pharos.errors import ParameterError
 from pharos.interaction import GymEnv, make_vec
 from pharos.rules import InterpretedStepping
+from refusals import refusal
 
 SMALL = {
     "simple_grid": {"height": 3, "width": 4, "rewards": (((1, 1), 0.1),), "penalties": (((0, 2), -0.5),)},
@@ -83,8 +84,7 @@ def test_rules_table_and_interpreted_twin_walk_the_same_way(space, mode, chance)
             np.testing.assert_array_equal(steps[0][4]["executed_action"], other[4]["executed_action"])
         done = steps[0][2] | steps[0][3]
         if mode == AutoresetMode.DISABLED and done.any():
-            with pytest.raises(gymnasium.error.ResetNeeded, match="reset_mask"):
-                compiled.step(actions)
+            assert "reset_mask" in refusal(gymnasium.error.ResetNeeded, compiled.step, actions)
             for walk in walks:
                 walk.reset(options={"reset_mask": done})
 
@@ -170,8 +170,7 @@ def test_episodes_start_in_the_states_given(breakout):
         np.testing.assert_array_equal(vec.states, states)
         vec.reset(options={"state": states[2]})
         np.testing.assert_array_equal(vec.states, states[[2] * 4])
-    with pytest.raises(ParameterError, match="expected one, or 4"):
-        vec.reset(options={"state": states[:2]})
+    assert "expected one, or 4" in refusal(ParameterError, vec.reset, options={"state": states[:2]})
 
 
 def test_observations_are_fresh_arrays_of_the_space(space):
@@ -196,21 +195,14 @@ def test_gymnasium_makes_it_by_name():
 
 def test_bad_input_is_refused_in_one_line():
     vec = make_vec("breakout", 2)
-    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
-        vec.step([0, 0])
+    assert "call reset" in refusal(gymnasium.error.ResetNeeded, vec.step, [0, 0])
     vec.reset(seed=0)
-    with pytest.raises(ParameterError, match="action 3 of environment 1; expected 0 to 2"):
-        vec.step(np.array([0, 3]))
-    with pytest.raises(ParameterError, match=r"expected \(2,\) integers"):
-        vec.step(np.array([0.0, 1.0]))
-    with pytest.raises(ParameterError, match="expected one integer, or 2"):
-        vec.reset(seed=[1, 2, 3])
-    with pytest.raises(ParameterError, match="reset_mask"):
-        vec.reset(options={"reset_mask": np.array([1, 0])})
-    with pytest.raises(ParameterError, match="num_envs is 0"):
-        make_vec("breakout", 0)
-    with pytest.raises(ParameterError, match="autoreset_mode is 'never'"):
-        make_vec("breakout", 2, autoreset_mode="never")
+    assert "action 3 of environment 1; expected 0 to 2" in refusal(ParameterError, vec.step, np.array([0, 3]))
+    assert "expected (2,) integers" in refusal(ParameterError, vec.step, np.array([0.0, 1.0]))
+    assert "expected one integer, or 2" in refusal(ParameterError, vec.reset, seed=[1, 2, 3])
+    assert "reset_mask" in refusal(ParameterError, vec.reset, options={"reset_mask": np.array([1, 0])})
+    assert "num_envs is 0" in refusal(ParameterError, make_vec, "breakout", 0)
+    assert "autoreset_mode is 'never'" in refusal(ParameterError, make_vec, "breakout", 2, autoreset_mode="never")
 
 
 def test_stable_baselines_gets_what_it_needs_at_the_ends_of_episodes():

@@ -16,6 +16,7 @@ from pharos.leaderboard import verification
 from pharos.leaderboard.entry import write
 from pharos.system import storage
 from pharos.training import read_record, run_id
+from refusals import refusal
 
 OWN = """
 from dataclasses import dataclass
@@ -109,9 +110,7 @@ def test_every_byte_that_is_cut_off_or_changed_is_told_in_one_line(file):
     damaged = [whole[:k] for k in places] + [whole[:k] + bytes([whole[k] ^ 1]) + whole[k + 1 :] for k in places]
     for data in [*damaged, whole + b"\0"]:
         file.write_bytes(data)
-        with pytest.raises(FileFormatError, match=r"grid\.safetensors: ") as told:
-            leaderboard.read(file)
-        assert "\n" not in str(told.value)
+        assert "grid.safetensors: " in refusal(FileFormatError, leaderboard.read, file)
 
 
 @pytest.mark.parametrize(
@@ -131,11 +130,9 @@ def test_sizes_are_held_against_the_file_before_anything_is_allocated(file, plac
     header = {**json.loads(data[8 : 8 + length]), "policy": place}
     text = json.dumps(header).encode()
     file.write_bytes(struct.pack("<Q", len(text)) + text + data[8 + length :])
-    with pytest.raises(ResultCorrupted, match="cut short or changed"):
-        leaderboard.read(file)
+    assert "cut short or changed" in refusal(ResultCorrupted, leaderboard.read, file)
     file.write_bytes(struct.pack("<Q", 1 << 60) + data[8:])
-    with pytest.raises(FileFormatError, match="its header would have"):
-        leaderboard.read(file)
+    assert "its header would have" in refusal(FileFormatError, leaderboard.read, file)
 
 
 @pytest.mark.parametrize("text", ["\x1b[2J", "left\u202eright", "\ud800", "x" * 3000])
@@ -177,8 +174,7 @@ def test_another_version_of_the_rules_is_another_mdp(entry, file):
 )
 def test_names_of_code_are_refused_without_trust(entry, file, part, name):
     config = dataclasses.replace(entry.config, **{part: name})
-    with pytest.raises(UntrustedCode, match="--trust"):
-        leaderboard.verify(changed(entry, file, config=config))
+    assert "--trust" in refusal(UntrustedCode, leaderboard.verify, changed(entry, file, config=config))
 
 
 def test_the_version_of_the_rules_is_that_of_the_run_though_its_class_is_not_loaded(run, entry, tmp_path, monkeypatch):
@@ -298,11 +294,9 @@ def test_one_hostile_entry_costs_its_own_row(entry, tmp_path, monkeypatch):
     usual = verification.policy_of
 
     def policy_of(entry, *given, **options):
-        return (
-            usual(entry, *given, **options)
-            if entry.name == "q_learning"
-            else {"bug": dict.pop, "slow": endless}[entry.name]({}, "it is not there")
-        )
+        if entry.name == "q_learning":
+            return usual(entry, *given, **options)
+        return {"bug": dict.pop, "slow": endless}[entry.name]({}, "it is not there")
 
     monkeypatch.setattr(verification, "policy_of", policy_of)
     made = leaderboard.board(folder, tmp_path / "board.html", max_seconds=2)
@@ -397,8 +391,7 @@ def test_what_a_network_claims_is_computed_again(tmp_path):
         leaderboard.verify(changed(entry, file, arrays=wide, hyperparameters={"net_arch": [1 << 22, 8]}))
     name = next(iter(entry.arrays))
     missing = {**entry.arrays, name: np.full_like(entry.arrays[name], np.nan)}
-    with pytest.raises(FileFormatError, match="are not finite"):
-        leaderboard.verify(changed(entry, file, arrays=missing))
+    assert "are not finite" in refusal(FileFormatError, leaderboard.verify, changed(entry, file, arrays=missing))
     few = dict(list(entry.arrays.items())[1:])
     with pytest.raises(FileFormatError, match=r"its network is none of dqn|does not have"):
         leaderboard.verify(changed(entry, file, arrays=few))

@@ -1,12 +1,10 @@
 """Bisimulation: the coarsest partition by brute force, values that are kept, published minimal MDPs."""
 
-import itertools
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
@@ -15,7 +13,7 @@ from pharos import importers
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from pharos.mdp.bisimulation import minimize
-from strategies import deterministic_mdps, general_mdps, outcome_mdps, probabilities
+from strategies import deterministic_mdps, examples, general_mdps, outcome_mdps, probabilities
 
 BRIDGE = Path(__file__).parents[1] / "data" / "bridge"
 
@@ -38,36 +36,36 @@ def bisimilar(mdp):
         same = new
 
 
+def assert_values_are_kept(mdp, found):
+    whole, merged = (pharos.value_iteration(each, 1e-9) for each in (mdp, found.mdp))
+    np.testing.assert_allclose(merged.v[found.classes], whole.v, atol=1e-6)
+    assert merged.value_at_start == pytest.approx(whole.value_at_start, abs=1e-6)
+
+
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
-@given(deterministic_mdps(max_states=7, max_actions=2))
+@examples(150, deterministic_mdps(max_states=7, max_actions=2))
 def test_classes_are_those_of_the_greatest_bisimulation(mdp):
     classes = minimize(mdp).classes
     assert ((classes[:, None] == classes[None]) == bisimilar(mdp)[:-1, :-1]).all()
 
 
 @pytest.mark.slow
-@settings(max_examples=80, deadline=None)
-@given(deterministic_mdps(max_states=7, max_actions=2), probabilities, probabilities)
+@examples(80, deterministic_mdps(max_states=7, max_actions=2), probabilities, probabilities)
 def test_values_are_kept_under_every_chance(mdp, sticky, random):
     mdp = random_actions(sticky_actions(mdp, sticky), random)
     found = minimize(mdp)
-    whole, merged = (pharos.value_iteration(each, 1e-9) for each in (mdp, found.mdp))
-    np.testing.assert_allclose(merged.v[found.classes], whole.v, atol=1e-6)
-    assert merged.value_at_start == pytest.approx(whole.value_at_start, abs=1e-6)
+    assert_values_are_kept(mdp, found)
     assert found.mdp.chance == mdp.chance
 
 
-@settings(max_examples=50, deadline=None)
-@given(deterministic_mdps(max_states=7, max_actions=2))
+@examples(50, deterministic_mdps(max_states=7, max_actions=2))
 def test_a_minimal_mdp_stays_as_it_is(mdp):
     smaller = minimize(mdp)
     assert minimize(smaller.mdp).num_classes == smaller.num_classes
     assert (np.diff(smaller.representatives) > 0).all()
 
 
-@settings(max_examples=50, deadline=None)
-@given(deterministic_mdps(max_states=6, max_actions=2), st.data())
+@examples(50, deterministic_mdps(max_states=6, max_actions=2), st.data())
 def test_states_that_look_different_stay_apart(mdp, data):
     looks = np.array(data.draw(st.lists(st.integers(0, 2), min_size=mdp.num_states, max_size=mdp.num_states)))
     found = minimize(mdp, looks)
@@ -81,8 +79,7 @@ def test_copies_of_a_state_are_merged():
     """A corridor in which every cell is there twice."""
     length = 6
     cells = np.arange(length)
-    onwards = np.append(cells[1:], -1)
-    table = np.concatenate([np.stack([onwards, cells], axis=1), np.stack([onwards, cells], axis=1)])
+    table = np.tile(np.stack([np.append(cells[1:], -1), cells], axis=1), (2, 1))
     rewards = np.zeros((2 * length, 2))
     rewards[[length - 1, 2 * length - 1], 0] = 1
     found = minimize(TabularMDP.from_arrays(table, rewards))
@@ -106,11 +103,7 @@ def test_what_bridge_has_consolidated_is_minimal_or_tells_screens_apart(name):
 
 def bisimilar_general(mdp):
     """(S, S) bool by a greatest fixed point: the probabilities of reaching each class of the relation are equal."""
-    matrix = np.zeros((mdp.num_states, mdp.num_actions, mdp.num_states))
-    for s, a in itertools.product(range(mdp.num_states), range(mdp.num_actions)):
-        for t, p in naive_mdp.outcomes(mdp, s, a):
-            if t >= 0:
-                matrix[s, a, t] += p
+    matrix = naive_mdp.matrix_of(mdp)
     same = (mdp.rewards[:, None] == mdp.rewards[None]).all(axis=2)
     same &= mdp.terminal[:, None] == mdp.terminal[None]
     while True:
@@ -123,16 +116,14 @@ def bisimilar_general(mdp):
 
 
 @pytest.mark.long
-@settings(max_examples=100, deadline=None)
-@given(st.one_of(general_mdps(), outcome_mdps()))
+@examples(100, st.one_of(general_mdps(), outcome_mdps()))
 def test_classes_of_general_mdps_are_those_of_the_greatest_bisimulation(mdp):
     classes = minimize(mdp).classes
     assert ((classes[:, None] == classes[None]) == bisimilar_general(mdp)).all()
 
 
 @pytest.mark.long
-@settings(max_examples=80, deadline=None)
-@given(general_mdps(), probabilities, probabilities, st.data())
+@examples(80, general_mdps(), probabilities, probabilities, st.data())
 def test_values_of_general_mdps_are_kept_when_states_are_doubled(mdp, sticky, random, data):
     """Each state twice, and each transition spread over both copies."""
     size, actions = mdp.num_states, mdp.num_actions
@@ -143,9 +134,7 @@ def test_values_of_general_mdps_are_kept_when_states_are_doubled(mdp, sticky, ra
     one, other = (random_actions(sticky_actions(each, sticky), random) for each in (mdp, twice))
     found = minimize(other)
     assert found.num_classes == minimize(one).num_classes
-    whole, merged = (pharos.value_iteration(each, 1e-9) for each in (other, found.mdp))
-    np.testing.assert_allclose(merged.v[found.classes], whole.v, atol=1e-6)
-    assert merged.value_at_start == pytest.approx(whole.value_at_start, abs=1e-6)
+    assert_values_are_kept(other, found)
 
 
 def rounds_of_all(mdp):

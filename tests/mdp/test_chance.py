@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 
 import pharos
 from naive import builder as naive_builder
 from pharos.errors import RuleError, StateSpaceError, StateSpaceTooLarge
 from pharos.plots import states_by_depth
+from strategies import examples
 from worlds import ChanceWorld, Row, chance_worlds
 
 search = importlib.import_module("pharos.state_space.search")
@@ -52,8 +52,7 @@ def assert_agrees(space: pharos.StateSpace, env) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None)
-@given(env=chance_worlds())
+@examples(25, env=chance_worlds())
 def test_build_agrees_with_a_plain_enumeration_on_random_worlds(env, tmp_path_factory):
     assert_agrees(build(env, tmp_path_factory.mktemp("space") / "space"), env)
 

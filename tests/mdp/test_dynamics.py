@@ -1,9 +1,11 @@
 """What executing actions does: every question has one answer, however the transitions are stored."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import sparse
 
 from naive import mdp as naive_mdp
 from pharos.mdp import (
@@ -25,6 +27,7 @@ from pharos.solvers import evaluate_policy, uniform_value, value_iteration, wors
 from strategies import (
     as_outcome_tables,
     deterministic_mdps,
+    examples,
     general_mdps,
     lazy_mdps,
     outcome_mdps,
@@ -32,8 +35,6 @@ from strategies import (
     small_mdps,
     with_chance,
 )
-
-often = settings(max_examples=80, deadline=None)
 
 
 class Listed(Dynamics):
@@ -105,16 +106,7 @@ def moved(dynamics, play, now, width):
 
 def as_matrices(mdp):
     """The same MDP, stored as a matrix."""
-    size, num_actions = mdp.num_states, mdp.num_actions
-    P = np.zeros((size, num_actions, size))
-    for s in range(size):
-        for a in range(num_actions):
-            for t, p in naive_mdp.outcomes(mdp, s, a):
-                if t >= 0:
-                    P[s, a, t] += p
-    from scipy import sparse
-
-    return Matrices(sparse.csr_matrix(P.reshape(size * num_actions, size)), num_actions)
+    return Matrices(sparse.csr_matrix(naive_mdp.matrix_of(mdp).reshape(-1, mdp.num_states)), mdp.num_actions)
 
 
 def representations(mdp):
@@ -127,8 +119,7 @@ def same(answers):
 
 
 @pytest.mark.slow
-@often
-@given(st.one_of(small_mdps(), outcome_mdps(), lazy_mdps()), st.integers(0, 2**32))
+@examples(80, st.one_of(small_mdps(), outcome_mdps(), lazy_mdps()), st.integers(0, 2**32))
 def test_every_representation_gives_the_same_answers(mdp, seed):
     rng = np.random.default_rng(seed)
     size, num_actions = mdp.num_states, mdp.num_actions
@@ -137,11 +128,9 @@ def test_every_representation_gives_the_same_answers(mdp, seed):
     several = rng.normal(size=(size + 1, num_actions, 3))
     states = np.flatnonzero(rng.random(size) < 0.7)
     mass = rng.random((size, num_actions)) * (rng.random((size, num_actions)) < 0.5)
-    same([each.expected(values) for each in all_of_them])
-    same([each.expected(values, states) for each in all_of_them])
-    same([each.expected(by_action) for each in all_of_them])
-    same([each.expected(several) for each in all_of_them])
-    same([each.expected(several, states) for each in all_of_them])
+    for x in (values, by_action, several):
+        same([each.expected(x) for each in all_of_them])
+        same([each.expected(x, states) for each in all_of_them])
     same([each.largest(values) for each in all_of_them])
     same([each.smallest(values, states) for each in all_of_them])
     same([each.pushed(mass) for each in all_of_them])
@@ -160,8 +149,7 @@ def test_every_representation_gives_the_same_answers(mdp, seed):
 
 
 @pytest.mark.long
-@often
-@given(st.one_of(small_mdps(), with_chance(outcome_mdps()), lazy_mdps()), st.integers(0, 2**32))
+@examples(80, st.one_of(small_mdps(), with_chance(outcome_mdps()), lazy_mdps()), st.integers(0, 2**32))
 def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
     rng = np.random.default_rng(seed)
     looks_back = mdp.is_sticky and seed % 2 == 0
@@ -194,24 +182,16 @@ def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
 
 
 @pytest.mark.long
-@often
-@given(st.one_of(small_mdps(), lazy_mdps()))
+@examples(80, st.one_of(small_mdps(), lazy_mdps()))
 def test_solvers_take_any_representation(mdp):
-    from dataclasses import replace
-
     other = replace(mdp, dynamics=Listed.of(mdp))
-    for solve in (
-        value_iteration,
-        worst_value,
-        uniform_value,
-        lambda m: evaluate_policy(m, np.zeros(m.num_states, int)),
-    ):
+    evaluate = lambda m: evaluate_policy(m, np.zeros(m.num_states, int))  # noqa: E731
+    for solve in (value_iteration, worst_value, uniform_value, evaluate):
         one, two = solve(mdp), solve(other)
         assert np.abs(one.v - two.v).max() <= one.error_bound + two.error_bound
 
 
-@often
-@given(deterministic_mdps())
+@examples(80, deterministic_mdps())
 def test_a_matrix_with_one_outcome_each_is_deterministic(mdp):
     dynamics = as_matrices(mdp)
     assert dynamics.is_deterministic
@@ -224,8 +204,7 @@ def test_a_matrix_with_several_outcomes_is_not_deterministic():
     assert mdp.dynamics.deterministic_table() is None
 
 
-@often
-@given(general_mdps(), st.integers(0, 2**32))
+@examples(80, general_mdps(), st.integers(0, 2**32))
 def test_sampled_next_states_are_possible_ones_and_about_as_frequent(mdp, seed):
     states = np.zeros(2000, int)
     actions = np.full(2000, mdp.num_actions - 1)
@@ -237,11 +216,9 @@ def test_sampled_next_states_are_possible_ones_and_about_as_frequent(mdp, seed):
 
 
 @pytest.mark.slow
-@often
-@given(st.one_of(small_mdps(), lazy_mdps()))
+@examples(80, st.one_of(small_mdps(), lazy_mdps()))
 def test_pairs_that_can_be_met_are_those_of_the_explicit_matrices(mdp):
-    P, _, start = naive_mdp.augmented(mdp)
-    ended = np.append(np.repeat(np.asarray(mdp.terminal), mdp.num_actions + 1), True)
+    (P, _, start), ended = naive_mdp.augmented(mdp), naive_mdp.is_over(mdp)
     reached, later = start > 0, np.zeros(len(start), bool)
     for _ in range(len(start)):
         following = (P[reached & ~ended] > 1e-12).any(axis=(0, 1)) if (reached & ~ended).any() else later & False
@@ -253,29 +230,27 @@ def test_pairs_that_can_be_met_are_those_of_the_explicit_matrices(mdp):
 
 def test_where_every_action_is_repeated_only_first_actions_go_on():
     mdp = sticky_actions(TabularMDP.from_arrays([[1, 2], [2, 0], [0, 1]], np.zeros((3, 2))), 1.0)
-    one_way = TabularMDP.from_arrays([[1, 3], [2, 0], [2, 2], [3, 3]], np.zeros((4, 2)))
     assert mdp.pairs_within().all()
-    assert sticky_actions(one_way, 1.0).pairs_within().tolist() == [[0, 0], [1, 0], [1, 0], [0, 1]]
-    assert sticky_actions(one_way, 0.5).pairs_within().tolist() == [[0, 1], [1, 0], [1, 1], [1, 1]]
-    assert sticky_actions(one_way, 1.0).pairs_within(1).tolist() == [[0, 0], [1, 0], [0, 0], [0, 1]]
 
 
 @pytest.mark.parametrize(
-    ("steps", "pairs"),
+    ("sticky", "steps", "pairs"),
     [
-        (0, [[0, 0], [0, 0], [0, 0], [0, 0]]),
-        (1, [[0, 0], [1, 0], [0, 0], [0, 1]]),
-        (2, [[0, 1], [1, 0], [1, 0], [1, 1]]),
-        (3, [[0, 1], [1, 0], [1, 1], [1, 1]]),
+        (1.0, None, [[0, 0], [1, 0], [1, 0], [0, 1]]),
+        (1.0, 1, [[0, 0], [1, 0], [0, 0], [0, 1]]),
+        (0.5, None, [[0, 1], [1, 0], [1, 1], [1, 1]]),
+        (0.5, 0, [[0, 0], [0, 0], [0, 0], [0, 0]]),
+        (0.5, 1, [[0, 0], [1, 0], [0, 0], [0, 1]]),
+        (0.5, 2, [[0, 1], [1, 0], [1, 0], [1, 1]]),
+        (0.5, 3, [[0, 1], [1, 0], [1, 1], [1, 1]]),
     ],
 )
-def test_pairs_within_some_steps_end_with_those_of_the_last_step(steps, pairs):
+def test_pairs_within_some_steps_end_with_those_of_the_last_step(sticky, steps, pairs):
     one_way = TabularMDP.from_arrays([[1, 3], [2, 0], [2, 2], [3, 3]], np.zeros((4, 2)))
-    assert sticky_actions(one_way, 0.5).pairs_within(steps).tolist() == pairs
+    assert sticky_actions(one_way, sticky).pairs_within(steps).tolist() == pairs
 
 
-@often
-@given(probabilities, probabilities, st.integers(0, 2**32))
+@examples(80, probabilities, probabilities, st.integers(0, 2**32))
 def test_weights_draws_and_adjoints_of_chance_agree(sticky, random, seed):
     rng = np.random.default_rng(seed)
     chance, num_actions = Chance.of(sticky, random), 3
@@ -299,13 +274,10 @@ def test_weights_draws_and_adjoints_of_chance_agree(sticky, random, seed):
         assert (executed * values).sum() == pytest.approx((mass * of_choice).sum())
 
 
-@settings(max_examples=30, deadline=None)
-@given(small_mdps())
+@examples(30, small_mdps())
 def test_an_action_leads_to_a_state_where_its_probability_is_not_zero(mdp):
-    possible = np.zeros((mdp.num_states, mdp.num_actions, mdp.num_states + 1), bool)
-    for s, a in np.ndindex(possible.shape[:2]):
-        for t, p in naive_mdp.outcomes(mdp, s, a):
-            possible[s, a, t] |= p > 1e-12
+    P = naive_mdp.matrix_of(mdp)
+    possible = np.concatenate([P, 1 - P.sum(axis=2, keepdims=True)], axis=2) > 1e-12
     for state in range(mdp.num_states + 1):
         assert (mdp.dynamics.leads_to(state) == possible[:, :, state]).all()
 

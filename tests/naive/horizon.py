@@ -5,15 +5,12 @@ import math
 
 import numpy as np
 
-from naive.mdp import augmented
+from naive.mdp import absorbing
 
 
 def analysis(mdp, steps):
     """k_min, window, H and its lists, by dictionaries over (step, node) and loops over everything."""
-    P, R, start = augmented(mdp)
-    width = mdp.num_actions + 1
-    for n in np.flatnonzero(np.append(np.repeat(mdp.terminal, width), True)):
-        P[n], R[n] = np.eye(len(P))[n], 0.0
+    P, R, start = absorbing(mdp)
     size, num_actions = R.shape
 
     def q_of(value):

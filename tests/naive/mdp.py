@@ -15,28 +15,53 @@ def augmented(mdp):
     A pair has index s (A + 1) + b; one more state, the last, is the end.
     """
     num_states, num_actions = mdp.num_states, mdp.num_actions
-    chance = mdp.chance
     size = num_states * (num_actions + 1) + 1
     P = np.zeros((size, num_actions, size))
     R = np.zeros((size, num_actions))
     P[-1, :, -1] = 1
     for s, b, a in itertools.product(range(num_states), range(num_actions + 1), range(num_actions)):
-        if b == num_actions:
-            executed = np.full(num_actions, (1 - chance.first_chosen) / num_actions)
-            executed[a] += chance.first_chosen
-        else:
-            executed = np.full(num_actions, chance.uniform / num_actions)
-            executed[a] += chance.chosen
-            executed[b] += chance.previous
         i = s * (num_actions + 1) + b
-        for x in range(num_actions):
-            R[i, a] += executed[x] * mdp.rewards[s, x]
+        for x, p in enumerate(executed(mdp, b)[a]):
+            R[i, a] += p * mdp.rewards[s, x]
             for t, probability in outcomes(mdp, s, x):
                 j = size - 1 if t < 0 else t * (num_actions + 1) + x
-                P[i, a, j] += executed[x] * probability
+                P[i, a, j] += p * probability
     start = np.zeros(size)
     start[mdp.start_states * (num_actions + 1) + num_actions] = mdp.start_probabilities
     return P, R, start
+
+
+def executed(mdp, b):
+    """(A chosen, A executed) probabilities where b was executed before, or nothing, where it is A."""
+    A, chance = mdp.num_actions, mdp.chance
+    if b == A:
+        return np.eye(A) * chance.first_chosen + (1 - chance.first_chosen) / A
+    joint = np.eye(A) * chance.chosen + chance.uniform / A
+    joint[:, b] += chance.previous
+    return joint
+
+
+def is_over(mdp):
+    """(N,) whether an episode has ended at a node of `augmented`: terminal states and the end."""
+    return np.append(np.repeat(np.asarray(mdp.terminal), mdp.num_actions + 1), True)
+
+
+def absorbing(mdp):
+    """The same as `augmented`, where terminal states and the end are never left and pay nothing."""
+    P, R, start = augmented(mdp)
+    for n in np.flatnonzero(is_over(mdp)):
+        P[n], R[n] = np.eye(len(P))[n], 0.0
+    return P, R, start
+
+
+def matrix_of(mdp):
+    """(S, A, S) the probability of each next state; what a row lacks to 1 ends the episode."""
+    P = np.zeros((mdp.num_states, mdp.num_actions, mdp.num_states))
+    for s, a in np.ndindex(P.shape[:2]):
+        for t, p in outcomes(mdp, s, a):
+            if t >= 0:
+                P[s, a, t] += p
+    return P
 
 
 def outcomes(mdp, s, x):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from naive.mdp import outcomes
+from naive.mdp import executed, outcomes
 
 
 def value_of_memory(policy, mdp, shown, steps):
@@ -22,22 +22,12 @@ def value_of_memory(policy, mdp, shown, steps):
         after = {}
         for (s, b, history), p in mass.items():
             reached.add((s, b, history))
-            chosen = _answer(policy, history, num_actions)
-            executed = np.zeros(num_actions)
-            for a in range(num_actions):
-                if b == num_actions:
-                    executed += chosen[a] * (1 - mdp.chance.first_chosen) / num_actions
-                    executed[a] += chosen[a] * mdp.chance.first_chosen
-                else:
-                    executed += chosen[a] * mdp.chance.uniform / num_actions
-                    executed[a] += chosen[a] * mdp.chance.chosen
-                    executed[b] += chosen[a] * mdp.chance.previous
-            for x in range(num_actions):
-                value += mdp.gamma**step * p * executed[x] * mdp.rewards[s, x]
+            for x, weight in enumerate(_answer(policy, history, num_actions) @ executed(mdp, b)):
+                value += mdp.gamma**step * p * weight * mdp.rewards[s, x]
                 for t, q in outcomes(mdp, s, x):
-                    if executed[x] * q > 0 and t >= 0 and not mdp.terminal[t]:
+                    if weight * q > 0 and t >= 0 and not mdp.terminal[t]:
                         key = (int(t), x, (*history, tuple(shown(int(t), x, False))))
-                        after[key] = after.get(key, 0.0) + p * executed[x] * q
+                        after[key] = after.get(key, 0.0) + p * weight * q
         mass = after
     return value, len(reached)
 

@@ -16,6 +16,7 @@ from pharos.environments.mini_grid import mini_grid
 from pharos.environments.worlds.freeway import NUM_COLORS
 from pharos.observations import observe
 from pharos.observations.images import num_values
+from worlds import random_states
 
 NAMES = [name for name in pharos.list_environments() if name.startswith(("breakout/", "freeway/", "game_2048/"))]
 CORRIDOR = "mini_grid/key-corridor-s6r3"
@@ -35,10 +36,6 @@ def values_of(env, states):
         assert len(np.unique(shades[known])) == len(known)
         values[:, layer] = known[(pixels[:, layer, :, :, None] == shades[known]).argmax(axis=-1)]
     return values
-
-
-def any_states(env, count, rng):
-    return env.components.low + rng.integers(0, env.components.size, (count, len(env.components)))
 
 
 def breakout(env, planes):
@@ -68,7 +65,7 @@ DECODERS = {"breakout": breakout, "freeway": freeway, "game_2048": game_2048}
 @pytest.mark.parametrize("name", NAMES)
 def test_any_state_is_read_back_from_its_image(name):
     env = pharos.make(name)
-    states = any_states(env, 60, np.random.default_rng(0))
+    states = random_states(env, 60)
     for state, planes in zip(states, values_of(env, states), strict=True):
         assert tuple(map(int, DECODERS[env.name](env, planes))) == tuple(state.tolist())
 

@@ -9,6 +9,7 @@ import pharos
 from pharos.environments.built_in import BUILT_IN
 from pharos.errors import ParameterError, RuleError
 from pharos.observations import observe
+from refusals import refusal
 
 pytestmark = pytest.mark.long  # with each class compiled
 
@@ -144,8 +145,7 @@ def test_hidden_layers_are_not_seen(name):
         assert different(interpreted(env, name, hide="paddle")(states)) == 2
     with pytest.raises(ParameterError, match=r"_image of breakout: there is no 'bal' to hide; .* paddle, ball$"):
         observe(env, name, hide="bal")
-    with pytest.raises(ParameterError, match="there is no 'ball_trail' to hide"):
-        observe(env, name, hide="ball_trail")
+    assert "there is no 'ball_trail' to hide" in refusal(ParameterError, observe, env, name, hide="ball_trail")
 
 
 def test_hidden_variables_are_always_0():
@@ -164,8 +164,7 @@ def test_hidden_variables_are_always_0():
         ParameterError, match="vector of breakout: there is no 'ball' to hide; expected some of ball_row"
     ):
         observe(env, "vector", hide="ball")
-    with pytest.raises(ParameterError, match="hide is 3; expected a name, or -1 to -17"):
-        observe(env, "vector", hide=3)
+    assert "hide is 3; expected a name, or -1 to -17" in refusal(ParameterError, observe, env, "vector", hide=3)
 
 
 def test_steps_show_what_observations_show():

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_reach import CHANCES
 
 from pharos import solvers
 from pharos.agents.batched import make_batch
-from pharos.mdp import TabularMDP, lazy_actions, random_actions, sticky_actions
+from pharos.mdp import TabularMDP, lazy_actions, sticky_actions
 from pharos.policies import Evaluation, TableAnswers, is_small_table, table_values
 from pharos.training import ChanceSetting, RunConfig, TaskCache, evaluate_agent
 from pharos.training.curve import values_together
@@ -43,15 +44,7 @@ def alone(mdp, policy):
 
 
 @pytest.mark.parametrize("starts", [1, 3])
-@pytest.mark.parametrize(
-    "chance",
-    [
-        lambda mdp: mdp,
-        lambda mdp: random_actions(mdp, 0.1),
-        lambda mdp: sticky_actions(mdp, 0.25),
-        lambda mdp: random_actions(sticky_actions(mdp, 0.25), 0.1),
-    ],
-)
+@pytest.mark.parametrize("chance", CHANCES)
 def test_policies_are_worth_among_copies_what_they_are_worth_alone(chance, starts):
     for horizon in (1, 17):
         mdp = chance(mdp_of(horizon, starts))
@@ -62,7 +55,7 @@ def test_policies_are_worth_among_copies_what_they_are_worth_alone(chance, start
     assert len({each.error_bound for each in together}) > 1
 
 
-@pytest.mark.parametrize("chance", [lambda mdp: mdp, lambda mdp: random_actions(sticky_actions(mdp, 0.25), 0.1)])
+@pytest.mark.parametrize("chance", [CHANCES[0], CHANCES[3]])
 def test_tables_are_worth_together_what_they_are_worth_alone(chance, monkeypatch):
     mdp = chance(mdp_of(17, 3))
     tables = list(np.random.default_rng(2).integers(mdp.num_actions, size=(5, mdp.num_states)))
@@ -95,17 +88,13 @@ def test_which_mdps_have_copies():
 @pytest.mark.parametrize("agent", ["dqn", "ppo"])
 def test_the_runs_of_a_batch_have_the_values_that_each_has_alone(agent):
     members = TaskCache()
-    group = [
-        members.member(
-            seed,
-            RunConfig(
-                environment="simple_grid", chance=ChanceSetting(sticky=sticky), agent=agent, seed=seed, **SETTING
-            ),
-            None,
-        )
-        for sticky in (0.25, 0.1)
-        for seed in range(3)
-    ]
+
+    def config(sticky, seed):
+        chance = ChanceSetting(sticky=sticky)
+        return RunConfig(environment="simple_grid", chance=chance, agent=agent, seed=seed, **SETTING)
+
+    cells = [(sticky, seed) for sticky in (0.25, 0.1) for seed in range(3)]
+    group = [members.member(seed, config(sticky, seed), None) for sticky, seed in cells]
     batch = make_batch(agent, [member.run for member in group])
     batch.learn([150], lambda point: None)
     together = values_together(batch, group)

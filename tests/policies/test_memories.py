@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
@@ -12,7 +11,7 @@ from naive.memory import value_of_memory
 from pharos.errors import ParameterError
 from pharos.policies import policy_value
 from pharos.training import Task, evaluate_agent, load_agent, train
-from strategies import small_mdps
+from strategies import examples, small_mdps
 
 CHANCE = [{}, {"random": 0.2}, {"sticky": 0.25}, {"sticky": 0.25, "random": 0.2}]
 
@@ -92,8 +91,9 @@ def sight_of(classes, num_actions, previous_action=False):
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
-@given(small_mdps(max_states=4, max_actions=2), st.integers(0, 10**6), st.booleans(), st.booleans(), st.integers(1, 4))
+@examples(
+    150, small_mdps(max_states=4, max_actions=2), st.integers(0, 10**6), st.booleans(), st.booleans(), st.integers(1, 4)
+)
 def test_the_value_is_that_of_all_histories(mdp, seed, sharp, sees_previous, steps):
     """States that look alike, sticky and random actions, several starts, chance in the rules."""
     mdp, rng = mdp.with_horizon(steps), np.random.default_rng(seed)

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
@@ -14,12 +13,12 @@ from pharos.mdp import TabularMDP
 from pharos.policies import TableAnswers, policy_value
 from pharos.policies.value import _half_width
 from pharos.solvers import evaluate_policy
-from strategies import small_mdps
+from refusals import failing
+from strategies import examples, small_mdps
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
-@given(small_mdps(), st.integers(0, 10**6), st.sampled_from([None, 3]))
+@examples(100, small_mdps(), st.integers(0, 10**6), st.sampled_from([None, 3]))
 def test_what_a_policy_reaches_has_the_values_of_the_whole_mdp(mdp, seed, horizon):
     mdp, rng = mdp.with_horizon(horizon), np.random.default_rng(seed)
     table = rng.dirichlet(np.ones(mdp.num_actions), mdp.num_states)
@@ -60,9 +59,7 @@ class RecurrentDistribution:
 
 class RecurrentPPO:
     policy = RecurrentDistribution()
-
-    def predict(self, observation, *, deterministic=False):
-        raise AssertionError
+    predict = failing(AssertionError())
 
 
 def test_a_policy_with_a_memory_is_refused_in_one_line(tmp_path):

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import pharos
-from pharos import Environment
 from pharos.hardness import diameter
 from pharos.interaction.gym_env import GymEnv
 from pharos.interaction.vector_env import make_vec
@@ -22,36 +21,12 @@ from pharos.rules.compiled import exploration_kernels, interaction_kernels
 from pharos.rules.compiler import numeric_attributes
 from pharos.rules.exploration import no_ages
 from pharos.system.compiling import private_folder
+from worlds import Corridor
 
 
 def corridor_class(**rules):
     """A class of its own, with the same rules as the others: what one process compiled, the next finds."""
-
-    def variables(self):
-        return {"position": range(self.length)}
-
-    def transition(self, state, action, out):
-        out[0] = min(max(state[0] + 2 * action - 1, 0), self.length - 1)
-
-    def is_terminal(self, state):
-        return state[0] == self.length - 1
-
-    def reward(self, state, action, next_state):
-        return float(next_state[0] == self.length - 1)
-
-    members = {
-        "__annotations__": {"length": int},
-        "length": 5,
-        "name": "corridor",
-        "actions": ("left", "right"),
-        "variables": variables,
-        "initial_state": lambda self: (0,),
-        "transition": transition,
-        "is_terminal": is_terminal,
-        "reward": reward,
-        **rules,
-    }
-    return dataclass(frozen=True, kw_only=True)(type("Corridor", (Environment,), members))
+    return dataclass(frozen=True, kw_only=True)(type("Corridor", (Corridor,), rules))
 
 
 @pytest.fixture
@@ -191,10 +166,8 @@ def test_kernels_do_not_depend_on_rules_that_they_do_not_call():
     assert changed() == set()
     assert changed(reward=reward) == {"rewards_of", "step_one", "step_many", "step_and_draw_one"}
     assert changed(draw=draw) == drawings
-    assert changed(is_terminal=lambda self, state: state[0] >= self.length - 1) == set(before) - drawings - {
-        "rewards_of",
-        "outcome_one",
-    } | {"step_and_draw_one"}
+    others = set(before) - drawings - {"rewards_of", "outcome_one"} | {"step_and_draw_one"}
+    assert changed(is_terminal=lambda self, state: state[0] >= self.length - 1) == others
 
 
 @pytest.mark.slow
@@ -207,9 +180,8 @@ def test_a_folder_that_others_can_write_to_is_not_read(cache, filled, tmp_path):
         (cache / "compiled" / path.name).write_bytes(hashlib.sha256(data).digest() + data)
     os.chmod(cache / "compiled", 0o777)
     private_folder.cache_clear()
-    with pytest.warns(
-        RuntimeWarning, match=r"compiled can be written to by other users; .*compiled-\d+ is used instead"
-    ):
+    instead = r"compiled can be written to by other users; .*compiled-\d+ is used instead"
+    with pytest.warns(RuntimeWarning, match=instead):
         pharos.build(corridor_class()(), tmp_path / "second")
     assert not (tmp_path / "it ran").exists()
     assert files_of(cache / f"compiled-{os.getuid()}")

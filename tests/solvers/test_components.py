@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csgraph, csr_matrix
 
@@ -10,7 +9,7 @@ from benchmark_modules import benchmark
 from pharos.mdp import Table
 from pharos.solvers import fixed_point, value_iteration, worst_value
 from pharos.solvers.fixed_point import ComponentSolver
-from strategies import small_mdps
+from strategies import examples, small_mdps
 
 pytestmark = pytest.mark.long
 
@@ -36,8 +35,7 @@ def tables(draw):
     return Table(table.astype(np.int32)), rng.random(num_states) < 0.9
 
 
-@given(tables(), st.integers(1, 8))
-@settings(max_examples=200, deadline=None)
+@examples(200, tables(), st.integers(1, 8))
 def test_components_are_those_of_scipy_in_topological_order(drawn, least):
     dynamics, live = drawn
     found, leads = dynamics.components(live, least), graph(dynamics, live)
@@ -74,8 +72,7 @@ def always(patched):
     return done
 
 
-@given(small_mdps(), st.sampled_from([0.5, 0.9, 0.99]), st.sampled_from([value_iteration, worst_value]))
-@settings(max_examples=60, deadline=None)
+@examples(60, small_mdps(), st.sampled_from([0.5, 0.9, 0.99]), st.sampled_from([value_iteration, worst_value]))
 def test_values_by_components_and_by_sweeps_alone_are_within_both_bounds(mdp, gamma, solve):
     mdp = mdp.with_gamma(gamma)
     alone = solve(mdp, 1e-6)

@@ -4,7 +4,6 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_error_bounds import finest, largest_error
 
@@ -13,7 +12,7 @@ from pharos.errors import PrecisionError
 from pharos.mdp import BEST, TabularMDP, random_actions
 from pharos.solvers import evaluate_policy, policy_iteration, value_iteration, worst_value
 from pharos.solvers.policy_iteration import PolicyIteration
-from strategies import hard_mdps
+from strategies import examples, hard_mdps
 
 nearly_1 = st.sampled_from([0.9999, 1 - 1e-6, 1 - 1e-9])
 
@@ -89,8 +88,7 @@ def attempts_at_once(request):
 
 
 @pytest.mark.long
-@settings(max_examples=30, deadline=None)
-@given(mdp=hard_mdps(), gamma=nearly_1)
+@examples(30, mdp=hard_mdps(), gamma=nearly_1)
 def test_values_near_gamma_1_are_within_their_bound_whatever_way_finds_them(attempts_at_once, mdp, gamma):
     mdp = mdp.with_gamma(gamma)
     for solve, sign in ((value_iteration, 1), (worst_value, -1)):

@@ -1,6 +1,7 @@
 """Values by several processes: those of one process, whatever the number, and going on after a kill."""
 
 import contextlib
+import errno
 import itertools
 import json
 import os
@@ -12,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
@@ -22,7 +22,8 @@ from pharos.ranks import RankFailed
 from pharos.solvers import evaluate_policy, ranked, uniform_value, value_iteration
 from pharos.solvers.ranked import shared_solution
 from rank_threads import Killed, fails_at, out_of_order, threads
-from strategies import FEW, deterministic_mdps, hard_mdps, lazy_mdps, outcome_mdps, small_mdps
+from refusals import failing, refusal
+from strategies import FEW, deterministic_mdps, examples, hard_mdps, lazy_mdps, outcome_mdps, small_mdps
 
 MPIEXEC = shutil.which("mpiexec", path=Path(sys.executable).parent)
 MANY = st.one_of(small_mdps(), hard_mdps(), lazy_mdps())
@@ -58,8 +59,7 @@ def test_three_ranks_find_the_values_of_one():
 
 
 @pytest.mark.long
-@settings(max_examples=40, deadline=None)
-@given(mdp=MANY, size=st.integers(1, 5), select=st.sampled_from([BEST, WORST, None]), seed=st.integers(0, 99))
+@examples(40, mdp=MANY, size=st.integers(1, 5), select=st.sampled_from([BEST, WORST, None]), seed=st.integers(0, 99))
 def test_values_by_ranks_are_within_the_bounds(mdp, size, select, seed):
     mdp = mdp.with_gamma(min(mdp.gamma, 0.8)).with_horizon(None)
     tolerance = 1e-7 * max(1.0, np.abs(mdp.rewards).max())
@@ -72,8 +72,7 @@ def test_values_by_ranks_are_within_the_bounds(mdp, size, select, seed):
 
 
 @pytest.mark.long
-@settings(max_examples=30, deadline=None)
-@given(mdp=MANY, size=st.integers(2, 5), horizon=st.integers(1, 9))
+@examples(30, mdp=MANY, size=st.integers(2, 5), horizon=st.integers(1, 9))
 def test_values_of_a_horizon_are_the_same_bits(mdp, size, horizon):
     alone = value_iteration(mdp, horizon=horizon)
     shared = solved(mdp, min(size, mdp.num_states), horizon=horizon)
@@ -120,8 +119,8 @@ def ranges(draw, num_states):
 
 
 @pytest.mark.long
-@settings(max_examples=60, deadline=None)
-@given(
+@examples(
+    60,
     mdp=st.one_of(deterministic_mdps(9), outcome_mdps(FEW), st.sampled_from(CHAINS)),
     seed=st.integers(0, 2**32),
     draws=st.booleans(),
@@ -158,8 +157,9 @@ def swept_by_ranges(mdp, cuts, sweeps):
 
 
 @pytest.mark.long
-@settings(max_examples=40, deadline=None)
-@given(mdp=st.one_of(deterministic_mdps(max_states=9), st.just(chain(40))), seed=st.integers(0, 2**32), data=st.data())
+@examples(
+    40, mdp=st.one_of(deterministic_mdps(max_states=9), st.just(chain(40))), seed=st.integers(0, 2**32), data=st.data()
+)
 def test_sweeps_in_place_keep_the_order_of_the_states(mdp, seed, data):
     mdp = mdp.with_gamma(min(mdp.gamma, 0.8))
     cuts = data.draw(ranges(mdp.num_states))
@@ -172,32 +172,28 @@ def test_sweeps_in_place_keep_the_order_of_the_states(mdp, seed, data):
 
 def test_what_processes_cannot_do_is_said():
     mdp = chain(5)
-    with pytest.raises(ParameterError, match=r"6 processes for 5 states; expected at most one for each state"):
-        solved(mdp, 6)
+    assert "6 processes for 5 states; expected at most one for each state" in refusal(ParameterError, solved, mdp, 6)
     for wrong in (0, 2, True, "many"):
         with pytest.raises(ParameterError, match="expected 1, or 'mpi' in a program that `mpiexec"):
             value_iteration(mdp, processes=wrong)
-    with pytest.raises(ParameterError, match="expected processes=1, a horizon, or gamma < 1"):
-        solved(mdp.with_gamma(1.0), 2)
+    assert "expected processes=1, a horizon, or gamma < 1" in refusal(ParameterError, solved, mdp.with_gamma(1.0), 2)
     with pytest.raises(ParameterError, match="keep the last step alone"):
         value_iteration(mdp, processes="mpi", horizon=3, keep_all=True)
-    with pytest.raises(PrecisionError, match="raise the tolerance or lower gamma"):
-        solved(mdp, 2, tolerance=1e-17)
+    assert "raise the tolerance or lower gamma" in refusal(PrecisionError, solved, mdp, 2, tolerance=1e-17)
 
 
 @pytest.mark.long
 def test_sweeps_that_gain_nothing_end(monkeypatch):
     monkeypatch.setattr(ranked.RankedBackup, "sweep", lambda _: 1e-9)  # rounding errors that are moved about
-    with pytest.raises(PrecisionError, match="64-bit floats reach a bound of 9e-09"):
-        solved(chain(10), 2, tolerance=1e-9)
+    assert "64-bit floats reach a bound of 9e-09" in refusal(PrecisionError, solved, chain(10), 2, tolerance=1e-9)
 
 
 # Checkpoints ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.long
-@settings(max_examples=30, deadline=None)
-@given(
+@examples(
+    30,
     size=st.integers(1, 5),
     who=st.integers(0, 4),
     number=st.integers(0, 120),
@@ -260,11 +256,7 @@ def test_a_checkpoint_that_is_not_whole_is_no_checkpoint(harm, tmp_path, monkeyp
 @pytest.mark.long
 def test_a_full_disk_ends_no_solving(tmp_path, monkeypatch):
     monkeypatch.setattr(ranked, "_SHARE", 0)
-
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(ranked.storage, "replacing", full)
+    monkeypatch.setattr(ranked.storage, "replacing", failing(errno.ENOSPC))
     with pytest.warns(UserWarning, match=r"No space left on device; values are not kept any more, solving goes on"):
         result = solved(chain(), 2, checkpoint=tmp_path, checkpoint_seconds=-1.0)
     assert result.error_bound <= 1e-6

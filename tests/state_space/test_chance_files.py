@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_hostile_spaces import edited, refused, sealed
-from test_resuming import FullDisk, _build_and_die_at, _InterruptAtLine, build, files_of, in_a_child
+from test_resuming import FullDisk, _build_and_die_at, _InterruptAtLine, build, files_of
 
 import pharos
+from children import exit_code
 from pharos.errors import DiskFull, PharosError, StateSpaceCorrupted, StateSpaceMismatch, StateSpaceTooLarge
 from pharos.state_space import read_manifest
 from pharos.system.arrays import PACKED, PackedIndices, unpacked
@@ -105,11 +106,9 @@ def test_a_build_that_dies_at_any_step_ends_in_the_same_files(case, tmp_path, mo
     monkeypatch.setattr(search, "CHUNK", 1024)
     for call in range(1, 400, 3):
         folder = tmp_path / f"space{call}"
-        process = in_a_child(_build_and_die_at, call, world, folder)
-        process.join()
-        if process.exitcode == 0:
+        if (code := exit_code(_build_and_die_at, call, world, folder)) == 0:
             break
-        assert process.exitcode == 9
+        assert code == 9
         build(world, folder)
         assert {**files_of(folder), "lock": b""} == expected  # who died with all done has left its name in the lock
     assert 20 < call < 398

@@ -8,21 +8,18 @@ import numpy as np
 import pytest
 
 import pharos
+import worlds
 from pharos.environments import Environment, Layer
 from pharos.errors import ParameterError, RuleError
-from worlds import Row
 
 COUNTER = itertools.count()
 RED, BLUE = (200, 60, 60), (60, 60, 200)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Corridor(Row):
+class Corridor(worlds.Corridor):
     """Walk right to the end of a corridor. A good class, which the tests below break in one place each."""
 
-    length: int = 5
-
-    name = "corridor"
     variable = "position"
     layers = {"end": Layer("E", RED), "agent": Layer(("A", "a"), (BLUE, RED))}
 
@@ -31,12 +28,6 @@ class Corridor(Row):
             out[0] = state[0] + 1
         elif state[0] > 0:
             out[0] = state[0] - 1
-
-    def is_terminal(self, state):
-        return state[0] == self.length - 1
-
-    def reward(self, state, action, next_state):
-        return 1.0 if next_state[0] == self.length - 1 else 0.0
 
     def grid(self):
         return 1, self.length

@@ -17,9 +17,10 @@ from hypothesis.extra import numpy as hnp
 from test_format_page import CODE_OF_40_BITS
 from test_hostile_spaces import sealed
 from test_ranks import build_by_threads
-from test_resuming import _build_and_die_at, build, files_of, in_a_child
+from test_resuming import _build_and_die_at, build, files_of
 
 import pharos
+from children import exit_code
 from pharos import hardness
 from pharos.errors import StateSpaceCorrupted, StateSpaceMismatch, StateSpaceTooLarge
 from pharos.interaction import GymEnv, make_vec
@@ -31,7 +32,7 @@ from pharos.state_space import search
 from pharos.system import arrays, memory
 from pharos.system.arrays import INT40, PACKED, PackedIndices, blocks_of, holds_end
 from rank_threads import threads
-from strategies import deterministic_mdps, outcome_mdps
+from strategies import deterministic_mdps, examples, outcome_mdps
 from worlds import ChanceWorld
 
 EDGES = (0, 1, -1, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**39 - 1, -(2**31), -(2**39))
@@ -237,8 +238,8 @@ def test_a_part_has_the_same_next_states_whatever_the_width_and_the_blocks(state
 
 
 @pytest.mark.long
-@settings(max_examples=40, deadline=None)
-@given(
+@examples(
+    40,
     world=st.sampled_from(sorted(WORLDS)),
     limit=st.sampled_from([0, 60, 300, 2000, 10**6]),
     stops=st.lists(st.integers(20, 6000), max_size=2),
@@ -268,8 +269,7 @@ def test_a_build_that_dies_ends_in_the_same_files(world, spaces, tmp_path, monke
     monkeypatch.setattr(search, "INT32_STATES", 200)
     monkeypatch.setattr(search, "CHUNK", 512)
     for call in range(1, 60, 4):
-        process = in_a_child(_build_and_die_at, call, WORLDS[world], tmp_path / f"space{call}")
-        process.join()
+        exit_code(_build_and_die_at, call, WORLDS[world], tmp_path / f"space{call}")
         build(WORLDS[world], tmp_path / f"space{call}")
         found = {**files_of(tmp_path / f"space{call}"), "lock": b""}
         assert found == files_of(spaces(world)[1].folder)
@@ -313,8 +313,8 @@ def same(one, other):
 
 
 @pytest.mark.long
-@settings(max_examples=60, deadline=None)
-@given(
+@examples(
+    60,
     st.one_of(deterministic_mdps(), outcome_mdps(("dense, palette", "ragged, one by one"))),
     st.sampled_from(sorted(CHANCES)),
     st.integers(0, 2**32),
@@ -332,8 +332,9 @@ def test_values_are_the_same_to_the_last_bit(mdp, chance, seed):
 
 
 @pytest.mark.long
-@settings(max_examples=60, deadline=None)
-@given(st.one_of(deterministic_mdps(), outcome_mdps(("dense, palette", "ragged, one by one"))), st.integers(0, 2**32))
+@examples(
+    60, st.one_of(deterministic_mdps(), outcome_mdps(("dense, palette", "ragged, one by one"))), st.integers(0, 2**32)
+)
 def test_dynamics_answer_the_same(mdp, seed):
     one, other, rng = mdp.dynamics, packed(mdp).dynamics, np.random.default_rng(seed)
     size, actions = mdp.num_states, mdp.num_actions
@@ -362,8 +363,7 @@ def test_dynamics_answer_the_same(mdp, seed):
 
 
 @pytest.mark.long
-@settings(max_examples=40, deadline=None)
-@given(deterministic_mdps(), st.booleans(), st.booleans())
+@examples(40, deterministic_mdps(), st.booleans(), st.booleans())
 def test_distances_and_gaps_are_the_same(mdp, restart, is_lean):
     wide = packed(mdp)
     with pytest.MonkeyPatch.context() as patch:

@@ -5,7 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
@@ -14,6 +13,7 @@ from pharos.errors import ParameterError
 from pharos.kernels.hash_table import fill, fill_more, fill_range, find, mixed, slot_of
 from pharos.rules.layout import layout_of, pack, unpack
 from pharos.rules.packed_view import clear_fault, fault, get_word, packed_view, set_word
+from strategies import examples
 
 sizes = st.sampled_from([1, 2, 3, 4, 5, 8, 9, 64, 255, 256, 257, 2**31, 2**32, 2**32 + 1, 2**62, 2**63 - 1])
 ranges = st.lists(st.tuples(st.integers(-(2**62), 0), sizes), min_size=1, max_size=30)
@@ -44,16 +44,14 @@ def packed_by_hand(components: Components, state) -> list[int]:
     return words
 
 
-@given(ranges, st.integers(0, 2**32))
-@settings(max_examples=200, deadline=None)
+@examples(200, ranges, st.integers(0, 2**32))
 def test_packing_is_what_the_format_says(ranges, seed):
     components = components_of(ranges)
     layout, states = layout_of(components), states_of(components, seed)
     assert pack(layout, states).tolist() == [packed_by_hand(components, state) for state in states]
 
 
-@given(ranges, st.integers(0, 2**32))
-@settings(max_examples=200, deadline=None)
+@examples(200, ranges, st.integers(0, 2**32))
 def test_unpacking_gives_back_what_was_packed(ranges, seed):
     components = components_of(ranges)
     layout, states = layout_of(components), states_of(components, seed)
@@ -111,8 +109,7 @@ few = st.lists(
 
 
 @pytest.mark.slow
-@given(few, st.integers(0, 2**32), st.data())
-@settings(max_examples=200, deadline=None)
+@examples(200, few, st.integers(0, 2**32), st.data())
 def test_the_compiled_view_reads_and_writes_components(ranges, seed, data):
     components = components_of(ranges)
     layout, state = layout_of(components), states_of(components, seed, 1)[0].tolist()
@@ -127,8 +124,7 @@ def test_the_compiled_view_reads_and_writes_components(ranges, seed, data):
 
 
 @pytest.mark.slow
-@given(few, st.integers(0, 2**32), st.data())
-@settings(max_examples=200, deadline=None)
+@examples(200, few, st.integers(0, 2**32), st.data())
 def test_a_value_out_of_range_is_noted_and_leaves_the_neighbours_alone(ranges, seed, data):
     components = components_of(ranges)
     layout, state = layout_of(components), states_of(components, seed, 1)[0].tolist()
@@ -169,8 +165,7 @@ def test_slots_are_inside_of_the_table_and_spread_over_it(capacity):
     assert ((counts - expected) ** 2 / expected).sum() < 50  # chi-squared with 15 degrees of freedom
 
 
-@given(st.integers(1, 3), st.integers(1, 3000), st.integers(0, 2**32))
-@settings(max_examples=50, deadline=None)
+@examples(50, st.integers(1, 3), st.integers(1, 3000), st.integers(0, 2**32))
 def test_what_is_in_the_table_is_found_and_nothing_else(words, count, seed):
     rng = np.random.default_rng(seed)
     keys = np.unique(rng.integers(0, 4000, (2 * count, words)).astype(np.uint64), axis=0)

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_resuming import build, files_of
 
@@ -26,6 +25,8 @@ from pharos.state_space.manifest import Plan, lock
 from pharos.state_space.progress import reporter
 from pharos.state_space.search import Options, journal_of
 from rank_threads import Killed, fails_at, loop
+from refusals import failing
+from strategies import examples
 from worlds import ChanceWorld
 
 WORLDS = {
@@ -70,8 +71,8 @@ def test_three_ranks_write_the_files_of_one_process(world, tmp_path):
 
 
 @pytest.mark.long
-@settings(max_examples=60, deadline=None)
-@given(
+@examples(
+    60,
     world=st.sampled_from(sorted(WORLDS)),
     size=st.integers(1, 6),
     rows=st.sampled_from([8, 24, 64, 1000]),
@@ -84,8 +85,8 @@ def test_files_do_not_depend_on_ranks_or_blocks(world, size, rows, wide):
 
 
 @pytest.mark.long
-@settings(max_examples=60, deadline=None)
-@given(
+@examples(
+    60,
     world=st.sampled_from(["breakout", "chance"]),
     size=st.integers(2, 5),
     who=st.integers(0, 4),
@@ -140,8 +141,7 @@ def test_a_table_that_does_not_fit_is_one_line_and_one_process_goes_on(tmp_path,
 # Owners ---------------------------------------------------------------------------------------------------------------
 
 
-@settings(deadline=None, max_examples=30)
-@given(seed=st.integers(0, 2**32 - 1), words=st.integers(1, 3))
+@examples(30, seed=st.integers(0, 2**32 - 1), words=st.integers(1, 3))
 def test_owners_keep_the_first_place_whatever_the_order_of_arrival(seed, words):
     rng = np.random.default_rng(seed)
     asked = rng.integers(0, 6, (60, words)).astype(np.uint64)
@@ -162,8 +162,7 @@ def test_owners_keep_the_first_place_whatever_the_order_of_arrival(seed, words):
             assert numbers[entry] == (entry if is_known else -1 - first[state])
 
 
-@settings(deadline=None, max_examples=30)
-@given(seed=st.integers(0, 2**32 - 1), size=st.integers(1, 9))
+@examples(30, seed=st.integers(0, 2**32 - 1), size=st.integers(1, 9))
 def test_candidates_go_to_one_owner_each_in_their_order(seed, size):
     rng = np.random.default_rng(seed)
     keys = rng.integers(0, 50, (100, 2)).astype(np.uint64)
@@ -316,12 +315,9 @@ def test_a_rank_of_mpi_that_fails_tells_the_others(monkeypatch):
         def fail(self, error):
             self.told = error
 
-    def fails(*_):
-        raise RuleError("a rule failed")
-
     second = Second()
     monkeypatch.setattr(ranked_table, "mpi_rank", lambda: second)
-    monkeypatch.setattr(ranked_table, "answer", fails)
+    monkeypatch.setattr(ranked_table, "answer", failing(RuleError("a rule failed")))
     with pytest.raises(RuleError), ranked_table.rank_of_build(None, None):
         pass
     assert str(second.told) == "a rule failed"

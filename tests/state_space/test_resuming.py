@@ -18,10 +18,12 @@ import numpy as np
 import pytest
 
 import pharos
+from children import exit_code, fork, in_a_child, kill
 from pharos.errors import DiskFull, RuleError, StateSpaceIncomplete, StateSpaceLocked, StateSpaceTooLarge
 from pharos.state_space import manifest as writing
 from pharos.system import storage
 from pharos.system.arrays import PackedIndices
+from refusals import failing
 from worlds import Row, TableWorld
 
 building = importlib.import_module("pharos.state_space.build")
@@ -31,7 +33,7 @@ machine = importlib.import_module("pharos.system.memory")
 
 BREAKOUT = pharos.make("breakout", height=7, columns=5)  # 27,692 states; a frontier of hundreds
 NARROW = TableWorld(num_positions=5000, lows="-1000,0,7", sizes=f"{2**40},{2**30},1", num_starts=3, end_share=0.05)
-fork = multiprocessing.get_context("fork")
+DATA = ("states.bin", "successors.bin", "terminal.bin")
 
 
 @pytest.fixture
@@ -57,6 +59,18 @@ def assert_same_files(folder: Path, expected: Path) -> None:
         assert found[name] == reference[name], name
 
 
+def assert_resumes(folder: Path, expected: Path) -> None:
+    """What was begun in a folder is built to the end, and has the files of a build that nothing disturbed."""
+    build(BREAKOUT, folder)
+    assert_same_files(folder, expected)
+
+
+def stop_at(max_states: int, folder: Path, **options) -> None:
+    """Begin a build that ends at a limit of states."""
+    with pytest.raises(StateSpaceTooLarge, match=rf"passed max_states={max_states}, \d+ left to expand"):
+        build(BREAKOUT, folder, max_states=max_states, **options)
+
+
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("undisturbed")
@@ -80,17 +94,9 @@ def test_files_do_not_depend_on_threads_or_blocks(env, workers, chunk, wide, tmp
 def test_a_table_that_threads_fill_together_gives_the_same_files(room, tmp_path, undisturbed, monkeypatch):
     monkeypatch.setattr(table, "PARALLEL_FILL", 0)
     monkeypatch.setattr(table, "LEFT_OVER", room)
-    with pytest.raises(StateSpaceTooLarge):
-        build(BREAKOUT, tmp_path / "space", workers=2, max_states=20_000)
+    stop_at(20_000, tmp_path / "space", workers=2)
     build(BREAKOUT, tmp_path / "space", workers=3)
     assert_same_files(tmp_path / "space", undisturbed["breakout"])
-
-
-def in_a_child(work, *args) -> multiprocessing.Process:
-    """Run `work` in a forked process and return it; forked, so that nothing is imported or compiled again."""
-    process = fork.Process(target=work, args=args)
-    process.start()
-    return process
 
 
 def _build_slowly(env, folder):
@@ -106,13 +112,10 @@ def test_a_build_killed_again_and_again_ends_in_the_same_files(tmp_path, undistu
         while process.is_alive() and not (folder / "manifest.json").exists():  # the first child's first checkpoint
             time.sleep(0.001)
         process.join(timeout=rng.uniform(0.03, 0.12))
-        os.kill(process.pid, signal.SIGKILL)
-        process.join()
-        assert process.exitcode == -signal.SIGKILL
+        kill(process)
     with pytest.raises(StateSpaceIncomplete):
         pharos.load(folder)
-    build(BREAKOUT, folder)
-    assert_same_files(folder, undisturbed["breakout"])
+    assert_resumes(folder, undisturbed["breakout"])
 
 
 def _build_and_die_at(call: int, env, folder):
@@ -148,24 +151,18 @@ def _build_and_die_at(call: int, env, folder):
 def test_a_build_that_dies_at_any_step_of_a_checkpoint_ends_in_the_same_files(tmp_path, undisturbed, monkeypatch):
     monkeypatch.setattr(search, "CHUNK", 4096)
     for call in range(1, 30):
-        folder = tmp_path / f"space{call}"
-        process = in_a_child(_build_and_die_at, call, BREAKOUT, folder)
-        process.join()
-        assert process.exitcode == 9
-        build(BREAKOUT, folder)
-        assert_same_files(folder, undisturbed["breakout"])
+        assert exit_code(_build_and_die_at, call, BREAKOUT, tmp_path / f"space{call}") == 9
+        assert_resumes(tmp_path / f"space{call}", undisturbed["breakout"])
 
 
 def test_what_was_written_after_the_last_checkpoint_does_not_count(tmp_path, undisturbed, small_blocks):
     folder = tmp_path / "space"
-    with pytest.raises(StateSpaceTooLarge):
-        build(BREAKOUT, folder, max_states=9000)
-    for name in ("states.bin", "successors.bin", "terminal.bin"):
+    stop_at(9000, folder)
+    for name in DATA:
         with open(folder / name, "ab") as file:
             file.write(b"\x07" * 1000)
     (folder / "manifest.json.tmp").write_text('{"format": "pharos sta')
-    build(BREAKOUT, folder)
-    assert_same_files(folder, undisturbed["breakout"])
+    assert_resumes(folder, undisturbed["breakout"])
 
 
 def test_a_keyboard_interrupt_keeps_what_was_found(tmp_path, undisturbed, small_blocks):
@@ -181,8 +178,7 @@ def test_a_keyboard_interrupt_keeps_what_was_found(tmp_path, undisturbed, small_
         with pytest.raises(KeyboardInterrupt):
             build(BREAKOUT, folder, progress=interrupt, checkpoint_seconds=1e9)
         assert building.read_manifest(folder)["num_expanded"] == found[-1]
-    build(BREAKOUT, folder)
-    assert_same_files(folder, undisturbed["breakout"])
+    assert_resumes(folder, undisturbed["breakout"])
 
 
 class _InterruptAtLine:
@@ -222,19 +218,16 @@ def test_an_interrupt_at_any_line_keeps_counts_and_files_together(tmp_path, undi
         folder = tmp_path / f"space{line}"
         with pytest.raises(KeyboardInterrupt):
             _InterruptAtLine(line).build(BREAKOUT, folder)
-        build(BREAKOUT, folder)
-        assert_same_files(folder, undisturbed["breakout"])
+        assert_resumes(folder, undisturbed["breakout"])
 
 
 def test_raising_max_states_goes_on_where_the_build_stopped(tmp_path, undisturbed, small_blocks):
     folder = tmp_path / "space"
     for limit in (1000, 5000, 20000):
-        with pytest.raises(StateSpaceTooLarge, match=rf"passed max_states={limit}, \d+ left to expand"):
-            build(BREAKOUT, folder, max_states=limit)
+        stop_at(limit, folder)
     assert building.read_manifest(folder)["num_states"] > 15000
-    space = build(BREAKOUT, folder, max_states=33674)
+    assert build(BREAKOUT, folder, max_states=33674).num_states == 33674
     assert_same_files(folder, undisturbed["breakout"])
-    assert space.num_states == 33674
     with pytest.raises(StateSpaceTooLarge):
         build(BREAKOUT, folder, max_states=33673)
 
@@ -243,11 +236,22 @@ def test_raising_max_states_goes_on_where_the_build_stopped(tmp_path, undisturbe
 
 
 @pytest.fixture
-def little_memory(monkeypatch):
+def any_memory(monkeypatch):
+    monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
+
+
+@pytest.fixture
+def little_memory(any_memory, monkeypatch):
     """Memory that holds nothing: the table is on disk at once, chunks have 1024 rows, and a part of the table is a few
     pages."""
     monkeypatch.setattr(machine, "available_memory", lambda: 0)
-    monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory) -> pharos.StateSpace:
+    """142,063 states: the table grows twice."""
+    env = pharos.make("breakout", height=8, columns=6)
+    return build(env, tmp_path_factory.mktemp("wall") / "undisturbed")
 
 
 @pytest.mark.slow
@@ -265,49 +269,42 @@ def test_files_do_not_depend_on_where_the_table_is(
 @pytest.mark.slow
 @pytest.mark.parametrize("limit", (1 << 16, 1 << 20, 3 << 19))
 @pytest.mark.parametrize("chunk", (64, 1 << 16))
-def test_the_table_moves_to_disk_in_the_middle_of_a_build(limit, chunk, tmp_path, monkeypatch):
-    env = pharos.make("breakout", height=8, columns=6)  # 142,063 states: the table grows twice
-    build(env, tmp_path / "undisturbed")
+def test_the_table_moves_to_disk_in_the_middle_of_a_build(limit, chunk, wall, tmp_path, any_memory, monkeypatch):
     monkeypatch.setattr(search, "CHUNK", chunk)
-    monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
     moved = []
     spill = search.Search._spill
     monkeypatch.setattr(
         search.Search, "_spill", lambda self, *args: (moved.append(self.position.count), spill(self, *args))
     )
-    build(env, tmp_path / "space", memory=limit)
+    build(wall.environment, tmp_path / "space", memory=limit)
     assert len(moved) == 1 and (moved[0] > 1000) == (limit > 1 << 16)
-    assert_same_files(tmp_path / "space", tmp_path / "undisturbed")
+    assert_same_files(tmp_path / "space", wall.folder)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", (1, 2))
-def test_a_fuller_table_stays_in_memory_where_one_of_twice_the_size_does_not_fit(workers, tmp_path, monkeypatch):
-    env = pharos.make("breakout", height=8, columns=6)  # 142,063 states: 4 MiB by a table of which half is used
-    build(env, tmp_path / "undisturbed")
-    monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
+def test_a_fuller_table_stays_in_memory_where_one_of_twice_the_size_does_not_fit(
+    workers, wall, tmp_path, any_memory, monkeypatch
+):
+    """4 MiB by a table of which half is used."""
     monkeypatch.setattr(search.Search, "_spill", lambda *_: pytest.fail("the table moved to disk"))
     sizes = []
     grow = table.MemoryTable.grow
     monkeypatch.setattr(
         table.MemoryTable, "grow", lambda self, *args: (grow(self, *args), sizes.append((len(self.slots), self.room)))
     )
-    build(env, tmp_path / "space", workers=workers, memory=3 << 20)
-    assert_same_files(tmp_path / "space", tmp_path / "undisturbed")
+    build(wall.environment, tmp_path / "space", workers=workers, memory=3 << 20)
+    assert_same_files(tmp_path / "space", wall.folder)
     slots, room = sizes[-1]
     assert room > 142_063 > 0.5 * slots and 4 * slots + 8 * room <= 3 << 20
 
 
 @pytest.mark.slow
-def test_memory_may_come_and_go_between_sessions(tmp_path, undisturbed, monkeypatch):
+def test_memory_may_come_and_go_between_sessions(tmp_path, undisturbed, any_memory):
     folder = tmp_path / "space"
-    monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
-    for limit, memory in ((3000, 1 << 16), (9000, None), (15_000, 1 << 16), (25_000, 1 << 20), (None, 1 << 16)):
-        if limit:
-            with pytest.raises(StateSpaceTooLarge):
-                build(BREAKOUT, folder, max_states=limit, memory=memory)
-        else:
-            build(BREAKOUT, folder, memory=memory)
+    for limit, memory in ((3000, 1 << 16), (9000, None), (15_000, 1 << 16), (25_000, 1 << 20)):
+        stop_at(limit, folder, memory=memory)
+    build(BREAKOUT, folder, memory=1 << 16)
     assert_same_files(folder, undisturbed["breakout"])
 
 
@@ -318,13 +315,10 @@ def test_a_build_on_disk_killed_again_and_again_leaves_no_table_behind(tmp_path,
     for _ in range(6):
         process = in_a_child(_build_slowly, BREAKOUT, folder)
         process.join(timeout=rng.uniform(0.05, 0.2))
-        os.kill(process.pid, signal.SIGKILL)
-        process.join()
-        assert process.exitcode == -signal.SIGKILL
+        kill(process)
         left = {name for name in files_of(folder) if not storage.is_temporary(name)}
         assert left <= {*building.OUR_FILES, "manifest.json"}
-    build(BREAKOUT, folder)
-    assert_same_files(folder, undisturbed["breakout"])
+    assert_resumes(folder, undisturbed["breakout"])
 
 
 @pytest.mark.parametrize("num_actions", (2, 1000, 3_000_000, 10**8))
@@ -340,23 +334,17 @@ def test_indices_widen_while_the_table_is_on_disk(widened, tmp_path, little_memo
     build(BREAKOUT, tmp_path / "space")
     wide, expected = pharos.load(tmp_path / "space"), pharos.load(widened)
     assert isinstance(wide.successors, PackedIndices)
-    assert (np.asarray(wide.successors) == np.asarray(expected.successors)).all() and (
-        wide.packed_states == expected.packed_states
-    ).all()
+    assert (np.asarray(wide.successors) == np.asarray(expected.successors)).all()
+    assert (wide.packed_states == expected.packed_states).all()
 
 
 @pytest.mark.slow
-def test_interpreted_rules_are_enumerated_with_the_table_on_disk(tmp_path, undisturbed, little_memory, monkeypatch):
-    monkeypatch.setattr("pharos.rules.rules.compiled_or_none", lambda *args: None)
-    build(BREAKOUT, tmp_path / "space")
-    assert_same_files(tmp_path / "space", undisturbed["breakout"])
+def test_interpreted_rules_are_enumerated_with_the_table_on_disk(tmp_path, undisturbed, little_memory, interpreted):
+    assert_resumes(tmp_path / "space", undisturbed["breakout"])
 
 
 def _build_where_the_table_does_not_fit(env, folder):
-    def refused(descriptor, start, size):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    os.posix_fallocate = refused
+    os.posix_fallocate = failing(errno.ENOSPC)
     try:
         build(env, folder, memory=1 << 20)
     except DiskFull as error:
@@ -364,17 +352,12 @@ def _build_where_the_table_does_not_fit(env, folder):
     os._exit(0)
 
 
-def test_a_disk_without_room_for_the_table_loses_nothing(tmp_path, monkeypatch):
-    env = pharos.make("breakout", height=8, columns=6)
-    monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
+def test_a_disk_without_room_for_the_table_loses_nothing(wall, tmp_path, any_memory, monkeypatch):
     monkeypatch.setattr(search, "CHUNK", 512)
-    process = in_a_child(_build_where_the_table_does_not_fit, env, tmp_path / "space")
-    process.join()
-    assert process.exitcode == 7
+    assert exit_code(_build_where_the_table_does_not_fit, wall.environment, tmp_path / "space") == 7
     assert building.read_manifest(tmp_path / "space")["num_expanded"] > 0
-    build(env, tmp_path / "space")
-    build(env, tmp_path / "undisturbed")
-    assert_same_files(tmp_path / "space", tmp_path / "undisturbed")
+    build(wall.environment, tmp_path / "space")
+    assert_same_files(tmp_path / "space", wall.folder)
 
 
 @pytest.mark.slow
@@ -498,30 +481,20 @@ def test_indices_widen_while_threads_are_a_piece_ahead(limit, tmp_path, undistur
 @pytest.mark.parametrize("limit", (1000, 4000, 6000, 20000))
 def test_a_build_that_widens_its_indices_resumes_to_the_same_files(limit, widened, tmp_path, small_blocks, monkeypatch):
     monkeypatch.setattr(search, "INT32_STATES", 5000)
-    folder = tmp_path / "space"
-    with pytest.raises(StateSpaceTooLarge):
-        build(BREAKOUT, folder, max_states=limit)
-    build(BREAKOUT, folder, workers=2)
-    assert_same_files(folder, widened)
+    stop_at(limit, tmp_path / "space")
+    build(BREAKOUT, tmp_path / "space", workers=2)
+    assert_same_files(tmp_path / "space", widened)
 
 
 @pytest.mark.long
 def test_a_build_that_dies_while_it_widens_its_indices_resumes_to_the_same_files(widened, tmp_path, monkeypatch):
     monkeypatch.setattr(search, "INT32_STATES", 5000)
     monkeypatch.setattr(search, "CHUNK", 512)
-    start = tmp_path / "start"
-    with pytest.raises(StateSpaceTooLarge):
-        build(BREAKOUT, start, max_states=3000)
+    stop_at(3000, tmp_path / "start")
     for call in range(1, 25):
-        folder = tmp_path / f"space{call}"
-        folder.mkdir()
-        for name, content in files_of(start).items():
-            (folder / name).write_bytes(content)
-        process = in_a_child(_build_and_die_at, call, BREAKOUT, folder)
-        process.join()
-        assert process.exitcode == 9
-        build(BREAKOUT, folder)
-        assert_same_files(folder, widened)
+        folder = shutil.copytree(tmp_path / "start", tmp_path / f"space{call}")
+        assert exit_code(_build_and_die_at, call, BREAKOUT, folder) == 9
+        assert_resumes(folder, widened)
 
 
 # Disks and other processes -------------------------------------------------------------------------------------------
@@ -540,14 +513,11 @@ def _build_with_little_disk(limit, env, folder):
 @pytest.mark.parametrize("limit", (0, 100, 3000, 20_000, 100_000, 200_000))
 def test_a_full_disk_loses_nothing(limit, tmp_path, undisturbed, small_blocks):
     folder = tmp_path / "space"
-    process = in_a_child(_build_with_little_disk, limit, BREAKOUT, folder)
-    process.join()
-    assert process.exitcode == 7
+    assert exit_code(_build_with_little_disk, limit, BREAKOUT, folder) == 7
     manifest = building.read_manifest(folder)
     if limit >= 20_000:
         assert 12 * (manifest["num_expanded"] + 2 * 512) > limit  # all that fitted, but for the blocks under way
-    build(BREAKOUT, folder)
-    assert_same_files(folder, undisturbed["breakout"])
+    assert_resumes(folder, undisturbed["breakout"])
 
 
 class FullDisk:
@@ -614,9 +584,6 @@ class _FileOnFullDisk:
         return getattr(self.file, name)
 
 
-DATA = ("states.bin", "successors.bin", "terminal.bin")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("freed_at_once", (False, True))
 @pytest.mark.parametrize("call", (1, 2, 7, 23))
@@ -628,28 +595,27 @@ def test_a_disk_that_is_full_at_any_point_loses_nothing(
     kind, seconds, call, freed_at_once, tmp_path, undisturbed, small_blocks, monkeypatch
 ):
     folder = tmp_path / "space"
-    committed = []
+    committed = [0]
 
-    def note(_):  # what a checkpoint has promised so far
-        committed.append((building.read_manifest(folder) or {"num_expanded": 0})["num_expanded"])
+    def expanded():  # what a checkpoint has promised so far
+        return (building.read_manifest(folder) or {"num_expanded": 0})["num_expanded"]
 
     with monkeypatch.context() as patch:
         disk = FullDisk(patch, kind, call, freed_at_once)
         with pytest.raises(
             DiskFull, match=r"cannot write \(No space left on device; \d+ MiB free\).*same command resumes"
         ):
-            build(BREAKOUT, folder, checkpoint_seconds=seconds, progress=note)
+            build(BREAKOUT, folder, checkpoint_seconds=seconds, progress=lambda _: committed.append(expanded()))
         assert disk.calls >= call
-    kept = (building.read_manifest(folder) or {"num_expanded": 0})["num_expanded"]
-    assert kept >= max(committed, default=0)
+    kept = expanded()
+    assert kept >= max(committed)
     if not freed_at_once and kind != "open":
         with pytest.MonkeyPatch.context() as patch:  # the disk is still full: the same error, and still nothing is lost
             FullDisk(patch, kind, 1, False)
             with pytest.raises(DiskFull):
                 build(BREAKOUT, folder, checkpoint_seconds=0.0)
-        assert (building.read_manifest(folder) or {"num_expanded": 0})["num_expanded"] >= kept
-    build(BREAKOUT, folder)
-    assert_same_files(folder, undisturbed["breakout"])
+        assert expanded() >= kept
+    assert_resumes(folder, undisturbed["breakout"])
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="files are known by their descriptors")
@@ -694,11 +660,17 @@ def _hold(env, folder, ready, release):
     build(env, folder, progress=wait)
 
 
-def test_two_builds_do_not_share_a_folder(tmp_path, undisturbed, small_blocks):
-    folder = tmp_path / "space"
+def another_build(folder):
+    """A process that builds in a folder, and what it waits for."""
     ready, release = fork.Event(), fork.Event()
     process = in_a_child(_hold, BREAKOUT, folder, ready, release)
     ready.wait()
+    return process, release
+
+
+def test_two_builds_do_not_share_a_folder(tmp_path, undisturbed, small_blocks):
+    folder = tmp_path / "space"
+    process, release = another_build(folder)
     try:
         with pytest.raises(StateSpaceLocked, match=rf"another process \(process {process.pid}\) is building there"):
             build(BREAKOUT, folder)
@@ -713,9 +685,7 @@ def test_in_the_cache_another_build_is_waited_for(tmp_path, undisturbed, small_b
     """As the jobs of an array do, whose cache is cold: nobody named that folder."""
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
     folder = building.cached_folder(BREAKOUT)
-    ready, release = fork.Event(), fork.Event()
-    process = in_a_child(_hold, BREAKOUT, folder, ready, release)
-    ready.wait()
+    process, release = another_build(folder)
     threading.Timer(0.5, release.set).start()
     with pytest.warns(RuntimeWarning, match="another process is building there; waiting until it is done"):
         build(BREAKOUT, None)
@@ -735,11 +705,6 @@ def test_a_folder_in_which_somebody_has_just_begun_is_not_foreign(tmp_path, undi
 
 
 def test_a_killed_build_leaves_no_lock(tmp_path, undisturbed, small_blocks):
-    folder = tmp_path / "space"
-    ready, release = fork.Event(), fork.Event()
-    process = in_a_child(_hold, BREAKOUT, folder, ready, release)
-    ready.wait()
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
-    build(BREAKOUT, folder)
-    assert_same_files(folder, undisturbed["breakout"])
+    process, _ = another_build(tmp_path / "space")
+    kill(process)
+    assert_resumes(tmp_path / "space", undisturbed["breakout"])

@@ -27,9 +27,9 @@ from pharos.training import read_record, train_config
 TESTS = Path(__file__).parents[1]
 
 
-def specification(seeds=3, engine="batched", **block):
-    block = {"environments": ["frozen_lake/4x4"], "agents": ["dqn"], "seeds": seeds} | block
-    return study.specification({"name": "fake", "steps": 100, "evaluations": 10, "engine": engine, "blocks": [block]})
+def specification(**given):
+    usual = {"agents": ["dqn"], "seeds": 3, "steps": 100, "evaluations": 10, "engine": "batched"}
+    return fake_training.specification(**usual | given)
 
 
 @pytest.fixture
@@ -47,11 +47,8 @@ def run(spec, folder, **options):
 
 @pytest.mark.slow
 def test_what_fits_together_is_trained_together(tmp_path, sizes):
-    spec = specification(
-        environments=["frozen_lake/4x4", "frozen_lake/8x8"],
-        chance=["plain", {"random": 0.1}],
-        agents=["dqn", "q_learning"],
-    )
+    cells = {"environments": ["frozen_lake/4x4", "frozen_lake/8x8"], "chance": ["plain", {"random": 0.1}]}
+    spec = specification(agents=["dqn", "q_learning"], **cells)
     end = run(spec, tmp_path / "out")
     assert (end.total, end.finished, end.failed, end.running) == (24, 24, 0, 0)
     assert sizes() == [12, 12]  # both lakes and chances share the shape of vectors; tables are another batch
@@ -120,16 +117,19 @@ def test_a_batch_that_is_killed_too_often_goes_on_in_halves(tmp_path, sizes, mon
     assert sizes() == [2, 2, 4, 4, 4]
 
 
+SCRIPT = """
+import sys
+sys.path[:0] = sys.argv[1:3]
+if __name__ == "__main__":
+    from test_study_batches import run, specification
+    run(specification(seeds=6), sys.argv[3])
+"""
+
+
 @pytest.mark.slow
 def test_a_runner_that_is_killed_leaves_nothing_half_done(tmp_path, sizes):
-    code = (
-        "import sys; sys.path[:0] = sys.argv[1:3]\n"
-        "if __name__ == '__main__':\n"
-        "    from test_study_batches import run, specification\n"
-        "    run(specification(seeds=6), sys.argv[3])"
-    )
     script = tmp_path / "script.py"
-    script.write_text(code)
+    script.write_text(SCRIPT)
     environment = {**os.environ, "PHAROS_FAKE_SECONDS": "0.1"}
     folders = [str(TESTS), str(TESTS / "study")]
     process = subprocess.Popen([sys.executable, str(script), *folders, str(tmp_path / "out")], env=environment)
@@ -165,8 +165,11 @@ def cache(tmp_path_factory):
 def config(cache, monkeypatch):
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(cache))
     shutil.rmtree(cache / "values", ignore_errors=True)
-    block = {"environments": ["frozen_lake/4x4"], "chance": [{"sticky": 0.25}], "agents": ["q_learning"], "seeds": 1}
-    return study.specification({"name": "a", "steps": 300, "evaluations": 3, "blocks": [block]}).runs[0].config
+    return kept_study(seeds=1).runs[0].config
+
+
+def kept_study(seeds):
+    return fake_training.specification(steps=300, evaluations=3, chance=[{"sticky": 0.25}], seeds=seeds)
 
 
 def test_kept_values_are_those_of_the_task_to_the_last_bit(config):
@@ -231,8 +234,7 @@ def test_values_of_other_rules_are_not_taken(config, monkeypatch):
 
 @pytest.mark.long
 def test_a_study_with_the_usual_runner_ends_with_the_results_of_training_alone(config, tmp_path):
-    block = {"environments": ["frozen_lake/4x4"], "chance": [{"sticky": 0.25}], "agents": ["q_learning"], "seeds": 2}
-    spec = study.specification({"name": "a", "steps": 300, "evaluations": 3, "blocks": [block]})
+    spec = kept_study(seeds=2)
     assert study.run(spec, tmp_path / "study", workers=2).finished == 2
     train_config(config, tmp_path / "alone")
     there = tmp_path / "study" / "runs" / spec.runs[0].id

@@ -25,10 +25,7 @@ blocks:
 
 def pharos(*arguments, cwd):
     command = [sys.executable, "-m", "pharos", "study", *arguments]
-    environment = {
-        **os.environ,
-        "NUMBA_CACHE_DIR": str(cwd / "numba"),
-    }  # nothing is compiled yet, as after an installation
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cwd / "numba")}  # nothing is compiled yet
     environment.pop("NUMBA_NUM_THREADS", None)
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, env=environment)
 
@@ -65,10 +62,7 @@ def test_show_counts_the_runs(folder):
     ("arguments", "message"),
     [
         (("run", "lak.yaml"), "pharos: unknown study (no such file, and no such preset) 'lak.yaml'"),
-        (
-            ("run", "lake.yaml", "--shard", "3/2"),
-            "pharos: shard is '3/2'; expected i/n with i from 1 to n, such as 1/8",
-        ),
+        (("run", "lake.yaml", "--shard", "3/2"), "shard is '3/2'; expected i/n with i from 1 to n, such as 1/8"),
         (("run", "lake.yaml", "--on", "moon"), "pharos: unknown place to run on 'moon'; known: local, ray, slurm"),
         (("report", "lake.yaml", "--out", "nowhere"), "no run of 'lake' is finished; execute `pharos study run` first"),
     ],
@@ -81,10 +75,9 @@ def test_wrong_usage_is_one_line_and_exit_code_2(folder, arguments, message):
 
 @pytest.mark.long
 def test_a_study_with_failed_runs_ends_with_exit_code_1_and_says_where_to_look(folder):
-    wrong = SPECIFICATION.replace("name: lake", "name: wrong").replace(
-        "[q_learning]", "[q_learning]\n    hyperparameters: {q_learning: {learning_rat: 0.5}}"
-    )
-    (folder / "wrong.yaml").write_text(wrong)
+    wrong = "[q_learning]\n    hyperparameters: {q_learning: {learning_rat: 0.5}}"
+    text = SPECIFICATION.replace("name: lake", "name: wrong").replace("[q_learning]", wrong)
+    (folder / "wrong.yaml").write_text(text)
     done = pharos("run", "wrong.yaml", cwd=folder)
     assert done.returncode == 1
     assert done.stdout == "wrong: 0 of 2 runs finished, 2 failed\n"
@@ -94,8 +87,7 @@ def test_a_study_with_failed_runs_ends_with_exit_code_1_and_says_where_to_look(f
 @pytest.mark.slow
 def test_a_study_is_found_by_its_name_after_it_was_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    block = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "seeds": 1}
-    spec = study.specification({"name": "lake", "steps": 10, "evaluations": 1, "blocks": [block]})
+    spec = fake_training.specification("lake", steps=10, evaluations=1, seeds=1)
     study.run(spec, runner=fake_training.train)
     assert study.status("lake").finished == 1 and study.status("lake").folder == "studies/lake"
     assert study.specification("lake").name == "lake"

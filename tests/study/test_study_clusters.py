@@ -15,15 +15,7 @@ from pharos import study
 from pharos.errors import MissingExtra, ParameterError
 from pharos.study.execution import shard_of
 
-SPECIFICATION = study.specification(
-    {
-        "name": "fake",
-        "steps": 100,
-        "evaluations": 10,
-        "seeds": 4,
-        "blocks": [{"environments": ["frozen_lake"], "agents": ["dqn", "q_learning"]}],
-    }
-)
+SPECIFICATION = fake_training.specification(steps=100, evaluations=10, seeds=4, agents=["dqn", "q_learning"])
 
 
 @pytest.fixture
@@ -35,20 +27,16 @@ def undisturbed(tmp_path):
 
 @pytest.mark.long
 def test_submitted_jobs_execute_their_shards(tmp_path, undisturbed, monkeypatch):
-    monkeypatch.setenv(
-        "PYTHONPATH", os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
-    )
-    parameters = {"timeout_min": 2}
-    jobs = study.submit(
-        SPECIFICATION, tmp_path / "there", shards=2, cluster="local", parameters=parameters, runner=fake_training.train
-    )
+    path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    monkeypatch.setenv("PYTHONPATH", path)
+    options = {"shards": 2, "cluster": "local", "parameters": {"timeout_min": 2}, "runner": fake_training.train}
+    jobs = study.submit(SPECIFICATION, tmp_path / "there", **options)
     assert [job.result()["finished"] for job in jobs] == [4, 4]
     assert fake_training.results(tmp_path / "there") == undisturbed
-    again = {"shards": 2, "cluster": "local", "parameters": parameters, "runner": fake_training.train}
-    assert study.submit(SPECIFICATION, tmp_path / "there", **again) == []
+    assert study.submit(SPECIFICATION, tmp_path / "there", **options) == []
     one = shard_of(SPECIFICATION.runs, "2/2")[0].id
     shutil.rmtree(tmp_path / "there" / "runs" / one)
-    (job,) = study.submit(SPECIFICATION, tmp_path / "there", **again)
+    (job,) = study.submit(SPECIFICATION, tmp_path / "there", **options)
     assert job.result()["finished"] == 4
     assert fake_training.results(tmp_path / "there") == undisturbed
 
@@ -101,9 +89,8 @@ def test_on_ray_every_run_is_one_task_and_lost_ones_have_failed(tmp_path, undist
     assert end.errors == {lost: "RuntimeError: the worker died"}
     assert double.ended and double.waits == 8
     double.dies.clear()
-    assert (
-        study.run_on_ray(SPECIFICATION, tmp_path / "ray", runner=fake_training.train, retry_failed=True).finished == 8
-    )
+    end = study.run_on_ray(SPECIFICATION, tmp_path / "ray", runner=fake_training.train, retry_failed=True)
+    assert end.finished == 8
     assert fake_training.results(tmp_path / "ray") == undisturbed
 
 
@@ -111,10 +98,7 @@ def test_on_ray_a_batch_is_one_task_and_one_that_is_lost_goes_on_in_halves(tmp_p
     sizes = tmp_path / "sizes"
     sizes.touch()
     monkeypatch.setenv("PHAROS_FAKE_BATCHES", str(sizes))
-    block = {"environments": ["frozen_lake"], "agents": ["dqn"], "seeds": 6}
-    spec = study.specification(
-        {"name": "fake", "steps": 100, "evaluations": 10, "engine": "batched", "blocks": [block]}
-    )
+    spec = fake_training.specification(steps=100, evaluations=10, engine="batched", agents=["dqn"], seeds=6)
     lost = spec.runs[0].id
     double = RayDouble(dies=[lost])
     monkeypatch.setitem(sys.modules, "ray", double)

@@ -1,7 +1,6 @@
 """Executing a study: what is missing runs, failures stay alone, and kill -9 at any moment loses and repeats nothing."""
 
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -13,19 +12,22 @@ from pathlib import Path
 import pytest
 
 import fake_training
+from children import exit_code
+from edits import edited_json, flip
 from pharos import study
 from pharos.errors import AllRunsFailed, ParameterError, PharosError
 from pharos.study import execution as _execution
 from pharos.study import execution as preparing
 from pharos.study import worker as _worker
 from pharos.study.execution import shard_of
+from refusals import failing
 
 TESTS = Path(__file__).parents[1]
 
 
-def specification(name="fake", seeds=3, **block):
-    block = {"environments": ["frozen_lake/4x4"], "agents": ["dqn", "q_learning"], "seeds": seeds} | block
-    return study.specification({"name": name, "steps": 100, "evaluations": 10, "blocks": [block]})
+def specification(name="fake", **given):
+    usual = {"agents": ["dqn", "q_learning"], "seeds": 3, "steps": 100, "evaluations": 10}
+    return fake_training.specification(name, **usual | given)
 
 
 @pytest.fixture
@@ -193,14 +195,10 @@ if __name__ == "__main__":
 
 
 def start_runner(tmp_path, log):
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")]),
-        "PHAROS_FAKE_LOG": str(log),
-        "PHAROS_FAKE_SECONDS": "0.2",
-    }
+    path = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
+    environment = {"PYTHONPATH": path, "PHAROS_FAKE_LOG": str(log), "PHAROS_FAKE_SECONDS": "0.2"}
     arguments = [sys.executable, "-c", RUNNER, str(tmp_path / "fake.yaml"), str(tmp_path / "out")]
-    return subprocess.Popen(arguments, env=environment)
+    return subprocess.Popen(arguments, env={**os.environ, **environment})
 
 
 def wait_for(condition, seconds=600):
@@ -221,14 +219,18 @@ def workers_of(folder):
     return found
 
 
+def undisturbed(spec, tmp_path, log):
+    """Results of a study that nothing disturbs, beside whose folder its specification lies now."""
+    assert study.run(spec, tmp_path / "undisturbed", runner=fake_training.train, workers=2).finished == len(spec.runs)
+    log.write_text("")
+    (tmp_path / "fake.yaml").write_text((tmp_path / "undisturbed" / "study.yaml").read_text())
+    return fake_training.results(tmp_path / "undisturbed")
+
+
 @pytest.mark.long
 def test_killing_runner_and_workers_loses_and_repeats_nothing(tmp_path, log):
-    spec = specification(seeds=8)
-    undisturbed = study.run(spec, tmp_path / "undisturbed", runner=fake_training.train, workers=2)
-    assert undisturbed.finished == 16
-    log.write_text("")
-    (tmp_path / "fake.yaml").write_text(Path(tmp_path, "undisturbed", "study.yaml").read_text())
-    out = tmp_path / "out"
+    expected, out = undisturbed(specification(seeds=8), tmp_path, log), tmp_path / "out"
+    assert len(expected) == 16
 
     for killed in (1, 2):
         runner = start_runner(tmp_path, log)
@@ -243,20 +245,17 @@ def test_killing_runner_and_workers_loses_and_repeats_nothing(tmp_path, log):
         assert len(fake_training.results(out)) < 16, f"kill {killed} came too late"
 
     assert start_runner(tmp_path, log).wait(60) == 0
-    assert fake_training.results(out) == fake_training.results(tmp_path / "undisturbed")
+    assert fake_training.results(out) == expected
     assert set(Counter(log.read_text().split()).values()) == {1}
     assert not (out / "partial").exists()
 
 
 @pytest.mark.long
 def test_two_runners_on_one_folder_share_the_work(tmp_path, log):
-    spec = specification(seeds=4)
-    study.run(spec, tmp_path / "undisturbed", runner=fake_training.train, workers=2)
-    log.write_text("")
-    (tmp_path / "fake.yaml").write_text(Path(tmp_path, "undisturbed", "study.yaml").read_text())
+    expected = undisturbed(specification(seeds=4), tmp_path, log)
     both = [start_runner(tmp_path, log) for _ in range(2)]
     assert [runner.wait(60) for runner in both] == [0, 0]
-    assert fake_training.results(tmp_path / "out") == fake_training.results(tmp_path / "undisturbed")
+    assert fake_training.results(tmp_path / "out") == expected
     assert set(Counter(log.read_text().split()).values()) == {1}
 
 
@@ -302,9 +301,8 @@ def no_run(file):
 
 
 def of_text(file):
-    record = json.loads(file.read_text())
-    record["result"]["cumulative_regret"] = "=cmd"
-    file.write_text(json.dumps(record))
+    with edited_json(file) as record:
+        record["result"]["cumulative_regret"] = "=cmd"
 
 
 DAMAGES = {
@@ -319,19 +317,12 @@ DAMAGES = {
 
 @pytest.mark.slow
 def test_a_bit_in_a_page_of_a_curve_is_noticed_and_the_run_made_again(tmp_path):
-    spec = study.specification(
-        {
-            "name": "a",
-            "steps": 60,
-            "seeds": 2,
-            "blocks": [{"environments": ["frozen_lake/4x4"], "agents": ["q_learning"]}],
-        }
-    )
+    spec = fake_training.specification(steps=60, seeds=2)
     study.run(spec, tmp_path, workers=2)
     bad = spec.runs[1].id
     file = tmp_path / "runs" / bad / "curve.parquet"
     whole = file.read_bytes()
-    file.write_bytes(whole[:200] + bytes([whole[200] ^ 4]) + whole[201:])
+    flip(file, 200, 4)
     assert list(study.status(spec, tmp_path).damaged) == [bad]
     assert study.run(spec, tmp_path, workers=2).finished == 2
     assert file.read_bytes() == whole
@@ -404,10 +395,7 @@ def without_flock(monkeypatch):
     import errno
     import fcntl
 
-    def flock(*_):
-        raise OSError(errno.ENOSYS, "Function not implemented")
-
-    monkeypatch.setattr(fcntl, "flock", flock)
+    monkeypatch.setattr(fcntl, "flock", failing(errno.ENOSYS))
 
 
 def test_where_locks_are_not_supported_runs_and_instances_are_no_longer_taken_for_held(tmp_path, log, monkeypatch):
@@ -455,8 +443,5 @@ def test_a_worker_on_a_full_disk_says_a_line(tmp_path, capfd):
     partial.mkdir(parents=True)
     (partial / "log.txt").symlink_to("/dev/full")
     arguments = (lambda *_: 1 / 0, [run.config], [run.id], tmp_path, (), True, dict(os.environ))
-    process = multiprocessing.get_context("fork").Process(target=_worker.main, args=arguments)
-    process.start()
-    process.join()
-    assert process.exitcode == 1
+    assert exit_code(_worker.main, *arguments) == 1
     assert capfd.readouterr().err == f"pharos: run {run.id}: No space left on device\n"

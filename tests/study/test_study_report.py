@@ -11,6 +11,7 @@ import pytest
 
 import fake_training
 from command_line import process
+from edits import edited_json
 from pharos import study
 from pharos.study import worker as _worker
 from pharos.study.execution import claim
@@ -19,27 +20,22 @@ from pharos.study.report import files, number
 from pharos.study.report.page import table
 from pharos.system.wording import latex_text
 
-SPECIFICATION = {
-    "name": "lakes",
-    "steps": 400,
-    "evaluations": 8,
-    "seeds": 2,
-    "hardness": {"measures": ["sum_of_reciprocal_gaps", "diameter"], "budget": 5},
-    "blocks": [
-        {
-            "environments": ["simple_grid/4x4-decoy", "simple_grid/4x4-plain", "frozen_lake/4x4"],
-            "observations": ["vector", "simple_image"],
-            "agents": ["dqn", "ppo", "q_learning"],
-        }
-    ],
+HARDNESS = {"measures": ["sum_of_reciprocal_gaps", "diameter"], "budget": 5}
+CELLS = {
+    "environments": ["simple_grid/4x4-decoy", "simple_grid/4x4-plain", "frozen_lake/4x4"],
+    "observations": ["vector", "simple_image"],
+    "agents": ["dqn", "ppo", "q_learning"],
 }
+BEGINNING = ("Summary", "Findings of the paper", "Regret", "Profiles", "Vector against image", "Hardness and regret")
+MIDDLE = ("Unseen classes", "Agreement of agents", "Hardness of the instances", "Returns", "Beside the paper")
+HEADINGS = [*BEGINNING, *MIDDLE, "Instances", "Each instance", "How it was made"]
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """(folder, StudyReport) of a study with one failed and one missing run."""
     folder = tmp_path_factory.mktemp("study")
-    spec = study.specification(SPECIFICATION)
+    spec = fake_training.specification("lakes", steps=400, evaluations=8, seeds=2, hardness=HARDNESS, **CELLS)
     claim(spec, folder)
     for run in spec.runs[2:]:
         fake_training.attempt(run, folder)
@@ -106,32 +102,15 @@ def test_the_page_is_well_formed_and_loads_nothing_from_outside(written):
     assert "<!--TITLE-->" not in page
     (script,) = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)  # its own, and the browser runs no other
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    assert (
-        page.count("<script") == 1
-        and f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'" in page
-    )
+    assert page.count("<script") == 1
+    assert f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'" in page
 
 
 @pytest.mark.slow
 def test_every_section_is_there_and_every_link_leads_to_one(written):
     page = written[1].html.read_text()
     reader = read(page)
-    assert reader.headings == [
-        "Summary",
-        "Findings of the paper",
-        "Regret",
-        "Profiles",
-        "Vector against image",
-        "Hardness and regret",
-        "Unseen classes",
-        "Agreement of agents",
-        "Hardness of the instances",
-        "Returns",
-        "Beside the paper",
-        "Instances",
-        "Each instance",
-        "How it was made",
-    ]
+    assert reader.headings == HEADINGS
     for link in (item for item in reader.loaded if item.startswith("#")):
         assert f'id="{link[1:]}"' in page
 
@@ -182,10 +161,8 @@ def test_runs_of_different_length_or_without_regret_leave_a_report(tmp_path):
     spec = study.specification({"name": "odd", "evaluations": 5, "hardness": hardness, "blocks": blocks})
     for run in spec.runs:
         fake_training.attempt(run, tmp_path)
-        file = tmp_path / "runs" / run.id / "run.json"
-        record = json.loads(file.read_text())
-        record["result"]["normalized_regret"] = None  # as pharos writes what is not a number
-        file.write_text(json.dumps(record))
+        with edited_json(tmp_path / "runs" / run.id / "run.json") as record:
+            record["result"]["normalized_regret"] = None  # as pharos writes what is not a number
     steps, tasks, _ = same_steps(study.curves(spec, tmp_path))
     assert list(steps) == [20, 40, 60, 80, 100] and [task.shape for task in tasks] == [(2, 5)]
     report = study.report(spec, tmp_path)
@@ -214,10 +191,7 @@ def test_the_command_prints_where_the_report_is(written, again):
 
 def report_of(tmp_path, name="own", change=None, **block):
     block = {"environments": ["frozen_lake/4x4", "frozen_lake/8x8"], "observations": ["vector", "simple_image"]} | block
-    hardness = {"measures": ["diameter", "sum_of_reciprocal_gaps"], "budget": 5}
-    spec = study.specification(
-        {"name": name, "steps": 400, "evaluations": 4, "seeds": 2, "hardness": hardness, "blocks": [block]}
-    )
+    spec = fake_training.specification(name, steps=400, evaluations=4, seeds=2, hardness=HARDNESS, **block)
     for run in spec.runs:
         fake_training.attempt(run, tmp_path)
     if change is not None:
@@ -231,18 +205,8 @@ def test_a_study_without_dqn_says_nothing_false_and_has_no_empty_section(tmp_pat
     report, page = report_of(tmp_path, agents=["ppo", "q_learning"], chance=["plain", {"sticky": 0.25}])
     text = " ".join(page.text)
     assert "is known for no instance" not in text and "dqn" not in text
-    assert page.headings == [
-        "Summary",
-        "Regret",
-        "Profiles",
-        "Vector against image",
-        "Hardness and regret",
-        "Hardness of the instances",
-        "Returns",
-        "Instances",
-        "Each instance",
-        "How it was made",
-    ]
+    left_out = ("Findings of the paper", "Unseen classes", "Agreement of agents", "Beside the paper")
+    assert page.headings == [each for each in HEADINGS if each not in left_out]
     assert "the paper prints" not in text and "Findings" not in text and "The paper's figure" not in text
     assert "Cumulative regret of PPO" in text and "costs PPO more regret" in text
     names = {file.stem for file in report.figures}
@@ -260,9 +224,8 @@ def test_each_agent_that_sees_observations_has_models(tmp_path):
     text = " ".join(page.text)
     assert "Cumulative regret of PPO" in text and "Cumulative regret of a2c" in text
     assert {"representations_ppo", "representations_a2c"} <= {file.stem for file in report.figures}
-    assert {"coefficients_cumulative_regret.csv", "coefficients_cumulative_regret_a2c.csv"} <= {
-        file.name for file in report.tables
-    }
+    files = {file.name for file in report.tables}
+    assert {"coefficients_cumulative_regret.csv", "coefficients_cumulative_regret_a2c.csv"} <= files
 
 
 def test_a_study_too_small_for_models_has_a_line_in_their_place(tmp_path, sketched):
@@ -274,10 +237,9 @@ def test_a_study_too_small_for_models_has_a_line_in_their_place(tmp_path, sketch
 
 
 def test_what_has_no_run_is_not_measured_and_the_cost_is_told_beforehand(tmp_path, sketched):
-    block = {"environments": ["frozen_lake/4x4", "frozen_lake/8x8"], "agents": ["q_learning"]}
-    spec = study.specification({"name": "half", "hardness": {"measures": ["diameter"], "budget": 7}, "blocks": [block]})
-    run = spec.runs[0]
-    fake_training.attempt(run, tmp_path)
+    hardness = {"measures": ["diameter"], "budget": 7}
+    spec = fake_training.specification(hardness=hardness, environments=["frozen_lake/4x4", "frozen_lake/8x8"])
+    fake_training.attempt(spec.runs[0], tmp_path)
     told = []
     study.report(spec, tmp_path, progress=told.append)
     assert [line for line in told if "hardness of" in line] == [
@@ -290,10 +252,7 @@ def test_what_has_no_run_is_not_measured_and_the_cost_is_told_beforehand(tmp_pat
 
 def test_estimated_regret_is_marked_and_its_half_width_stands_in_the_summary(tmp_path, sketched):
     def estimate(spec):
-        import pandas as pd
-
-        run = spec.runs[0]
-        file = tmp_path / "runs" / run.id / "curve.parquet"
+        file = tmp_path / "runs" / spec.runs[0].id / "curve.parquet"
         pd.read_parquet(file).assign(exact=False, error_bound=0.05).to_parquet(file)
 
     report, page = report_of(tmp_path, change=estimate, agents=["ppo"])
@@ -312,11 +271,9 @@ def test_estimated_regret_is_marked_and_its_half_width_stands_in_the_summary(tmp
 def test_damaged_runs_are_named_in_the_report_and_absurd_numbers_do_not_stop_it(tmp_path):
     def damage(spec):
         for run, change in zip(spec.runs, ({"seconds": 1e308}, {"cumulative_regret": -1e300}), strict=False):
-            file = tmp_path / "runs" / run.id / "run.json"
-            record = json.loads(file.read_text())
-            record["seconds"] = change.pop("seconds", 0.5)
-            record["result"] |= change
-            file.write_text(json.dumps(record))
+            with edited_json(tmp_path / "runs" / run.id / "run.json") as record:
+                record["seconds"] = change.pop("seconds", 0.5)
+                record["result"] |= change
 
     report, page = report_of(tmp_path, change=damage, agents=["ppo"])
     assert "Damaged, counted as missing:" in " ".join(page.text)
@@ -325,13 +282,9 @@ def test_damaged_runs_are_named_in_the_report_and_absurd_numbers_do_not_stop_it(
 
 
 def test_texts_that_a_spreadsheet_would_run_are_escaped_and_numbers_stay_numbers():
-    import pandas as pd
-
-    from pharos.study.report.files import spreadsheet_safe
-
     texts = ["=HYPERLINK(1)", "+1+cmd", "-1+cmd", "@SUM(A1)", "\tx", "\rx", "plain", "-5", None]
     data = pd.DataFrame({"=cmd|calc": texts, "number": [-1.5] * 9})
-    safe = spreadsheet_safe(data)
+    safe = files.spreadsheet_safe(data)
     assert list(safe.columns) == ["'=cmd|calc", "number"]
     assert safe.iloc[:, 0].tolist()[:8] == [*("'" + text for text in texts[:6]), "plain", "-5"]
     assert (safe["number"] == -1.5).all() and safe["number"].dtype == float
@@ -339,10 +292,8 @@ def test_texts_that_a_spreadsheet_would_run_are_escaped_and_numbers_stay_numbers
 
 def test_received_records_reach_the_tables_without_formulas(tmp_path, sketched):
     def inject(spec):
-        file = tmp_path / "runs" / spec.runs[0].id / "run.json"
-        record = json.loads(file.read_text())
-        record["result"] |= {"=cmd|' /C calc'!A0": 1.0, "note": "=HYPERLINK(0)"}
-        file.write_text(json.dumps(record))
+        with edited_json(tmp_path / "runs" / spec.runs[0].id / "run.json") as record:
+            record["result"] |= {"=cmd|' /C calc'!A0": 1.0, "note": "=HYPERLINK(0)"}
 
     report, _ = report_of(tmp_path, change=inject, agents=["ppo"])
     text = next(file for file in report.tables if file.name == "runs.csv").read_text()
@@ -351,10 +302,7 @@ def test_received_records_reach_the_tables_without_formulas(tmp_path, sketched):
 
 
 def test_the_page_escapes_whatever_a_study_says(tmp_path, sketched):
-    block = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "seeds": 1}
-    spec = study.specification(
-        {"name": "x", "description": "<script>alert(1)</script>", "blocks": [block], "steps": 10}
-    )
+    spec = fake_training.specification(description="<script>alert(1)</script>", steps=10, seeds=1)
     fake_training.attempt(spec.runs[0], tmp_path)
     page = study.report(spec, tmp_path).html.read_text()
     assert "<script>alert" not in page and page.count("<script") == 1 and "&lt;script&gt;" in page

@@ -1,6 +1,7 @@
 """A specification: what it expands to, and what it says of mistakes."""
 
 import json
+import re
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ from pharos.errors import ParameterError, UnknownName, UntrustedCode
 from pharos.study import Specification, presets, run_id, specification
 from pharos.study.specification import parse
 from pharos.system import sources
+from refusals import refusal
 
 LAKES = """\
 name: lakes
@@ -69,9 +71,8 @@ def test_the_id_of_a_run_is_the_xxh3_hash_of_its_sorted_json():
 @pytest.mark.slow
 def test_ids_are_the_same_in_another_process_with_another_hash_seed():
     code = "from pharos.study import specification; print(*[run.id for run in specification('quick').runs])"
-    found = subprocess.run(
-        [sys.executable, "-c", code], env={"PYTHONHASHSEED": "7"}, capture_output=True, text=True, check=True
-    )
+    options = {"env": {"PYTHONHASHSEED": "7"}, "capture_output": True, "text": True, "check": True}
+    found = subprocess.run([sys.executable, "-c", code], **options)
     assert found.stdout.split() == [run.id for run in specification("quick").runs]
 
 
@@ -134,16 +135,12 @@ def test_defaults_of_a_study_go_before_those_of_the_library_and_below_those_of_a
 def test_a_mistake_is_told_with_its_line_and_the_nearest_name(line, wrong, expected):
     lines = LAKES.splitlines()
     lines[line - 1] = wrong
-    with pytest.raises(ParameterError) as caught:
-        parse("\n".join(lines) + "\n")
-    assert expected in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert expected in refusal(ParameterError, parse, "\n".join(lines) + "\n")
 
 
 @pytest.mark.parametrize("text", ["", "- a\n", "name: a\n", "blocks: []\nname: a\n", "a"])
 def test_what_is_no_study_is_refused(text):
-    with pytest.raises(ParameterError, match="specification"):
-        parse(text)
+    assert "specification" in refusal(ParameterError, parse, text)
 
 
 def test_a_mapping_is_read_as_well_and_a_missing_file_suggests_a_preset():
@@ -151,8 +148,7 @@ def test_a_mapping_is_read_as_well_and_a_missing_file_suggests_a_preset():
     assert isinstance(study, Specification) and len(study.runs) == 5
     with pytest.raises(ParameterError, match=r"specification\.blocks\.0\.agents\.0: unknown agent"):
         specification({"name": "a", "blocks": [{"environments": ["frozen_lake"], "agents": ["dqm"]}]})
-    with pytest.raises(UnknownName, match="did you mean 'quick'"):
-        specification("quik")
+    assert "did you mean 'quick'" in refusal(UnknownName, specification, "quik")
 
 
 def test_the_presets_are_those_of_the_paper():
@@ -270,9 +266,7 @@ def test_environments_of_a_file_take_the_place_of_those_that_are_given(tmp_path)
 def test_a_wrong_list_of_environments_is_a_line(tmp_path, text, message):
     file = tmp_path / "list.yaml"
     file.write_text(text)
-    with pytest.raises(ParameterError, match=message) as error:
-        specification("hardness-sealed", environments=file)
-    assert "\n" not in str(error.value)
+    assert re.search(message, refusal(ParameterError, specification, "hardness-sealed", environments=file))
 
 
 def test_classes_of_ones_own_in_a_list_need_trust_and_lie_beside_it(tmp_path, monkeypatch):
@@ -285,8 +279,7 @@ def test_classes_of_ones_own_in_a_list_need_trust_and_lie_beside_it(tmp_path, mo
     (tmp_path / "sealed" / "yard_of_a_list.py").write_text(code)
     file = tmp_path / "sealed" / "list.yaml"
     file.write_text("- {name: 'yard_of_a_list.py:Yard', parameters: {height: 3, width: 3}}\n")
-    with pytest.raises(UntrustedCode, match="add --trust"):
-        specification("hardness-sealed", environments=file)
+    assert "add --trust" in refusal(UntrustedCode, specification, "hardness-sealed", environments=file)
     found = specification("hardness-sealed", environments=file, trust=True)
     assert {run.cell["environment"] for run in found.runs} == {"yard"}
     again = specification(found.model_dump(mode="json", exclude_unset=True), trust=True)
@@ -294,8 +287,7 @@ def test_classes_of_ones_own_in_a_list_need_trust_and_lie_beside_it(tmp_path, mo
 
 
 def test_environments_are_given_to_studies_that_ask_for_them_alone(tmp_path):
-    with pytest.raises(ParameterError, match="--environments FILE"):
-        specification("hardness-sealed")
+    assert "--environments FILE" in refusal(ParameterError, specification, "hardness-sealed")
     (tmp_path / "list.yaml").write_text("- taxi/5x5")
     with pytest.raises(ParameterError, match="has environments of its own"):
         specification("quick", environments=tmp_path / "list.yaml")

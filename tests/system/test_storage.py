@@ -3,7 +3,6 @@
 import errno
 import json
 import math
-import multiprocessing
 import os
 import resource
 import signal
@@ -15,13 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from children import exit_code, fork, in_a_child, kill
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, StateSpaceLocked
 from pharos.system import storage
+from refusals import failing
+from strategies import examples
 
-fork = multiprocessing.get_context("fork")
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
@@ -59,10 +59,7 @@ def _write_with_little_disk(limit, file):
 def test_a_full_disk_leaves_the_old_file_and_names_it(limit, tmp_path):
     file = tmp_path / "kept"
     file.write_text("old")
-    process = fork.Process(target=_write_with_little_disk, args=(limit, file))
-    process.start()
-    process.join()
-    assert process.exitcode == 7
+    assert exit_code(_write_with_little_disk, limit, file) == 7
     assert file.read_text() == "old" and names(tmp_path) == ["kept"]
 
 
@@ -70,11 +67,7 @@ def test_a_full_disk_leaves_the_old_file_and_names_it(limit, tmp_path):
 def test_a_file_has_its_name_only_once_it_is_on_the_disk(call, tmp_path, monkeypatch):
     file = tmp_path / "kept"
     file.write_text("old")
-
-    def full(*_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, call, full)
+    monkeypatch.setattr(os, call, failing(errno.ENOSPC))
     with pytest.raises(OSError, match="No space left"):
         storage.replace_file(file, "new")
     assert file.read_text() == "old" and names(tmp_path) == ["kept"]
@@ -108,13 +101,8 @@ def test_links_are_followed_and_devices_are_written_to(tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "real" / "file")
     storage.replace_file(tmp_path / "link", "new")
     assert (tmp_path / "link").is_symlink() and (tmp_path / "real" / "file").read_text() == "new"
-    done = subprocess.run(
-        [sys.executable, "-c", "from pharos.system import storage; storage.replace_file('/dev/stdout', 'hello')"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout == "hello"
+    code = "from pharos.system import storage; storage.replace_file('/dev/stdout', 'hello')"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "hello"
 
 
 def test_leftovers_of_killed_processes_are_removed_and_others_stay(tmp_path):
@@ -125,8 +113,7 @@ def test_leftovers_of_killed_processes_are_removed_and_others_stay(tmp_path):
             out.write(b"half")
             os.kill(os.getpid(), signal.SIGKILL)
 
-    process = fork.Process(target=die)
-    process.start()
+    process = in_a_child(die)
     process.join()
     assert len(names(tmp_path)) == 1 and storage.is_temporary(names(tmp_path)[0])
     alive = storage.temporary_path(file)
@@ -154,20 +141,25 @@ def _hold(folder, ready, release):
 def locks(request, monkeypatch):
     """File systems that lock, and those that answer that they do not."""
     if request.param != "flock":
-        number = getattr(errno, request.param)
-
-        def refuse(*_):
-            raise OSError(number, os.strerror(number))
-
-        monkeypatch.setattr(storage.fcntl, "flock", refuse)
-    return request.param
+        monkeypatch.setattr(storage.fcntl, "flock", failing(getattr(errno, request.param)))
 
 
-def test_one_process_holds_a_folder_until_it_ends(locks, tmp_path):
+@pytest.fixture
+def no_locks(monkeypatch):
+    monkeypatch.setattr(storage.fcntl, "flock", failing(errno.ENOSYS))
+
+
+@pytest.fixture
+def holder(locks, tmp_path):
+    """A process that holds the folder, and what releases it."""
     ready, release = fork.Event(), fork.Event()
-    process = fork.Process(target=_hold, args=(tmp_path, ready, release))
-    process.start()
+    process = in_a_child(_hold, tmp_path, ready, release)
     ready.wait()
+    return process, release
+
+
+def test_one_process_holds_a_folder_until_it_ends(holder, tmp_path):
+    process, release = holder
     for error, activity in ((FolderLocked, "at work"), (StateSpaceLocked, "building")):
         with (
             pytest.raises(error, match=rf"another process \(process {process.pid}\) is {activity} there; wait for it"),
@@ -192,25 +184,15 @@ def test_a_lock_that_its_holder_has_removed_holds_nothing(tmp_path, monkeypatch)
         assert names(tmp_path) == ["lock"]
 
 
-def test_a_process_that_is_killed_holds_nothing(locks, tmp_path):
-    ready, release = fork.Event(), fork.Event()
-    process = fork.Process(target=_hold, args=(tmp_path, ready, release))
-    process.start()
-    ready.wait()
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
-    with storage.lock(tmp_path):
-        pass
-    with storage.lock(tmp_path):
-        pass
+def test_a_process_that_is_killed_holds_nothing(holder, tmp_path):
+    kill(holder[0])
+    for _ in range(2):
+        with storage.lock(tmp_path):
+            pass
     assert names(tmp_path) == ["lock"]
 
 
-def test_a_claim_of_another_machine_is_left_alone_and_named(tmp_path, monkeypatch):
-    def refuse(*_):
-        raise OSError(errno.ENOSYS, "Function not implemented")
-
-    monkeypatch.setattr(storage.fcntl, "flock", refuse)
+def test_a_claim_of_another_machine_is_left_alone_and_named(no_locks, tmp_path):
     (tmp_path / storage.CLAIM).write_text("process 1 on another-machine, 0123")
     with (
         pytest.raises(FolderLocked, match=r"\(process 1 on another-machine\).*if it is gone, delete .*lock\.claim"),
@@ -220,14 +202,9 @@ def test_a_claim_of_another_machine_is_left_alone_and_named(tmp_path, monkeypatc
     assert names(tmp_path) == ["lock", "lock.claim"]
 
 
-def test_a_claim_that_cannot_be_removed_is_said_to_be_there(tmp_path, monkeypatch):
-    def refuse(*_):
-        raise OSError(errno.ENOSYS, "Function not implemented")
-
-    monkeypatch.setattr(storage.fcntl, "flock", refuse)
+def test_a_claim_that_cannot_be_removed_is_said_to_be_there(no_locks, tmp_path, monkeypatch):
     monkeypatch.setattr(storage, "CLAIM_ATTEMPTS", 3)
-    dead = fork.Process(target=int)
-    dead.start()
+    dead = in_a_child(int)
     dead.join()
     (tmp_path / storage.CLAIM).write_text(f"process {dead.pid} on {storage._host()}, 0123")
     (tmp_path / "lock.claim.removal").write_text("killed in the middle of it")
@@ -236,10 +213,6 @@ def test_a_claim_that_cannot_be_removed_is_said_to_be_there(tmp_path, monkeypatc
 
 
 def _count(folder, times, counter):
-    def refuse(*_):
-        raise OSError(errno.ENOSYS, "Function not implemented")
-
-    storage.fcntl.flock = refuse
     done, deadline = 0, time.monotonic() + 60
     while done < times and time.monotonic() < deadline:
         try:
@@ -254,24 +227,18 @@ def _count(folder, times, counter):
 
 
 @pytest.mark.slow
-def test_processes_with_claims_never_hold_a_folder_together(tmp_path):
+def test_processes_with_claims_never_hold_a_folder_together(no_locks, tmp_path):
     """Half of them are killed while they hold it, so that others race to take the claim over."""
     folder, counter = tmp_path / "folder", tmp_path / "counter"
     folder.mkdir()
     counter.write_text("0")
-    processes = [fork.Process(target=_count, args=(folder, 100, counter)) for _ in range(6)]
-    for process in processes:
-        process.start()
-    for process in processes:
+    for process in [in_a_child(_count, folder, 100, counter) for _ in range(6)]:
         process.join()
     assert int(counter.read_text()) == 6 * 50
 
 
 def test_a_lock_that_fails_otherwise_is_no_lock_of_another(tmp_path, monkeypatch):
-    def refuse(*_):
-        raise OSError(errno.EIO, "Input/output error")
-
-    monkeypatch.setattr(storage.fcntl, "flock", refuse)
+    monkeypatch.setattr(storage.fcntl, "flock", failing(errno.EIO))
     with pytest.raises(ParameterError, match="cannot be locked: Input/output error"), storage.lock(tmp_path):
         raise AssertionError
 
@@ -280,8 +247,7 @@ def test_a_lock_that_fails_otherwise_is_no_lock_of_another(tmp_path, monkeypatch
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
-@given(value=st.dictionaries(st.text(max_size=5), values, max_size=4))
+@examples(100, value=st.dictionaries(st.text(max_size=5), values, max_size=4))
 def test_what_is_written_as_json_comes_back_and_is_intact(tmp_path_factory, value):
     file = tmp_path_factory.mktemp("json") / "value.json"
     record = storage.sealed(value)
@@ -330,8 +296,7 @@ def test_a_file_has_the_digest_of_its_bytes(tmp_path):
 
 def test_nothing_heavy_is_loaded():
     code = "import sys, pharos.system.storage; print([n for n in ('numba', 'scipy', 'pandas') if n in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
     assert Path(storage.__file__).name == "storage.py"
 
 

@@ -26,20 +26,22 @@ def search(trials, out=None, **options):
 
 def test_the_score_is_the_mean_normalized_regret_of_runs_that_anyone_can_repeat():
     result = search(1)
-    runs = [train("q_learning", LAKE, steps=2000, seed=seed, evaluation_interval=100) for seed in (7, 8)]
-    rows = [row["normalized_regret"] for run in runs for row in run.curve[1:]]
-    assert result.score == result.first_score == pytest.approx(sum(rows) / len(rows))
+    assert result.score == result.first_score == pytest.approx(mean_regret([{}]))
     assert result.hyperparameters == hyperparameters("q_learning", "frozen_lake", "index")
+
+
+def mean_regret(chances):
+    """The mean normalised regret of the same runs, one by one."""
+    options = {"steps": 2000, "evaluation_interval": 100}
+    runs = [train("q_learning", LAKE, seed=seed, **options, **chance) for chance in chances for seed in (7, 8)]
+    rows = [row["normalized_regret"] for run in runs for row in run.curve[1:]]
+    return sum(rows) / len(rows)
 
 
 @pytest.mark.slow
 def test_several_kinds_of_chance_count_alike():
-    result = search(1, chances=[{}, {"random": 0.1}, {"sticky": 0.25, "random": 0.1}])
-    rows = []
-    for chance in ({}, {"random": 0.1}, {"sticky": 0.25, "random": 0.1}):
-        runs = [train("q_learning", LAKE, steps=2000, seed=seed, evaluation_interval=100, **chance) for seed in (7, 8)]
-        rows += [row["normalized_regret"] for run in runs for row in run.curve[1:]]
-    assert result.score == pytest.approx(sum(rows) / len(rows))
+    chances = [{}, {"random": 0.1}, {"sticky": 0.25, "random": 0.1}]
+    assert search(1, chances=chances).score == pytest.approx(mean_regret(chances))
 
 
 @pytest.mark.slow
@@ -150,18 +152,8 @@ def test_a_search_that_cannot_be_done_is_refused(change, message):
 
 @pytest.mark.slow
 def test_the_command_answers_in_json_and_train_takes_its_file(tmp_path):
-    options = (
-        "--agent",
-        "q_learning",
-        "--steps",
-        1000,
-        "--trials",
-        2,
-        "--seeds",
-        "4",
-        "--search",
-        "learning_rate=0.5,0.7",
-    )
+    options = ("--agent", "q_learning", "--steps", 1000, "--trials", 2, "--seeds", 4)
+    options += ("--search", "learning_rate=0.5,0.7")
     done = run("tune", LAKE, "frozen_lake/8x8", *options, "--out", tmp_path / "t", "--json")
     answer = json.loads(done.stdout)
     assert answer["hyperparameters"]["learning_rate"] in (0.5, 0.7)

@@ -1,5 +1,6 @@
 """Predictions of a study: written before its runs, hashed and dated; and what is said of them afterwards."""
 
+import errno
 import json
 from types import SimpleNamespace
 
@@ -23,6 +24,7 @@ from pharos.validation import (
     write_predictions,
 )
 from pharos.validation import unseen_classes as validation
+from refusals import failing, refusal
 
 SPEC = {
     "name": "tiny",
@@ -92,10 +94,8 @@ def test_the_layers_of_a_network_are_those_of_its_hyperparameters():
     assert layers({}) == [128]
     assert layers({"net_arch": [64, 32]}) == layers({"policy_kwargs": {"net_arch": [64, 32]}}) == [64, 32]
     assert layers({"net_arch": {"pi": [64], "vf": [64]}}) == [64]
-    with pytest.raises(ParameterError, match="same layers for policy and value"):
-        layers({"net_arch": {"pi": [64], "vf": [32]}})
-    with pytest.raises(ParameterError, match="'activation_fn'"):
-        layers({"policy_kwargs": {"activation_fn": "relu"}})
+    assert "same layers for policy and value" in refusal(ParameterError, layers, {"net_arch": {"pi": [64], "vf": [32]}})
+    assert "'activation_fn'" in refusal(ParameterError, layers, {"policy_kwargs": {"activation_fn": "relu"}})
 
 
 def test_a_file_of_predictions_has_its_hash_and_its_date(predicted, tmp_path):
@@ -114,15 +114,12 @@ def test_a_file_of_predictions_has_its_hash_and_its_date(predicted, tmp_path):
     swapped = pq.read_table(tmp_path / "q.parquet")
     swapped = swapped.replace_schema_metadata(pq.read_table(tmp_path / "p.parquet").schema.metadata)
     pq.write_table(swapped, tmp_path / "q.parquet", write_page_checksum=True)
-    with pytest.raises(ResultCorrupted, match="changed after it was written"):
-        read_predictions(tmp_path / "q.parquet")
+    assert "changed after it was written" in refusal(ResultCorrupted, read_predictions, tmp_path / "q.parquet")
     pq.write_table(swapped.replace_schema_metadata({}), tmp_path / "q.parquet", write_page_checksum=True)
-    with pytest.raises(FileFormatError, match="holds no predictions"):
-        read_predictions(tmp_path / "q.parquet")
+    assert "holds no predictions" in refusal(FileFormatError, read_predictions, tmp_path / "q.parquet")
     for words in ('{"study": "tiny', "[1]", "{}"):
         pq.write_table(swapped.replace_schema_metadata({b"pharos.predictions": words}), tmp_path / "q.parquet")
-        with pytest.raises(ResultCorrupted, match="what it says of itself is damaged"):
-            read_predictions(tmp_path / "q.parquet")
+        assert "what it says of itself is damaged" in refusal(ResultCorrupted, read_predictions, tmp_path / "q.parquet")
     with pytest.raises(FileFormatError, match="no such file; expected predictions"):
         read_predictions(tmp_path / "absent.parquet")
 
@@ -148,13 +145,8 @@ def test_predictions_stay_where_others_cannot_be_written(predicted, tmp_path, mo
     file, spec = tmp_path / "p.parquet", specification(SPEC)
     write_predictions(spec, predicted, file)
     before = file.read_bytes()
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(prediction.training, "write_table", full)
-    with pytest.raises(OSError, match="No space left"):
-        write_predictions(spec, predicted.assign(kernel_regret=1.0), file)
+    monkeypatch.setattr(prediction.training, "write_table", failing(errno.ENOSPC))
+    assert "No space left" in refusal(OSError, write_predictions, spec, predicted.assign(kernel_regret=1.0), file)
     assert file.read_bytes() == before and list(tmp_path.iterdir()) == [file]
 
 
@@ -212,11 +204,9 @@ def test_a_wrong_sign_within_mdps_is_seen():
 
 
 def test_too_few_classes_are_a_line():
-    with pytest.raises(ParameterError, match="at least three classes"):
-        validation(*made_up(0.0, classes=2))
+    assert "at least three classes" in refusal(ParameterError, validation, *made_up(0.0, classes=2))
     frame, cells = made_up(0.0)
-    with pytest.raises(ParameterError, match="no cell of the predictions"):
-        validation(frame, cells.assign(agent="ppo"))
+    assert "no cell of the predictions" in refusal(ParameterError, validation, frame, cells.assign(agent="ppo"))
 
 
 @pytest.mark.long
