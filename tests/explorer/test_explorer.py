@@ -262,7 +262,7 @@ def test_the_page_and_its_answers_come_from_its_address(served):
 
 
 def test_it_listens_on_the_loopback_interface_alone(served):
-    assert served._server._http.server_address[0] == "127.0.0.1"
+    assert served._http.server_address[0] == "127.0.0.1"
 
 
 @pytest.mark.parametrize(
@@ -305,7 +305,7 @@ def test_a_target_that_is_no_address_is_answered(served):
 
 def test_one_connection_too_many_is_closed_at_once_and_the_next_is_answered(served):
     at = ("127.0.0.1", urlsplit(served.url).port)
-    http_server = served._server._http
+    http_server = served._http
     with contextlib.ExitStack() as stack:
         for _ in range(MOST_CONNECTIONS):
             stack.enter_context(socket.create_connection(at, timeout=20))

@@ -3,6 +3,7 @@
 pharos explore: an MDP state by state, on a page in the browser.
 """
 
+import contextlib
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -32,7 +33,7 @@ from pharos.mdp import ChanceSetting
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from pharos.explorer import Exploration, Learnt, Server
+    from pharos.explorer import Exploration, Explorer, Learnt
 
 
 app = Commands(no_args_is_help=True, help="Draw runs, values, state spaces, hardness and policies at play.")
@@ -204,7 +205,7 @@ def explore(
         port: Of the local server; 0: any free one.
         browser: Open the page in the browser.
     """
-    from pharos.explorer import Server, write
+    from pharos.explorer import Explorer, write
 
     with progress_line("exploring") as report:
         world = _exploration(
@@ -218,32 +219,29 @@ def explore(
             progress=report,
             in_one_page=out is not None,
         )
-        server = None if out is not None else Server(world, port)
+        explorer = None if out is not None else Explorer(world, port=port)
         file = None if out is None else write(world, out)
     answer: dict[str, Any] = {"title": world.title, "num_states": world.mdp.num_states, "gamma": world.mdp.gamma}
     if file is not None:
         print_json({**answer, "file": file, "bytes": file.stat().st_size}) if json else print(file)
-    if server is not None:
-        print_json({**answer, "url": server.url, "port": server.port}) if json else print(server.url)
+    if explorer is not None:
+        print_json({**answer, "url": explorer.url, "port": explorer.port}) if json else print(explorer.url)
         sys.stdout.flush()
-        _serve(server, browser and not json and sys.stdout.isatty())
+        _serve(explorer, browser and not json and sys.stdout.isatty())
 
 
-def _serve(server: "Server", with_browser: bool) -> None:
+def _serve(explorer: "Explorer", with_browser: bool) -> None:
     """Answer until the user interrupts; that is how it ends, so it is no error."""
     from pharos.explorer import open_browser
 
-    try:
-        if with_browser and not open_browser(server.url):
+    with explorer, contextlib.suppress(KeyboardInterrupt):
+        if with_browser and not open_browser(explorer.url):
             complain("no browser opened: open the address above in one on this machine")
         if sys.stderr.isatty():
             complain("Ctrl-C ends it")
-        server.serve()
-    except KeyboardInterrupt:
-        if sys.stderr.isatty():
-            print(file=sys.stderr)
-    finally:
-        server.leave()
+        explorer.wait()
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
 
 
 def _learnt(policy: str | None, trust: bool) -> "Learnt | None":

@@ -10,7 +10,7 @@ from pharos.system import lazy
 if TYPE_CHECKING:
     from pharos.explorer.exploration import Exploration
     from pharos.explorer.keys import ARROWS, keys_of
-    from pharos.explorer.launch import Explorer, Server, exploration_of, explore, open_browser
+    from pharos.explorer.launch import Explorer, exploration_of, explore, open_browser
     from pharos.explorer.pages import contents, page, write
     from pharos.explorer.states import Learnt
 

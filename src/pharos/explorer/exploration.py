@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from pharos.drawing import empty_grid, fitting_cell, image, planes_of, tile
-from pharos.environments import Environment, Layer, State
+from pharos.environments import Environment, State
 from pharos.errors import ParameterError
 from pharos.explorer.keys import keys_of
 from pharos.explorer.states import (
@@ -35,6 +35,7 @@ from pharos.explorer.states import (
 )
 from pharos.hardness import discounted_visits, occupancy
 from pharos.mdp import TabularMDP
+from pharos.observations import num_values
 from pharos.solvers import Solution, uniform_value, value_iteration
 from pharos.state_space import StateSpace
 
@@ -490,7 +491,7 @@ def kit_of(env: Environment) -> dict[str, Any]:
     rows, columns = env.grid()
     cell = fitting_cell(rows, columns, LONGEST, LONGEST)
     tiles = [
-        [url_of(tile(name, layer, value + 1, cell) * (1, 1, 1, 255)) for value in range(num_kinds(layer))]
+        [url_of(tile(name, layer, value + 1, cell) * (1, 1, 1, 255)) for value in range(num_values(layer))]
         for name, layer in env.layers.items()
     ]
     return {
@@ -502,13 +503,6 @@ def kit_of(env: Environment) -> dict[str, Any]:
         "tiles": tiles,
         "layers": list(env.layers),
     }
-
-
-def num_kinds(layer: Layer) -> int:
-    """Number of values of a layer that look different; higher ones look like the last."""
-    colors = len(layer.color) if np.ndim(layer.color) == 2 else 1
-    sprites = len(layer.sprite) if layer.sprite is not None and not isinstance(layer.sprite[0], str) else 1
-    return max(len(layer.glyph), colors, sprites)
 
 
 def url_of(picture: np.ndarray) -> str:

@@ -1,6 +1,6 @@
 """Opening the explorer: from an environment, a state space, an MDP or the folder of a run to a page in the browser.
 
-`Server` is a small local one of the page: one address, one token, GET alone, no files. It listens on the loopback
+`Explorer` is a small local server of the page: one address, one token, GET alone, no files. It listens on the loopback
 interface. A request is answered where its Host header names this server (a page from elsewhere whose name was led here
 by DNS does not) and its path begins with the token, compared in constant time. Answers come from a table of questions;
 no part of a request ever names a file.
@@ -39,20 +39,20 @@ SECONDS = 30  # of waiting for a request
 MOST_CONNECTIONS = 64  # at once; a thread each
 
 
-class Server:
-    """Answers questions about an MDP on the loopback interface.
+class Explorer:
+    """A page that is served on the loopback interface until `close` is called, or the process ends.
 
     Args:
-        world: what is asked.
+        exploration: what it shows.
         port: 0 for any that is free.
     Attributes:
-        url: the address of the page, with its token.
+        url: its address, with its token, on this machine alone; whoever knows it may look.
     Raises:
         ParameterError: the port is taken, or may not be used.
     """
 
-    def __init__(self, world: Exploration, port: int = 0):
-        self.world, self.token = world, secrets.token_urlsafe(24)
+    def __init__(self, exploration: Exploration, *, port: int = 0):
+        self.exploration, self.token = exploration, secrets.token_urlsafe(24)
         self.lock = threading.Lock()  # compiled loops may not run in two threads at once
         try:
             self._http = _Http((HOST, port), _Handler)
@@ -66,20 +66,32 @@ class Server:
         self.port = int(self._http.server_address[1])
         self.url = f"http://{HOST}:{self.port}/{self.token}/"
         self.hosts = frozenset(f"{name}:{self.port}" for name in NAMES)
-        self._page = page(world).encode()
-
-    def serve(self) -> None:
-        """Answer until `close` is called, or the process is interrupted."""
-        self._http.serve_forever(poll_interval=0.2)
+        self._page = page(exploration).encode()
+        self._thread = threading.Thread(
+            target=self._http.serve_forever, args=(0.2,), name="pharos explorer", daemon=True
+        )
+        self._thread.start()
 
     def close(self) -> None:
-        """Stop, and give the port back."""
+        """Stop answering, and give the port back."""
         self._http.shutdown()
         self._http.server_close()
+        self._thread.join()
 
-    def leave(self) -> None:
-        """Give the port back where `serve` has ended."""
-        self._http.server_close()
+    def wait(self) -> None:
+        """Return when the process is interrupted (Ctrl-C)."""
+        with contextlib.suppress(KeyboardInterrupt):
+            while self._thread.is_alive():
+                self._thread.join(0.5)
+
+    def __enter__(self) -> "Explorer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"Explorer({self.exploration.title}, {self.url})"
 
     def answer(self, path: str, query: str) -> tuple[HTTPStatus, str, bytes]:
         """Status, type and content for what stands behind the token."""
@@ -90,7 +102,7 @@ class Server:
         words = {name: values[-1] for name, values in parse_qs(query, keep_blank_values=True).items()}
         try:
             with self.lock:
-                answer = QUESTIONS[path](self.world, words)
+                answer = QUESTIONS[path](self.exploration, words)
         except PharosError as error:
             return _said(HTTPStatus.BAD_REQUEST, str(error))
         except MemoryError:
@@ -147,7 +159,7 @@ Address: TypeAlias = tuple[str, int] | str
 
 class _Http(ThreadingHTTPServer):
     daemon_threads = True
-    owner: Server
+    owner: Explorer
 
     def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]):
         self.places = threading.BoundedSemaphore(MOST_CONNECTIONS)
@@ -206,7 +218,7 @@ class _Handler(BaseHTTPRequestHandler):
         if with_content:
             self.wfile.write(content)
 
-    def _answer(self, owner: Server) -> tuple[HTTPStatus, str, bytes]:
+    def _answer(self, owner: Explorer) -> tuple[HTTPStatus, str, bytes]:
         hosts = self.headers.get_all("Host", [])
         if len(hosts) != 1 or hosts[0].lower() not in owner.hosts:
             return _said(HTTPStatus.MISDIRECTED_REQUEST, "this server answers to its own address alone")
@@ -232,41 +244,6 @@ class _Handler(BaseHTTPRequestHandler):
 RECORD = "run.json"
 GAMMA = 0.99
 """The discount, where none is given: values of states need one, as they belong to no number of steps to go."""
-
-
-class Explorer:
-    """A page that is served until `close` is called, or the process ends.
-
-    Attributes:
-        url: its address, on this machine alone; whoever knows it may look.
-        exploration: what it shows.
-    """
-
-    def __init__(self, exploration: Exploration, *, port: int = 0):
-        self.exploration, self._server = exploration, Server(exploration, port)
-        self.url = self._server.url
-        self._thread = threading.Thread(target=self._server.serve, name="pharos explorer", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop answering."""
-        self._server.close()
-        self._thread.join()
-
-    def wait(self) -> None:
-        """Return when the process is interrupted (Ctrl-C)."""
-        with contextlib.suppress(KeyboardInterrupt):
-            while self._thread.is_alive():
-                self._thread.join(0.5)
-
-    def __enter__(self) -> "Explorer":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __repr__(self) -> str:
-        return f"Explorer({self.exploration.title}, {self.url})"
 
 
 def explore(  # noqa: PLR0913

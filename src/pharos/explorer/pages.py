@@ -20,7 +20,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, UnknownName
 from pharos.explorer.exploration import Exploration, number
-from pharos.explorer.states import OPTIMAL, Axis, axes_of, find_axis
+from pharos.explorer.states import OPTIMAL, Axis, axes_of
 from pharos.mdp import TabularMDP
 from pharos.system import storage
 
@@ -45,13 +45,7 @@ def quantities(world: Exploration) -> dict[str, str]:
 
 
 def quantity(world: Exploration, name: str, states: np.ndarray) -> np.ndarray:
-    """(N,) a quantity of states; NaN where it has none, as most have in terminal states.
-
-    Raises:
-        UnknownName: there is none of this name.
-    """
-    if name not in quantities(world):
-        raise UnknownName("quantity", name, quantities(world))
+    """(N,) a quantity of states, one of `quantities`; NaN where it has none, as most have in terminal states."""
     kind, _, policy = name.partition("_")
     if name == "layer":
         layers = world.layers.of(states).astype(np.float64)
@@ -95,15 +89,15 @@ def heat_map(
             axes are the same.
     Cost: one read of the packed states, and of what the quantity is made of.
     """
-    axes = axes_of(world.states)
-    across, down = find_axis(axes, x), find_axis(axes, y)
-    if across is down:
+    axes, names, fixed = axes_of(world.states), world.states.names, fixed or {}
+    questions = [("axis", x, axes), ("axis", y, axes), ("summary", how, HOW), ("quantity", what, quantities(world))]
+    for kind, name, choices in [*questions, *(("variable", name, names) for name in fixed)]:
+        if name not in choices:
+            raise UnchoicesName(kind, name, choices)
+    if x == y:
         raise ParameterError(f"both axes are {x!r}; expected two of {', '.join(axes)}")
-    if how not in HOW:
-        raise UnknownName("summary", how, HOW)
-    if what not in quantities(world):
-        raise UnknownName("quantity", what, quantities(world))
-    slices = {_variable(world, name): value for name, value in (fixed or {}).items()}
+    across, down = axes[x], axes[y]
+    slices = {names.index(name): value for name, value in fixed.items()}
     cells = _Cells(down.count, across.count)
     for start in range(0, world.mdp.num_states, BLOCK):
         block = slice(start, min(start + BLOCK, world.mdp.num_states))
@@ -115,12 +109,6 @@ def heat_map(
         terminal = world.mdp.terminal[here]
         cells.add(places[0] * across.count + places[1], here, quantity(world, what, here), terminal)
     return {"x": asdict(across), "y": asdict(down), "what": what, "how": how} | cells.answer(what, how)
-
-
-def _variable(world: Exploration, name: str) -> int:
-    if name not in world.states.names:
-        raise UnknownName("variable", name, world.states.names)
-    return world.states.names.index(name)
 
 
 class _Cells:

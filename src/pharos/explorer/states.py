@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pharos.errors import ParameterError, UnknownName
+from pharos.errors import ParameterError
 from pharos.mdp import Dynamics, TabularMDP
 from pharos.policies import PolicyAnswers, PolicyLike, Sight, TabularAgent, evaluate_policy
 from pharos.solvers import Solution
@@ -160,13 +160,6 @@ def _intervals(size: int) -> tuple[int, int]:
     """(number of intervals, values in each)."""
     width = -(-size // MOST)
     return -(-size // width), width
-
-
-def find_axis(axes: Mapping[str, Axis], name: str) -> Axis:
-    """UnknownName where there is none of this name."""
-    if name not in axes:
-        raise UnknownName("axis", name, axes)
-    return axes[name]
 
 
 # Layers ---------------------------------------------------------------------------------------------------------------

@@ -282,7 +282,7 @@ class LargeHorizon:
             kind for kind in (np.uint8, np.uint16, np.uint32, np.uint64) if mdp.num_actions <= 8 * kind(0).itemsize
         )
         needed = (16 + bits(0).itemsize) * steps * states
-        if needed > (room := _room()):
+        if needed > (room := _PARTS * memory.available_memory()):
             raise UndefinedMeasure(
                 f"effective_horizon: {steps} steps of the {states} states that they can meet need "
                 f"{needed / 2**30:.1f} GiB, more than {room / 2**30:.1f}, "
@@ -366,10 +366,6 @@ class LargeHorizon:
             self.kernels.greedy_return(self.next_states, self.rewards, self.ahead[t + 1], value, now)
             value, now = now, value
         return self._at_start(value)
-
-
-def _room() -> float:
-    return _PARTS * memory.available_memory()
 
 
 # Discounted MDPs ------------------------------------------------------------------------------------------------------

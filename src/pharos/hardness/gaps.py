@@ -158,32 +158,17 @@ class TieProof:
         self.holds = mdp.dynamics.is_deterministic and not mdp.is_random
         self._step = -1
 
-    def look_at(
-        self,
-        step: int,
-        own: np.ndarray,
-        rewards: np.ndarray,
-        following: np.ndarray,
-        gap: np.ndarray,
-        counted: np.ndarray,
-    ) -> None:
-        """Take up a block of N states.
-
-        Args:
-            step: values of different steps are different; blocks of one step come together.
-            own: (N, W), the computed values of the states.
-            rewards, following: (N, A), what executing an action pays, and the computed value of what follows.
-            gap: (N, A), 0 for the best computed actions.
-            counted: (N,), 0 for states that do not matter.
-        """
+    def look_at(self, part: GapBlock, own: np.ndarray) -> None:
+        """Take up a block of N states, whose computed values are `own` (N, W); blocks of one step come together."""
         if not self.holds:
             return
-        if step != self._step:
-            self._step, self._filled = step, 0
+        if part.number != self._step:  # values of different steps are different
+            self._step, self._filled = part.number, 0
             self._map = _empty_map(_FIRST, own.shape[1])
-            ended = np.zeros((1, own.shape[1])), np.zeros_like(rewards[:1]), np.zeros_like(rewards[:1])
-            self._extend(*ended, np.zeros_like(gap[:1]), np.ones(1, np.int64))  # worth 0 for ever
-        self._extend(own, rewards, following, gap, counted)
+            nothing = np.zeros_like(part.rewards[:1])
+            ended = np.zeros((1, own.shape[1])), nothing, nothing
+            self._extend(*ended, np.zeros_like(part.gap[:1]), np.ones(1, np.int64))  # worth 0 for ever
+        self._extend(own, part.rewards, part.following, part.gap, part.counted)
 
     def _extend(
         self, own: np.ndarray, rewards: np.ndarray, following: np.ndarray, gap: np.ndarray, counted: np.ndarray
@@ -248,7 +233,7 @@ class UnresolvedTies:
         self.equal += equal
         if not self.small and self.proof.holds:
             own = part.step.own[part.states[0] : part.states[-1] + 1] if part.is_whole else part.step.own[part.states]
-            self.proof.look_at(part.number, own, part.rewards, part.following, part.gap, part.counted)
+            self.proof.look_at(part, own)
 
     def unresolved(self, parts: Iterator[GapBlock]) -> int:
         """How many are not proven; `parts` once more, where that is to be seen one by one."""

@@ -94,17 +94,9 @@ def gorp_bound(
         raise ParameterError(f"no methods given; expected some of {', '.join(METHODS)}")
     _needs_one_outcome("gorp_bound", mdp)
     search = Search(mdp, steps, names)
-    ms: list[int | None] = []
-    values: list[float] = []
-    failures: list[float] = []
-    for k in ks:
-        samples, failure = search.samples(k)
-        ms.append(samples)
-        failures.append(failure)
-        if samples is None:
-            values.append(math.inf)
-        else:
-            values.append(k + (math.log(samples) / math.log(mdp.num_actions) if mdp.num_actions > 1 else 0.0))
+    ms, failures = (list(each) for each in zip(*map(search.samples, ks), strict=True))
+    log_actions = math.log(mdp.num_actions) if mdp.num_actions > 1 else math.inf
+    values = [math.inf if m is None else k + math.log(m) / log_actions for k, m in zip(ks, ms, strict=True)]
     return GorpBound(
         min(values),
         ks,

@@ -190,8 +190,7 @@ def _measured(measure: Measure, problem: Problem, file: "ResultsFile | None") ->
     certificate, seconds = certificate_of(outcome), watch.seconds
     result = replace(empty, value=_plain(outcome), text=_text(outcome), certificate=certificate, seconds=seconds)
     if file is not None:
-        error_bound = _error_bound(problem)
-        file.put(measure, result.value, result.text, certificate, seconds, problem.budget, error_bound)
+        file.put(measure, result, problem.budget, _error_bound(problem))
     return result
 
 
@@ -307,26 +306,17 @@ class ResultsFile:
             self.error_bound = max(bound, self.error_bound or 0.0)
         return {"value": content["value"], "text": text, "seconds": seconds, "certificate": certificate}
 
-    def put(
-        self,
-        measure: Measure,
-        value: object,
-        text: str,
-        certificate: Certificate,
-        seconds: float,
-        budget: Budget,
-        error_bound: float | None = None,
-    ) -> None:
+    def put(self, measure: Measure, result: Result, budget: Budget, error_bound: float | None) -> None:
         """Keep a result, and how wrong the optimal values behind it may be. A folder that cannot be written to
         (another's, or a full disk) keeps nothing."""
         if self.path is None or measure.version is None:
             return
         content = {
-            "value": value,
-            "text": text,
-            "seconds": seconds,
-            "certificate": vars(certificate),
-            "budget": {"seconds": budget.seconds, "searches": budget.searches},
+            "value": result.value,
+            "text": result.text,
+            "seconds": result.seconds,
+            "certificate": vars(result.certificate),
+            "budget": vars(budget),
             "error_bound": None if measure.depends == "structure" else error_bound,
         }
         try:  # as text: JSON proper has no infinity

@@ -628,13 +628,13 @@ def visits_of(mdp: TabularMDP, policy: np.ndarray, episode: int) -> Visits:
     """The visits of a policy (S, A) in an episode of some steps, without terminal states."""
     walk = Walk(mdp, policy, episode)
     first, later = np.zeros(mdp.num_states), np.zeros((mdp.num_states, mdp.width))
-    for nodes, alive in walk.distributions():
+    for mass, is_first, alive in walk.distributions():
         if alive <= 1e-12:
             break
-        if nodes.first:
-            first += nodes.mass[:, 0]
+        if is_first:
+            first += mass[:, 0]
         else:
-            later += nodes.mass
+            later += mass
     first[~walk.live] = later[~walk.live] = 0.0
     return Visits(first, later, walk.executed(first, later))
 

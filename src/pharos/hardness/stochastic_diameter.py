@@ -393,8 +393,17 @@ class _Diameter(TargetBounds):
         return float(max(self.settled_upper, self.lower, self.upper.max()))
 
     def _promising(self) -> Iterator[list[int]]:
-        """Batches of open targets, the farthest from some node first; they grow, as one makes a guess for the next."""
-        order = [int(target) for target in _by_promise(self.targets, self.upper > -math.inf, self.spending)]
+        """Batches of open targets, the farthest from some node first: a large hitting time, early, rules out others.
+
+        They grow, as one makes a guess for the next.
+        """
+        wanted, promise, targets = self.upper > -math.inf, np.zeros(len(self.upper)), self.targets
+        for target in np.flatnonzero(wanted):
+            if self.spending.is_over:
+                break
+            count = targets.distances(int(target))
+            promise[target] = targets.distance[targets.order[count - 1]] if count else 0
+        order = [target for target in np.argsort(-promise, kind="stable").tolist() if wanted[target]]
         size = 1
         while order and not self.spending.is_over:
             order = [target for target in order if self.upper[target] > -math.inf]
@@ -435,9 +444,10 @@ class _Diameter(TargetBounds):
         """
         threads = self.threads
         scaling = bounding or not self.spending.searches
-        task = (self.tolerance, self.lower, self.spending, scaling, bounding)
         looks = [
-            pool.submit(_look, own, part, *task) for i, own in enumerate(threads) if (part := batch[i :: len(threads)])
+            pool.submit(self._looks, own, part, self.lower, scaling, bounding)
+            for i, own in enumerate(threads)
+            if (part := batch[i :: len(threads)])
         ]
         for look in itertools.chain.from_iterable(look.result() for look in looks):
             if scaling and look.lower >= self.lower:
@@ -454,6 +464,22 @@ class _Diameter(TargetBounds):
         for own in threads:
             own.initial_scale = self.targets.initial_scale
         self.report()
+
+    def _looks(
+        self, targets: HittingTimes, some: Sequence[int], enough: float, scaling: bool, bounding: bool
+    ) -> "list[_Look]":
+        """Solve each of `some`; one with an upper bound of at most `enough` no further than that."""
+        looks = []
+        for target in some:
+            j, count, lost = targets.open(target)
+            missing = 0 if lost is None else np.unique(targets.choices.underlying[lost]).size
+            bounds = targets.solve(j, count, self.tolerance, enough, self.spending)
+            times = j * bounds.high if bounding and lost is None and math.isfinite(bounds.high) else None
+            limited = bounds.limited and not bounds.meets(self.tolerance)
+            scale = targets.scale_of(j) if scaling else 1.0
+            lower = max(bounds.lower, targets.least)
+            looks.append(_Look(target, lower, bounds.upper, limited, missing, scale, times))
+        return looks
 
 
 def shortened(travel: HubBounds, times: np.ndarray, away: np.ndarray, spending: BudgetClock) -> Iterator[np.ndarray]:
@@ -493,41 +519,6 @@ class _Look:
     unreachable: int
     scale: float
     times: np.ndarray | None
-
-
-def _look(
-    targets: HittingTimes,
-    some: Sequence[int],
-    tolerance: float,
-    enough: float,
-    spending: BudgetClock,
-    scaling: bool,
-    bounding: bool,
-) -> list[_Look]:
-    """Solve each of `some`; one with an upper bound of at most `enough` no further than that."""
-    looks = []
-    for target in some:
-        j, count, lost = targets.open(target)
-        missing = 0 if lost is None else np.unique(targets.choices.underlying[lost]).size
-        bounds = targets.solve(j, count, tolerance, enough, spending)
-        times = j * bounds.high if bounding and lost is None and math.isfinite(bounds.high) else None
-        limited = bounds.limited and not bounds.meets(tolerance)
-        scale = targets.scale_of(j) if scaling else 1.0
-        looks.append(_Look(target, max(bounds.lower, targets.least), bounds.upper, limited, missing, scale, times))
-    return looks
-
-
-def _by_promise(targets: HittingTimes, wanted: np.ndarray, spending: BudgetClock) -> np.ndarray:
-    """The targets wanted, those first that are farthest from some node: a large hitting time, early, rules out
-    others."""
-    promise = np.zeros(len(wanted))
-    for target in np.flatnonzero(wanted):
-        if spending.is_over:
-            break
-        count = targets.distances(int(target))
-        promise[target] = targets.distance[targets.order[count - 1]] if count else 0
-    order = np.argsort(-promise, kind="stable")
-    return order[wanted[order]]
 
 
 # Stochastic eccentricity ----------------------------------------------------------------------------------------------

@@ -357,14 +357,20 @@ class SumSweep:
     def _fits(self, words: int) -> bool:
         return 24 * words * self.graph.num_nodes <= _BATCH_MEMORY
 
+    def _limit(self, words: int) -> int:
+        """How many searches at once `words` and the budget allow for."""
+        return int(min(64 * words, max(1, self.spending.budget.searches - self.spending.searches)))
+
+    def _farthest(self, upper: np.ndarray, words: int) -> np.ndarray:
+        """Open nodes, those of the largest upper bounds first, as many as are searched from at once."""
+        nodes = np.flatnonzero(np.greater(upper, self.best))
+        return nodes[np.argsort(-upper[nodes].astype(np.int64), kind="stable")[: self._limit(words)]]
+
     def _search_many(self, outward: bool, words: int) -> int:
         """The exact eccentricities of the open nodes with the largest upper bounds; table entries read, times words."""
         graph = self.graph
         upper, lower = (self.out_upper, self.out_lower) if outward else (self.in_upper, self.in_lower)
-        nodes = np.flatnonzero(np.greater(upper, self.best))
-        limit = int(min(64 * words, max(1, self.spending.budget.searches - self.spending.searches)))
-        if len(nodes) > limit:
-            nodes = np.sort(nodes[np.argsort(-upper[nodes].astype(np.int64), kind="stable")[:limit]])
+        nodes = np.sort(self._farthest(upper, words))
         sources = nodes.astype(graph.dtype)
         words = -(-len(sources) // 64)
         largest = np.empty(len(sources), np.int64)
@@ -391,7 +397,7 @@ class SumSweep:
         nodes = np.flatnonzero(np.greater(self.in_upper, self.best)).astype(graph.dtype)
         degrees = many_searches.num_successors(table, ends, graph.num_nodes)[nodes]
         order = nodes[np.lexsort((-self.in_upper[nodes].astype(np.int64), -degrees.astype(np.int64)))]
-        limit = int(min(64 * many_searches.WORDS, max(1, self.spending.budget.searches - self.spending.searches)))
+        limit = self._limit(many_searches.WORDS)
         blocked, active, arriving = (np.zeros(graph.num_nodes, np.bool_) for _ in range(3))
         sources = np.sort(many_searches.spread_out(table, ends, order, blocked, limit))
         origins, front, coming = (np.zeros((graph.num_nodes, many_searches.WORDS), np.uint64) for _ in range(3))
@@ -432,10 +438,7 @@ class SumSweep:
         is_tried = self._open()[0] and self._fits(1)
         clock = HiddenClock.of(self.graph, self.to, self.away) if is_tried else None
         while clock is not None and self._open()[0] and not self.spending.is_over:
-            nodes = np.flatnonzero(np.greater(self.in_upper, self.best))
-            words = _WORDS[-1] if self._fits(_WORDS[-1]) else 1
-            limit = int(min(64 * words, max(1, self.spending.budget.searches - self.spending.searches)))
-            targets = nodes[np.argsort(-self.in_upper[nodes].astype(np.int64), kind="stable")[:limit]]
+            targets = self._farthest(self.in_upper, _WORDS[-1] if self._fits(_WORDS[-1]) else 1)
             largest, _ = clock.largest_to(self.graph, targets, self.best)
             self.in_upper[targets] = largest
             self.best = max(self.best, int(largest.max()))

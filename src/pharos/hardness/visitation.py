@@ -130,15 +130,15 @@ def occupancy(
         raise ParameterError(f"tolerance is {tolerance!r}; expected a number above 0")
     total, largest = np.zeros(shape), np.zeros(shape)
     by_step, scale, steps, left = [], 1.0, 0, 0.0
-    for now, alive in walk.distributions():
+    for now, first, alive in walk.distributions():
         if walk.horizon is None:
             left = scale * alive / (1 - mdp.gamma)
             if left <= tolerance:
                 break
-        walk.record(now, executed, scale, total, largest)
+        walk.record(now, first, executed, scale, total, largest)
         if keep_all:
             each = np.zeros(shape)
-            walk.record(now, executed, 1.0, each, np.zeros(shape))
+            walk.record(now, first, executed, 1.0, each, np.zeros(shape))
             by_step.append(each)
         scale *= mdp.gamma
         steps += 1
@@ -252,7 +252,7 @@ class Walk:
 
         That is where the rules of later steps hold. Without states where play ends.
         """
-        start = next(self.distributions())[0].mass
+        start = next(self.distributions())[0]
         started, now = np.zeros(len(start)), np.zeros((len(start), self.width))
         if self.mdp.is_sticky:
             started += start[:, 0]
@@ -282,45 +282,35 @@ class Walk:
                 return started, visits, left
             before = left
 
-    def distributions(self) -> Iterator[tuple["Nodes", float]]:
-        """(distribution, probability that play goes on) at t = 0, 1, ...; T of them with a horizon.
+    def distributions(self) -> Iterator[tuple[np.ndarray, bool, float]]:
+        """(mass, whether it is the first step, probability that play goes on) at t = 0, 1, ...; T with a horizon.
 
-        Each is overwritten by later ones.
+        mass is (S, 1), or under sticky actions after the first step (S, A), by the previously executed action. Each is
+        overwritten by later ones.
         """
         states = self.mdp.num_states
         start = np.zeros((states, 1))
         np.add.at(start[:, 0], self.mdp.start_states, self.mdp.start_probabilities)
-        yield Nodes(start, True), float(start[self.live].sum())
+        yield start, True, float(start[self.live].sum())
         after, now = np.zeros((states, self.width)), np.zeros((states, self.width))
         alive = self._push(start, True, now)
         t = 1
         while self.horizon is None or t < self.horizon:
-            yield Nodes(now, False), alive
+            yield now, False, alive
             alive = self._push(now, False, after)
             now, after = after, now
             t += 1
 
-    def record(self, nodes: "Nodes", executed: bool, scale: float, total: np.ndarray, largest: np.ndarray) -> None:
+    def record(
+        self, mass: np.ndarray, first: bool, executed: bool, scale: float, total: np.ndarray, largest: np.ndarray
+    ) -> None:
         """Add the pairs (state, action) of one step."""
-        play = self.first if nodes.first else self.later
+        play = self.first if first else self.later
         weights = (play.chance if executed else Chance()).triple
-        kernels.record(self.live, play.policy, weights, nodes.mass, scale, total, largest)
+        kernels.record(self.live, play.policy, weights, mass, scale, total, largest)
 
     def _push(self, now: np.ndarray, first: bool, after: np.ndarray) -> float:
         return self.mdp.dynamics.move(self.first if first else self.later, now, after)
-
-
-@dataclass(frozen=True, eq=False)
-class Nodes:
-    """Where a policy is at one step.
-
-    Attributes:
-        mass: (S, 1), or under sticky actions after the first step (S, A), by the previously executed action.
-        first: whether it is the first step, without a previous action.
-    """
-
-    mass: np.ndarray
-    first: bool
 
 
 # Standard occupancy ---------------------------------------------------------------------------------------------------
@@ -497,12 +487,12 @@ def _occupied(mdp: TabularMDP, steps: int) -> tuple[np.ndarray, np.ndarray]:
     walk = Walk(mdp, None, steps)
     largest, total = np.zeros((mdp.num_states, walk.width)), np.zeros((mdp.num_states, walk.width))
     alone = np.zeros((0, 1))  # under sticky actions a start has no previous action: nodes of their own
-    for now, _ in walk.distributions():
-        if now.first and mdp.is_sticky:
-            alone = now.mass[walk.live]
+    for now, first, _ in walk.distributions():
+        if first and mdp.is_sticky:
+            alone = now[walk.live]
             continue
-        np.maximum(largest, now.mass, out=largest)
-        total += now.mass
+        np.maximum(largest, now, out=largest)
+        total += now
     most, often = (np.append(each[walk.live], alone) for each in (largest, total))
     return most[often > 0], often[often > 0]
 

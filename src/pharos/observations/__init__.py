@@ -21,7 +21,7 @@ from pharos.observations.vector import Index, OneHot, Vector
 from pharos.system import lazy
 
 if TYPE_CHECKING:
-    from pharos.observations.images import RENDERERS, ComplexImage, SimpleImage, render, renderers
+    from pharos.observations.images import RENDERERS, ComplexImage, SimpleImage, num_values, render, renderers
     from pharos.observations.memoryless import MemorylessLoss, memoryless_loss
     from pharos.observations.networks import Network, default_network, network_inputs, ntk, tangent_kernel
     from pharos.observations.observation import OwnObservation, imported, observation_of, own_observation

@@ -31,7 +31,7 @@ from pharos.observations.observation import Observation, hidden_names, in_blocks
 
 
 def num_values(layer: Layer) -> int:
-    """Number of values that a plane of this layer may have besides 0."""
+    """Number of values of a layer's plane, besides 0, that look different; higher ones look like the last."""
     colors = len(layer.color) if np.ndim(layer.color) == 2 else 1
     sprites = len(layer.sprite) if layer.sprite is not None and not isinstance(layer.sprite[0], str) else 1
     return max(len(layer.glyph), colors, sprites)

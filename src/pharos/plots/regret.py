@@ -183,12 +183,8 @@ def _line(
 ) -> None:
     axis.plot(steps, values.mean(axis=0), color=color, label=label)
     if len(values) > 1:
-        low, high = bootstrap_interval([values.T], _mean, confidence=confidence, resamples=resamples)
+        low, high = bootstrap_interval([values.T], np.mean, confidence=confidence, resamples=resamples)
         axis.fill_between(steps, low, high, color=color, alpha=0.18, linewidth=0)
-
-
-def _mean(values: np.ndarray, axis: int) -> np.ndarray:
-    return values.mean(axis=axis)
 
 
 # Predictions ----------------------------------------------------------------------------------------------------------

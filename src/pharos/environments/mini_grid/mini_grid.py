@@ -6,6 +6,7 @@ Source: Chevalier-Boisvert et al. (2023), "Minigrid & Miniworld"; the package mi
 import re
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -271,10 +272,11 @@ class MiniGrid(Environment):
         """The grid as numbers."""
         return level_of(self.layout)
 
-    @property
-    def cells(self) -> np.ndarray:
-        """(rows, columns) int64: FREE, WON, LOST, BLOCKED, or DOOR + the number of a door."""
-        return self.parsed.cells
+    cells = property(attrgetter("parsed.cells"))  # these five as in `Level`
+    door_colors = property(attrgetter("parsed.door_colors"))
+    things = property(attrgetter("parsed.things"))
+    target_door = property(attrgetter("parsed.target_door"))
+    target_thing = property(attrgetter("parsed.target_thing"))
 
     @property
     def width(self) -> int:
@@ -284,27 +286,7 @@ class MiniGrid(Environment):
     @property
     def num_doors(self) -> int:
         """Doors of the layout."""
-        return len(self.parsed.door_colors)
-
-    @property
-    def door_colors(self) -> np.ndarray:
-        """(doors,) int64: numbers of `COLORS`."""
-        return self.parsed.door_colors
-
-    @property
-    def things(self) -> np.ndarray:
-        """(things, 4) int64: row, column, kind and colour at the start."""
-        return self.parsed.things
-
-    @property
-    def target_door(self) -> int:
-        """The door that has to be opened; -1: none."""
-        return self.parsed.target_door
-
-    @property
-    def target_thing(self) -> int:
-        """The thing that has to be picked up; -1: none."""
-        return self.parsed.target_thing
+        return len(self.door_colors)
 
     @property
     def max_episode_steps(self) -> int:  # type: ignore[override]
