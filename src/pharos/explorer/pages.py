@@ -93,7 +93,7 @@ def heat_map(
     questions = [("axis", x, axes), ("axis", y, axes), ("summary", how, HOW), ("quantity", what, quantities(world))]
     for kind, name, choices in [*questions, *(("variable", name, names) for name in fixed)]:
         if name not in choices:
-            raise UnchoicesName(kind, name, choices)
+            raise UnknownName(kind, name, choices)
     if x == y:
         raise ParameterError(f"both axes are {x!r}; expected two of {', '.join(axes)}")
     across, down = axes[x], axes[y]
