@@ -1,8 +1,5 @@
 """From hardness and regret to the paper's models, figures and tables."""
 
-import importlib
-from typing import Any
-
 from pharos.study.analysis import (
     Comparison,
     Models,
@@ -25,9 +22,11 @@ from pharos.study.logs import LOGGERS, RunLog, log
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study.report import StudyReport, report
 from pharos.study.specification import presets, specification
-from pharos.study.statistics import Estimate, interquartile_mean, stratified_interval
+from pharos.study.statistics import interquartile_mean
 from pharos.study.tables import cells, curves, hardness_table, paper_instance, predict, table
 from pharos.training import run_id
+from pharos.validation import outcomes, read_predictions, write_predictions
+from pharos.validation import unseen_classes as validation
 
 __all__ = [
     "Models",
@@ -57,20 +56,7 @@ __all__ = [
     "validation",
 ]
 _shared = """
-    Comparison Estimate Fit LOGGERS RunLog Status aggregate_r_squared fit_models has_regret interquartile_mean intervals
+    Comparison Fit LOGGERS RunLog Status aggregate_r_squared fit_models has_regret interquartile_mean intervals
     leave_one_class_out_r_squared mean_curve opened paper_agreement paper_instance paper_regressions paper_returns
-    read_predictions run_id run_on_ray stratified_interval write_predictions
+    read_predictions run_id run_on_ray write_predictions
 """
-# Functions of pharos.validation, under the names that they have in studies.
-_VALIDATION = {
-    "outcomes": "outcomes",
-    "read_predictions": "read_predictions",
-    "validation": "unseen_classes",
-    "write_predictions": "write_predictions",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _VALIDATION:
-        raise AttributeError(f"module 'pharos.study' has no attribute {name!r}")
-    return getattr(importlib.import_module("pharos.validation"), _VALIDATION[name])

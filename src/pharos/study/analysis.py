@@ -21,7 +21,7 @@ from pharos.study.regression import (
     fit_models,
     leave_one_class_out_r_squared,
 )
-from pharos.study.statistics import mean_of_means, stratified_interval
+from pharos.study.statistics import interquartile_mean, mean_of_means
 from pharos.study.tables import paper_instance
 from pharos.training import bootstrap_interval
 
@@ -132,11 +132,11 @@ def intervals(rows: "pd.DataFrame", *, resamples: int = 1000) -> "pd.DataFrame":
         if len(defined) == 0:
             continue
         tasks = [task["normalized_regret"].to_numpy(float) for _, task in defined.groupby(["instance", "chance"])]
-        estimate = stratified_interval(tasks, resamples=resamples)
+        lower, upper = bootstrap_interval(tasks, interquartile_mean, resamples=resamples)
         line = dict(zip(("environment", "agent", "observation"), key, strict=True))
         line |= {"tasks": len(tasks), "runs": len(defined)}
-        ends = (estimate.lower, estimate.upper) if max(map(len, tasks)) > 1 else (float("nan"),) * 2
-        lines.append(line | {"iqm": estimate.value, "lower": ends[0], "upper": ends[1]})
+        ends = (float(lower), float(upper)) if max(map(len, tasks)) > 1 else (float("nan"),) * 2
+        lines.append(line | {"iqm": float(interquartile_mean(*tasks)), "lower": ends[0], "upper": ends[1]})
     columns = ["environment", "agent", "observation", "tasks", "runs", "iqm", "lower", "upper"]
     return pd.DataFrame(lines, columns=columns)
 

@@ -221,7 +221,7 @@ def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> b
     """Whether the run was added: a finished one that is there already stays."""
     target = place / "partial" / id
     storage.remove_leftovers(target)
-    if _worker.read_status(place, id) == _worker.FINISHED:
+    if _worker.read_status(place / "runs" / id) == _worker.FINISHED:
         return False
     partial = storage.temporary_path(target)
     partial.mkdir(parents=True)

@@ -132,15 +132,20 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class ObservationEntry(_Part):
-    """An observation and its options."""
+class _Named(_Part):
+    """What has a name; of one's own it is looked for in a folder."""
 
     name: str
-    options: dict[str, Any] = {}
     _folder: Path | None = PrivateAttr(None)
 
     def model_post_init(self, context: Any) -> None:
         self._folder = (context or {}).get("folder") if is_reference(self.name) else None
+
+
+class ObservationEntry(_Named):
+    """An observation and its options."""
+
+    options: dict[str, Any] = {}
 
     @field_validator("name")
     @classmethod
@@ -157,18 +162,13 @@ class ObservationEntry(_Part):
         return own_observation(self.name, self._folder)
 
 
-class EnvironmentEntry(_Part):
+class EnvironmentEntry(_Named):
     """An environment: a name that `pharos.make` knows, and parameters; the class it counts as, if not its own; and what
     is seen of it, if not what its block says."""
 
-    name: str
     parameters: dict[str, Any] = {}
     family: str = Field("", pattern=NAME)
     observations: list[Annotated[ObservationEntry, BeforeValidator(_entry)]] | None = Field(None, min_length=1)
-    _folder: Path | None = PrivateAttr(None)
-
-    def model_post_init(self, context: Any) -> None:
-        self._folder = (context or {}).get("folder") if is_reference(self.name) else None
 
     @cached_property
     def instance(self) -> Environment:

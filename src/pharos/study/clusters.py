@@ -88,7 +88,7 @@ def submit(
 
 def _has_work(runs: Iterable[Run], place: Path, retry_failed: bool) -> bool:
     over = ("finished",) if retry_failed else ("finished", "failed")
-    return any(_worker.read_status(place, run.id) not in over for run in runs)
+    return any(_worker.read_status(place / "runs" / run.id) not in over for run in runs)
 
 
 def run_shard(folder: str, options: dict[str, Any]) -> dict[str, Any]:

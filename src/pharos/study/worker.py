@@ -35,10 +35,10 @@ BatchRunner = Callable[[Sequence[Mapping[str, Any]], Sequence[Path], Path], Sequ
 """runner(configs, folders, folder for checkpoints) -> for each run None, or why it failed."""
 
 
-def read_status(folder: Path, id: str) -> str | None:
-    """`finished` or `failed`; None where the run has no folder yet, or a damaged record."""
+def read_status(folder: Path) -> str | None:
+    """`finished` or `failed`; None where a run has no folder yet, or a damaged record."""
     try:
-        record = read_record(folder / "runs" / id)
+        record = read_record(folder)
     except FileFormatError:
         return None
     return None if record is None else str(record["status"])
@@ -95,10 +95,10 @@ def attempt(
             except FolderLocked:
                 ends[id] = BUSY
                 continue
-            done = read_status(folder, id)
+            done = read_status(folder / "runs" / id)
             if done == FINISHED or (done == FAILED and id not in again):
                 ends[id] = done
-            elif is_complete(partial):  # its process was killed before it could publish it
+            elif read_status(partial) == FINISHED:  # its process was killed before it could publish it
                 training.clear_run(partial)
                 publish(partial, folder, id)
             else:
@@ -108,7 +108,7 @@ def attempt(
                 todo.append((config, id, partial))
         if todo:
             _execute(runner, todo, folder)
-        return [ends.get(id) or read_status(folder, id) or FAILED for id in ids]
+        return [ends.get(id) or read_status(folder / "runs" / id) or FAILED for id in ids]
 
 
 def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, Path]], folder: Path) -> None:
@@ -125,7 +125,7 @@ def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, P
         shutil.copyfile(first / "log.txt", place / "log.txt")
     seconds = (time.perf_counter() - began) / len(todo)
     for (config, id, place), reason in zip(todo, errors, strict=True):
-        if not is_complete(place):
+        if read_status(place) != FINISHED:
             missing = "the runner returned without a finished run.json and a curve.parquet"
             write_failure(place, config, id, reason or missing, seconds)
         publish(place, folder, id)
@@ -169,15 +169,6 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def is_complete(partial: Path) -> bool:
-    """Whether the folder of a run has a finished result."""
-    try:
-        record = read_record(partial)
-    except FileFormatError:  # cut short
-        return False
-    return record is not None and record["status"] == FINISHED
 
 
 @contextlib.contextmanager
