@@ -98,7 +98,7 @@ def test_tutorials_run_as_scripts(path, tmp_path):
     assert done.stdout == "".join("".join(output["text"]) for output in shown)
 
 
-FRAGMENTS = {"format.md", "large-runs.md", "troubleshooting.md"}  # the first is run by test_format_page.py
+FRAGMENTS = {"format.md", "large-runs.md"}  # the first is run by test_format_page.py
 SCRIPTS_OF_PAGES = [page for page in PAGES if BLOCK.search(page.read_text()) and page.name not in FRAGMENTS]
 LAKE_STUDY = """
 name: lakes
