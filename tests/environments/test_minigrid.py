@@ -89,6 +89,7 @@ def test_key_corridor_has_its_published_values(remember):
 def test_the_table_and_the_environment_agree_at_every_step_of_walks(name):
     env = FullyObsWrapper(gymnasium.make(name, disable_env_checker=True, max_steps=10**6))
     mdp, grids, _ = minigrid_recording(name, seed=3)
+    assert (importers.minigrid_grids(name, seed=3) == grids).all()
     assert len(grids) == mdp.num_states
     best = pharos.value_iteration(mdp.with_gamma(0.9).with_horizon(None)).policy
     rng = np.random.default_rng(0)

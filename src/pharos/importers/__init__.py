@@ -10,6 +10,7 @@ from pharos.importers.gymnasium import (
     gymnasium_outcomes,
     matrices,
     minigrid,
+    minigrid_grids,
     minigrid_recording,
 )
 
@@ -22,6 +23,7 @@ __all__ = [
     "load",
     "matrices",
     "minigrid",
+    "minigrid_grids",
     "save",
     "storm",
     "storm_recording",

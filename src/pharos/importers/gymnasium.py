@@ -339,6 +339,23 @@ def minigrid_recording(
     return TabularMDP.from_arrays(table, rewards, gamma=1.0, horizon=horizon), grids, names
 
 
+def minigrid_grids(
+    env: object,
+    *,
+    seed: int = 0,
+    actions: Sequence[int] | None = None,
+    max_states: int = MOST_STATES,
+    remember_carried: bool = False,
+) -> np.ndarray:
+    """Return what one sees of each state of `minigrid` with the same arguments, as `minigrid_recording` gives it.
+
+    Args, errors and cost: as of `minigrid`.
+    """
+    driver = _Driver(env, seed, remember_carried)
+    driver.explore(actions, max_states)
+    return np.stack([driver.image(state) for state in driver.snapshots])
+
+
 class _Driver:
     """An environment that can be put into any state that it has been in."""
 
