@@ -17,7 +17,7 @@ import yaml
 
 import pharos
 from pharos import errors
-from pharos.system import lazy
+from pharos.system import compiling, lazy
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -221,3 +221,17 @@ def _is_there(module, name):
         return hasattr(importlib.import_module(module), name) or bool(importlib.util.find_spec(f"{module}.{name}"))
     except ModuleNotFoundError:
         return False
+
+
+def test_kernels_compiled_of_other_texts_are_forgotten(tmp_path, monkeypatch):
+    """Whichever file of the folder has changed: one kernel may call another one's."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    (tmp_path / "called.py").write_text("1")
+    (tmp_path / "__pycache__").mkdir()
+    index = tmp_path / "__pycache__" / "caller.function.nbi"
+    for change, is_kept in ((None, False), (None, True), ("22", False), (None, True)):
+        if change:
+            (tmp_path / "called.py").write_text(change)
+        index.touch()
+        compiling.prepare(tmp_path)
+        assert index.exists() == is_kept

@@ -22,6 +22,9 @@ from pharos.system.storage import compiled_folders
 SMALL = 1 << 16
 """Entries below which rules and kernels are interpreted, as compiling takes longer (benchmarks/startup.py); 0: none."""
 
+SOURCES = "sources.json"
+"""Names, times and sizes of the files whose kernels lie compiled beside it."""
+
 _lock = threading.Lock()
 _total, _running, _began = 0.0, 0, 0.0
 is_told = False
@@ -67,7 +70,20 @@ def prepare(kernels: Path) -> None:
         os.environ["NUMBA_CACHE_DIR"] = str(
             private_folder(storage.cache_directory()) or storage.temporary_folder("pharos-")
         )
+    if not os.environ.get("NUMBA_CACHE_DIR"):
+        _forget_outdated(kernels)
     _listen()
+
+
+def _forget_outdated(kernels: Path) -> None:
+    """Delete what was compiled of other texts: Numba looks at a kernel's own file, not at those of what it calls."""
+    files = [(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in sorted(kernels.glob("*.py"))]
+    text, compiled = storage.json_text(files), kernels / "__pycache__"
+    with contextlib.suppress(OSError):  # of a process that does the same at the same time
+        if not (compiled / SOURCES).is_file() or (compiled / SOURCES).read_text() != text:
+            for index in compiled.glob("*.nbi"):
+                index.unlink()
+            storage.replace_file(compiled / SOURCES, text, durable=False)
 
 
 def _can_be_written(folder: Path) -> bool:
