@@ -26,7 +26,3 @@ __all__ = [
     "QLearning",
     "hyperparameters",
 ]
-_shared = """
-    AGENTS AgentKind BATCHED Q_LEARNING_DEFAULTS TABULAR_OBSERVATION agent_kind agent_source algorithm batched
-    check_hyperparameters extractor is_known joined_states make_model state_of
-"""

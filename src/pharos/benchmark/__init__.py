@@ -45,9 +45,5 @@ __all__ = [
     "submit",
     "verify",
 ]
-_shared = """
-    Audit AxisComparison Difference Interval benchmark_board make_audit make_commitment sealed_copies
-    sealed_instances season_seed write_suite
-"""
 
 __getattr__ = lazy.attributes(__name__)

@@ -31,9 +31,5 @@ __all__ = [
     "submit",
     "verify",
 ]
-_shared = """
-    Board Cell Check Claim Entry Limits Ranking Verdict check_ending check_values in_file read_sealed reason
-    stored_table write_checked write_page write_sealed
-"""
 
 __getattr__ = lazy.attributes(__name__)

@@ -55,11 +55,5 @@ __all__ = [
     "random_actions",
     "sticky_actions",
 ]
-_shared = """
-    BEST BellmanEquation ChanceSetting Dynamics ExpandedMDP Extreme Lazy Matrices Minimization OutcomeTable Outcomes
-    PaidOutcomes Part PolicyStep PolicyTable Rewards STEPS Selection Table WORST check_horizon chosen_mass count_of
-    executed_actions mass_of mean_of_actions nodes_of_outcomes outcomes_of paid_outcomes ranged_rewards require_mdp
-    rewards_of_outcomes rewards_of_space rewards_of_staying runs_between runs_of shares_of whole_number
-"""
 
 __getattr__ = lazy.attributes(__name__)

@@ -30,8 +30,3 @@ from pharos.policies.value import (
 __all__ = [
     "evaluate_policy",
 ]
-_shared = """
-    DeepPolicy Evaluation Model Policy PolicyAnswers PolicyLike QueriedPolicy ReachableRows ReachedSolution
-    RecurrentPolicy Sight TableAnswers TabularAgent deep_policy is_small_table is_walk policy_function policy_value
-    reachable_rows table_values walk_values
-"""

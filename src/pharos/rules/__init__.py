@@ -16,9 +16,4 @@ if TYPE_CHECKING:
     from pharos.rules.rules import Rules, not_compiled, rules_of
     from pharos.rules.stepping import InterpretedStepping
 
-_shared = """
-    CompiledDrawing CompiledExploration CompiledMotion InterpretedStepping Layout Rules fingerprint_of_rules
-    layout_of mutable_attributes not_compiled pack reason_of refused_reward rules_of unpack
-"""
-
 __getattr__ = lazy.attributes(__name__)

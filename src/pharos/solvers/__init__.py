@@ -17,7 +17,3 @@ __all__ = [
     "uniform_value",
     "value_iteration",
 ]
-_shared = """
-    ReferenceValues TablePolicy cumulative_expected_regret evaluate_apart regret regret_scale uniform_policy
-    worst_value
-"""

@@ -11,6 +11,3 @@ __all__ = [
     "build",
     "load",
 ]
-_shared = """
-    cached_folder is_of_state_space read_manifest
-"""

@@ -55,8 +55,3 @@ __all__ = [
     "unpack",
     "validation",
 ]
-_shared = """
-    Comparison Fit LOGGERS RunLog Status aggregate_r_squared fit_models has_regret interquartile_mean intervals
-    leave_one_class_out_r_squared mean_curve opened paper_agreement paper_instance paper_regressions paper_returns
-    read_predictions run_id run_on_ray write_predictions
-"""

@@ -54,10 +54,5 @@ __all__ = [
     "train_many",
     "tune",
 ]
-_shared = """
-    CELL Curve ENGINES ExecutionOptions FailedRun Horizon Progress SPACES TaskCache TaskValues TuningResult
-    bootstrap_interval check_agent clear_run digest_of_curve read_curve read_curve_table read_record read_rows
-    read_table run_id train_parts versions write_curve write_policy write_record write_table
-"""
 
 __getattr__ = lazy.attributes(__name__)

@@ -32,7 +32,3 @@ __all__ = [
     "regret_predictor",
     "unseen_classes",
 ]
-_shared = """
-    Cells OUTCOMES POLICY_CURVES POLICY_PREDICTORS PREDICTORS PRIMARY PredictedCells PredictedRegret Predictions
-    SAMPLED_PREDICTORS class_predictions predicted read_predictions write_predictions
-"""
