@@ -224,7 +224,8 @@ def last_policy_by_place(run, world, words):
     value, values = record["result"]["final_value"], RegretCurve.read(run).values
     entry = leaderboard.submit(run, run / "entry.safetensors")
     try:
-        of_learner = representation.Learner(task.mdp, hardness.Schedule(steps=10), 4).regret(value)
+        alone = representation.Representation.of_matrix(np.eye(task.mdp.num_states))
+        of_learner = representation.Learner(task.mdp, alone, hardness.Schedule(steps=10), 4).regret(value)
     except UndefinedMeasure:
         of_learner = math.nan
     return {
