@@ -10,6 +10,7 @@ same curve file.
 """
 
 import os
+import signal
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -241,7 +242,9 @@ def _train_part(
     device: str,
     tell: ProgressCallback,
 ) -> None:
-    """What a process does: it tells how far it is."""
+    """What a process does: it tells how far it is, and ends at once where it is told to, as it has nothing to give back
+    and whoever repeats the call wants its locks."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     configs, folders = zip(*entries, strict=True)
     members = TaskCache(trust=True, device=device)  # of code that the process which started this one has imported
     train_configs(configs, folders, checkpoints=checkpoints, progress=tell, members=members)
