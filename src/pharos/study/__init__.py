@@ -1,5 +1,7 @@
 """From hardness and regret to the paper's models, figures and tables."""
 
+from typing import TYPE_CHECKING
+
 from pharos.study.analysis import (
     Comparison,
     Models,
@@ -24,9 +26,12 @@ from pharos.study.report import StudyReport, report
 from pharos.study.specification import presets, specification
 from pharos.study.statistics import interquartile_mean
 from pharos.study.tables import cells, curves, hardness_table, paper_instance, predict, table
+from pharos.system import lazy
 from pharos.training import run_id
-from pharos.validation import outcomes, read_predictions, write_predictions
-from pharos.validation import unseen_classes as validation
+
+if TYPE_CHECKING:  # loaded where they are asked for
+    from pharos.validation import outcomes, read_predictions, write_predictions
+    from pharos.validation import unseen_classes as validation
 
 __all__ = [
     "Models",
@@ -55,3 +60,5 @@ __all__ = [
     "unpack",
     "validation",
 ]
+
+__getattr__ = lazy.attributes(__name__)

@@ -24,16 +24,17 @@ def attributes(package: str) -> Callable[[str], object]:
     """
 
     @functools.cache
-    def modules() -> dict[str, str]:
+    def places() -> dict[str, tuple[str, str]]:
         tree = ast.parse(Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8"))
         blocks = [node for node in tree.body if isinstance(node, ast.If)]
         imports = [node for block in blocks for node in block.body if isinstance(node, ast.ImportFrom)]
-        return {alias.name: str(node.module) for node in imports for alias in node.names}
+        return {alias.asname or alias.name: (str(node.module), alias.name) for node in imports for alias in node.names}
 
     def attribute(name: str) -> object:
-        if name.startswith("__") or name not in modules():
+        if name.startswith("__") or name not in places():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(modules()[name]), name)
+        module, name_there = places()[name]
+        value = getattr(importlib.import_module(module), name_there)
         setattr(sys.modules[package], name, value)
         return value
 
