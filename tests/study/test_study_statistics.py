@@ -109,6 +109,20 @@ def test_a_row_that_alone_determines_a_coefficient_has_no_influence_and_no_warni
     assert (np.isnan(found.influence) == alone).all()
 
 
+@pytest.mark.parametrize("function", [fit_models, leave_one_class_out_r_squared])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.drop(columns="diameter"), "no column 'diameter'"),
+        (lambda t: t.assign(diameter=0.0), "values <= 0"),
+        (lambda t: t.assign(regret=np.nan), "not finite"),
+    ],
+)
+def test_unusable_tables_get_a_clear_error(function, change, message):
+    with pytest.raises(ParameterError, match=message):
+        function(change(study_table(noise=0.5)))
+
+
 def test_too_few_rows_have_no_model_and_a_line_says_so():
     fits, notes = fit_models(study_table(noise=0.5).iloc[:5])
     assert not fits and "the single model of all has 5 rows; needs at least" in notes[0]

@@ -70,7 +70,11 @@ def fit_models(rows: "pd.DataFrame", measures: Sequence[str] = MEASURES) -> tupl
 
     Returns:
         The models that there are enough rows for, and a line for each other and for predictors that are left out.
+    Raises:
+        ParameterError: a column is missing, a number is not finite, or a measure is not positive (its logarithm is
+            needed).
     """
+    rows = _checked(rows, measures)
     kinds: list[tuple[str, str, pd.DataFrame, list[str]]] = [("single", "all", rows, ["observation", "environment"])]
     for model, column, other in (
         ("representation", "observation", "environment"),
@@ -185,10 +189,11 @@ def leave_one_class_out_r_squared(rows: "pd.DataFrame", measures: Sequence[str] 
     Returns:
         NaN where all regrets are the same.
     Raises:
-        ParameterError: there is one class alone.
+        ParameterError: a table that `fit_models` refuses, or there is one class alone.
     """
     import statsmodels.formula.api as smf
 
+    rows = _checked(rows, measures)
     predicted = np.empty(len(rows))
     for environment in rows["environment"].unique():
         inside = (rows["environment"] == environment).to_numpy()
@@ -199,6 +204,24 @@ def leave_one_class_out_r_squared(rows: "pd.DataFrame", measures: Sequence[str] 
         predicted[inside] = result.predict(rows[inside])
     actual = rows["regret"].to_numpy(float)
     return r_squared(actual, actual - predicted)
+
+
+def _checked(data: "pd.DataFrame", measures: Sequence[str]) -> "pd.DataFrame":
+    for column in ("environment", "observation", "regret", *measures):
+        if column not in data.columns:
+            raise ParameterError(
+                f"the study's table has no column {column!r}; found {', '.join(map(str, data.columns))}"
+            )
+    for column in ("regret", *measures):
+        values = data[column].to_numpy(float)
+        if not np.isfinite(values).all():
+            raise ParameterError(
+                f"column {column!r} has {int((~np.isfinite(values)).sum())} values that are not finite"
+            )
+    for column in measures:
+        if (data[column] <= 0).any():
+            raise ParameterError(f"column {column!r} has values <= 0; the models take its logarithm")
+    return data.reset_index(drop=True)
 
 
 def _independent(rows: "pd.DataFrame", predictors: Sequence[str]) -> tuple[list[str], int, list[str]]:
