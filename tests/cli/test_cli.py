@@ -430,13 +430,18 @@ def test_what_fails_is_one_line_and_exit_code_1(failure, tmp_path):
     [
         (KeyboardInterrupt(), 130, "interrupted"),
         (EOFError("Ran out of input"), 1, "a file ended too early (Ran out of input); if it is compiled code, delete "),
-        (PermissionError(13, "Permission denied", "/somewhere"), 1, "pharos: /somewhere: Permission denied\n"),
     ],
 )
 def test_what_ends_a_build_is_one_line_with_its_exit_code(failure, monkeypatch, raised, code, said):
     monkeypatch.setattr("pharos.state_space.build", failing(raised))
     found, line = failure("build", "simple_grid")
     assert found == code and said in line
+
+
+def test_a_full_or_forbidden_disk_is_one_line(failure, monkeypatch):
+    error = PermissionError(13, "Permission denied", "/somewhere")
+    monkeypatch.setattr("pharos.state_space.build", failing(error))
+    assert failure("build", "simple_grid") == (1, "pharos: /somewhere: Permission denied\n")
 
 
 # As a process --------------------------------------------------------------------------------------------------------

@@ -228,6 +228,36 @@ def test_slippery_frozen_lake_is_solved_as_quantecon_solves_it(size, expected, t
     assert abs(reached.value_at_start - expected) < 1e-6
 
 
+@pytest.mark.parametrize("size", [4, 8])
+def test_slippery_ice_is_four_thirds_of_uniform_minus_a_third_of_the_opposite_action(size):
+    """The formula of random_actions(p) with p = 4/3 and the opposite action: a law, but no mixture for any p in [0,
+    1].
+    """
+    table, _, ends = our_law(pharos.make("frozen_lake", size=size))
+    opposite = table[:, [2, 3, 0, 1]]
+    uniform = table.mean(axis=1, keepdims=True)
+    slippery, _, _ = gymnasium_law(size, slippery=True)
+    np.testing.assert_allclose((4 / 3 * uniform - opposite / 3)[~ends], slippery[~ends], atol=1e-12)
+
+
+@pytest.mark.parametrize("p", [0.0, 0.3, 1.0])
+def test_under_the_uniform_policy_slippery_ice_and_random_actions_are_the_same(p):
+    table, _, ends = our_law(pharos.make("frozen_lake"))
+    slippery, _, _ = gymnasium_law(4, slippery=True)
+    randomized = (1 - p) * table + p * table.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(randomized.mean(axis=1)[~ends], slippery.mean(axis=1)[~ends], atol=1e-12)
+
+
+def test_no_random_actions_come_nearer_to_slippery_ice_than_a_sixth():
+    table, _, ends = our_law(pharos.make("frozen_lake"))
+    slippery, _, _ = gymnasium_law(4, slippery=True)
+    uniform = table.mean(axis=1, keepdims=True)
+    shares = np.linspace(0, 1, 301)
+    distances = [abs(((1 - p) * table + p * uniform - slippery)[~ends]).max() for p in shares]
+    assert min(distances) == pytest.approx(1 / 6)
+    assert shares[int(np.argmin(distances))] == pytest.approx(2 / 3)
+
+
 def test_random_maps_are_solvable_reproducible_and_differ():
     maps, again = (
         [pharos.make("frozen_lake", size=6, seed=seed, frozen_probability=0.6).tiles for seed in range(20)]

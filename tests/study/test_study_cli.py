@@ -62,7 +62,10 @@ def test_show_counts_the_runs(folder):
     ("arguments", "message"),
     [
         (("run", "lak.yaml"), "pharos: unknown study (no such file, and no such preset) 'lak.yaml'"),
-        (("run", "lake.yaml", "--shard", "3/2"), "shard is '3/2'; expected i/n with i from 1 to n, such as 1/8"),
+        (
+            ("run", "lake.yaml", "--shard", "3/2"),
+            "pharos: shard is '3/2'; expected i/n with i from 1 to n, such as 1/8",
+        ),
         (("run", "lake.yaml", "--on", "moon"), "pharos: unknown place to run on 'moon'; known: local, ray, slurm"),
         (("report", "lake.yaml", "--out", "nowhere"), "no run of 'lake' is finished; execute `pharos study run` first"),
     ],
