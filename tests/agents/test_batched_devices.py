@@ -85,7 +85,7 @@ def test_a_batch_elsewhere_goes_on_from_its_state_bit_for_bit(agent):
 def test_convolutions_side_by_side_are_those_run_by_run(monkeypatch):
     generator = torch.Generator().manual_seed(0)
     parameters = networks.Parameters()
-    layer = networks.Convolution(parameters, "c", (2, 12, 12), 5, 4, 2, 1 / 255)
+    layer = networks.ConvolutionLayer(parameters, "c", (2, 12, 12), 5, 4, 2, 1 / 255)
     rows = torch.randn(3, parameters.length, generator=generator)
     values, x = parameters.views(rows), 255 * torch.rand(3, 4, layer.inputs, generator=generator)
     dy, answers = torch.randn(3, 4, layer.outputs, generator=generator), []

@@ -23,7 +23,7 @@ from pharos.benchmark.contents import (
 )
 from pharos.benchmark.latex import latex_of
 from pharos.benchmark.page import page
-from pharos.benchmark.scores import Interval
+from pharos.benchmark.scores import ConfidenceInterval
 from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite
 from pharos.errors import ParameterError
 
@@ -242,13 +242,13 @@ def test_a_predictor_that_there_is_not_is_refused():
 @pytest.mark.parametrize(
     ("frontier", "text"),
     [
-        (Interval(9.43, 8.31, 10.77), "9.43 bits (8.31 to 10.8)"),
-        (Interval(9.43), "9.43 bits"),
-        (Interval(9.43, -math.inf, math.inf), "9.43 bits (below the ladder to beyond the ladder)"),
-        (Interval(24.0, 24.0, math.inf, "above"), "beyond 24 bits"),
-        (Interval(24.0, 19.0, math.inf, "above"), "beyond 24 bits (19 or more)"),
-        (Interval(6.0, -math.inf, 6.0, "below"), "below 6 bits"),
-        (Interval(6.0, -math.inf, 7.0, "below"), "below 6 bits (7 or less)"),
+        (ConfidenceInterval(9.43, 8.31, 10.77), "9.43 bits (8.31 to 10.8)"),
+        (ConfidenceInterval(9.43), "9.43 bits"),
+        (ConfidenceInterval(9.43, -math.inf, math.inf), "9.43 bits (below the ladder to beyond the ladder)"),
+        (ConfidenceInterval(24.0, 24.0, math.inf, "above"), "beyond 24 bits"),
+        (ConfidenceInterval(24.0, 19.0, math.inf, "above"), "beyond 24 bits (19 or more)"),
+        (ConfidenceInterval(6.0, -math.inf, 6.0, "below"), "below 6 bits"),
+        (ConfidenceInterval(6.0, -math.inf, 7.0, "below"), "below 6 bits (7 or less)"),
     ],
 )
 def test_frontiers_in_words(frontier, text):
@@ -391,8 +391,11 @@ def test_regret_without_clipping_is_said_only_where_it_differs():
 
 
 def test_zero_has_no_sign():
-    assert number(Interval(-0.001, -0.004, 0.02), "+.2f") == "+0.00 (+0.00 to +0.02)"
-    assert number(Interval(-0.0)) == "0.00" and number(Interval(-0.006, -0.2, 0.0)) == "-0.01 (-0.20 to 0.00)"
+    assert number(ConfidenceInterval(-0.001, -0.004, 0.02), "+.2f") == "+0.00 (+0.00 to +0.02)"
+    assert (
+        number(ConfidenceInterval(-0.0)) == "0.00"
+        and number(ConfidenceInterval(-0.006, -0.2, 0.0)) == "-0.01 (-0.20 to 0.00)"
+    )
 
 
 @pytest.mark.parametrize(("exact", "text"), [((1, 1), "exact on all tasks"), ((1, 0), "exact on 1 of 2 tasks, else")])

@@ -14,7 +14,7 @@ from command_line import run
 from naive import benchmark as naive
 from pharos.benchmark import AgentResults, compare, load_suite, power
 from pharos.benchmark.comparison import frontier_difference, holm, least_difference
-from pharos.benchmark.scores import Interval
+from pharos.benchmark.scores import ConfidenceInterval
 from pharos.errors import ParameterError
 from small_benchmark import CORE, RUNGS, constant, drawn, small_suite
 
@@ -113,13 +113,13 @@ def test_holm_passes_over_what_is_not_a_number():
 
 
 def test_differences_of_frontiers_beyond_the_ladder():
-    inside, above = Interval(5.0, 4.0, 6.5), Interval(8.0, 7.0, math.inf, "above")
-    assert frontier_difference(above, inside) == Interval(3.0, 3 - math.hypot(1, 1.5), math.inf, "above")
-    assert frontier_difference(inside, above) == Interval(-3.0, -math.inf, -3 + math.hypot(1.5, 1), "below")
+    inside, above = ConfidenceInterval(5.0, 4.0, 6.5), ConfidenceInterval(8.0, 7.0, math.inf, "above")
+    assert frontier_difference(above, inside) == ConfidenceInterval(3.0, 3 - math.hypot(1, 1.5), math.inf, "above")
+    assert frontier_difference(inside, above) == ConfidenceInterval(-3.0, -math.inf, -3 + math.hypot(1.5, 1), "below")
     both = frontier_difference(above, above)
     assert math.isnan(both.value) and (both.low, both.high) == (-math.inf, math.inf)
-    below = Interval(1.0, -math.inf, 2.0, "below")
-    assert frontier_difference(inside, below) == Interval(4.0, 4 - math.hypot(1, 1), math.inf, "above")
+    below = ConfidenceInterval(1.0, -math.inf, 2.0, "below")
+    assert frontier_difference(inside, below) == ConfidenceInterval(4.0, 4 - math.hypot(1, 1), math.inf, "above")
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from scipy import stats
 
 from naive import benchmark as naive
 from pharos.benchmark import score
-from pharos.benchmark.scores import Interval, frontier, interquartile_interval, mean_interval
+from pharos.benchmark.scores import ConfidenceInterval, frontier, interquartile_interval, mean_interval
 from pharos.errors import ParameterError
 from small_benchmark import CORE, LEVELS, RUNGS, constant, drawn, results, small_suite
 from strategies import examples
@@ -25,7 +25,7 @@ def test_optimal_play_scores_1_and_lies_beyond_every_frontier():
         for each in (found.core, found.final, found.iqm, found.axes["noise"].score, *found.tasks.values()):
             assert (each.value, each.low, each.high) == (1.0, 1.0, 1.0)
         assert found.optimality_gap.value == 0.0
-        assert found.axes["noise"].frontier == Interval(8.0, 8.0, math.inf, "above")
+        assert found.axes["noise"].frontier == ConfidenceInterval(8.0, 8.0, math.inf, "above")
         assert not found.preliminary and not found.below_random
 
 
@@ -34,7 +34,7 @@ def test_uniform_play_scores_0_before_every_frontier():
     for each in (found.core, found.final, found.iqm, found.axes["noise"].score, *found.tasks.values()):
         assert (each.value, each.low, each.high) == (0.0, 0.0, 0.0)
     assert found.optimality_gap.value == pytest.approx(1.0, abs=1e-6)
-    assert found.axes["noise"].frontier == Interval(1.0, -math.inf, 1.0, "below")
+    assert found.axes["noise"].frontier == ConfidenceInterval(1.0, -math.inf, 1.0, "below")
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -128,7 +128,7 @@ def test_an_end_of_the_interval_beyond_the_ladder_is_infinite():
     found = frontier(np.array(LEVELS), rungs)
     assert not found.censored and 4.0 < found.low < found.value < 8.0 and found.high == math.inf
     assert str(found) == f"{found.value:.3g} ({found.low:.3g} or more)"
-    assert frontier(np.array([3.0]), [np.array([0.2, 0.21])]) == Interval(3.0, 3.0, math.inf, "above")
+    assert frontier(np.array([3.0]), [np.array([0.2, 0.21])]) == ConfidenceInterval(3.0, 3.0, math.inf, "above")
 
 
 def test_one_seed_has_values_without_intervals():
@@ -136,14 +136,14 @@ def test_one_seed_has_values_without_intervals():
     assert found.preliminary and not found.below_random
     for each in (found.core, found.iqm, found.optimality_gap, found.axes["noise"].frontier, *found.tasks.values()):
         assert math.isfinite(each.value) and math.isnan(each.low) and math.isnan(each.high)
-    assert str(Interval(0.5)) == "0.500"
+    assert str(ConfidenceInterval(0.5)) == "0.500"
 
 
 def test_intervals_as_text():
-    assert str(Interval(9.42, 8.3, 10.81)) == "9.42 (8.3 to 10.8)"
-    assert str(Interval(1.0, -math.inf, 2.0, "below")) == "< 1.000 (2 or less)"
-    assert str(Interval(math.nan, -math.inf, math.inf, "above")) == "not comparable"
-    assert Interval(8.0, 7.0, math.inf, "above").text(ends=False) == "> 8"
+    assert str(ConfidenceInterval(9.42, 8.3, 10.81)) == "9.42 (8.3 to 10.8)"
+    assert str(ConfidenceInterval(1.0, -math.inf, 2.0, "below")) == "< 1.000 (2 or less)"
+    assert str(ConfidenceInterval(math.nan, -math.inf, math.inf, "above")) == "not comparable"
+    assert ConfidenceInterval(8.0, 7.0, math.inf, "above").text(ends=False) == "> 8"
 
 
 def test_order_of_tasks_and_seeds_changes_nothing():

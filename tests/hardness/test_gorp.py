@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from naive.gorp import failure_probability, returns_of_paths
 from pharos import hardness, importers
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.gorp import METHODS, Search, knapsack
+from pharos.hardness.gorp import METHODS, GorpSearch, knapsack
 from pharos.mdp import TabularMDP, sticky_actions
 from refusals import refusal
 from strategies import deterministic_mdps, examples, small_mdps
@@ -56,7 +56,7 @@ def test_exact_probabilities_give_a_smaller_bound_that_is_proven(corridor):
 
 @pytest.mark.long
 def test_gorp_succeeds_as_often_as_the_exact_probability_says(corridor):
-    search = Search(corridor, 100, ("exact",))
+    search = GorpSearch(corridor, 100, ("exact",))
     runs = hardness.run_gorp(corridor, k=1, m=100, runs=60, seed=3)
     expected = 1 - search.failure(100, 1)
     assert runs.success_rate == pytest.approx(expected, abs=3.3 * math.sqrt(expected * (1 - expected) / 60))
@@ -80,7 +80,7 @@ def test_gorp_repeats_itself_with_the_same_seed(corridor):
 )
 def test_no_proven_method_is_below_the_probability_of_failure(mdp, steps, k, m, method):
     mdp = mdp.with_initial(int(mdp.start_states[0]))
-    search = Search(mdp, steps, (method,))
+    search = GorpSearch(mdp, steps, (method,))
     assert search.failure(m, k) >= failure_probability(mdp, steps, k, m) - 1e-9
 
 
@@ -101,7 +101,7 @@ def paying_once(draw):
 @examples(60, paying_once(), st.integers(1, 4), st.integers(1, 2), st.integers(1, 3))
 def test_the_exact_method_is_the_probability_of_failure(mdp, steps, k, m):
     assume(mdp.num_actions**k <= 4)
-    search = Search(mdp, steps, ("exact",))
+    search = GorpSearch(mdp, steps, ("exact",))
     if search.two_valued:
         assert search.failure(m, k) == pytest.approx(failure_probability(mdp, steps, k, m), abs=1e-9)
 

@@ -412,7 +412,9 @@ def test_what_does_not_exist_says_so():
 
 
 def test_a_kernel_that_does_not_fit_is_told_before_anything_is_learnt(grid, monkeypatch):
-    monkeypatch.setattr("pharos.hardness.representation.Learner.curve", failing(AssertionError("learnt first")))
+    monkeypatch.setattr(
+        "pharos.hardness.representation.IdealisedLearner.curve", failing(AssertionError("learnt first"))
+    )
     with pytest.raises(ParameterError, match="landmarks is 1; expected at least 2"):
         representation(grid, "vector", "mlp16", landmarks=1)
     with pytest.raises(ParameterError, match="landmarks is 1; expected at least 2"):

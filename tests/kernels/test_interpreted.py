@@ -16,7 +16,7 @@ from numba.core.registry import CPUDispatcher
 
 import pharos
 from pharos import hardness, kernels, solvers
-from pharos.rules.interpreted import InterpretedExploration
+from pharos.rules.interpreted import InterpretedExpansion
 from pharos.system import compiling
 
 TESTS = Path(__file__).parents[1]
@@ -120,13 +120,13 @@ def test_rules_that_are_compiled_already_are_hardly_interpreted_again(tmp_path, 
     env = pharos.make("breakout", height=7, columns=5, brick_rows=1)
     pharos.build(env, tmp_path / "first", progress=False)
     asked = []
-    expand = InterpretedExploration.expand_and_find
+    expand = InterpretedExpansion.expand_and_find
 
     def counted(self, states, start, stop, *rest):
         asked.append(stop - start)
         expand(self, states, start, stop, *rest)
 
-    monkeypatch.setattr(InterpretedExploration, "expand_and_find", counted)
+    monkeypatch.setattr(InterpretedExpansion, "expand_and_find", counted)
     pharos.build(env, tmp_path / "second", progress=False)
     assert not asked
     monkeypatch.setattr("pharos.rules.rules.explored", set())  # as in another process, which finds them on disk

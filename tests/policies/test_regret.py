@@ -225,7 +225,7 @@ def last_policy_by_place(run, world, words):
     entry = leaderboard.submit(run, run / "entry.safetensors")
     try:
         alone = representation.Representation.of_matrix(np.eye(task.mdp.num_states))
-        of_learner = representation.Learner(task.mdp, alone, hardness.Schedule(steps=10), 4).regret(value)
+        of_learner = representation.IdealisedLearner(task.mdp, alone, hardness.Schedule(steps=10), 4).regret(value)
     except UndefinedMeasure:
         of_learner = math.nan
     return {

@@ -14,7 +14,7 @@ from pharos import hardness, importers
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.observations import representation
 from pharos.validation import PRIMARY, Published, prediction, published
-from pharos.validation.prediction import Order
+from pharos.validation.prediction import PairOrder
 
 CHOICES = Path(__file__).parents[2] / "docs" / "studies" / "choices"
 
@@ -173,12 +173,13 @@ def test_networks_of_ones_own_are_predicted():
 
 
 def test_orders_are_told_in_words():
-    assert str(Order("vector", "hash", 0.3, 19, 20)) == "vector is easier than hash: right in 19 of 20 such pairs"
+    assert str(PairOrder("vector", "hash", 0.3, 19, 20)) == "vector is easier than hash: right in 19 of 20 such pairs"
     assert (
-        str(Order("vector", "hash", 0.02, 9, 10)) == "vector or hash: too close to call (right in 9 of 10 such pairs)"
+        str(PairOrder("vector", "hash", 0.02, 9, 10))
+        == "vector or hash: too close to call (right in 9 of 10 such pairs)"
     )
-    assert "too close" in str(Order("vector", "hash", 0.3, 5, 10))
-    assert "too close" in str(Order("vector", "hash", 0.3, 0, 0))
+    assert "too close" in str(PairOrder("vector", "hash", 0.3, 5, 10))
+    assert "too close" in str(PairOrder("vector", "hash", 0.3, 0, 0))
 
 
 @pytest.mark.slow

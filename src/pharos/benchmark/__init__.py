@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pharos.benchmark.page import report
     from pharos.benchmark.repetition import Audit, make_audit
     from pharos.benchmark.results import AgentResults, baselines, read_results
-    from pharos.benchmark.scores import AxisScore, BenchmarkScore, Interval, score
+    from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, score
     from pharos.benchmark.sealed import sealed_copies, sealed_instances, season_seed, write_suite
     from pharos.benchmark.submission import Submission, submit, verify
     from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite, load_suite

@@ -120,7 +120,7 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
     if agent in EXACT:
         if setting:
             raise ParameterError(f"agent {agent!r} has no hyperparameters; found {', '.join(setting)}")
-        return Exact(agent, "exact")
+        return ExactForm(agent, "exact")
     if agent.endswith(".py"):
         raise ParameterError(f"agent {agent!r}: expected what in the file, such as {agent}:learn")
     if is_reference(agent) and not is_known(agent):
@@ -129,7 +129,7 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
         if not isinstance(code, type):
             return _function(code, source, setting)
         check_hyperparameters(code, setting)
-        return Trained(agent, "class", setting, source, sha256(source.file))
+        return TrainedForm(agent, "class", setting, source, sha256(source.file))
     defaults = {**hyperparameters_of(agent, "", ""), **ALSO.get(agent, {})} if agent in AGENTS else {}
     chosen = {**defaults, **suite.hyperparameters.get(agent, {}), **setting}
     lacking = batched.supports(agent, chosen) if agent in BATCHED else None
@@ -137,7 +137,7 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
         raise ParameterError(f"the batched engine: {lacking}")
     if agent not in AGENTS or not AGENTS[agent].is_tabular:
         check_hyperparameters(agent, chosen, batched.OURS if agent in BATCHED else ())
-    return Trained(agent, "engine" if agent in AGENTS else "class", chosen)
+    return TrainedForm(agent, "engine" if agent in AGENTS else "class", chosen)
 
 
 def sha256(file: str | os.PathLike) -> str:
@@ -148,7 +148,7 @@ def sha256(file: str | os.PathLike) -> str:
 # What pharos trains ---------------------------------------------------------------------------------------------------
 
 
-class Trained(Form):
+class TrainedForm(Form):
     """An agent that `pharos.training` trains: runs of the batched engine that fit together as one program."""
 
     def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
@@ -230,7 +230,7 @@ def _function(code: object, source: Source | None, setting: Mapping[str, Any]) -
     checksum = sha256(source.file) if source is not None else _text_checksum(code)
     with contextlib.suppress(TypeError, ValueError):
         inspect.signature(code).bind(None, None, 0, None)
-        return Compiled(name, "jax", source=source, checksum=checksum, learn=code)
+        return CompiledForm(name, "jax", source=source, checksum=checksum, learn=code)
     try:
         inspect.signature(code).bind(None, 0, 0)
     except (TypeError, ValueError) as error:
@@ -238,7 +238,7 @@ def _function(code: object, source: Source | None, setting: Mapping[str, Any]) -
             f"agent {name!r}: {error}; expected a function learn(env, steps, seed), or learn(env, params, steps, key) "
             f"of JAX"
         ) from None
-    return Generated(name, "generator", source=source, checksum=checksum, learn=code)
+    return GeneratedForm(name, "generator", source=source, checksum=checksum, learn=code)
 
 
 def _text_checksum(code: Callable[..., Any]) -> str:
@@ -248,7 +248,7 @@ def _text_checksum(code: Callable[..., Any]) -> str:
 
 
 @dataclass(frozen=True)
-class Generated(Form):
+class GeneratedForm(Form):
     """A generator, run in processes of its own with one thread each; in this one where no other can import it.
 
     Attributes:
@@ -355,7 +355,7 @@ def _is_finished(job: Job) -> bool:
 
 
 @dataclass(frozen=True)
-class Compiled(Form):
+class CompiledForm(Form):
     """A function of JAX: one program for all seeds of a task, which is run again where one of them is missing.
 
     Attributes:
@@ -390,7 +390,7 @@ class Compiled(Form):
 
 
 @dataclass(frozen=True)
-class Exact(Form):
+class ExactForm(Form):
     """The optimal policy, whose value solving gives, and uniform play, evaluated: nothing is run."""
 
     regrets: dict[str, float] = field(default_factory=dict)

@@ -23,7 +23,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.interaction import GymEnv
-from pharos.policies import Model, PolicyAnswers, PolicyLike, RecurrentPolicy, deep_policy
+from pharos.policies import PolicyAnswers, PolicyLike, RecurrentPolicy, SB3Model, deep_policy
 from pharos.training import Curve, Evaluation, Task, evaluate_agent
 
 BLOCK = 4096  # observations that a policy is asked about at once
@@ -39,7 +39,7 @@ class BudgetSpent(Exception):
 
 
 @dataclass
-class Budget:
+class StepBudget:
     """Steps of all copies of an environment together.
 
     Attributes:
@@ -64,7 +64,7 @@ class CountedEnv(gymnasium.Wrapper):
     `gymnasium.vector.SyncVectorEnv([env.copy] * 8)`.
     """
 
-    def __init__(self, task: Task, budget: Budget, seed: int):
+    def __init__(self, task: Task, budget: StepBudget, seed: int):
         super().__init__(GymEnv(task.env, **task.interaction))
         self.task, self.budget, self.seed = task, budget, seed
         self.seeds = np.random.SeedSequence(seed)
@@ -115,7 +115,7 @@ class Snapshots:
             ParameterError: it answers something else than actions or probabilities.
         """
         task = self.task
-        if isinstance(policy, Model):
+        if isinstance(policy, SB3Model):
             policy = deep_policy(policy)
         has_no_table = isinstance(policy, np.ndarray | RecurrentPolicy)
         if has_no_table or task.sight.frames > 1 or task.mdp.num_states > LARGEST:
@@ -151,7 +151,7 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
     Raises:
         ParameterError: it is no generator of policies; or whatever its code raises.
     """
-    budget = Budget(steps, steps // evaluations)
+    budget = StepBudget(steps, steps // evaluations)
     snapshots = Snapshots(task)
     last: PolicyLike | Evaluation = uniform_policy(task)
     counting: list[PolicyLike | Evaluation] = [last]

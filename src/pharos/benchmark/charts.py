@@ -9,7 +9,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pharos.benchmark.scores import Interval
+from pharos.benchmark.scores import ConfidenceInterval
 
 WIDTH = 340
 MARKERS = ("M-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0z", "M-4 -4h8v8h-8z", "M0 -5l5 9h-10z", "M0 -5.5l5 5.5l-5 5.5l-5 -5.5z")
@@ -130,7 +130,7 @@ def legend(names: Sequence[str], theory: str | None = None) -> Element:
     return element("ul", *(element("li", mark, name) for name, mark in marks), class_="legend")
 
 
-def bars(rows: Mapping[int, tuple[str, Interval]], title: str) -> Element:
+def bars(rows: Mapping[int, tuple[str, ConfidenceInterval]], title: str) -> Element:
     """Horizontal bars of scores in [0, 1] with their intervals: place of an agent -> its name and score."""
     left, wide, step = 122, 160, 24
     height = step * len(rows) + 18
@@ -168,9 +168,9 @@ def radar(axes: Sequence[str], scores: Sequence[Mapping[str, float]], title: str
 
 def ladder_panel(
     levels: Sequence[float],
-    lines: Sequence[Sequence[Interval | None]],
+    lines: Sequence[Sequence[ConfidenceInterval | None]],
     theory: Sequence[float | None],
-    frontier: Interval,
+    frontier: ConfidenceInterval,
     unit: str,
     title: str,
 ) -> Element:
@@ -217,7 +217,7 @@ def ladder_panel(
     return drawing(WIDTH, bottom + 38, title, *shapes)
 
 
-def difference_bar(difference: Interval) -> Element:
+def difference_bar(difference: ConfidenceInterval) -> Element:
     """A difference of scores as a bar from the middle, with its interval."""
     value, low, high = (65 + 64 * max(-1.0, min(1.0, end)) for end in (difference.value, *ends(difference)))
     bar = {"x": min(65.0, value), "y": 4, "width": abs(value - 65), "height": 8, "class_": "f0" if value > 65 else "f1"}
@@ -227,7 +227,7 @@ def difference_bar(difference: Interval) -> Element:
     return picture
 
 
-def learning_panel(steps: int, lines: Sequence[Sequence[Interval]], title: str) -> Element:
+def learning_panel(steps: int, lines: Sequence[Sequence[ConfidenceInterval]], title: str) -> Element:
     """Normalised regret at evaluations, equally far apart up to `steps`: a line for each agent, the first with a band.
 
     Args:
@@ -322,12 +322,12 @@ def shortened(text: str, letters: int) -> str:
     return text if len(text) <= letters else text[: letters - 1] + "…"
 
 
-def ends(interval: Interval) -> tuple[float, float]:
+def ends(interval: ConfidenceInterval) -> tuple[float, float]:
     """The ends of an interval, for drawing: both at the value where one seed leaves none."""
     return (interval.value, interval.value) if np.isnan(interval.low) else (interval.low, interval.high)
 
 
-def frontier_text(frontier: Interval, unit: str = "", interval: bool = True) -> str:
+def frontier_text(frontier: ConfidenceInterval, unit: str = "", interval: bool = True) -> str:
     """A frontier in words: `9.4 bits (8.3 to 10.8)`, `beyond 24 bits (from 19)`, `below 4 bits`."""
     side = {"above": "beyond ", "below": "below ", "": ""}[frontier.censored]
     text = f"{side}{frontier.value:.3g}{' ' if unit else ''}{unit}"

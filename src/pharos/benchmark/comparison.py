@@ -21,7 +21,7 @@ import numpy as np
 from pharos.benchmark.results import AgentResults
 from pharos.benchmark.scores import (
     CONFIDENCE,
-    Interval,
+    ConfidenceInterval,
     axis_score,
     check_suite,
     interval_around,
@@ -53,8 +53,8 @@ class Difference:
 
     ours: float
     theirs: float
-    interval: Interval
-    improvement: Interval
+    interval: ConfidenceInterval
+    improvement: ConfidenceInterval
     p_value: float
     adjusted: float
     verdict: str
@@ -72,8 +72,8 @@ class AxisComparison:
     axis: str
     unit: str
     score: Difference
-    frontiers: tuple[Interval, Interval]
-    frontier: Interval
+    frontiers: tuple[ConfidenceInterval, ConfidenceInterval]
+    frontier: ConfidenceInterval
 
 
 @dataclass(frozen=True)
@@ -217,18 +217,20 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return adjusted.tolist()
 
 
-def frontier_difference(ours: Interval, theirs: Interval) -> Interval:
+def frontier_difference(ours: ConfidenceInterval, theirs: ConfidenceInterval) -> ConfidenceInterval:
     """Return the difference of two frontiers, with the interval that follows from theirs (Newcombe's, or MOVER).
 
     low = d - sqrt((v1 - l1)^2 + (u2 - v2)^2),   high = d + sqrt((u1 - v1)^2 + (v2 - l2)^2)
     """
     if ours.censored and ours.censored == theirs.censored:
-        return Interval(math.nan, -math.inf, math.inf, ours.censored)
+        return ConfidenceInterval(math.nan, -math.inf, math.inf, ours.censored)
     value = ours.value - theirs.value
     low = value - math.hypot(ours.value - ours.low, theirs.high - theirs.value)
     high = value + math.hypot(ours.high - ours.value, theirs.value - theirs.low)
     above = ours.censored == "above" or theirs.censored == "below"
-    return Interval(value, low, high, "above" if above else "below" if ours.censored or theirs.censored else "")
+    return ConfidenceInterval(
+        value, low, high, "above" if above else "below" if ours.censored or theirs.censored else ""
+    )
 
 
 def _difference(x: Mapping[str, np.ndarray], y: Mapping[str, np.ndarray], names: Sequence[str]) -> Difference:

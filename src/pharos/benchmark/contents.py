@@ -13,7 +13,7 @@ import numpy as np
 from pharos.benchmark.charts import ends, frontier_text
 from pharos.benchmark.comparison import Comparison, compare, results_of, suite_of_results
 from pharos.benchmark.results import FILE, AgentResults, baselines
-from pharos.benchmark.scores import BenchmarkScore, Interval, mean_interval, run_regrets, run_scores, score
+from pharos.benchmark.scores import BenchmarkScore, ConfidenceInterval, mean_interval, run_regrets, run_scores, score
 from pharos.benchmark.suite import BenchmarkTask, Suite
 from pharos.errors import ParameterError
 from pharos.plots import agent_name
@@ -130,10 +130,10 @@ def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:
     yield from (f"{name} ({k})" for k in count(2))
 
 
-def regret_of(agent: Agent, task: BenchmarkTask) -> Interval | None:
+def regret_of(agent: Agent, task: BenchmarkTask) -> ConfidenceInterval | None:
     """Normalised regret of an agent on a task, clipped to [0, 1]; None where it did not run."""
     own = agent.score.tasks.get(task.name)
-    return None if own is None else Interval(1 - own.value, 1 - own.high, 1 - own.low)
+    return None if own is None else ConfidenceInterval(1 - own.value, 1 - own.high, 1 - own.low)
 
 
 def sentence(contents: Contents) -> str:
@@ -180,7 +180,7 @@ def listed(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
-def residuals(contents: Contents) -> list[tuple[BenchmarkTask, Interval, float]]:
+def residuals(contents: Contents) -> list[tuple[BenchmarkTask, ConfidenceInterval, float]]:
     """Tasks whose regret is more than 0.2 above the predicted one, the largest first: task, observed, predicted."""
     pairs = [(task, regret_of(contents.agent, task), contents.predicted(task)) for task in contents.suite.tasks]
     rows = [(task, own, expected) for task, own, expected in pairs if own is not None and expected is not None]
@@ -204,7 +204,7 @@ def final_regret(agent: Agent, task: BenchmarkTask) -> float:
     return float(np.clip(agent.results.curves[task.name][:, -1], 0.0, 1.0).mean())
 
 
-def learning_curve(agent: Agent, names: Sequence[str]) -> list[Interval]:
+def learning_curve(agent: Agent, names: Sequence[str]) -> list[ConfidenceInterval]:
     """Mean over tasks of normalised regret at each evaluation, each run's clipped to [0, 1]; empty if one was not run.
 
     Args:
@@ -261,7 +261,7 @@ def seeds_text(results: AgentResults) -> str:
     return f"seed{'s' * (len(results.seeds) > 1)} {', '.join(map(str, results.seeds))}"
 
 
-def number(interval: Interval, form: str = ".2f") -> str:
+def number(interval: ConfidenceInterval, form: str = ".2f") -> str:
     """A score with its interval, which one seed does not have: `0.70 (0.68 to 0.72)`."""
     value, low, high = (f"{round(each, 2) + 0.0:{form}}" for each in (interval.value, interval.low, interval.high))
     if math.isnan(interval.value):
@@ -269,6 +269,6 @@ def number(interval: Interval, form: str = ".2f") -> str:
     return value if math.isnan(interval.low) else f"{value} ({low} to {high})"
 
 
-def signed(interval: Interval) -> str:
+def signed(interval: ConfidenceInterval) -> str:
     """A difference of scores with its interval: `+0.12 (+0.03 to +0.21)`."""
     return number(interval, "+.2f")

@@ -20,7 +20,7 @@ import numpy as np
 
 from pharos.benchmark.agents import Form, Job, Tell, agent_form
 from pharos.benchmark.results import FILE, AgentResults
-from pharos.benchmark.scores import AxisScore, BenchmarkScore, Interval, score
+from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, score
 from pharos.benchmark.suite import CORE, BenchmarkTask, Suite, load_suite
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError, PharosError, UnknownName
 from pharos.system import storage
@@ -55,7 +55,7 @@ class Outcome:
         return score(self.results, self.suite)
 
     @property
-    def score(self) -> Interval:
+    def score(self) -> ConfidenceInterval:
         """That of the core."""
         return self.scores.core
 

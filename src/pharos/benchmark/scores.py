@@ -35,7 +35,7 @@ GRID = 256  # points of a segment between two rungs, where the band is compared 
 
 
 @dataclass(frozen=True)
-class Interval:
+class ConfidenceInterval:
     """A value and its 95 % interval over seeds.
 
     Attributes:
@@ -80,8 +80,8 @@ class AxisScore:
 
     axis: str
     unit: str
-    score: Interval
-    frontier: Interval
+    score: ConfidenceInterval
+    frontier: ConfidenceInterval
 
 
 @dataclass(frozen=True)
@@ -99,12 +99,12 @@ class BenchmarkScore:
         missing: tasks of the suite without results, which no score contains.
     """
 
-    core: Interval
-    final: Interval
-    iqm: Interval
-    optimality_gap: Interval
+    core: ConfidenceInterval
+    final: ConfidenceInterval
+    iqm: ConfidenceInterval
+    optimality_gap: ConfidenceInterval
     axes: Mapping[str, AxisScore]
-    tasks: Mapping[str, Interval]
+    tasks: Mapping[str, ConfidenceInterval]
     preliminary: bool
     below_random: tuple[str, ...]
     missing: tuple[str, ...] = field(default=())
@@ -220,30 +220,32 @@ def standard_error(strata: Sequence[np.ndarray], weights: Sequence[float]) -> tu
 
 def interval_around(
     value: float, error: float, degrees: float, bounds: tuple[float, float] = (-math.inf, math.inf)
-) -> Interval:
+) -> ConfidenceInterval:
     """Return value ± t error, its ends clipped to `bounds`."""
     from scipy.special import stdtrit
 
     half = error * float(stdtrit(degrees, (1.0 + CONFIDENCE) / 2.0)) if error else error
-    return Interval(value, max(value - half, bounds[0]), min(value + half, bounds[1]))
+    return ConfidenceInterval(value, max(value - half, bounds[0]), min(value + half, bounds[1]))
 
 
-def mean_interval(strata: Sequence[np.ndarray], bounds: tuple[float, float] = (-math.inf, math.inf)) -> Interval:
+def mean_interval(
+    strata: Sequence[np.ndarray], bounds: tuple[float, float] = (-math.inf, math.inf)
+) -> ConfidenceInterval:
     """Return the mean over tasks of the mean over runs, with Student's interval; NaN without tasks."""
     if not strata:
-        return Interval(math.nan)
+        return ConfidenceInterval(math.nan)
     value = float(np.mean([own.mean() for own in strata]))
     return interval_around(value, *standard_error(strata, [1.0 / len(strata)] * len(strata)), bounds)
 
 
-def interquartile_interval(strata: Sequence[np.ndarray]) -> Interval:
+def interquartile_interval(strata: Sequence[np.ndarray]) -> ConfidenceInterval:
     """Return the interquartile mean of all runs of all tasks pooled, with Student's interval.
 
     The standard error is that of twice the mean of runs winsorised at the pooled quartiles, over seeds within tasks.
     NaN without tasks.
     """
     if not strata:
-        return Interval(math.nan)
+        return ConfidenceInterval(math.nan)
     pooled = np.sort(np.concatenate(strata))
     cut = len(pooled) // 4
     value = float(pooled[cut : len(pooled) - cut].mean())
@@ -255,7 +257,7 @@ def interquartile_interval(strata: Sequence[np.ndarray]) -> Interval:
 # Frontier -------------------------------------------------------------------------------------------------------------
 
 
-def frontier(levels: np.ndarray, regrets: Sequence[np.ndarray]) -> Interval:
+def frontier(levels: np.ndarray, regrets: Sequence[np.ndarray]) -> ConfidenceInterval:
     """Return the level where mean normalised regret crosses 0.5, linear between rungs, with its interval.
 
     Means over seeds are made increasing along the rungs (isotonic regression, equal weights). The interval holds the
@@ -275,7 +277,7 @@ def frontier(levels: np.ndarray, regrets: Sequence[np.ndarray]) -> Interval:
     value, censored = _crossing(levels, isotonic_regression(means).x)
     sizes = np.array([len(own) for own in regrets])
     if sizes.min() < 2:
-        return Interval(value, censored=censored)
+        return ConfidenceInterval(value, censored=censored)
     variances = np.array([np.var(own, ddof=1) / len(own) for own in regrets])
     variances[variances < 1e-30] = 0.0
     grid, position = levels, np.arange(len(levels), dtype=np.float64)
@@ -296,7 +298,7 @@ def frontier(levels: np.ndarray, regrets: Sequence[np.ndarray]) -> Interval:
     high = (
         math.inf if staying.size and staying[-1] == len(grid) - 1 else grid[staying[-1]] if staying.size else levels[0]
     )
-    return Interval(value, min(float(low), value), max(float(high), value), censored)
+    return ConfidenceInterval(value, min(float(low), value), max(float(high), value), censored)
 
 
 def _crossing(levels: np.ndarray, regrets: np.ndarray) -> tuple[float, str]:

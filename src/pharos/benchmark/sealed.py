@@ -21,7 +21,7 @@ import numpy as np
 from pharos.benchmark.suite import CORE, BenchmarkTask, Protocol, Suite, digest_of_suite, digest_of_task
 from pharos.environments import make
 from pharos.errors import MissingExtra, ParameterError
-from pharos.importers import Outcomes, save
+from pharos.importers import ImportedOutcomes, save
 from pharos.mdp import TabularMDP, paid_outcomes
 from pharos.system import storage
 from pharos.training import Task
@@ -140,7 +140,7 @@ def _copy(task: BenchmarkTask, protocol: Protocol, draw: np.random.Generator, fo
     )
 
 
-def permuted_actions(mdp: TabularMDP, actions: np.ndarray) -> tuple[TabularMDP, Outcomes | None]:
+def permuted_actions(mdp: TabularMDP, actions: np.ndarray) -> tuple[TabularMDP, ImportedOutcomes | None]:
     """The MDP whose action i is action actions[i] of another one, and its outcomes where it has chance.
 
     Args:
@@ -161,7 +161,7 @@ def permuted_actions(mdp: TabularMDP, actions: np.ndarray) -> tuple[TabularMDP, 
     after = np.where(after == num_states, -1, after)[order]
     counts = np.bincount(rows, minlength=num_states * num_actions)
     offsets = np.concatenate([[0], np.cumsum(counts)])
-    outcomes = Outcomes(offsets, after, probabilities[order], rewards[order])
+    outcomes = ImportedOutcomes(offsets, after, probabilities[order], rewards[order])
     place = np.arange(len(rows)) - offsets[rows]
     tables = [np.zeros((num_states * num_actions, counts.max()), kind) for kind in (np.int64, float, float)]
     for table, values in zip(tables, outcomes[1:], strict=True):

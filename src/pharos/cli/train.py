@@ -21,7 +21,7 @@ from pharos.system.wording import in_words, many
 from pharos.training import TrainingOptions
 
 if TYPE_CHECKING:
-    from pharos.training import Progress, TrainingResult
+    from pharos.training import TrainingProgress, TrainingResult
 
 
 OPTIONS = "agent observation observation_options steps engine hyperparameters evaluation_interval"
@@ -157,11 +157,11 @@ def _facts_of_many(
     return facts
 
 
-def _telling_of_many(show: Callable[[int, str], None]) -> "Callable[[Progress], None]":
+def _telling_of_many(show: Callable[[int, str], None]) -> "Callable[[TrainingProgress], None]":
     """Return the callback of `train_many`, which shows the mean regret of the policies, and the pace."""
     began: list[tuple[float, int]] = []
 
-    def tell(now: "Progress") -> None:
+    def tell(now: "TrainingProgress") -> None:
         if not began:
             began.append((time.perf_counter(), now.done))
         passed, before = time.perf_counter() - began[0][0], began[0][1]

@@ -26,10 +26,10 @@ from pharos.explorer.states import (
     LEARNT,
     OPTIMAL,
     UNIFORM,
-    Layers,
     Learnt,
     NumberedStates,
     SpaceStates,
+    StateLayers,
     States,
     probabilities,
 )
@@ -40,7 +40,7 @@ from pharos.solvers import Solution, uniform_value, value_iteration
 from pharos.state_space import StateSpace
 
 
-class Visits:
+class DiscountedVisits:
     """Discounted visits of states by policies, from the start: d(s) = sum over t of gamma^t P(s_t = s)."""
 
     def __init__(self, exploration: "Exploration"):
@@ -153,9 +153,9 @@ class Exploration:
     # Of all states --------------------------------------------------------------------------------------------------
 
     @cached_property
-    def layers(self) -> Layers:
+    def layers(self) -> StateLayers:
         """The breadth-first layers."""
-        return Layers(self.mdp, is_numbered=self.space is not None)
+        return StateLayers(self.mdp, is_numbered=self.space is not None)
 
     def values(self, name: str, states: np.ndarray) -> np.ndarray:
         """(N,) values of a policy in states, where there is no action before."""
@@ -186,9 +186,9 @@ class Exploration:
         return np.full(len(states), self.mdp.num_actions if previous is None else previous)
 
     @cached_property
-    def visits(self) -> Visits:
+    def visits(self) -> DiscountedVisits:
         """Visits of states by policies."""
-        return Visits(self)
+        return DiscountedVisits(self)
 
     # Of one state ---------------------------------------------------------------------------------------------------
 

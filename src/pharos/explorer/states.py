@@ -1,8 +1,8 @@
 """States of an MDP as the page shows them: their variables, their layers, and what a learnt policy does there.
 
-`States`: the variables of a state space, or where there are none the number itself. `Layers`, breadth-first: the states
-whose shortest way from a start state has 0, 1, 2, ... steps. `Learnt`: the policy of a run, its table, its value, and
-its losses.
+`States`: the variables of a state space, or where there are none the number itself. `StateLayers`, breadth-first: the
+states whose shortest way from a start state has 0, 1, 2, ... steps. `Learnt`: the policy of a run, its table, its
+value, and its losses.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp import Dynamics, TabularMDP
-from pharos.policies import PolicyAnswers, PolicyLike, Sight, TabularAgent, evaluate_policy
+from pharos.policies import PolicyAnswers, PolicyLike, StateObserver, TabularAgent, evaluate_policy
 from pharos.solvers import Solution
 from pharos.state_space import StateSpace
 
@@ -169,7 +169,7 @@ BLOCK = 1 << 16  # states whose successors are looked at in one go
 BARS = 200  # of the drawing of all layers
 
 
-class Layers:
+class StateLayers:
     """The layers of an MDP.
 
     Args:
@@ -290,7 +290,9 @@ class Learnt:
             return evaluate_policy(mdp, policy)
         if space is None or space.environment is None:
             raise ParameterError("a policy of observations needs an environment that is known; give it as a table")
-        sight = Sight(space, space.environment, self.observation, dict(self.observation_options), self.previous_action)
+        sight = StateObserver(
+            space, space.environment, self.observation, dict(self.observation_options), self.previous_action
+        )
         width = mdp.policy_width
         if sight.frames > 1 or mdp.num_states * width > ASKED_EVERYWHERE or (self.previous_action and width == 1):
             return evaluate_policy(

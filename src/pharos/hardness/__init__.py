@@ -19,7 +19,7 @@ from pharos.hardness.effective_horizon import (
 )
 from pharos.hardness.gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
 from pharos.hardness.gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
-from pharos.hardness.interval import Budget, Certificate, Certified, Interval, Progress
+from pharos.hardness.interval import Budget, Certificate, Certified, Interval, MeasureProgress
 from pharos.hardness.kernel_regret import (
     KernelRegret,
     Spectral,

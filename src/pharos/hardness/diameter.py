@@ -27,7 +27,7 @@ import numpy as np
 import xxhash
 
 from pharos.errors import FileFormatError, ParameterError, UndefinedMeasure
-from pharos.hardness.interval import Budget, BudgetClock, Interval, Progress, conventions_of
+from pharos.hardness.interval import Budget, BudgetClock, Interval, MeasureProgress, conventions_of
 from pharos.hardness.stochastic_diameter import stochastic_diameter, stochastic_start_eccentricity
 from pharos.hardness.sum_sweep import Graph, SumSweep
 from pharos.kernels import graph as kernels
@@ -47,7 +47,7 @@ def diameter(
     restart: bool = True,
     tolerance: float = 1e-6,
     budget: Budget | float | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[MeasureProgress], None] | None = None,
     bounds: str | os.PathLike | None = None,
 ) -> Interval:
     """Return D, the maximum over ordered pairs of states s != s' of the least expected number of steps from s to s'.
@@ -63,7 +63,7 @@ def diameter(
             False: terminal states are absorbing, so that D is infinite wherever a state cannot be reached from one.
         tolerance: relative width of the interval from which on it counts as exact. Counted steps are exact anyway.
         budget: seconds (300 by default), or a `Budget`; a value out of reach comes as the interval proven by then.
-        progress: called with a `Progress` now and then.
+        progress: called with a `MeasureProgress` now and then.
         bounds: a folder for the bounds on all states, 8 bytes each, where memory has no room for searches of a
             deterministic MDP: the same call goes on from them where one was killed, or its budget spent. They are
             removed once the diameter is known.

@@ -93,7 +93,7 @@ def gorp_bound(
     if not names:
         raise ParameterError(f"no methods given; expected some of {', '.join(METHODS)}")
     _needs_one_outcome("gorp_bound", mdp)
-    search = Search(mdp, steps, names)
+    search = GorpSearch(mdp, steps, names)
     ms, failures = (list(each) for each in zip(*map(search.samples, ks), strict=True))
     log_actions = math.log(mdp.num_actions) if mdp.num_actions > 1 else math.inf
     values = [math.inf if m is None else k + math.log(m) / log_actions for k, m in zip(ks, ms, strict=True)]
@@ -211,7 +211,7 @@ def _needs_one_outcome(name: str, mdp: TabularMDP) -> None:
         raise UndefinedMeasure(f"{name} is defined for deterministic MDPs: {mdp} has chance; take the MDP without it")
 
 
-class Search:
+class GorpSearch:
     """The smallest m, to 1 %, that is proven to make GORP fail with probability 1/2 at most."""
 
     def __init__(self, mdp: TabularMDP, steps: int, methods: tuple[str, ...]):

@@ -56,7 +56,7 @@ PRODUCT = 1 + 2.0**-50
 
 
 @dataclass(frozen=True)
-class Bounds:
+class HittingTimeBounds:
     """Bounds of all hitting times of a target: J* lies between J times `low` and J times `high`.
 
     largest: the largest J. limited: whether floats are too short for closer bounds, so that more time would not help.
@@ -91,15 +91,15 @@ class Bounds:
         """Whether the bounds are within `tolerance` of each other."""
         return math.isfinite(self.high) and self.high - self.low <= tolerance * self.high
 
-    def but_limited(self) -> "Bounds":
+    def but_limited(self) -> "HittingTimeBounds":
         """The same bounds, as close as floats allow."""
-        return Bounds(self.low, self.high, self.largest, True)
+        return HittingTimeBounds(self.low, self.high, self.largest, True)
 
 
-def certified(above: float, below: float, largest: float) -> Bounds:
+def certified(above: float, below: float, largest: float) -> HittingTimeBounds:
     """The bounds that follow from T J - J <= above and J - T J <= below."""
     high = PRODUCT / (1 - above) if above < 1 - 1e-9 else math.inf
-    return Bounds(1 / ((1 + below) * PRODUCT), high, largest)
+    return HittingTimeBounds(1 / ((1 + below) * PRODUCT), high, largest)
 
 
 def added(high: np.ndarray, low: np.ndarray, more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -207,7 +207,7 @@ class HittingTimes:
         j[~sure] = TOP  # a choice that may lead there is never the best
         return j, nodes.size, ~sure
 
-    def bounds(self, j: np.ndarray, count: int) -> Bounds:
+    def bounds(self, j: np.ndarray, count: int) -> HittingTimeBounds:
         """Bounds by the residuals of J; the greedy policy stands in `policy` then. `least` is the best lower one."""
         arrays = (*self.arrays, self.goal, self.order, count, j, None, self.policy, None, None)
         above, below, largest = hitting.residuals(*arrays)
@@ -215,7 +215,7 @@ class HittingTimes:
         self.least = max(self.least, bounds.lower)
         return bounds
 
-    def sweep(self, j: np.ndarray, count: int, sweeps: int, enough: float, spending: BudgetClock) -> Bounds:
+    def sweep(self, j: np.ndarray, count: int, sweeps: int, enough: float, spending: BudgetClock) -> HittingTimeBounds:
         """Sweeps in place; ends early where the upper bound is at most `enough`, the budget ends, or J does not
         move."""
         for number in range(sweeps):
@@ -251,7 +251,9 @@ class HittingTimes:
                 self.raised = self.swept
         return float(change)
 
-    def solve(self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: BudgetClock) -> Bounds:
+    def solve(
+        self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: BudgetClock
+    ) -> HittingTimeBounds:
         """Bounds within `tolerance` of each other, or an upper bound of at most `enough`, or what budget and floats
         allow."""
         bounds, failures, stalls, apart = self._converged(j, count, tolerance, enough, spending), 0, 0, math.inf
@@ -283,7 +285,9 @@ class HittingTimes:
             bounds = self._converged(j, count, tolerance, enough, spending)
         return bounds
 
-    def _converged(self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: BudgetClock) -> Bounds:
+    def _converged(
+        self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: BudgetClock
+    ) -> HittingTimeBounds:
         """Sweeps; as long as at their rate the bounds meet sooner than a linear solve takes, or nearly as soon.
 
         The rate is that of three times `SWEEPS` / 2 sweeps: moves along the slow mode set single ones back.
@@ -335,7 +339,9 @@ class HittingTimes:
 
     # Two floats a node ------------------------------------------------------------------------------------------------
 
-    def _refined(self, j: np.ndarray, count: int, tolerance: float, plain: Bounds, spending: BudgetClock) -> Bounds:
+    def _refined(
+        self, j: np.ndarray, count: int, tolerance: float, plain: HittingTimeBounds, spending: BudgetClock
+    ) -> HittingTimeBounds:
         """Bounds of a J that is the sum of two floats; `plain`, those of one, where they are no better. j becomes J +
         W."""
         high, low = j.copy(), np.zeros_like(j)
@@ -365,7 +371,7 @@ class HittingTimes:
 
     def _moved(
         self, high: np.ndarray, low: np.ndarray, count: int, factored: tuple[np.ndarray, "Factors"]
-    ) -> tuple[Bounds, np.ndarray]:
+    ) -> tuple[HittingTimeBounds, np.ndarray]:
         """(bounds of J* relative to J + W, J + W rounded up); a policy that is greedy in J - W in place of that in J
         where ties need it."""
         inner, factors = factored
@@ -391,7 +397,7 @@ class HittingTimes:
             margin[inner] += np.maximum(more, 0.0)
         lower = certified(0.0, below, 1.0).low
         ratio = float(np.min(below_high[inner] / ceiling[inner], initial=1.0)) / PRODUCT
-        return Bounds(max(ratio * lower, 0.0), upper, float(ceiling[inner].max(initial=0.0)), True), ceiling
+        return HittingTimeBounds(max(ratio * lower, 0.0), upper, float(ceiling[inner].max(initial=0.0)), True), ceiling
 
     def _residuals(
         self, high: np.ndarray, low: np.ndarray, count: int

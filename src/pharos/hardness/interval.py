@@ -197,7 +197,7 @@ class Budget:
 
 
 @dataclass(frozen=True)
-class Progress:
+class MeasureProgress:
     """How far a measure is: the interval so far, the searches done, how many candidates are left, and seconds since the
     start."""
 
@@ -217,7 +217,7 @@ class BudgetClock:
     def __init__(
         self,
         budget: Budget,
-        progress: Callable[[Progress], None] | None,
+        progress: Callable[[MeasureProgress], None] | None,
         conventions: Mapping[str, Any] = MappingProxyType({}),
     ):
         """conventions: what the values refer to that are measured meanwhile."""
@@ -244,4 +244,4 @@ class BudgetClock:
         """Call `progress`, where there is one and the last call is long enough ago."""
         if self.progress is not None and (now or self.seconds - self._reported >= 0.1):
             self._reported = self.seconds
-            self.progress(Progress(lower, upper, self.searches, candidates, self.seconds))
+            self.progress(MeasureProgress(lower, upper, self.searches, candidates, self.seconds))

@@ -27,9 +27,9 @@ from pharos.hardness.representation import (
     WORST_GREEDY,
     WORST_PLAYED,
     Grouped,
+    IdealisedLearner,
     Identity,
     KernelOperator,
-    Learner,
     LearningCurve,
     Memory,
     Representation,
@@ -147,11 +147,11 @@ def kernel_regret(
         kernel is 4 C^2 bytes of C different observations; beyond MOST_EXACT of them, landmarks.
     Source: pharos; Sirignano and Spiliopoulos (2019), Cai et al. (2019) for the limit of wide networks.
     """
-    learner = Learner(mdp, representation, schedule, horizon, solution)
+    learner = IdealisedLearner(mdp, representation, schedule, horizon, solution)
     return regret_in_kernel(learner, {"schedule": asdict(learner.schedule)})
 
 
-def regret_in_kernel(learner: Learner, settings: Mapping[str, Any]) -> KernelRegret:
+def regret_in_kernel(learner: IdealisedLearner, settings: Mapping[str, Any]) -> KernelRegret:
     """The regret of a learner with a kernel, by landmarks where there are too many observations, and with a table.
 
     Args:
@@ -237,7 +237,7 @@ def kernel_policy_regret(
     return regret_in_kernel(learner, {"schedule": of_schedule, "rollouts": learner.rollouts.to_dict()})
 
 
-class PolicyLearner(Learner):
+class PolicyLearner(IdealisedLearner):
     """An MDP, and actor-critics on it."""
 
     measure = "kernel_policy_regret"

@@ -12,7 +12,7 @@ from pharos.hardness.diameter import diameter, start_eccentricity_interval
 from pharos.hardness.effective_horizon import effective_horizon, stationary_effective_horizon
 from pharos.hardness.gaps import Gaps, resolved_gaps, solved
 from pharos.hardness.gorp import gorp_bound
-from pharos.hardness.interval import Budget, Certified, Progress
+from pharos.hardness.interval import Budget, Certified, MeasureProgress
 from pharos.hardness.kernel_regret import (
     aliasing_floor,
     kernel_learning_time,
@@ -92,10 +92,10 @@ class Problem:
         if self.progress is not None:
             self.progress(what, line)
 
-    def interval_reporter(self, what: str) -> Callable[[Progress], None]:
+    def interval_reporter(self, what: str) -> Callable[[MeasureProgress], None]:
         """A callback for measures that narrow an interval down."""
 
-        def show(progress: Progress) -> None:
+        def show(progress: MeasureProgress) -> None:
             upper = f"{progress.upper:.6g}" if math.isfinite(progress.upper) and progress.upper < 2**31 - 1 else "?"
             self.report(
                 what,

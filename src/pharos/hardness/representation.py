@@ -1,7 +1,7 @@
 """What a network makes of the states of an MDP: which look alike, and how much learning at one changes another.
 
-Products with its kernel are those of the kernel itself, the identity, or landmarks and a diagonal (Nyström). `Learner`
-is Q-learning of a network in expectation, what `kernel_regret` builds on.
+Products with its kernel are those of the kernel itself, the identity, or landmarks and a diagonal (Nyström).
+`IdealisedLearner` is Q-learning of a network in expectation, what `kernel_regret` builds on.
 """
 
 import math
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.visitation import Walk, drawn, standard_occupancy
+from pharos.hardness.visitation import Propagation, drawn, standard_occupancy
 from pharos.mdp import TabularMDP, whole_number
 from pharos.solvers import Solution, evaluate_policy, regret_scale, uniform_value, value_iteration
 
@@ -411,7 +411,7 @@ class LearningCurve:
         return {name: np.round(values, 6).tolist() for name, values in vars(self).items()}
 
 
-class Learner:
+class IdealisedLearner:
     """An MDP, and what learners on it have in common.
 
     Attributes:
@@ -570,7 +570,7 @@ class Memory:
         self.later = np.zeros((shape[0], mdp.width, shape[1]))
         self.rewards = np.asarray(mdp.reward_table.rows(states), np.float64)
 
-    def play(self, visits: "Visits", policy: np.ndarray, period: int) -> tuple[float, float]:
+    def play(self, visits: "ExpectedVisits", policy: np.ndarray, period: int) -> tuple[float, float]:
         """Add `period` steps of a policy (N, A), by its visits. Returns (expected return, expected steps) of an
         episode."""
         length = float(visits.executed.sum())
@@ -597,7 +597,7 @@ class Memory:
         return np.divide(total, visits, out=q.copy(), where=visits > 0), visits
 
 
-class Visits(NamedTuple):
+class ExpectedVisits(NamedTuple):
     """Expected visits in an episode: first (S,), of the first step; later (S, W), by the previously executed action;
     executed (S, A), of all steps by what is executed."""
 
@@ -624,9 +624,9 @@ class OfPolicies(Generic[Answer]):
         return answer
 
 
-def visits_of(mdp: TabularMDP, policy: np.ndarray, episode: int) -> Visits:
+def visits_of(mdp: TabularMDP, policy: np.ndarray, episode: int) -> ExpectedVisits:
     """The visits of a policy (S, A) in an episode of some steps, without terminal states."""
-    walk = Walk(mdp, policy, episode)
+    walk = Propagation(mdp, policy, episode)
     first, later = np.zeros(mdp.num_states), np.zeros((mdp.num_states, mdp.width))
     for mass, is_first, alive in walk.distributions():
         if alive <= 1e-12:
@@ -636,7 +636,7 @@ def visits_of(mdp: TabularMDP, policy: np.ndarray, episode: int) -> Visits:
         else:
             later += mass
     first[~walk.live] = later[~walk.live] = 0.0
-    return Visits(first, later, walk.executed(first, later))
+    return ExpectedVisits(first, later, walk.executed(first, later))
 
 
 def greedy_policy(values: np.ndarray) -> np.ndarray:

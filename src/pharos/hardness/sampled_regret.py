@@ -18,9 +18,9 @@ from pharos.hardness.representation import (
     MARGIN,
     WORST_GREEDY,
     Grouped,
+    IdealisedLearner,
     Identity,
     KernelOperator,
-    Learner,
     Representation,
     Schedule,
     greedy_policy,
@@ -222,7 +222,7 @@ def sampled_regret(
     )
 
 
-class SampledLearner(Learner):
+class SampledLearner(IdealisedLearner):
     """An MDP, and learners that walk on it."""
 
     measure = "sampled_regret"

@@ -1,8 +1,8 @@
 """The diameter of a graph by directed ExactSumSweep, searches from many nodes at once, and the argument of clocks.
 
-`Graph` is that of a deterministic MDP, with searches forward and backward. `Layers` are those of a graph that contains
-a clock: every edge leads from one layer of nodes to the next, and round again. `orbits` are states that cannot be told
-apart by where actions lead. Source: Borassi et al. (2015); Then et al. (2014). Clocks are an argument of ours.
+`Graph` is that of a deterministic MDP, with searches forward and backward. `GraphLayers` are those of a graph that
+contains a clock: every edge leads from one layer of nodes to the next, and round again. `orbits` are states that cannot
+be told apart by where actions lead. Source: Borassi et al. (2015); Then et al. (2014). Clocks are an argument of ours.
 
 Clocks that the restart hides: the largest distances to many states, by searches that stand in the same layer. Let H be
 the graph without the edges of states that end, and e(u) the least number of steps from u to a state that ends, and one
@@ -106,7 +106,7 @@ def _leads_to_end(table: Indices, terminal: np.ndarray) -> bool:
 WIDE = 1024
 
 
-class Layers(NamedTuple):
+class GraphLayers(NamedTuple):
     """The nodes of a graph by layer.
 
     Attributes:
@@ -119,7 +119,7 @@ class Layers(NamedTuple):
     position: np.ndarray
 
     @staticmethod
-    def of(layer: np.ndarray, widths: np.ndarray, dtype: DTypeLike) -> "Layers":
+    def of(layer: np.ndarray, widths: np.ndarray, dtype: DTypeLike) -> "GraphLayers":
         """
         Args:
             layer: (N,) that of each node. widths: (P,) how many nodes each has. dtype: of nodes.
@@ -128,7 +128,7 @@ class Layers(NamedTuple):
         order = np.argsort(layer, kind="stable").astype(dtype)
         position = np.empty(len(layer), np.int32)
         position[order] = np.arange(len(layer)) - np.repeat(first[:-1], widths)
-        return Layers(order, first, position)
+        return GraphLayers(order, first, position)
 
     @property
     def number(self) -> int:
@@ -160,7 +160,7 @@ class HiddenClock(NamedTuple):
 
     home: np.ndarray
     away: np.ndarray
-    layers: Layers
+    layers: GraphLayers
 
     @staticmethod
     def of(graph: Graph, home: np.ndarray, away: np.ndarray) -> "HiddenClock | None":
@@ -179,7 +179,7 @@ class HiddenClock(NamedTuple):
         widths = np.bincount(layer, minlength=cycle)
         if int(widths.max()) > WIDE:
             return None
-        return HiddenClock(home.copy(), away.copy(), Layers.of(layer, widths, graph.dtype))
+        return HiddenClock(home.copy(), away.copy(), GraphLayers.of(layer, widths, graph.dtype))
 
     def largest_to(self, graph: Graph, targets: np.ndarray, best: int) -> tuple[np.ndarray, int]:
         """((targets,) max over u of d(u, target), or `best` where that is larger; table entries read)."""
@@ -473,7 +473,7 @@ class SumSweep:
         widest = int(widths.max())
         if widest > WIDE:
             return f"all cycles have multiples of {cycle} steps, but a layer of {widest} states is too wide to follow"
-        layers = Layers.of(layer, widths, graph.dtype)
+        layers = GraphLayers.of(layer, widths, graph.dtype)
         now, later = (np.empty((widest, -(-widest // 64)), np.uint64) for _ in range(2))
         max_reads = 200 * graph.num_nodes * graph.next_states.shape[1] + 10**8
         gap, _ = kernels.last_gap(graph.next_states, graph.ends, graph.start, *layers, now, later, max_reads)

@@ -118,7 +118,7 @@ def occupancy(
         the 2.4 million states of `breakout/12x8x1` take 0.8 s.
     Source: Puterman (1994), section 6.9; Laidlaw, Russell and Dragan (2023) for mu_t.
     """
-    walk = Walk(mdp, policy, horizon)
+    walk = Propagation(mdp, policy, horizon)
     shape = (mdp.num_states, mdp.num_actions)
     if keep_all and walk.horizon is None:
         raise ParameterError("keep_all is for episodes of T steps: give a horizon")
@@ -171,7 +171,7 @@ def discounted_visits(
     Cost: O(S A) a pass; at most ln(1 / tolerance) / (1 - gamma) passes, in breadth-first order a tenth of them and
         fewer.
     """
-    walk = Walk(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
+    walk = Propagation(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
     started, visits, left = walk.discounted(tolerance)
     return started + visits.sum(axis=1), left
 
@@ -188,7 +188,7 @@ def discounted_arrivals(
     Returns:
         (S + 1,) float64, entry S for the end; and the bound.
     """
-    walk = Walk(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
+    walk = Propagation(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
     started, visits, left = walk.discounted(tolerance)
     executed = walk.executed(started, visits)
     result = np.append(started + visits.sum(axis=1), 0.0)
@@ -212,7 +212,7 @@ def support_with_ends(mdp: TabularMDP, policy: TablePolicy | None = None) -> np.
         ParameterError: the policy is wrong.
     Cost: O(S A); with transitions as a matrix that for each step to the last state that is met.
     """
-    walk = Walk(mdp, policy, 1)
+    walk = Propagation(mdp, policy, 1)
     started, is_visited = walk.after_the_start()
     is_visited = (is_visited > 0).astype(np.float64)
     mdp.dynamics.support(walk.later, is_visited)
@@ -226,7 +226,7 @@ def support_with_ends(mdp: TabularMDP, policy: TablePolicy | None = None) -> np.
     return np.append(np.where(walk.live, live, arrived), ends)
 
 
-class Walk:
+class Propagation:
     """Distributions of a policy's states, one step after the other.
 
     Pairs (state, previous action) under sticky actions.
@@ -484,7 +484,7 @@ def covering(mdp: TabularMDP, *, horizon: int | None = None) -> Covering:
 
 def _occupied(mdp: TabularMDP, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """(max over t, sum over t) of the probability of each node that uniform play meets and that is not terminal."""
-    walk = Walk(mdp, None, steps)
+    walk = Propagation(mdp, None, steps)
     largest, total = np.zeros((mdp.num_states, walk.width)), np.zeros((mdp.num_states, walk.width))
     alone = np.zeros((0, 1))  # under sticky actions a start has no previous action: nodes of their own
     for now, first, _ in walk.distributions():

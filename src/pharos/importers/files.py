@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
-from pharos.importers.folder import Outcomes
+from pharos.importers.folder import ImportedOutcomes
 from pharos.mdp import TabularMDP, whole_number
 from pharos.system import storage
 
@@ -186,7 +186,7 @@ def storm_recording(
     target: str | None = None,
     gamma: float = 1.0,
     horizon: int | None = None,
-) -> tuple[TabularMDP, Outcomes | None]:
+) -> tuple[TabularMDP, ImportedOutcomes | None]:
     """Return the MDP of `storm`, and its outcomes with the reward of each, for `importers.save(..., outcomes=)`.
 
     The outcomes are None where no choice pays different rewards, so that the MDP says it all.
@@ -215,7 +215,7 @@ def storm_recording(
     return _mdp(model, outcomes, gamma, horizon), outcomes if _differ(outcomes) else None
 
 
-def _outcomes(model: Any, ended: np.ndarray, paid: Any) -> Outcomes:
+def _outcomes(model: Any, ended: np.ndarray, paid: Any) -> ImportedOutcomes:
     """What every state and action may lead to and what that pays; of states that end the episode, its end."""
     matrix, states = model.transition_matrix, model.nr_states
     first = [matrix.get_row_group_start(s) for s in range(states)]
@@ -234,7 +234,9 @@ def _outcomes(model: Any, ended: np.ndarray, paid: Any) -> Outcomes:
             likely += [p for _, p in row]
             rewards += [0.0] if ended[s] else _rewards(paid, s, choice, successors[offsets[-1] :], ended)
             offsets.append(len(successors))
-    return Outcomes(np.array(offsets), np.array(successors, np.int64), np.array(likely), np.array(rewards, np.float64))
+    return ImportedOutcomes(
+        np.array(offsets), np.array(successors, np.int64), np.array(likely), np.array(rewards, np.float64)
+    )
 
 
 def _rewards(paid: Any, state: int, choice: int, successors: list[int], ended: np.ndarray) -> list[float]:
@@ -252,13 +254,13 @@ def _rewards(paid: Any, state: int, choice: int, successors: list[int], ended: n
     return [always + of.get(following, 0.0) for following in successors]
 
 
-def _differ(outcomes: Outcomes) -> bool:
+def _differ(outcomes: ImportedOutcomes) -> bool:
     """Whether some state and action pays different rewards."""
     begin = outcomes.offsets[:-1]
     return bool((np.minimum.reduceat(outcomes.rewards, begin) < np.maximum.reduceat(outcomes.rewards, begin)).any())
 
 
-def _mdp(model: Any, outcomes: Outcomes, gamma: float, horizon: int | None) -> TabularMDP:
+def _mdp(model: Any, outcomes: ImportedOutcomes, gamma: float, horizon: int | None) -> TabularMDP:
     from scipy import sparse
 
     begin, counts, states = outcomes.offsets[:-1], np.diff(outcomes.offsets), model.nr_states

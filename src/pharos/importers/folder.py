@@ -27,7 +27,7 @@ from pharos.system.mdp_files import (
 )
 
 
-class Outcomes(NamedTuple):
+class ImportedOutcomes(NamedTuple):
     """What each state and action may lead to, and what that pays.
 
     Attributes:
@@ -56,7 +56,7 @@ def save(
     time_limit: int | None = None,
     observations: np.ndarray | None = None,
     observed: str | None = None,
-    outcomes: Outcomes | None = None,
+    outcomes: ImportedOutcomes | None = None,
 ) -> Path:
     """Write an MDP without chance into a folder.
 
@@ -122,7 +122,7 @@ def _warn(text: str) -> None:
     warnings.warn(text, RuntimeWarning, stacklevel=4)
 
 
-def _checked_outcomes(mdp: TabularMDP, outcomes: Outcomes) -> dict[str, np.ndarray]:
+def _checked_outcomes(mdp: TabularMDP, outcomes: ImportedOutcomes) -> dict[str, np.ndarray]:
     """Their arrays by their names; ParameterError where they are not those of the MDP."""
     offsets, successors, probabilities, rewards = (np.asarray(each) for each in outcomes)
     pairs = mdp.num_states * mdp.num_actions

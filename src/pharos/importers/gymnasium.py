@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, RuleError, StateSpaceTooLarge
 from pharos.importers.files import MINIGRID_STEPS
-from pharos.importers.folder import Outcomes
+from pharos.importers.folder import ImportedOutcomes
 from pharos.mdp import TabularMDP
 
 SAMPLED_STEPS = 10_000
@@ -77,7 +77,7 @@ def gymnasium(env: object, *, gamma: float = 0.99, horizon: int | None = None, c
     return TabularMDP.from_matrices(matrix, rewards, gamma=gamma, initial=initial, horizon=horizon)
 
 
-def gymnasium_outcomes(env: object) -> Outcomes | None:
+def gymnasium_outcomes(env: object) -> ImportedOutcomes | None:
     """Return the outcomes of the same table with the reward of each, for `importers.save(..., outcomes=)`.
 
     None where no action pays different rewards, so that the MDP says it all.
@@ -97,7 +97,7 @@ def gymnasium_outcomes(env: object) -> Outcomes | None:
     next_states, probabilities, rewards = (
         np.array(each) for each in zip(*itertools.chain.from_iterable(entries), strict=True)
     )
-    return Outcomes(offsets, next_states.astype(np.int64), probabilities, rewards)
+    return ImportedOutcomes(offsets, next_states.astype(np.int64), probabilities, rewards)
 
 
 def _rows(env: Any) -> tuple[Any, list[list[list]]]:

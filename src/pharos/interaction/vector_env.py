@@ -28,7 +28,7 @@ from pharos.interaction.simulator import (
     seed_streams,
 )
 from pharos.kernels import stepping
-from pharos.kernels.stepping import DISABLED, SAME_STEP, Batch, first_outside
+from pharos.kernels.stepping import DISABLED, SAME_STEP, EnvironmentBatch, first_outside
 from pharos.mdp import OutcomeTable, rewards_of_outcomes, rewards_of_staying, whole_number
 from pharos.observations import NO_ACTION, Index, Seen, in_blocks
 from pharos.system.arrays import as_array
@@ -42,7 +42,7 @@ LARGEST_TABLE = 1 << 28  # bytes of observations that are computed beforehand
 _NO_VECTORS = np.empty((0, 0), np.float32)
 
 
-class Walk(ABC):
+class Stepper(ABC):
     """Where the N environments are, and how a step advances them.
 
     Kernels get Setting and Batch as plain tuples: named ones cost Numba a microsecond a call more.
@@ -82,7 +82,7 @@ class Walk(ABC):
         return _NO_VECTORS
 
     @abstractmethod
-    def step(self, batch: Batch) -> None:
+    def step(self, batch: EnvironmentBatch) -> None:
         """Advance every environment."""
 
     def seen(self, places: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
@@ -94,7 +94,7 @@ class Walk(ABC):
         return self.seen(self.current, previous, elapsed)
 
 
-class RulesWalk(Walk):
+class RulesStepper(Stepper):
     """States (N, D), advanced by the rules."""
 
     name = "state"
@@ -134,7 +134,7 @@ class RulesWalk(Walk):
             self._vector = np.empty(self.current.shape, np.float32)
         return self._vector
 
-    def step(self, batch: Batch) -> None:
+    def step(self, batch: EnvironmentBatch) -> None:
         self.final_elapsed[:] = batch.elapsed + 1
         parameters, setting, arrays = self.simulator.rules.parameters, self._setting, tuple(batch)
         faults: list[int] = []
@@ -153,7 +153,7 @@ class RulesWalk(Walk):
         return self._vector if len(self._vector) else super().observations(previous, elapsed)
 
 
-class TableWalk(Walk):
+class TableStepper(Stepper):
     """Indices (N,) of a built state space, advanced by looking successors up."""
 
     name = "index"
@@ -178,7 +178,7 @@ class TableWalk(Walk):
     def states(self, places: np.ndarray) -> np.ndarray:
         return self.space.states(places)
 
-    def step(self, batch: Batch) -> None:
+    def step(self, batch: EnvironmentBatch) -> None:
         self.final_elapsed[:] = batch.elapsed + 1
         walk_table: Callable[..., None] = stepping.walk_table
         terminal, setting, arrays = self.space.terminal, self._setting, tuple(batch)
@@ -278,8 +278,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         self._reward_channel = RewardChannel(interaction.chance, n) if simulator.modifies_rewards else None
         self._num_drawn = n if simulator.has_outcomes else 0  # outcomes that are drawn in a step
         space = simulator.state_space
-        self._walk: Walk = (
-            RulesWalk(simulator, n, self._mode) if space is None else TableWalk(simulator, space, n, self._mode)
+        self._walk: Stepper = (
+            RulesStepper(simulator, n, self._mode) if space is None else TableStepper(simulator, space, n, self._mode)
         )
 
     @property
@@ -334,7 +334,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         terminated, truncated = np.empty(n, np.bool_), np.empty(n, np.bool_)
         walk = self._walk
         walk.step(
-            Batch(
+            EnvironmentBatch(
                 self._rng, actions, walk.current, self._previous, self._elapsed, self._ended,
                 rewards, terminated, truncated, executed, walk.final, walk.vectors(), probabilities,
             )

@@ -47,7 +47,7 @@ class Setting(NamedTuple):
     cumulative: np.ndarray
 
 
-class Batch(NamedTuple):
+class EnvironmentBatch(NamedTuple):
     """The arrays of N environments that a step reads and writes.
 
     Attributes:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 LONGEST_REASON = 400
 
-Progress = Callable[[int, int, str], None]
+BoardProgressCallback = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,10 @@ class Board(Generic[T]):
     refused: dict[str, str] = field(default_factory=dict)
 
     def judge(
-        self, files: Sequence[tuple[str, Path]], judged: Callable[[Path], tuple[T, str]], progress: Progress | None
+        self,
+        files: Sequence[tuple[str, Path]],
+        judged: Callable[[Path], tuple[T, str]],
+        progress: BoardProgressCallback | None,
     ) -> None:
         """Verify files, by name and path.
 
@@ -112,7 +115,7 @@ def board(
     *,
     title: str = "Leaderboard",
     trust: bool = False,
-    progress: Progress | None = None,
+    progress: BoardProgressCallback | None = None,
     **options: Any,
 ) -> Board[Verdict]:
     """Verify every entry in a folder, and write a page that ranks them; entries of one task share its solution.

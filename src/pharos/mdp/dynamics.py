@@ -76,7 +76,7 @@ class Outcomes(NamedTuple):
     probabilities: np.ndarray
 
 
-class Order(NamedTuple):
+class TopologicalOrder(NamedTuple):
     """An order of states in which each comes before those that it may lead to.
 
     Attributes:
@@ -88,7 +88,7 @@ class Order(NamedTuple):
     longest: int
 
 
-class Components(NamedTuple):
+class StronglyConnected(NamedTuple):
     """Strongly connected components of the states, in an order in which each stands before those that it leads to.
 
     Attributes:
@@ -218,7 +218,7 @@ class Dynamics(ABC):
         """
         return swept(self.for_sweeps, self.num_actions, equation, x, None, threads, part)
 
-    def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: Order) -> None:
+    def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: TopologicalOrder) -> None:
         """Replace each entry of x by its backup, from the last state of an order to the first: the fixed point."""
         swept(self.for_sweeps, self.num_actions, equation, x, order.states)
 
@@ -313,7 +313,7 @@ class Dynamics(ABC):
         outcomes.arrive(self.for_kernels, np.asarray(states), result)
         return result
 
-    def components(self, live: np.ndarray, least: int) -> Components:
+    def components(self, live: np.ndarray, least: int) -> StronglyConnected:
         """The strongly connected components of the states, of which live ones (S,) bool lead on.
 
         Args:
@@ -330,10 +330,16 @@ class Dynamics(ABC):
         bellman.component_order(self.for_kernels, live, number, first, is_cyclic, order)
         largest = int(np.diff(first).max(initial=0, where=is_cyclic))
         starts, has_cycle = bellman.joined(first, is_cyclic, least)
-        return Components(order, starts, has_cycle, count, largest)
+        return StronglyConnected(order, starts, has_cycle, count, largest)
 
     def settle_components(
-        self, equation: BellmanEquation, x: np.ndarray, parts: Components, target: float, settled: float, most: float
+        self,
+        equation: BellmanEquation,
+        x: np.ndarray,
+        parts: StronglyConnected,
+        target: float,
+        settled: float,
+        most: float,
     ) -> None:
         """Sweep x group by group of `components`, from the last to the first, until each is settled.
 
@@ -360,14 +366,14 @@ class Dynamics(ABC):
                 if most < 0 or not parts.has_cycle[group]:
                     break
 
-    def order(self, live: np.ndarray) -> Order | None:
+    def order(self, live: np.ndarray) -> TopologicalOrder | None:
         """An order of states in which each live one (S,) bool stands before those it leads to; None: there is none."""
         states = None
         if bellman.is_increasing(self.for_kernels, live, None)[0] >= 0:
             states = bellman.topological_order(self.for_kernels, live)
             if len(states) < self.num_states:
                 return None
-        return Order(states, int(bellman.longest_path(self.for_kernels, live, states)))
+        return TopologicalOrder(states, int(bellman.longest_path(self.for_kernels, live, states)))
 
     def check_age(self, live: np.ndarray, age: np.ndarray) -> None:
         """ParameterError unless each transition of a live state (S,) bool leads to one of larger age (S,)."""

@@ -19,7 +19,7 @@ from pharos.errors import ParameterError
 from pharos.kernels import outcomes as kernels
 from pharos.mdp.actions import States
 from pharos.mdp.arguments import as_array
-from pharos.mdp.dynamics import Dynamics, Order, Outcomes, as_indices, split
+from pharos.mdp.dynamics import Dynamics, Outcomes, TopologicalOrder, as_indices, split
 from pharos.system.arrays import (
     SUM_TOLERANCE,
     Indices,
@@ -189,7 +189,7 @@ class Lazy(Dynamics):
         stays = rng.random(len(states)) < self.laziness
         return np.where(stays, states, self.tables.sample(states, actions, rng))
 
-    def order(self, live: np.ndarray) -> Order | None:
+    def order(self, live: np.ndarray) -> TopologicalOrder | None:
         return None if live.any() else self.tables.order(live)
 
     def part(self, start: int, stop: int) -> tuple[Dynamics, np.ndarray]:

@@ -22,7 +22,7 @@ from pharos.mdp.arguments import (
     start_of,
     terminal_states,
 )
-from pharos.mdp.dynamics import Dynamics, Order
+from pharos.mdp.dynamics import Dynamics, TopologicalOrder
 from pharos.mdp.rewards import Rewards, expected_over_outcomes, rewards_of_shape
 from pharos.mdp.table import (
     Lazy,
@@ -420,7 +420,7 @@ class TabularMDP:
         self.dynamics.check_age(~np.asarray(self.terminal), array)
         return replace(self, age=array)
 
-    def order(self) -> Order | None:
+    def order(self) -> TopologicalOrder | None:
         """An order of the states in which each stands before those it may lead to; None: some can be visited again.
 
         Cost: from ages at most a sort; else O(S A) and 16 bytes a state.
@@ -431,7 +431,7 @@ class TabularMDP:
         if (age[1:] < age[:-1]).any():
             states = np.argsort(age, kind="stable")
             age = age[states]
-        return Order(states, int(np.count_nonzero(age[1:] != age[:-1])))
+        return TopologicalOrder(states, int(np.count_nonzero(age[1:] != age[:-1])))
 
     def within(self, steps: int) -> "TabularMDP":
         """The same MDP with only those states that can be met within `steps` steps from a start; they keep their order.

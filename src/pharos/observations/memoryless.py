@@ -62,7 +62,7 @@ def memoryless_loss(
             f"{mdp}: under sticky actions a policy without memory does not know the state; leave them out"
         )
     optimal = optimal or value_iteration(mdp, TOLERANCE)
-    search = _Search(mdp, np.asarray(classes), time.monotonic() + budget)
+    search = _PolicySearch(mdp, np.asarray(classes), time.monotonic() + budget)
     lower, upper = search.bounds(optimal)
     best, error = float(optimal.value_at_start), optimal.error_bound
     lower_loss = max(0.0, best - error - upper)
@@ -70,7 +70,7 @@ def memoryless_loss(
     return MemorylessLoss(lower_loss, upper_loss, upper_loss - lower_loss <= 10 * (TOLERANCE + error), search.solved)
 
 
-class _Search:
+class _PolicySearch:
     """Branch and bound over the observations that states share.
 
     Attributes:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 BLOCK = 4096
 MOST_HISTORIES = 1_000_000
 
-Progress = Callable[[int, str], None]
+AliasingProgressCallback = Callable[[int, str], None]
 """Called with how many states are done, and a text."""
 
 
@@ -42,7 +42,9 @@ class Aliasing:
         return self.num_sharing / self.num_states
 
 
-def aliasing(space: "StateSpace", observation: Observation, *, progress: Progress | None = None) -> Aliasing:
+def aliasing(
+    space: "StateSpace", observation: Observation, *, progress: AliasingProgressCallback | None = None
+) -> Aliasing:
     """Count the states of a state space that an observation does not tell apart.
 
     Of an observation of k frames the states that some histories do not tell apart, see `history_aliasing`.
@@ -55,7 +57,7 @@ def aliasing(space: "StateSpace", observation: Observation, *, progress: Progres
 
 
 def observation_classes(
-    space: "StateSpace", observation: Observation, *, progress: Progress | None = None
+    space: "StateSpace", observation: Observation, *, progress: AliasingProgressCallback | None = None
 ) -> np.ndarray:
     """Number the different observations of a state space.
 
@@ -85,7 +87,7 @@ def history_aliasing(
     observation: Observation,
     *,
     most: int = MOST_HISTORIES,
-    progress: Progress | None = None,
+    progress: AliasingProgressCallback | None = None,
 ) -> Aliasing:
     """Count the states that an observation of k frames does not tell apart, over all histories that play can have.
 
@@ -141,7 +143,7 @@ def _histories(space: "StateSpace", length: int, max_histories: int) -> np.ndarr
 
 
 def _numbered(
-    observations_of: Callable[[slice], np.ndarray], count: int, name: str, progress: Progress | None
+    observations_of: Callable[[slice], np.ndarray], count: int, name: str, progress: AliasingProgressCallback | None
 ) -> np.ndarray:
     """(count,) int64, the numbers of different observations, which `observations_of` gives for blocks of rows."""
     import xxhash

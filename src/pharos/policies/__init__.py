@@ -2,14 +2,14 @@
 
 from pharos.policies.policy import (
     DeepPolicy,
-    Model,
     Policy,
     PolicyAnswers,
     PolicyLike,
     QueriedPolicy,
     ReachableRows,
     RecurrentPolicy,
-    Sight,
+    SB3Model,
+    StateObserver,
     TableAnswers,
     TabularAgent,
     deep_policy,

@@ -46,7 +46,7 @@ class TabularAgent(Protocol):
 
 
 @runtime_checkable
-class Model(Protocol):
+class SB3Model(Protocol):
     """An algorithm of Stable-Baselines3."""
 
     @property
@@ -84,7 +84,7 @@ class RecurrentPolicy(Protocol):
         """((N, A) probabilities or (N,) actions, the next state); starts: (N,) bool, where an episode begins."""
 
 
-PolicyLike = np.ndarray | TabularAgent | Policy | RecurrentPolicy | Model | Callable[[Any], Any]
+PolicyLike = np.ndarray | TabularAgent | Policy | RecurrentPolicy | SB3Model | Callable[[Any], Any]
 """What is taken for a policy: a table (S,), (S, A) or (S, A + 1, A), an agent, a model of Stable-Baselines3, a function
 from a batch of observations to (N, A) probabilities or (N,) actions, or one that keeps a state besides."""
 
@@ -95,11 +95,11 @@ def policy_function(policy: PolicyLike) -> Callable[[Any], Any]:
     Raises:
         ParameterError: it is none, or has a memory.
     """
-    if isinstance(policy, RecurrentPolicy) and not isinstance(policy, Policy | Model):
+    if isinstance(policy, RecurrentPolicy) and not isinstance(policy, Policy | SB3Model):
         raise _remembers(policy)
     if isinstance(policy, Policy):
         return policy.action_probabilities
-    if isinstance(policy, Model):
+    if isinstance(policy, SB3Model):
         return DeepPolicy(policy).action_probabilities
     if callable(policy):
         return policy
@@ -120,7 +120,7 @@ class DeepPolicy:
         ParameterError: the policy has a memory, so that its probabilities do not belong to observations.
     """
 
-    def __init__(self, model: Model, *, deterministic: bool = False):
+    def __init__(self, model: SB3Model, *, deterministic: bool = False):
         if _has_memory(model):
             raise _remembers(model)
         self.model, self.deterministic = model, deterministic
@@ -180,12 +180,12 @@ class RecurrentDeepPolicy:
         return distribution.distribution.probs.numpy().astype(np.float64), after
 
 
-def deep_policy(model: Model) -> "DeepPolicy | RecurrentDeepPolicy":
+def deep_policy(model: SB3Model) -> "DeepPolicy | RecurrentDeepPolicy":
     """The policy of a model of Stable-Baselines3 or sb3-contrib, with a memory or without."""
     return RecurrentDeepPolicy(model) if _has_memory(model) else DeepPolicy(model)
 
 
-def _has_memory(model: Model) -> TypeGuard["RecurrentModel"]:
+def _has_memory(model: SB3Model) -> TypeGuard["RecurrentModel"]:
     distribution = getattr(model.policy, "get_distribution", None)
     return distribution is not None and "lstm_states" in inspect.signature(distribution).parameters
 
@@ -222,7 +222,7 @@ BATCH = 4096
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class StateObserver:
     """Observations of the states of an environment, as a policy sees them.
 
     Attributes:
@@ -468,7 +468,7 @@ class PolicyAnswers(QueriedPolicy):
         ParameterError: it is no policy, or was trained on other observations.
     """
 
-    def __init__(self, policy: PolicyLike, mdp: TabularMDP, sight: Sight, *, deterministic: bool = False):
+    def __init__(self, policy: PolicyLike, mdp: TabularMDP, sight: StateObserver, *, deterministic: bool = False):
         super().__init__(mdp, sees_previous_action=sight.previous_action)
         self.policy, self.sight, self.deterministic = policy_function(policy), sight, deterministic
         check_observation(policy, sight.observe.space, sight.observation)

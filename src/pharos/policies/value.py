@@ -22,14 +22,14 @@ from pharos.errors import DivergenceError, ParameterError
 from pharos.mdp import PolicyTable, Rewards, Table, TabularMDP, require_mdp
 from pharos.policies.policy import (
     Arrays,
-    Model,
     Policy,
     PolicyAnswers,
     PolicyLike,
     QueriedPolicy,
     ReachableRows,
     RecurrentPolicy,
-    Sight,
+    SB3Model,
+    StateObserver,
     TableAnswers,
     TabularAgent,
     check_observation,
@@ -50,7 +50,7 @@ class QueriedHistories(PolicyAnswers):
     without its first state and with the next state behind. So the value of the policy is exact where they are few.
     """
 
-    def __init__(self, policy: PolicyLike, mdp: TabularMDP, sight: Sight, *, deterministic: bool = False):
+    def __init__(self, policy: PolicyLike, mdp: TabularMDP, sight: StateObserver, *, deterministic: bool = False):
         if sight.previous_action:
             raise ParameterError("the policy sees several frames and the previous action; expected one or the other")
         super().__init__(policy, mdp, sight, deterministic=deterministic)
@@ -151,7 +151,7 @@ class QueriedMemories(QueriedHistories):
     Cost: what the policy keeps is stored for each row.
     """
 
-    def __init__(self, policy: RecurrentPolicy, mdp: TabularMDP, sight: Sight, *, deterministic: bool = False):
+    def __init__(self, policy: RecurrentPolicy, mdp: TabularMDP, sight: StateObserver, *, deterministic: bool = False):
         observation = sight.observe.observation
         if observation.frames > 1 or observation.irrelevant:
             besides = "several frames" if observation.frames > 1 else "irrelevant entries"
@@ -251,9 +251,11 @@ def _packed(tree: Arrays, count: int) -> list[bytes]:
     return [row.tobytes() for row in joined]
 
 
-def answers_of(policy: PolicyLike, mdp: TabularMDP, sight: Sight, *, deterministic: bool = False) -> PolicyAnswers:
+def answers_of(
+    policy: PolicyLike, mdp: TabularMDP, sight: StateObserver, *, deterministic: bool = False
+) -> PolicyAnswers:
     """The answers of a policy that sees observations, of one state or of several, or remembers them."""
-    if isinstance(policy, Model) and not isinstance(policy, Policy):
+    if isinstance(policy, SB3Model) and not isinstance(policy, Policy):
         policy = deep_policy(policy)
     if isinstance(policy, RecurrentPolicy) and not isinstance(policy, Policy):
         return QueriedMemories(policy, mdp, sight, deterministic=deterministic)
@@ -295,7 +297,7 @@ class Evaluation:
 def policy_value(
     policy: PolicyLike,
     mdp: TabularMDP,
-    sight: Callable[[], Sight],
+    sight: Callable[[], StateObserver],
     return_range: Callable[[], tuple[float, float]],
     *,
     deterministic: bool = False,
@@ -333,7 +335,7 @@ def policy_value(
     return Evaluation(value, False, width, len(answers.rows), episodes)
 
 
-class SightOptions(TypedDict, total=False):
+class ObserverOptions(TypedDict, total=False):
     """Options of policies that see observations, which `evaluate_policy` describes."""
 
     observation_options: Mapping[str, object] | None
@@ -350,7 +352,7 @@ def evaluate_policy(
     horizon: int | None = None,
     observation: object = None,
     processes: int | str = 1,
-    **seeing: Unpack[SightOptions],
+    **seeing: Unpack[ObserverOptions],
 ) -> Solution:
     """The values of a policy.
 
@@ -381,7 +383,7 @@ def evaluate_policy(
     """
     if isinstance(policy, TabularAgent):
         policy = policy.policy_table()
-    if observation is not None or isinstance(policy, Policy | RecurrentPolicy | Model):
+    if observation is not None or isinstance(policy, Policy | RecurrentPolicy | SB3Model):
         if processes != 1:
             raise ParameterError("a policy that sees observations is evaluated by one process; expected processes=1")
         timed = mdp if horizon is None else mdp.with_horizon(horizon)
@@ -441,7 +443,9 @@ def _solution_of_reached(
             f"{mdp}: is not of a state space whose environment is known, so there is nothing to observe; "
             f"give the policy as a table"
         )
-    sight = Sight(space, space.environment, observation, dict(observation_options or {}), previous_action, mdp.horizon)
+    sight = StateObserver(
+        space, space.environment, observation, dict(observation_options or {}), previous_action, mdp.horizon
+    )
     if sight.frames > 1:
         raise ParameterError(
             "the policy sees several frames, so its values belong to no state; use `pharos evaluate`, or "

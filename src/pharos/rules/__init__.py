@@ -10,7 +10,7 @@ from pharos.rules.layout import Layout, layout_of, pack, unpack
 from pharos.system import lazy
 
 if TYPE_CHECKING:
-    from pharos.rules.compiled import CompiledDrawing, CompiledExploration, CompiledMotion
+    from pharos.rules.compiled import CompiledDrawing, CompiledExpansion, CompiledMotion
     from pharos.rules.compiler import reason_of
     from pharos.rules.interpreted import refused_reward
     from pharos.rules.rules import Rules, not_compiled, rules_of

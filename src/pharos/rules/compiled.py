@@ -17,7 +17,7 @@ from pharos.rules.layout import Layout
 from pharos.system.arrays import Indices, PackedIndices
 
 if TYPE_CHECKING:
-    from pharos.rules.exploration import ExplorationKernels
+    from pharos.rules.exploration import ExpansionKernels
     from pharos.rules.interaction import InteractionKernels
 
 Rows = np.ndarray | tuple[np.ndarray, np.ndarray]  # terminal, or (terminal, probabilities)
@@ -34,7 +34,7 @@ _SUSPECTS = 16  # states of which a kernel cannot say in which one a rule failed
 @cache
 def exploration_kernels(
     cls: type[Environment], names: tuple[str, ...], num_words: int, num_actions: int, outcomes: int = 1
-) -> "ExplorationKernels":
+) -> "ExpansionKernels":
     """The kernels of `exploration.py` for the rules of a class that mention the attributes `names`."""
     from pharos.rules.exploration import exploration
 
@@ -70,7 +70,7 @@ def is_kept(env: Environment, layout: Layout) -> bool:
     return isinstance(cache, KernelCache) and cache.holds_any()
 
 
-class CompiledExploration(_Compiled):
+class CompiledExpansion(_Compiled):
     """See `rules.Exploration`. Threads may share the work: the kernels release Python's lock."""
 
     is_compiled = True

@@ -24,7 +24,7 @@ from pharos.system.arrays import SUM_TOLERANCE
 BATCH = 16  # states expanded before their successors are looked up: enough look-ups to hide the memory's latency
 
 
-class ExplorationKernels(NamedTuple):
+class ExpansionKernels(NamedTuple):
     """The compiled kernels; see the makers below."""
 
     explore: Function
@@ -43,7 +43,7 @@ class Words(NamedTuple):
 
 def exploration(
     compiler: Compiler, rules: CompiledRules, Parameters: Constructor, W: int, A: int, K: int = 1, pays: bool = False
-) -> ExplorationKernels:
+) -> ExpansionKernels:
     """The kernels of a class of environments whose states take W words, with A actions of at most K outcomes.
 
     pays: whether its reward depends on the outcome.
@@ -61,7 +61,7 @@ def exploration(
     else:
         rewards_of = rewards_of_kernel(compiler.calling("reward"), rules, Parameters, words, W, A)
     ages = ages_of_kernel(compiler.calling("age"), rules, Parameters, words, W) if "age" in rules else no_ages
-    return ExplorationKernels(
+    return ExpansionKernels(
         explore=explore_kernel(search, expand, prefetch_states, words, W, A * K),
         expand_and_find=expand_and_find_kernel(search, expand, prefetch_states, words, A * K),
         rewards_of=rewards_of,

@@ -231,7 +231,7 @@ _MOST_FILES = 1 << 16
 _SHARE = 64  # states that are worth sending to another process
 
 
-class InterpretedExploration:
+class InterpretedExpansion:
     """See `rules.Exploration`. One thread asks; the rules themselves run in as many processes as there are workers."""
 
     is_compiled = False

@@ -19,12 +19,12 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from pharos.environments import Environment
-from pharos.kernels.stepping import Batch, Setting
+from pharos.kernels.stepping import EnvironmentBatch, Setting
 from pharos.rules.compiled import (
     COUNTED,
     CompiledAges,
     CompiledDrawing,
-    CompiledExploration,
+    CompiledExpansion,
     CompiledMotion,
     CompiledRewards,
     CompiledStepping,
@@ -41,7 +41,7 @@ Engine = TypeVar("Engine")
 Reasons = dict[tuple[object, ...] | None, str]  # signature of the instances -> why Numba does not compile them
 
 
-class Exploration(Protocol):
+class Expansion(Protocol):
     """Successors of packed states, looked up in a table of states (kernels/hash_table.py). See exploration.py for the
     arrays.
 
@@ -94,7 +94,7 @@ class Exploration(Protocol):
         """End the processes that run rules, if there are any."""
 
 
-class Rewards(Protocol):
+class TransitionRewards(Protocol):
     """Rewards of stored transitions of packed states."""
 
     def threads(self, workers: int) -> int:
@@ -164,7 +164,7 @@ class Stepping(Protocol):
         """
 
     def step_many(
-        self, parameters: tuple[object, ...], setting: Setting, batch: Batch, first: int, last: int, /
+        self, parameters: tuple[object, ...], setting: Setting, batch: EnvironmentBatch, first: int, last: int, /
     ) -> int:
         """One step of many environments; -1, or which component of which left its range."""
 
@@ -191,20 +191,20 @@ class Rules:
         self.layout: Layout = layout_of(env.components)
 
     @cached_property
-    def exploration(self) -> Exploration:
-        compiled = compiled_or_none(CompiledExploration, self.env, self.layout)
+    def exploration(self) -> Expansion:
+        compiled = compiled_or_none(CompiledExpansion, self.env, self.layout)
         if compiled is not None:
             return compiled
-        from pharos.rules.interpreted import InterpretedExploration  # which few need
+        from pharos.rules.interpreted import InterpretedExpansion  # which few need
 
-        return InterpretedExploration(self.env, self.layout, self._workers)
+        return InterpretedExpansion(self.env, self.layout, self._workers)
 
     @cached_property
-    def first_exploration(self) -> Exploration:
+    def first_exploration(self) -> Expansion:
         """Interpreted, for the first states, which are all of a small space."""
-        from pharos.rules.interpreted import InterpretedExploration
+        from pharos.rules.interpreted import InterpretedExpansion
 
-        return InterpretedExploration(self.env, self.layout)
+        return InterpretedExpansion(self.env, self.layout)
 
     @property
     def is_ready(self) -> bool:
@@ -219,7 +219,7 @@ class Rules:
         except Exception:  # what Numba does not compile is told where it is compiled
             return False
 
-    def rewards_of(self, num_states: int) -> Rewards:
+    def rewards_of(self, num_states: int) -> TransitionRewards:
         """For so many states in all: those of a few are interpreted."""
         from pharos.rules.interpreted import InterpretedRewards
 
@@ -227,7 +227,7 @@ class Rules:
         return InterpretedRewards(self.env, self.layout) if is_small else self.rewards
 
     @cached_property
-    def rewards(self) -> Rewards:
+    def rewards(self) -> TransitionRewards:
         compiled = compiled_or_none(CompiledRewards, self.env, self.layout)
         if compiled is not None:
             return compiled
@@ -270,7 +270,7 @@ class Rules:
 
     def reason_not_compiled(self) -> str:
         """Why Numba does not compile the rules of exploration and rewards; "" where it does. Warns of nothing."""
-        return "".join(_reason(engine, self.env, self.layout)[1] for engine in (CompiledExploration, CompiledRewards))
+        return "".join(_reason(engine, self.env, self.layout)[1] for engine in (CompiledExpansion, CompiledRewards))
 
 
 def rules_of(env: Environment, *, workers: int = 1) -> Rules:

@@ -18,8 +18,8 @@ that others read before the rest 240, 231 and 284, and a halo that is one sweep 
 
 All ranks run the same loop and see the same numbers, so they need nobody who tells them when to stop.
 
-`Checkpoint` has the values so far, in a file, so that who is killed while solving goes on from there. `shared_solution`
-is what several processes share: who takes part, and the Solution that comes of it.
+`SolverCheckpoint` has the values so far, in a file, so that who is killed while solving goes on from there.
+`shared_solution` is what several processes share: who takes part, and the Solution that comes of it.
 """
 
 import contextlib
@@ -52,7 +52,7 @@ _HEADER = 5  # float64: sweeps, two numbers, rows, columns
 _DIGEST = 32  # characters of a digest; two follow, of the header and of the values
 
 
-class Checkpoint:
+class SolverCheckpoint:
     """Where ranks keep their values; the first one reads and writes.
 
     A file holds what one question has come to: its name is a digest of the MDP, of what is chosen and of the rest. It
@@ -270,7 +270,7 @@ def _mixed(numbers: np.ndarray) -> np.ndarray:
 def ranked_fixed_point(
     backup: RankedBackup,
     tolerance: float,
-    checkpoint: Checkpoint,
+    checkpoint: SolverCheckpoint,
     progress: Callable[[int, float], None] | None,
 ) -> tuple[float, int]:
     """Sweep until the proven bound is at most the tolerance. Returns (bound, sweeps).
@@ -303,7 +303,7 @@ def ranked_fixed_point(
 def ranked_induction(
     backup: RankedBackup,
     horizon: int,
-    checkpoint: Checkpoint,
+    checkpoint: SolverCheckpoint,
     progress: Callable[[int, float], None] | None,
 ) -> tuple[float, np.ndarray]:
     """The values with `horizon` steps to go. Returns (bound, values with one step less)."""
@@ -352,7 +352,7 @@ def shared_solution(
 
     def program(rank: Rank) -> tuple[float, int, np.ndarray, np.ndarray] | None:
         what = f"{mdp.gamma!r} {mdp.chance} horizon {horizon}"
-        file = Checkpoint(folder, what, checkpoint_seconds)
+        file = SolverCheckpoint(folder, what, checkpoint_seconds)
         backup = RankedBackup(mdp, select, rank)
         if horizon is None:
             bound, sweeps = ranked_fixed_point(backup, tolerance, file, progress)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceLocked, StateSpaceMismatch
 from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, Plan, lock, read_manifest
-from pharos.state_space.progress import Progress, reporter
+from pharos.state_space.progress import BuildProgressCallback, reporter
 from pharos.state_space.store import StateSpace, load
 from pharos.state_space.stored import SHARDS, check_files
 from pharos.system import memory as machine
@@ -40,7 +40,7 @@ def build(
     memory: int | None = None,
     workers: int | None = None,
     processes: int | str = 1,
-    progress: Progress | bool | None = None,
+    progress: BuildProgressCallback | bool | None = None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     wait: bool | None = None,
 ) -> StateSpace:
@@ -100,7 +100,12 @@ def build(
 
 
 def _build(
-    plan: Plan, path: Path, rank: "Rank | None", options: "Options", progress: Progress | bool | None, hold: Hold
+    plan: Plan,
+    path: Path,
+    rank: "Rank | None",
+    options: "Options",
+    progress: BuildProgressCallback | bool | None,
+    hold: Hold,
 ) -> bool:
     """Make the folder hold the finished state space; returns whether it did before."""
     from pharos.state_space.journal import remove_parts

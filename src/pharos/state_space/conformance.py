@@ -180,7 +180,7 @@ def _note_unseen_values(env: Environment, states: list[State], complete: bool, n
 
 def _check_compiled(env: Environment, check: InterpretedCheck, states: list[State], notes: list[str]) -> bool:
     """Run the compiled rules on the same states; False, and a note, where Numba cannot compile them."""
-    from pharos.rules import CompiledExploration, not_compiled, rules_of
+    from pharos.rules import CompiledExpansion, not_compiled, rules_of
 
     rules = rules_of(env)
     layout = rules.layout
@@ -192,7 +192,7 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
     keys = np.zeros((num_states * branches, layout.num_words), np.uint64)
     terminal = np.zeros(num_states, np.uint8)
     likely = np.ones((num_states, branches))
-    exploration = CompiledExploration(env, layout)
+    exploration = CompiledExpansion(env, layout)
     for i in range(num_states):  # one by one, to know the state of a fault
         component = exploration.component_at_fault(packed, i, keys, terminal, likely)
         if component is not None and component > len(env.components):

@@ -47,7 +47,7 @@ from pharos.state_space.manifest import (
     write_manifest,
 )
 from pharos.state_space.stored import check_outcome_rules, check_rules, states_to_check
-from pharos.state_space.table import Block
+from pharos.state_space.table import BranchBlock
 from pharos.system.arrays import OutcomesOfState, as_stored, dtype_of, from_stored
 
 BLOCK_BYTES = 1 << 22  # of a file that are copied at a time
@@ -164,7 +164,7 @@ class Journal:
         with ThreadPoolExecutor(1) as self._writer:
             yield
 
-    def append(self, states: np.ndarray, block: Block, position: Position) -> None:
+    def append(self, states: np.ndarray, block: BranchBlock, position: Position) -> None:
         """Append in the background, while the next chunk is expanded; at most two chunks wait.
 
         Counts and checksums are noted by the thread that writes, once a chunk is in all files: whatever interrupts the
@@ -175,7 +175,7 @@ class Journal:
         self._writes.append(self._writer.submit(self._write, states, block, Position(**vars(position))))
         self.appended = position.count
 
-    def _write(self, states: np.ndarray, block: Block, at: Position) -> None:
+    def _write(self, states: np.ndarray, block: BranchBlock, at: Position) -> None:
         self._files[STATES].append(states)
         self._append_successors(block.successors)
         self._files[TERMINAL].append(np.packbits(block.terminal, bitorder="little"))
@@ -289,7 +289,7 @@ MOST_PADDING = (3, 10)
 ENTRIES = 1 << 18  # of rows of K, as many as are copied at a time
 
 
-class Part(NamedTuple):
+class JournalRows(NamedTuple):
     """Some rows: the number of the first one, and that of its first outcome; then R rows of N outcomes in all.
 
     counts (R,); codes (R,), None where probabilities are spelled out; successors (N,).
@@ -319,13 +319,13 @@ class OutcomeParts:
     indices: str
     palette: np.ndarray | None
 
-    def parts(self) -> Iterator[Part]:
+    def parts(self) -> Iterator[JournalRows]:
         """All rows, some at a time."""
         for row, first, codes, counts in self._counts():
             yield self._part(row, first, codes, counts)
 
     def _counts(self) -> Iterator[tuple[int, int, np.ndarray | None, np.ndarray]]:
-        """(row, first, codes, counts) of each `Part`."""
+        """(row, first, codes, counts) of each `JournalRows`."""
         sizes = np.zeros(0, np.int64) if self.palette is None else (self.palette != 0).sum(axis=1)
         first, step = 0, max(1, ENTRIES // self.most_declared // self.num_actions) * self.num_actions
         for row in range(0, self.rows, step):
@@ -339,15 +339,15 @@ class OutcomeParts:
             yield row, first, codes, counts
             first += int(counts.sum())
 
-    def _part(self, row: int, first: int, codes: np.ndarray | None, counts: np.ndarray) -> Part:
+    def _part(self, row: int, first: int, codes: np.ndarray | None, counts: np.ndarray) -> JournalRows:
         entries = int(counts.sum())
         dtype = dtype_of(INDEX_TYPES[self.indices])
         place = first * dtype.itemsize
         stored = np.fromfile(self.folder / PARTS[self.indices], dtype, entries, offset=place)
         successors = np.asarray(from_stored(stored))
-        return Part(row, first, counts, codes, successors)
+        return JournalRows(row, first, counts, codes, successors)
 
-    def likely(self, part: Part) -> np.ndarray:
+    def likely(self, part: JournalRows) -> np.ndarray:
         """(N,) uint64, the bits of the probabilities of its outcomes."""
         if self.palette is None:
             entries = len(part.successors)
@@ -508,7 +508,7 @@ class OutcomeJournal(Journal):
 
     # Appending --------------------------------------------------------------------------------------------------------
 
-    def _write(self, states: np.ndarray, block: Block, at: Position) -> None:
+    def _write(self, states: np.ndarray, block: BranchBlock, at: Position) -> None:
         if self._failure:  # files have no gaps
             raise self._failure
         try:
@@ -517,7 +517,7 @@ class OutcomeJournal(Journal):
             self._failure = error
             raise
 
-    def _write_outcomes(self, states: np.ndarray, block: Block, at: Position) -> None:
+    def _write_outcomes(self, states: np.ndarray, block: BranchBlock, at: Position) -> None:
         bits = np.ascontiguousarray(block.probabilities).view(np.uint64)
         counts = np.empty(len(bits) * self._num_actions, np.int64)
         following, likely = np.empty(bits.size, self.index_dtype), np.empty(bits.size, np.uint64)

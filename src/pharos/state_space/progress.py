@@ -28,11 +28,11 @@ class BuildProgress:
     on_disk: bool = False
 
 
-Progress = Callable[[BuildProgress], None]
+BuildProgressCallback = Callable[[BuildProgress], None]
 
 
 @contextlib.contextmanager
-def reporter(progress: Progress | bool | None, env: Environment) -> Iterator[Progress]:
+def reporter(progress: BuildProgressCallback | bool | None, env: Environment) -> Iterator[BuildProgressCallback]:
     """The function that gets each BuildProgress: the caller's, a bar on a terminal, or nothing."""
     if callable(progress):
         yield progress
@@ -44,7 +44,7 @@ def reporter(progress: Progress | bool | None, env: Environment) -> Iterator[Pro
 
 
 @contextlib.contextmanager
-def _bar(env: Environment) -> Iterator[Progress]:
+def _bar(env: Environment) -> Iterator[BuildProgressCallback]:
     from rich.console import Console
     from rich.progress import Progress as Bar
     from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn

@@ -35,9 +35,9 @@ from pharos.ranks import Rank, mpi_rank
 from pharos.rules import rules_of
 from pharos.state_space.journal import Journal, Position
 from pharos.state_space.manifest import Plan
-from pharos.state_space.progress import Progress
+from pharos.state_space.progress import BuildProgressCallback
 from pharos.state_space.search import Options, Search
-from pharos.state_space.table import Block, MemoryTable
+from pharos.state_space.table import BranchBlock, MemoryTable
 from pharos.system.memory import huge_pages
 
 ROWS = 1 << 16  # of a rank in a superstep, at most
@@ -133,7 +133,7 @@ class RankedTable:
             order, counts = self._routed(part)
             self._take(self._parts(part[order], counts), self._parts(numbers[order], counts))
 
-    def expand(self, states: np.ndarray, first: int, count: int) -> tuple[Block, np.ndarray]:
+    def expand(self, states: np.ndarray, first: int, count: int) -> tuple[BranchBlock, np.ndarray]:
         """Expand states [first, first + rows), in order, when `count` are numbered.
 
         Returns:
@@ -144,7 +144,7 @@ class RankedTable:
         parts = [states[cuts[i] : cuts[i + 1]] for i in range(self.rank.size)]
         block, new = self._superstep(self.rank.scatter(parts, states[:0]), first, cuts, count)
         rows = [np.concatenate(self.rank.gather(array)) for array in block]
-        return Block(*rows), np.concatenate(self.rank.gather(new))
+        return BranchBlock(*rows), np.concatenate(self.rank.gather(new))
 
     def _say(self, *header: int) -> None:
         self.rank.broadcast(np.array(header, np.int64), _HEADER)
@@ -261,7 +261,15 @@ WIDE = 10_000
 class RankedSearch(Search):
     """The search of rank 0; the other ranks run `answer`."""
 
-    def __init__(self, plan: Plan, journal: Journal, options: Options, report: Progress, rank: Rank, wide: int = WIDE):
+    def __init__(
+        self,
+        plan: Plan,
+        journal: Journal,
+        options: Options,
+        report: BuildProgressCallback,
+        rank: Rank,
+        wide: int = WIDE,
+    ):
         super().__init__(plan, journal, options, report)
         self.threads = 1
         self._wide = wide

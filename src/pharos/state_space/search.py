@@ -19,8 +19,8 @@ from pharos.errors import StateSpaceTooLarge
 from pharos.rules import rules_of
 from pharos.state_space.journal import Journal, OutcomeJournal, Position
 from pharos.state_space.manifest import Plan
-from pharos.state_space.progress import BuildProgress, Progress
-from pharos.state_space.table import Block, MemoryTable, SpilledTable
+from pharos.state_space.progress import BuildProgress, BuildProgressCallback
+from pharos.state_space.table import BranchBlock, MemoryTable, SpilledTable
 from pharos.system import compiling
 from pharos.system import memory as machine
 from pharos.system.arrays import INT32_STATES, INT40_STATES
@@ -70,7 +70,7 @@ class Piece:
 class Search:
     """One run of a build, from the start states or the last checkpoint to the end."""
 
-    def __init__(self, plan: Plan, journal: Journal, options: Options, report: Progress):
+    def __init__(self, plan: Plan, journal: Journal, options: Options, report: BuildProgressCallback):
         self.plan, self.journal, self.options, self.report = plan, journal, options, report
         self.env: Environment = plan.env
         self.branches, self.num_words = plan.branches, plan.layout.num_words
@@ -86,7 +86,7 @@ class Search:
         self.spilled: SpilledTable | None = None
         self._ahead: Piece | None = None  # expanded by threads, not numbered yet
         self._spare: list[Piece] = []
-        self._blocks: list[Block] = []  # rows of a chunk, used in turn
+        self._blocks: list[BranchBlock] = []  # rows of a chunk, used in turn
         self._began = time.perf_counter()
 
     def run(self, manifest: dict[str, Any] | None) -> None:
@@ -170,13 +170,13 @@ class Search:
         self.journal.append(table.states[self.journal.appended : position.count], block, position)
         self._report()
 
-    def _block(self) -> Block:
+    def _block(self) -> BranchBlock:
         """Room for the rows of a chunk; the journal lets two chunks wait, so the third one back is written."""
         if len(self._blocks) == 3 and self._blocks[0].successors.dtype == self.journal.index_dtype:
             self._blocks.append(self._blocks.pop(0))
         else:
             rows = np.empty((self.chunk, self.branches), self.journal.index_dtype)
-            block = Block(rows, np.empty(self.chunk, np.uint8), self._probabilities(self.chunk))
+            block = BranchBlock(rows, np.empty(self.chunk, np.uint8), self._probabilities(self.chunk))
             self._blocks = [*self._blocks, block][-3:]
         return self._blocks[-1]
 
@@ -184,7 +184,7 @@ class Search:
         """Room for how likely the branches of some states are; none without chance."""
         return np.empty((rows if self.env.has_chance else 0, self.branches))
 
-    def _expand_narrow(self, block: Block, base: int, last: int) -> None:
+    def _expand_narrow(self, block: BranchBlock, base: int, last: int) -> None:
         """One thread does everything; with several it looks at the width of the frontier again after a while."""
         position, table = self.position, self.table
         stop = min(last, max(position.first + NARROW, position.count)) if self.threads > 1 else last
@@ -192,7 +192,7 @@ class Search:
         self.rules.explore(table.states, *block, table.slots, base, stop, table.room, progress)
         position.take(progress)
 
-    def _expand_wide(self, pool: ThreadPoolExecutor, block: Block, base: int) -> None:
+    def _expand_wide(self, pool: ThreadPoolExecutor, block: BranchBlock, base: int) -> None:
         """Number the successors of the piece that threads have expanded, while they expand the next one."""
         position = self.position
         piece = self._ahead or self._expand_ahead(pool, position.first, position.first - base)
@@ -332,7 +332,7 @@ class Search:
         self._report()
 
     def _expand_rows(
-        self, pool: ThreadPoolExecutor, states: np.ndarray, keys: np.ndarray, indices: np.ndarray, block: Block
+        self, pool: ThreadPoolExecutor, states: np.ndarray, keys: np.ndarray, indices: np.ndarray, block: BranchBlock
     ) -> None:
         """Successors of states to keys; to indices -1 - bucket, or in terminal states their own row."""
         threads = self.threads if len(states) >= WIDE else 1

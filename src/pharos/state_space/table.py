@@ -26,7 +26,7 @@ PARALLEL_FILL = 1 << 16  # states that are worth sharing between threads when th
 LEFT_OVER = 1 << 12  # states that may pass the end of a part of the table, which are a handful
 
 
-class Block(NamedTuple):
+class BranchBlock(NamedTuple):
     """What is found of some states, by B branches each: actions, or outcomes of actions (see `rules.Exploration`).
 
     Attributes:
@@ -37,9 +37,9 @@ class Block(NamedTuple):
     terminal: np.ndarray
     probabilities: np.ndarray
 
-    def rows(self, start: int, stop: int) -> "Block":
+    def rows(self, start: int, stop: int) -> "BranchBlock":
         """Some of them."""
-        return Block(self.successors[start:stop], self.terminal[start:stop], self.probabilities[start:stop])
+        return BranchBlock(self.successors[start:stop], self.terminal[start:stop], self.probabilities[start:stop])
 
 
 class MemoryTable:
@@ -183,7 +183,7 @@ class SpilledTable:
         self._order = np.empty(candidates, np.int32)
         self.appended = count
         likely = np.empty((self.rows if has_chance else 0, branches))
-        self._block = Block(np.empty((0, branches), np.int32), np.empty(self.rows, np.uint8), likely)
+        self._block = BranchBlock(np.empty((0, branches), np.int32), np.empty(self.rows, np.uint8), likely)
         self._table = DiskTable(path, num_words, memory // 4, 2 * count)
 
     def fill(self, states: np.ndarray) -> None:
@@ -195,7 +195,7 @@ class SpilledTable:
         """Enter the states of the table in memory into the empty one."""
         self._table.take_over(table.slots, table.states)
 
-    def block(self, dtype: np.dtype) -> Block:
+    def block(self, dtype: np.dtype) -> BranchBlock:
         """The rows of the chunk."""
         successors = self._block.successors
         if len(successors) != self.rows or successors.dtype != dtype:

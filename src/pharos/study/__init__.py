@@ -3,8 +3,8 @@
 from typing import TYPE_CHECKING
 
 from pharos.study.analysis import (
-    Comparison,
     Models,
+    PaperComparison,
     agreement,
     compare,
     intervals,

@@ -177,7 +177,7 @@ def paper_agreement() -> float:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PaperComparison:
     """Numbers of the paper beside ours.
 
     Attributes:
@@ -192,7 +192,7 @@ class Comparison:
     notes: Sequence[str] = field(default_factory=list)
 
 
-def compare(cells: "pd.DataFrame", runs: Sequence[Run], models: Sequence[Models]) -> Comparison:
+def compare(cells: "pd.DataFrame", runs: Sequence[Run], models: Sequence[Models]) -> PaperComparison:
     """Our value beside each number that the paper prints, where the study has one; NaN elsewhere."""
     numbers = {run.instance: paper_instance(run.config["environment"], run.config["parameters"]) for run in runs}
     ours: dict[tuple, tuple[float, ...]] = {}
@@ -212,7 +212,7 @@ def compare(cells: "pd.DataFrame", runs: Sequence[Run], models: Sequence[Models]
     for place, column in enumerate(("ours", "our_deviation", "our_steps")):
         returns[column] = [ours.get(key, nothing)[place] for key in keys]
     returns["difference"] = returns["ours"] - returns["mean"]
-    return Comparison(returns, _regressions(cells, models))
+    return PaperComparison(returns, _regressions(cells, models))
 
 
 def _regressions(cells: "pd.DataFrame", models: Sequence[Models]) -> "pd.DataFrame":

@@ -35,7 +35,7 @@ BEGINNING = ("place", "config", "folder", "task", "hyperparameters", "run", "key
 
 
 @dataclass(frozen=True)
-class Progress:
+class TrainingProgress:
     """How far the runs of `train_configs` are, told after each evaluation.
 
     Attributes:
@@ -51,7 +51,7 @@ class Progress:
     failed: int
 
 
-ProgressCallback = Callable[[Progress], None]
+ProgressCallback = Callable[[TrainingProgress], None]
 
 
 class CallbackError(BaseException):
@@ -164,7 +164,7 @@ class TrainingJobs:
             return
         failed = sum(isinstance(each, FailedRun) for each in self.results.values())
         try:
-            self.progress(Progress(done, self.total, rows, len(self.results) - failed, failed))
+            self.progress(TrainingProgress(done, self.total, rows, len(self.results) - failed, failed))
         except BaseException as error:
             raise CallbackError(error) from error
 

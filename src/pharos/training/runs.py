@@ -24,7 +24,7 @@ from pharos.observations import own_observation
 from pharos.system.records import split, takes
 from pharos.system.workers import Workers
 from pharos.training import results as _results
-from pharos.training.batch import Progress, ProgressCallback, TrainingJobs, train_configs
+from pharos.training.batch import ProgressCallback, TrainingJobs, TrainingProgress, train_configs
 from pharos.training.learners import FailedRun, TaskCache
 from pharos.training.options import TrainingOptions
 from pharos.training.results import TrainingResult, finished_result
@@ -159,7 +159,7 @@ def _train(
             f"expected an algorithm of Stable-Baselines3 and a folder (out)"
         )
 
-    def tell(now: Progress) -> None:
+    def tell(now: TrainingProgress) -> None:
         if progress is not None and 0 in now.rows:
             progress(now.rows[0]["step"], config.steps, now.rows[0])
 
@@ -226,13 +226,13 @@ def train_parts(
             workers.start(str(number), _train_part, (entries, checkpoints, device), configs[0].definitions)
         while workers:
             for key, now in workers.events():
-                if not isinstance(now, Progress):
+                if not isinstance(now, TrainingProgress):
                     continue  # it has ended
                 number = int(key)
                 done[number], finished[number], failed[number] = now.done, now.finished, now.failed
                 if progress is not None:
                     rows = {parts[number][place]: row for place, row in now.rows.items()}
-                    progress(Progress(sum(done), total, rows, sum(finished), sum(failed)))
+                    progress(TrainingProgress(sum(done), total, rows, sum(finished), sum(failed)))
     return [_end(config, folder) for config, folder in zip(configs, folders, strict=True)]
 
 

@@ -37,7 +37,7 @@ from pharos.observations import OwnObservation, own_observation
 from pharos.system import storage
 from pharos.system.wording import many
 from pharos.training import results as _results
-from pharos.training.batch import Progress, train_configs
+from pharos.training.batch import TrainingProgress, train_configs
 from pharos.training.learners import FailedRun, TaskCache
 from pharos.training.task import RunConfig, Task, run_id
 
@@ -301,7 +301,7 @@ class _Search:
             self.members.adopt(config, task)
             configs.append(config)
 
-        def progress(now: Progress) -> None:
+        def progress(now: TrainingProgress) -> None:
             regrets.extend(row["normalized_regret"] for row in now.rows.values())
             trial.report(sum(regrets) / len(regrets), len(regrets))
             if trial.should_prune():

@@ -162,7 +162,7 @@ class PredictedRegret(PrimaryRegret):
 
 
 @dataclass(frozen=True)
-class Order:
+class PairOrder:
     """Which of two cells is predicted to be easier, and how often such an order was right.
 
     Attributes:
@@ -228,7 +228,7 @@ class Prediction:
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def orders(self) -> list[Order]:
+    def orders(self) -> list[PairOrder]:
         """Each cell beside the easiest one; the easiest is named first."""
         calibration, ranked = published(self.agent), sorted(self.cells, key=lambda cell: cell.value)
         easiest, orders = ranked[0], []
@@ -236,7 +236,7 @@ class Prediction:
             difference, (easier, harder) = cell.value - easiest.value, self._names(easiest, cell)
             of_networks = easiest.network != cell.network and easiest.observation == cell.observation
             counts = NETWORKS_IN_ORDER if of_networks else calibration.ordered(difference)
-            orders.append(Order(easier, harder, difference, *counts, of_networks))
+            orders.append(PairOrder(easier, harder, difference, *counts, of_networks))
         return orders
 
     def _names(self, first: PredictedRegret, second: PredictedRegret) -> tuple[str, str]:

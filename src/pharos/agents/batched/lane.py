@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from pharos.agents.batched.arithmetic import CompiledArithmetic, CudaGraph, PinnedBuffer, TensorArithmetic, is_gpu, wait
-from pharos.agents.batched.networks import KERNEL, MASK, Network, Values, names_of, room, spread, whole
+from pharos.agents.batched.networks import KERNEL, MASK, BatchedNetwork, Values, names_of, room, spread, whole
 from pharos.agents.batched.runs import BLOCK, BatchRun, ObservationSource, as_networks_see, is_small, resolved
 from pharos.kernels import batched as kernels
 
@@ -21,7 +21,7 @@ LARGEST_TABLE = 1 << 28  # bytes of observations as networks take them, on the p
 SHARE_OF_DEVICE = 0.5  # of a GPU's free memory that a table may take
 
 
-class Sight:
+class NetworkView:
     """Observations of one source as a network sees them.
 
     An observation is one frame, or k frames one after another along the channels.
@@ -96,7 +96,7 @@ class ObservationTable:
         self.device, self.is_image = device, runs[0].observe.is_image
         sources = list({id(run.observe): run.observe for run in runs}.values())
         place = {id(source): i for i, source in enumerate(sources)}
-        self.sights = [Sight(source) for source in sources]
+        self.sights = [NetworkView(source) for source in sources]
         self.which = np.array([place[id(run.observe)] for run in runs])
         self._ends = np.cumsum([0, *(source.num_states for source in sources)])
         self._begins = self._ends[self.which]
@@ -193,7 +193,7 @@ class DeviceObservationTable(ObservationTable):
 # Lane -----------------------------------------------------------------------------------------------------------------
 
 
-Net = TypeVar("Net", bound=Network)
+Net = TypeVar("Net", bound=BatchedNetwork)
 ASKED = (16, 64, 256)  # rows of the blocks in which a policy is asked
 
 

@@ -101,7 +101,7 @@ def whole(y: Tensor) -> Tensor:
     return y.as_strided((y.shape[0], y.stride(0)), (y.stride(0), 1))
 
 
-class Layer:
+class NetworkLayer:
     """x (W, B, in) -> (W, B, out); keeps room for the results of each number of rows until it is called again."""
 
     def __init__(self, name: str, inputs: int, outputs: int, activation: str):
@@ -142,7 +142,7 @@ class Layer:
         return dy
 
 
-class Linear(Layer):
+class LinearLayer(NetworkLayer):
     """y = activation(x w + b).
 
     Args:
@@ -180,7 +180,7 @@ class Linear(Layer):
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> Tensor | None:
-        """See `Layer`."""
+        """See `NetworkLayer`."""
         y, dx = self._room(x, onward=onward)
         dy = self._before_activation(dy, y)
         torch.sum(dy, 1, keepdim=True, out=gradients[f"{self.name}.bias"])
@@ -188,7 +188,7 @@ class Linear(Layer):
         return torch.bmm(dy, values[f"{self.name}.weight"].transpose(1, 2), out=dx) if onward else None
 
 
-class PatchConvolution(Layer):
+class PatchConvolutionLayer(NetworkLayer):
     """A convolution of 3 x 3 with padding as one product: x holds the 9 C neighbours of each pixel, from 0 to 255.
 
     They come out of a table, so that nothing is unfolded here; 1 / 255 is a factor of the weights. y is (W, B, pixels
@@ -221,7 +221,7 @@ class PatchConvolution(Layer):
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
-        """See `Layer`; there is no gradient of the input."""
+        """See `NetworkLayer`; there is no gradient of the input."""
         y, _ = self._room(x)
         rows = self._rows(self._before_activation(dy, y))
         torch.sum(rows, 1, keepdim=True, out=gradients[f"{self.name}.bias"])
@@ -232,7 +232,7 @@ class PatchConvolution(Layer):
         return x.view(x.shape[0], x.shape[1] * self.pixels, -1)
 
 
-class Convolution(Layer):
+class ConvolutionLayer(NetworkLayer):
     """A strided convolution without padding; on the processor run by run, else as one grouped one.
 
     Args:
@@ -273,7 +273,7 @@ class Convolution(Layer):
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> Tensor | None:
-        """See `Layer`."""
+        """See `NetworkLayer`."""
         y, dx = self._room(x, onward=onward)
         dy = self._before_activation(dy, y)
         if is_one_by_one(x):
@@ -319,7 +319,7 @@ def is_one_by_one(x: Tensor) -> bool:
 class Stack:
     """Layers one after another."""
 
-    def __init__(self, layers: Sequence[Layer]):
+    def __init__(self, layers: Sequence[NetworkLayer]):
         self.layers = list(layers)
         self._inputs: list[Tensor] = []
 
@@ -342,20 +342,20 @@ class Stack:
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
-def extractor(parameters: Parameters, name: str, shape: tuple[int, ...], is_image: bool) -> list[Layer]:
+def extractor(parameters: Parameters, name: str, shape: tuple[int, ...], is_image: bool) -> list[NetworkLayer]:
     """The layers from an observation to 128 features: SmallMLP, or SmallCNN with one or three convolutions."""
     if not is_image:
-        return [Linear(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
+        return [LinearLayer(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
     if is_small(shape, is_image):
-        small = PatchConvolution(parameters, f"{name}.layers.0.0", shape, FILTERS)
-        return [small, Linear(parameters, f"{name}.layers.1", small.outputs, FEATURES, RELU, pixels=small.pixels)]
-    convolutions: list[Layer] = []
+        small = PatchConvolutionLayer(parameters, f"{name}.layers.0.0", shape, FILTERS)
+        return [small, LinearLayer(parameters, f"{name}.layers.1", small.outputs, FEATURES, RELU, pixels=small.pixels)]
+    convolutions: list[NetworkLayer] = []
     for i, (filters, kernel, stride) in enumerate(((32, 8, 4), (64, 4, 2), (64, 3, 1))):
         scale = 1 / 255 if i == 0 else 1.0
-        made = Convolution(parameters, f"{name}.layers.0.{2 * i}", shape, filters, kernel, stride, scale)
+        made = ConvolutionLayer(parameters, f"{name}.layers.0.{2 * i}", shape, filters, kernel, stride, scale)
         convolutions.append(made)
         shape = made.shape_out
-    return [*convolutions, Linear(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
+    return [*convolutions, LinearLayer(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
 
 
 def spread(own: Parameters, rows: np.ndarray, common: Parameters) -> np.ndarray:
@@ -372,10 +372,12 @@ def spread(own: Parameters, rows: np.ndarray, common: Parameters) -> np.ndarray:
     return result
 
 
-def hidden(parameters: Parameters, name: str, sizes: Sequence[int], activation: str) -> list[Layer]:
+def hidden(parameters: Parameters, name: str, sizes: Sequence[int], activation: str) -> list[NetworkLayer]:
     """Hidden layers as Stable-Baselines3 numbers them: name.0, name.2, ..."""
     inputs = [FEATURES, *sizes]
-    return [Linear(parameters, f"{name}.{2 * i}", inputs[i], outputs, activation) for i, outputs in enumerate(sizes)]
+    return [
+        LinearLayer(parameters, f"{name}.{2 * i}", inputs[i], outputs, activation) for i, outputs in enumerate(sizes)
+    ]
 
 
 def sizes_of(net_arch: NetArch, head: str = "pi") -> list[int]:
@@ -391,7 +393,7 @@ def names_of(name: str) -> list[str]:
     return [*extractors, *(each.replace(".layers.0.", ".convolutions.") for each in extractors if ".layers.0." in each)]
 
 
-class Network(Protocol):
+class BatchedNetwork(Protocol):
     """W networks of one shape, as a lane asks them.
 
     Attributes:
@@ -420,7 +422,7 @@ class QNetworks:
         sizes = sizes_of(net_arch)
         layers = extractor(parameters, "q_net.features_extractor", shape, is_image)
         layers += hidden(parameters, "q_net.q_net", sizes, RELU)
-        last = Linear(parameters, f"q_net.q_net.{2 * len(sizes)}", [FEATURES, *sizes][-1], num_actions, NONE)
+        last = LinearLayer(parameters, f"q_net.q_net.{2 * len(sizes)}", [FEATURES, *sizes][-1], num_actions, NONE)
         self.stack = Stack([*layers, last])
 
     def scores(self, values: Values, x: Tensor) -> Tensor:
@@ -451,8 +453,8 @@ class ActorCritics:
         actor, critic = sizes_of(net_arch, "pi"), sizes_of(net_arch, "vf")
         actor_layers = hidden(parameters, "mlp_extractor.policy_net", actor, TANH)
         critic_layers = hidden(parameters, "mlp_extractor.value_net", critic, TANH)
-        actor_layers.append(Linear(parameters, "action_net", [FEATURES, *actor][-1], num_actions, NONE))
-        critic_layers.append(Linear(parameters, "value_net", [FEATURES, *critic][-1], 1, NONE))
+        actor_layers.append(LinearLayer(parameters, "action_net", [FEATURES, *actor][-1], num_actions, NONE))
+        critic_layers.append(LinearLayer(parameters, "value_net", [FEATURES, *critic][-1], 1, NONE))
         self.actor, self.critic = Stack(actor_layers), Stack(critic_layers)
 
     def both(self, values: Values, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -29,7 +29,7 @@ CONNECTIONS = 5000  # likewise, at doors that connect all rooms
 Place = tuple[int, int]
 
 
-class Layout(NamedTuple):
+class GridLayout(NamedTuple):
     """A grid, row by row, and what is to be picked up or opened in it, such as "BR"; None: only goals are."""
 
     rows: tuple[str, ...]
@@ -79,10 +79,10 @@ class Canvas:
         self.player = self.free_cell(corner, size or (self.width, self.height), attempts=attempts)
         self.direction = self.integer(0, 4)
 
-    def layout(self, target: str | None = None) -> Layout:
+    def layout(self, target: str | None = None) -> GridLayout:
         """What was drawn, with the player in it."""
         self.cells[self.player] = PLAYER[self.direction]
-        return Layout(tuple("".join(row) for row in self.cells.T), target)
+        return GridLayout(tuple("".join(row) for row in self.cells.T), target)
 
 
 class Rooms(Canvas):
@@ -186,24 +186,24 @@ def _walled(width: int, height: int, seed: int | None) -> Canvas:
     return canvas
 
 
-def empty(size: int) -> Layout:
+def empty(size: int) -> GridLayout:
     return _walled(size, size, None).layout()
 
 
-def empty_random(size: int, seed: int) -> Layout:
+def empty_random(size: int, seed: int) -> GridLayout:
     canvas = _walled(size, size, seed)
     canvas.put_player()
     return canvas.layout()
 
 
-def dist_shift(size: int, strip: int) -> Layout:
+def dist_shift(size: int, strip: int) -> GridLayout:
     canvas = _walled(size, size - 2, None)
     canvas.cells[size - 2, size - 4], canvas.cells[size - 2, 1] = FLOOR, GOAL
     canvas.cells[3 : size - 3, [1, strip]] = LAVA
     return canvas.layout()
 
 
-def four_rooms(size: int, seed: int) -> Layout:
+def four_rooms(size: int, seed: int) -> GridLayout:
     canvas = Canvas(size, size, seed)
     canvas.walls_around(0, 0, size, size)
     middle = size // 2
@@ -221,7 +221,7 @@ def four_rooms(size: int, seed: int) -> Layout:
     return canvas.layout()
 
 
-def door_key(size: int, seed: int) -> Layout:
+def door_key(size: int, seed: int) -> GridLayout:
     canvas = _walled(size, size, seed)
     wall = canvas.integer(2, size - 2)
     canvas.cells[wall, :] = WALL
@@ -231,7 +231,7 @@ def door_key(size: int, seed: int) -> Layout:
     return canvas.layout()
 
 
-def lava_gap(size: int, seed: int) -> Layout:
+def lava_gap(size: int, seed: int) -> GridLayout:
     canvas = _walled(size, size, seed)
     column, row = canvas.integer(2, size - 2), canvas.integer(1, size - 1)
     canvas.cells[column, 1 : size - 1] = LAVA
@@ -239,7 +239,7 @@ def lava_gap(size: int, seed: int) -> Layout:
     return canvas.layout()
 
 
-def crossing(size: int, crossings: int, seed: int, obstacle: str) -> Layout:
+def crossing(size: int, crossings: int, seed: int, obstacle: str) -> GridLayout:
     """Straight obstacles across the room, and one opening in each, along a path that crosses them in random order."""
     canvas = _walled(size, size, seed)
     lines = [(side, place) for side in (RIGHT, DOWN) for place in range(2, size - 2, 2)]
@@ -263,15 +263,15 @@ def crossing(size: int, crossings: int, seed: int, obstacle: str) -> Layout:
     return canvas.layout()
 
 
-def lava_crossing(size: int, crossings: int, seed: int) -> Layout:
+def lava_crossing(size: int, crossings: int, seed: int) -> GridLayout:
     return crossing(size, crossings, seed, LAVA)
 
 
-def simple_crossing(size: int, crossings: int, seed: int) -> Layout:
+def simple_crossing(size: int, crossings: int, seed: int) -> GridLayout:
     return crossing(size, crossings, seed, WALL)
 
 
-def unlock(size: int, seed: int) -> Layout:
+def unlock(size: int, seed: int) -> GridLayout:
     canvas = Rooms(2, 1, size, seed)
     color = canvas.add_door(0, 0, RIGHT, locked=True)
     canvas.add_thing(0, 0, "K", color)
@@ -279,7 +279,7 @@ def unlock(size: int, seed: int) -> Layout:
     return canvas.layout("L" + color)
 
 
-def unlock_pickup(size: int, seed: int) -> Layout:
+def unlock_pickup(size: int, seed: int) -> GridLayout:
     canvas = Rooms(2, 1, size, seed)
     box = canvas.add_thing(1, 0, "B")
     canvas.add_thing(0, 0, "K", canvas.add_door(0, 0, RIGHT, locked=True))
@@ -287,7 +287,7 @@ def unlock_pickup(size: int, seed: int) -> Layout:
     return canvas.layout(box)
 
 
-def key_corridor(size: int, rows: int, seed: int) -> Layout:
+def key_corridor(size: int, rows: int, seed: int) -> GridLayout:
     canvas = Rooms(3, rows, size, seed)
     for row in range(1, rows):
         canvas.remove_wall(1, row, UP)
@@ -317,7 +317,7 @@ class Room(NamedTuple):
     entry: Place
 
 
-def multi_room(size: int, rooms: int, seed: int) -> Layout:
+def multi_room(size: int, rooms: int, seed: int) -> GridLayout:
     side = MULTI_ROOM_SIDE
     canvas = Canvas(side, side, seed)
     canvas.integer(rooms, rooms + 1)  # how many
@@ -397,7 +397,7 @@ def _fits(canvas: Canvas, room: Room, others: list[Room]) -> bool:
     )
 
 
-class Bounds(NamedTuple):
+class ParameterRange(NamedTuple):
     """What a parameter may be: its default, its lowest and highest value; the highest by the size."""
 
     default: int
@@ -415,31 +415,37 @@ class Recipe(NamedTuple):
         max_steps: the time limit of minigrid, by size and number of rooms.
     """
 
-    draw: Callable[..., Layout]
-    parameters: dict[str, Bounds]
+    draw: Callable[..., GridLayout]
+    parameters: dict[str, ParameterRange]
     max_steps: Callable[[int, int], int]
 
 
-def _recipe(draw: Callable[..., Layout], max_steps: Callable[[int, int], int], **parameters: Bounds) -> Recipe:
-    return Recipe(draw, {**parameters, "seed": Bounds(0, 0)}, max_steps)
+def _recipe(
+    draw: Callable[..., GridLayout], max_steps: Callable[[int, int], int], **parameters: ParameterRange
+) -> Recipe:
+    return Recipe(draw, {**parameters, "seed": ParameterRange(0, 0)}, max_steps)
 
 
-_CROSSINGS = {"size": Bounds(9, 5, odd=True), "crossings": Bounds(1, 0, lambda size: size - 3)}
+_CROSSINGS = {"size": ParameterRange(9, 5, odd=True), "crossings": ParameterRange(1, 0, lambda size: size - 3)}
 KINDS = {
-    "empty": Recipe(empty, {"size": Bounds(8, 4)}, lambda size, _: 4 * size**2),
-    "empty_random": _recipe(empty_random, lambda size, _: 4 * size**2, size=Bounds(6, 4)),
-    "four_rooms": _recipe(four_rooms, lambda size, _: 100, size=Bounds(19, 5)),
-    "door_key": _recipe(door_key, lambda size, _: 10 * size**2, size=Bounds(8, 5)),
-    "unlock": _recipe(unlock, lambda size, _: 8 * size**2, size=Bounds(6, 4)),
-    "unlock_pickup": _recipe(unlock_pickup, lambda size, _: 8 * size**2, size=Bounds(6, 4)),
-    "key_corridor": _recipe(key_corridor, lambda size, _: 30 * size**2, size=Bounds(6, 3), rows=Bounds(3, 1)),
-    "lava_gap": _recipe(lava_gap, lambda size, _: 4 * size**2, size=Bounds(7, 5)),
+    "empty": Recipe(empty, {"size": ParameterRange(8, 4)}, lambda size, _: 4 * size**2),
+    "empty_random": _recipe(empty_random, lambda size, _: 4 * size**2, size=ParameterRange(6, 4)),
+    "four_rooms": _recipe(four_rooms, lambda size, _: 100, size=ParameterRange(19, 5)),
+    "door_key": _recipe(door_key, lambda size, _: 10 * size**2, size=ParameterRange(8, 5)),
+    "unlock": _recipe(unlock, lambda size, _: 8 * size**2, size=ParameterRange(6, 4)),
+    "unlock_pickup": _recipe(unlock_pickup, lambda size, _: 8 * size**2, size=ParameterRange(6, 4)),
+    "key_corridor": _recipe(
+        key_corridor, lambda size, _: 30 * size**2, size=ParameterRange(6, 3), rows=ParameterRange(3, 1)
+    ),
+    "lava_gap": _recipe(lava_gap, lambda size, _: 4 * size**2, size=ParameterRange(7, 5)),
     "lava_crossing": _recipe(lava_crossing, lambda size, _: 4 * size**2, **_CROSSINGS),
     "simple_crossing": _recipe(simple_crossing, lambda size, _: 4 * size**2, **_CROSSINGS),
-    "multi_room": _recipe(multi_room, lambda _, rooms: 20 * rooms, size=Bounds(10, 4), rooms=Bounds(6, 1)),
+    "multi_room": _recipe(
+        multi_room, lambda _, rooms: 20 * rooms, size=ParameterRange(10, 4), rooms=ParameterRange(6, 1)
+    ),
     "dist_shift": Recipe(
         dist_shift,
-        {"size": Bounds(9, 7), "strip": Bounds(2, 2, lambda size: size - 4)},
+        {"size": ParameterRange(9, 7), "strip": ParameterRange(2, 2, lambda size: size - 4)},
         lambda size, _: 4 * size * (size - 2),
     ),
 }

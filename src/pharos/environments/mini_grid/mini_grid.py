@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pharos.environments.base import Environment, one_of, parameter, store
-from pharos.environments.mini_grid.layouts import COLORS, FLOOR, GOAL, KINDS, LAVA, PLAYER, WALL, Layout
+from pharos.environments.mini_grid.layouts import COLORS, FLOOR, GOAL, KINDS, LAVA, PLAYER, WALL, GridLayout
 from pharos.environments.mini_grid.look import LAYERS, LOOK
 from pharos.errors import ParameterError
 
@@ -44,7 +44,7 @@ class Level:
     target_thing: int
 
 
-def level_of(layout: Layout) -> Level:
+def level_of(layout: GridLayout) -> Level:
     """The numbers of a layout; ParameterError where its text is none, or the player can walk out of the grid."""
     rows = [re.findall("..", row) for row in layout.rows]
     cells = np.full((len(rows), len(rows[0])), FREE, np.int64)
@@ -260,10 +260,10 @@ class MiniGrid(Environment):
     # The layout, as text and as numbers -------------------------------------------------------------------------------
 
     @cached_property
-    def layout(self) -> Layout:
+    def layout(self) -> GridLayout:
         """The grid as text, as `level` takes it, and the target."""
         if self.level is not None:
-            return Layout(rows_of(self.level), self.target)
+            return GridLayout(rows_of(self.level), self.target)
         recipe = KINDS[str(self.kind)]
         return recipe.draw(**{name: getattr(self, name) for name in recipe.parameters})
 

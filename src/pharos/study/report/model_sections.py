@@ -10,7 +10,7 @@ from pharos.plots import agent_name, slug
 from pharos.study.analysis import REGRETS, Models, agreement, paper_agreement
 from pharos.study.figures import agents_figure
 from pharos.study.regression import Fit
-from pharos.study.report.page import Figures, Section, Table, image, table
+from pharos.study.report.page import Figures, ReportTable, Section, image, table
 from pharos.study.report.results import Results, coefficients
 from pharos.system.wording import in_words, many
 
@@ -243,7 +243,7 @@ def _part(agent: str, outcome: str, rows: "pd.DataFrame", figures: Figures) -> d
     }
 
 
-def _left_out(rows: "pd.DataFrame") -> Table | None:
+def _left_out(rows: "pd.DataFrame") -> ReportTable | None:
     columns = {
         "cells": rows["cells"],
         "classes": rows["classes"],
@@ -262,7 +262,7 @@ def _left_out(rows: "pd.DataFrame") -> Table | None:
     return _of_predictors(rows, columns, caption)
 
 
-def _within(rows: "pd.DataFrame") -> Table | None:
+def _within(rows: "pd.DataFrame") -> ReportTable | None:
     rows = rows[(rows["pairs"] > 0) & rows["p_agreement"].notna() | rows["agreement_lower"].notna()]
     columns = {
         "pairs": rows["pairs"],
@@ -281,7 +281,7 @@ def _within(rows: "pd.DataFrame") -> Table | None:
     return _of_predictors(rows, columns, caption)
 
 
-def _mixed(rows: "pd.DataFrame") -> Table | None:
+def _mixed(rows: "pd.DataFrame") -> ReportTable | None:
     rows = rows[rows["slope"].notna()]
     columns = {
         "slope": rows["slope"],
@@ -299,7 +299,7 @@ def _mixed(rows: "pd.DataFrame") -> Table | None:
     return _of_predictors(rows, columns, caption)
 
 
-def _of_predictors(rows: "pd.DataFrame", columns: Mapping[str, Any], caption: str) -> Table | None:
+def _of_predictors(rows: "pd.DataFrame", columns: Mapping[str, Any], caption: str) -> ReportTable | None:
     """A row for each predictor; None where there is none."""
     import pandas as pd
 

@@ -49,7 +49,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """A table whose cells are texts."""
 
     caption: str
@@ -95,7 +95,7 @@ def data_url(png: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
-def table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> Table:
+def table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> ReportTable:
     """A frame as a table: numbers short and to the right, whole ones without digits; no column that says nothing."""
     data = data[[name for name in data.columns if len(data) == 0 or not (data[name] == "").all()]]
     columns, digits_of = [], []
@@ -109,7 +109,7 @@ def table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> Table:
         [_cell(value, places) for value, places in zip(line, digits_of, strict=True)]
         for line in data.itertuples(index=False)
     ]
-    return Table(caption, columns, rows)
+    return ReportTable(caption, columns, rows)
 
 
 def _is_whole(values: np.ndarray) -> bool:

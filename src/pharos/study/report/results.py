@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pharos.agents import TABULAR_OBSERVATION
-from pharos.study.analysis import REGRETS, Comparison, Models, compare, intervals, models
+from pharos.study.analysis import REGRETS, Models, PaperComparison, compare, intervals, models
 from pharos.study.findings import findings
 from pharos.study.specification import Specification
 from pharos.study.statistics import aliasing_table, improvements, profiles, with_aliasing
@@ -49,7 +49,7 @@ class Results:
     intervals: "pd.DataFrame"
     profiles: "pd.DataFrame"
     improvements: "pd.DataFrame"
-    comparison: Comparison | None
+    comparison: PaperComparison | None
     findings: "pd.DataFrame | None"
 
     @property
