@@ -15,7 +15,7 @@ import pharos
 from pharos import drawing
 from pharos.environments import start_distribution
 from pharos.observations import render
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 DOCS = Path(__file__).parents[1] / "docs"
 FOLDER = DOCS / "gallery"
@@ -162,7 +162,7 @@ def row(cls):
         file = file_of(name, ".png")
         drawing.save_png(file, shown(env, state))
         states = pharos.build(env).num_states
-        seen.append(f"`{name}`, {states:,} states, after {many(steps, 'step')}: ![{name}](gallery/{file.name})")
+        seen.append(f"`{name}`, {states:,} states, after {pluralize(steps, 'step')}: ![{name}](gallery/{file.name})")
     for name in PLAYED[cls].split(", "):
         env, policy = (unturned if cls == "game_2048" else optimal)(name)
         pictures = [render(env, state, "complex_image", size="natural") for state in played(env, policy, cls)]

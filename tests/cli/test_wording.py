@@ -9,18 +9,18 @@ import pytest
 import pharos
 from pharos.mdp import TabularMDP
 from pharos.study.status import Status
-from pharos.system.wording import in_words, many
+from pharos.system.wording import in_words, pluralize
 
 
 @pytest.mark.parametrize(
     ("count", "said"), [(0, "0 runs"), (1, "1 run"), (2, "2 runs"), (1234, "1,234 runs"), (10**6, "1,000,000 runs")]
 )
 def test_one_is_singular(count, said):
-    assert many(count, "run") == said
+    assert pluralize(count, "run") == said
 
 
 def test_irregular_nouns_are_given():
-    assert (many(1, "class", "classes"), many(3, "class", "classes")) == ("1 class", "3 classes")
+    assert (pluralize(1, "class", "classes"), pluralize(3, "class", "classes")) == ("1 class", "3 classes")
 
 
 def test_one_run_one_state_and_one_action_are_singular():

@@ -149,7 +149,7 @@ def test_the_papers_instances_share_batches_where_shapes_and_numbers_of_states_a
     batches, pending = Batches(Path("nowhere")), deque((0.0, run) for run in runs)
     units = []
     while pending:
-        units.append(batches.unit(pending.popleft()[1], pending))
+        units.append(batches.next_batch(pending.popleft()[1], pending))
     assert sum(map(len, units)) == len(runs) == 2100 and min(map(len, units)) >= 6
     for unit in units:
         assert len({batches.key(run) for run in unit}) == 1 and len(unit) <= batches.width(unit[0])

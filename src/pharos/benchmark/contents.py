@@ -18,7 +18,7 @@ from pharos.benchmark.suite import BenchmarkTask, Suite
 from pharos.errors import ParameterError
 from pharos.plots import agent_name
 from pharos.system import storage
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 BESIDE = ("dqn", "ppo", "q_learning")
 RESIDUAL = 0.2
@@ -161,9 +161,9 @@ def _core_sentence(contents: Contents) -> str:
             own, common = comparison.core.interval, sum(name in comparison.tasks for name in names)
             word = "below" if own.high < 0 else "above" if own.low > 0 else "not shown to differ from"
             text = f"{other.name}'s {comparison.core.theirs:.2f}"
-            text += f" on {many(common, 'task')} in common" if common < len(names) else ""
+            text += f" on {pluralize(common, 'task')} in common" if common < len(names) else ""
             groups["beside" if math.isnan(own.low) else word].append(text)
-    parts = [f"Core score {number(contents.agent.score.core)} on {many(len(names), 'task')}"]
+    parts = [f"Core score {number(contents.agent.score.core)} on {pluralize(len(names), 'task')}"]
     parts += [f"{word} {listed(texts)}" for word, texts in groups.items() if texts]
     worst = f"worst on {listed(names[:3])}" if len(names) > 3 else ""
     return "; ".join(filter(None, (", ".join(parts), worst))) + ". The ladders were not run, so there are no frontiers."
@@ -232,7 +232,7 @@ def learning_sentence(contents: Contents) -> str:
     if early or late:
         step = contents.suite.protocol.steps * third // evaluations
         text += f" At step {step:,} its policy is not shown to be better than random play on {early} of "
-        text += f"{many(len(names), 'task')}, at the end on {late}."
+        text += f"{pluralize(len(names), 'task')}, at the end on {late}."
     return text
 
 

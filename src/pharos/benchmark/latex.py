@@ -2,7 +2,7 @@
 
 from pharos.benchmark.charts import frontier_text
 from pharos.benchmark.contents import Contents, excerpt, listed, number, seeds_text
-from pharos.system.wording import latex_text, many
+from pharos.system.wording import latex_text, pluralize
 
 
 def latex_of(contents: Contents) -> str:
@@ -23,7 +23,7 @@ def methods(contents: Contents) -> str:
     suite, own, protocol = contents.suite, contents.agent.results, contents.suite.protocol
     record = {name: own.record.get(name) for name in ("source", "hyperparameters", "versions")}
     others = f" beside {listed([latex_text(each.name) for each in contents.beside])}" if contents.beside else ""
-    num_tasks = f"{contents.num_run(suite.tasks)} of {many(len(suite.tasks), 'task')}"
+    num_tasks = f"{contents.num_run(suite.tasks)} of {pluralize(len(suite.tasks), 'task')}"
     lines = (
         rf"We ran {latex_text(contents.agent.name)}{others} on the Pharos Benchmark {latex_text(suite.name)}",
         rf"(SHA-256 of tasks and protocol: \texttt{{{latex_text(suite.digest)}}}): {num_tasks},",

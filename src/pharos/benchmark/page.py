@@ -47,7 +47,7 @@ from pharos.benchmark.contents import (
 from pharos.benchmark.latex import latex_of
 from pharos.benchmark.suite import BenchmarkTask, Ladder, Suite
 from pharos.system import storage
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
@@ -102,7 +102,7 @@ def page(contents: Contents) -> str:
 def _lead(contents: Contents) -> list[Element]:
     own = contents.agent.score
     lines = [element("p", sentence(contents), class_="lead")]
-    core = f"Core score {number(own.core)} on {many(contents.num_run(contents.suite.core), 'task')}"
+    core = f"Core score {number(own.core)} on {pluralize(contents.num_run(contents.suite.core), 'task')}"
     core += "".join(f"; {each.name} {each.score.core.value:.2f}" for each in contents.beside if each.score.has_core)
     rest = {"Final score": own.final, "interquartile mean": own.iqm}
     parts = [*(f"{name} {number(interval)}" for name, interval in rest.items()), unclipped_regret(contents)]
@@ -110,8 +110,8 @@ def _lead(contents: Contents) -> list[Element]:
     said = f"{f'{core}. ' if own.axes else ''}{', '.join(filter(None, parts))}."
     lines.append(element("p", f"{said if own.has_core else 'The core was not run.'} {scale}"))
     if own.preliminary:
-        seeds = many(len(contents.agent.results.seeds), "seed")
-        missing = f", and {many(len(own.missing), 'task')} without results" if own.missing else ""
+        seeds = pluralize(len(contents.agent.results.seeds), "seed")
+        missing = f", and {pluralize(len(own.missing), 'task')} without results" if own.missing else ""
         text = f"Preliminary: {seeds}{missing}; a result has {contents.suite.protocol.seeds} seeds and all tasks."
         lines.append(element("p", text, class_="warning"))
     if own.below_random:
@@ -142,7 +142,7 @@ def _learning(contents: Contents) -> Element | None:
         return None
     lines = [learning_curve(each, names) for each in contents.agents]
     without = [each.name for each, own in zip(contents.agents, lines, strict=True) if not own]
-    text = f"Normalised regret of the policy at each evaluation, mean over {many(len(names), 'core task')}. "
+    text = f"Normalised regret of the policy at each evaluation, mean over {pluralize(len(names), 'core task')}. "
     text += "Each run's is clipped to [0, 1] at each evaluation here; scores clip its mean over the run. The band is "
     text += f"the interval.{f' Without {listed(without)}, which did not run all of these.' if without else ''}"
     chart = learning_panel(contents.suite.protocol.steps, lines, "regret on the core while learning")
@@ -297,11 +297,11 @@ def _provenance(contents: Contents) -> Element:
     exact = own.record.get("exact")
     exact = exact if isinstance(exact, Mapping) else {}
     count = sum(bool(value) for value in exact.values())
-    how = "all tasks" if count == len(exact) else f"{count} of {many(len(exact), 'task')}, else estimated"
+    how = "all tasks" if count == len(exact) else f"{count} of {pluralize(len(exact), 'task')}, else estimated"
     facts = {
         "suite": f"{contents.suite.name}, digest {contents.suite.digest}",
-        "protocol": f"{protocol.steps:,} steps, {many(protocol.evaluations, 'evaluation')}, gamma {protocol.gamma:g}, "
-        f"horizon {protocol.horizon}",
+        "protocol": f"{protocol.steps:,} steps, {pluralize(protocol.evaluations, 'evaluation')}, "
+        f"gamma {protocol.gamma:g}, horizon {protocol.horizon}",
         "seeds": ", ".join(map(str, own.seeds)),
         "evaluation": f"exact on {how}" if exact else "see agent.json",
         **{f"baseline {each.name}": seeds_text(each.results) for each in contents.beside},

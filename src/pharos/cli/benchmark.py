@@ -12,7 +12,7 @@ from pharos.cli.answers import Answer, complain, console, counted_bar, print_tab
 from pharos.cli.command import Commands
 from pharos.cli.options import Count, file_ending, parse_seeds
 from pharos.errors import AllRunsFailed, ParameterError
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
     from pharos.benchmark import BenchmarkTask, Comparison, Difference, Power, Suite
@@ -95,7 +95,7 @@ def run(
     for reason, count in Counter(missing.values()).most_common():
         complain(f"{count} x {reason}")
     facts: list[tuple[str, object]] = [
-        ("runs", f"{many(len(results.seeds), 'seed')} of {many(len(results.curves), 'task')}"),
+        ("runs", f"{pluralize(len(results.seeds), 'seed')} of {pluralize(len(results.curves), 'task')}"),
         ("missing", "; ".join(missing) or "none"),
         ("regret", f"{results.mean():.4g} of uniform play, mean of all runs" if results.curves else "none"),
     ]
@@ -133,7 +133,7 @@ def seal(folder: Folder, *, season: str, beacon: str, suite: SuiteFile = "v1") -
     for name, each in made.items():
         write_suite(each, folder / f"{name}.yaml")
     answer = {name: {"file": folder / f"{name}.yaml", "digest": each.digest} for name, each in made.items()}
-    facts = [(name, f"{many(len(each.tasks), 'task')}, {each.digest}") for name, each in made.items()]
+    facts = [(name, f"{pluralize(len(each.tasks), 'task')}, {each.digest}") for name, each in made.items()]
     return Answer({"season": season, "seed": seed, **answer}, (str(folder), facts))
 
 
@@ -345,10 +345,10 @@ def _print(suite: "Suite") -> None:
         text += f" Minutes of one processor, all seeds, as shipped: {times}"
     protocol = suite.protocol
     setting = (
-        f"{protocol.steps:,} steps a task, {many(protocol.evaluations, 'evaluation')}, {many(protocol.seeds, 'seed')}, "
-        f"gamma {protocol.gamma:g}, horizon {protocol.horizon}"
+        f"{protocol.steps:,} steps a task, {pluralize(protocol.evaluations, 'evaluation')}, "
+        f"{pluralize(protocol.seeds, 'seed')}, gamma {protocol.gamma:g}, horizon {protocol.horizon}"
     )
-    title = f"{suite.name}, {many(len(suite.tasks), 'task')}: {suite.digest}"
+    title = f"{suite.name}, {pluralize(len(suite.tasks), 'task')}: {suite.digest}"
     columns = ("axis", "task", "level", ">DQN", ">PPO", ">table")
     print_table(title, columns, rows, before=[setting, ""], notes=[text])
 
@@ -397,7 +397,7 @@ def _print_comparison(comparison: "Comparison", tasks: bool) -> None:
         add(name, difference)
     notes = []
     if comparison.left_out:
-        number = many(len(comparison.left_out), "task")
+        number = pluralize(len(comparison.left_out), "task")
         left_out = ", ".join(comparison.left_out[:3]) + (", ..." if len(comparison.left_out) > 3 else "")
         notes.append(f"without {number} that one of them has not run: {left_out}")
     if any(each.p_value != each.p_value for each in comparison.tasks.values()):
@@ -441,4 +441,4 @@ def _print_power(agent: str, seeds: int, scores: "dict[str, Power]", difference:
         "Under a number of seeds: the least difference between two agents of so many seeds each that is found "
         "with power 0.8 (Welch's t, 5 %)."
     )
-    print_table(f"{agent}, {many(seeds, 'seed')}", columns, rows, notes=[note])
+    print_table(f"{agent}, {pluralize(seeds, 'seed')}", columns, rows, notes=[note])

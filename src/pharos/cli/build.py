@@ -16,7 +16,7 @@ from pharos.cli.options import Building, Count, SharedBuilding, Target
 from pharos.errors import ParameterError, PharosError, StateSpaceTooLarge
 from pharos.system import compiling
 from pharos.system.compiling import Stopwatch
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
     from pharos.environments import Environment
@@ -103,9 +103,9 @@ def count(target: Target, *, building: Building) -> Answer:
     apart = counted["num_states"] - counted["num_reachable_states"]
     return Answer(
         answer,
-        f"{target.title}: {many(counted['num_states'], 'state')} ({counted['num_terminal_states']:,} terminal"
+        f"{target.title}: {pluralize(counted['num_states'], 'state')} ({counted['num_terminal_states']:,} terminal"
         + (f", {apart:,} never reached" if apart else "")
-        + f"), {many(counted['num_actions'], 'action')}, {many(counted['num_transitions'], 'transition')}, "
+        + f"), {pluralize(counted['num_actions'], 'action')}, {pluralize(counted['num_transitions'], 'transition')}, "
         f"depth {counted['depth']:,}, {watch.seconds:.2f} s{extra}"
         + "".join(f", compiling {how_long}" for _, how_long in compiling_fact()),
     )

@@ -19,7 +19,7 @@ from pharos.errors import PharosError, StateSpaceLocked, StateSpaceTooLarge, Unk
 from pharos.mdp import ChanceSetting
 from pharos.system import compiling
 from pharos.system.compiling import Stopwatch
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
     from pharos.environments import Environment
@@ -71,7 +71,7 @@ def clear(environments: Annotated[list[str] | None, "[ENVIRONMENT]..."] = None) 
         freed += bytes_of(folder)
         shutil.rmtree(folder)
     answer = {"removed": removed, "bytes_freed": freed, "directory": directory}
-    return Answer(answer, f"{many(len(removed), 'state space')} deleted, {size_text(freed)} freed in {directory}")
+    return Answer(answer, f"{pluralize(len(removed), 'state space')} deleted, {size_text(freed)} freed in {directory}")
 
 
 def _compiled(directory: Path) -> list[Path]:
@@ -116,7 +116,7 @@ def _print(directory: Path, spaces: list[dict[str, Any]], compiled: int, total: 
     if rows:
         print_table("", ("environment", "parameters", ">states", ">size", ""), rows)
     print(
-        f"{many(len(spaces), 'state space')} and {size_text(compiled)} of compiled rules: "
+        f"{pluralize(len(spaces), 'state space')} and {size_text(compiled)} of compiled rules: "
         f"{size_text(total)} in {directory}"
     )
 
@@ -164,7 +164,7 @@ def warm(
             seconds[str(env)] = watch.compiling - before
     answer = {"environments": seconds, "seconds": watch.seconds, "compiling_seconds": watch.compiling}
     facts = [(name, f"{spent:.1f} s") for name, spent in seconds.items()]
-    return Answer(answer, (f"compiled for {many(len(facts), 'environment')}, and kept", facts))
+    return Answer(answer, (f"compiled for {pluralize(len(facts), 'environment')}, and kept", facts))
 
 
 def _use(env: "Environment", chance: ChanceSetting) -> None:

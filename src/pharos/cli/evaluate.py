@@ -27,7 +27,7 @@ from pharos.cli.options import (
 )
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.system import compiling
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
     from pharos.mdp import ChanceSetting, TabularMDP
@@ -109,7 +109,7 @@ def solve(
         ("error at most", f"{max(solution.error_bound, uniform.error_bound):.2g}"),
         ("discount", describe_discount(solution.gamma, solution.horizon)),
         ("chance", chance.in_words(mdp.dynamics.has_chance)),
-        ("states", f"{mdp.num_states:,} x {many(mdp.num_actions, 'action')}"),
+        ("states", f"{mdp.num_states:,} x {pluralize(mdp.num_actions, 'action')}"),
         ("sweeps", f"{solution.sweeps} in {solution.seconds:.2f} s"),
         *compiling_fact(),
         *([] if out is None else [("written", out)]),

@@ -14,7 +14,7 @@ from pharos.cli.answers import Answer, compiling_fact, complain, print_table, pr
 from pharos.cli.options import Building, Chance, Count, Discount, Seconds, Target, file_ending, parse_parameters
 from pharos.errors import ParameterError
 from pharos.system import compiling
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 from pharos.training import TrainingOptions
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ def _print(title: str, report: "Report", chance: str, definitions: bool) -> None
     conventions = report.conventions
     horizon = "none" if conventions["horizon"] is None else conventions["horizon"]
     setting = (
-        f"{many(conventions['num_states'], 'state')} x {many(conventions['num_actions'], 'action')}, "
+        f"{pluralize(conventions['num_states'], 'state')} x {pluralize(conventions['num_actions'], 'action')}, "
         f"discount {conventions['gamma']:g}, horizon {horizon}, chance: {chance}"
     )
     said = []
@@ -176,9 +176,8 @@ def _ties(report: "Report") -> list[str]:
         details = {} if result.undefined else result.certificate.details
         if "ties" in details:
             ties, tolerance = details["ties"], details["tie_tolerance"]
-            return [
-                f"{many(ties, 'tie')} at a tolerance of {tolerance:.2g}, {ties - details['unresolved_ties']:,} proven"
-            ]
+            num_proven = ties - details["unresolved_ties"]
+            return [f"{pluralize(ties, 'tie')} at a tolerance of {tolerance:.2g}, {num_proven:,} proven"]
     return []
 
 

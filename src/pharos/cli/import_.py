@@ -15,7 +15,7 @@ from pharos.cli.command import Commands
 from pharos.cli.options import Count, Discount, Gamma, Target, check_format
 from pharos.errors import ParameterError, UnknownName
 from pharos.mdp import ChanceSetting
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
@@ -134,7 +134,7 @@ def _answer(name: str, mdp: "TabularMDP", out: Path) -> Answer:
         "gamma": mdp.gamma,
         "folder": out,
     }
-    size = f"{mdp.num_states:,} x {many(mdp.num_actions, 'action')}"
+    size = f"{mdp.num_states:,} x {pluralize(mdp.num_actions, 'action')}"
     return Answer(answer, (name, [("states", size), ("horizon", mdp.horizon), ("folder", out)]))
 
 

@@ -18,7 +18,7 @@ from pharos.cli.answers import (
 from pharos.cli.options import Trust
 from pharos.errors import ParameterError
 from pharos.leaderboard import Limits
-from pharos.system.wording import in_words, many
+from pharos.system.wording import in_words, pluralize
 
 if TYPE_CHECKING:
     from pharos.leaderboard import Verdict
@@ -114,7 +114,7 @@ def _answer(verdict: "Verdict") -> dict[str, Any]:
 
 def _print(verdict: "Verdict") -> None:
     if verdict.exact:
-        how = f"exact: evaluated in {many(verdict.states, 'state')}, error at most {verdict.error_bound:.1e}"
+        how = f"exact: evaluated in {pluralize(verdict.states, 'state')}, error at most {verdict.error_bound:.1e}"
     else:
         how = (
             f"estimated from {verdict.episodes:,} episodes: {verdict.value:.6g} ± {verdict.error_bound:.2g} (99 %); "

@@ -8,7 +8,7 @@ from pharos.cli.answers import Answer, print_table, progress_bar, progress_line
 from pharos.cli.options import Building, Gamma, Seconds, Target, discount
 from pharos.errors import ParameterError
 from pharos.mdp import ChanceSetting
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
     import numpy as np
@@ -159,7 +159,7 @@ def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]], price
             *(">where one acts", ">loses"),
         ),
         rows,
-        before=[f"{many(space.num_states, 'state')}, {int(space.terminal.sum()):,} of them terminal"],
+        before=[f"{pluralize(space.num_states, 'state')}, {int(space.terminal.sum()):,} of them terminal"],
         notes=[
             *(f"{entry['observation']}: {entry['unavailable']}" for entry in entries if "unavailable" in entry),
             *([frames] if any(entry["options"].get("frames", 1) != 1 for entry in entries) else []),

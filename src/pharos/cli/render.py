@@ -17,7 +17,7 @@ from pharos.cli.answers import Answer, complain, console, describe
 from pharos.cli.options import Discount, Seed, Target, file_ending, parse_value
 from pharos.errors import ParameterError, PharosError, UnknownName
 from pharos.explorer import keys_of
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -186,7 +186,7 @@ def play(target: Target, *, state: str | None = None, seed: Seed | None = None) 
     answer = {"environment": env.name, "parameters": env.parameters, "steps": game.steps, "return": game.total}
     return Answer(
         {**answer, "state": game.state, "terminal": game.over},
-        f"{env.name}: {many(game.steps, 'step')}, return {game.total:g}{', ended' if game.over else ''}",
+        f"{env.name}: {pluralize(game.steps, 'step')}, return {game.total:g}{', ended' if game.over else ''}",
     )
 
 

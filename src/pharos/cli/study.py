@@ -16,7 +16,7 @@ from pharos.cli.command import Commands
 from pharos.cli.options import Count, Trust
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
 from pharos.observations import title
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 from pharos.training import ExecutionOptions
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def _print(study: "Specification") -> None:
         f"{study.name}  {study.description}",
         ("instance", "chance", "agents", "observations", ">steps", ">runs"),
         rows,
-        notes=[*notes, f"{many(len(runs), 'run')}, {many(_steps(study), 'step')}"],
+        notes=[*notes, f"{pluralize(len(runs), 'run')}, {pluralize(_steps(study), 'step')}"],
     )
 
 
@@ -212,7 +212,7 @@ def log(
     how = f"tensorboard --logdir {place / to}" if to == "tensorboard" else f"wandb sync {place / to}/offline-run-*"
     remedy = f"; `{how}` {'shows' if to == 'tensorboard' else 'sends'} them" if to == "tensorboard" or offline else ""
     answer = {"to": to, "folder": str(place / to), "added": number}
-    return Answer(answer, f"{place / to}: {many(number, 'run')} added{remedy}")
+    return Answer(answer, f"{place / to}: {pluralize(number, 'run')} added{remedy}")
 
 
 @app.command("predict")
@@ -244,10 +244,10 @@ def predict(
     missing = int(absent.sum())
 
     def text() -> None:
-        print(f"{out}: {many(len(predictions), 'cell')}, {said['date']}, sha256 {said['sha256']}")
+        print(f"{out}: {pluralize(len(predictions), 'cell')}, {said['date']}, sha256 {said['sha256']}")
         if missing:
             reason = predictions.loc[absent, "notes"].iloc[0]
-            complain(f"{many(missing, 'cell')} without a prediction, such as: {reason}")
+            complain(f"{pluralize(missing, 'cell')} without a prediction, such as: {reason}")
 
     return Answer({"file": str(out), "cells": len(predictions), "missing": missing, **said}, text)
 
@@ -262,7 +262,7 @@ def pack(source: Results, *, to: Annotated[Path, "FILE"]) -> Answer:
     from pharos import study
 
     number = study.pack(*source.opened(), file=to)
-    return Answer({"file": str(to), "runs": number}, f"{to}: {many(number, 'run')}, {to.stat().st_size:,} bytes")
+    return Answer({"file": str(to), "runs": number}, f"{to}: {pluralize(number, 'run')}, {to.stat().st_size:,} bytes")
 
 
 @app.command("unpack")
@@ -283,7 +283,7 @@ def unpack(
     from pharos import study
 
     folder, number = study.unpack(file, out, into=into, trust=trust)
-    said = f"{folder}: {many(number, 'run')} added; `pharos study report {folder}` reports on them"
+    said = f"{folder}: {pluralize(number, 'run')} added; `pharos study report {folder}` reports on them"
     return Answer({"folder": str(folder), "added": number}, said)
 
 
@@ -291,7 +291,7 @@ def _answer(status: "Status", failed: bool = False) -> Answer:
     def text() -> None:
         print(status)
         if status.missing:
-            print(f"{many(status.missing, 'run')} missing; `pharos study run` goes on from there")
+            print(f"{pluralize(status.missing, 'run')} missing; `pharos study run` goes on from there")
         for error, count in Counter(status.errors.values()).most_common(5):
             complain(f"{count} x {error}")
         for problem in list(status.damaged.values())[:5]:

@@ -17,7 +17,7 @@ from pharos.cli.answers import Answer, compiling_fact, complain, progress_bar
 from pharos.cli.options import Count, Discount, Seed, Target, parse_seeds, parse_value
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.system import compiling
-from pharos.system.wording import in_words, many
+from pharos.system.wording import in_words, pluralize
 from pharos.training import TrainingOptions
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def _train_many(title: str, *, seeds: list[int], steps: int, out: Path | None, *
 
     for error, count in Counter(failed.values()).most_common():
         complain(f"{count} x {error}")
-    return Answer(answer, (f"{title}, {many(len(seeds), 'seed')}", facts), bool(failed))
+    return Answer(answer, (f"{title}, {pluralize(len(seeds), 'seed')}", facts), bool(failed))
 
 
 def _quartiles(values: list[float | None]) -> list[float] | None:
@@ -149,7 +149,7 @@ def _facts_of_many(
         some = next(iter(results.values())).result
         best = sum(run.result["final_regret"] < 1e-6 for run in results.values())
         facts += [
-            ("optimal at the end", f"{best} of {many(len(results), 'run')}"),
+            ("optimal at the end", f"{best} of {pluralize(len(results), 'run')}"),
             ("values", f"optimal {some['value_optimal']:.6g}, uniform {some['value_uniform']:.6g}"),
         ]
     pace = len(results) * steps / seconds
@@ -183,7 +183,7 @@ def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, ob
         ("final regret", f"{result['final_regret']:.6g}"),
         ("cumulative regret", f"{learnt:.6g} of the learnt policies, {played:.6g} as played"),
         ("normalised regret", shown),
-        ("mean return", f"{result['mean_return']:.6g} over {many(result['episodes'], 'episode')}"),
+        ("mean return", f"{result['mean_return']:.6g} over {pluralize(result['episodes'], 'episode')}"),
         ("values", "exact" if result["exact"] else "some are estimates, see exact in curve.parquet"),
         ("chance", chance),
         ("seconds", f"{run.seconds:.1f} ({steps / run.seconds:,.0f} steps/s, evaluation included)"),
@@ -207,7 +207,8 @@ def _telling(show: Callable[[int, str], None]) -> Callable[[int, int, Any], None
     """Return the callback of `train`, which shows the value of the policy, beside the bar."""
 
     def tell(done: int, _steps: int, row: Mapping[str, Any]) -> None:
-        show(done, f"value {row['value']:.4g}, regret {row['expected_regret']:.4g}, {many(row['episodes'], 'episode')}")
+        episodes = pluralize(row["episodes"], "episode")
+        show(done, f"value {row['value']:.4g}, regret {row['expected_regret']:.4g}, {episodes}")
 
     return tell
 

@@ -34,7 +34,7 @@ from pharos.kernels import graph as kernels
 from pharos.mdp import ExpandedMDP, TabularMDP, require_mdp, whole_number
 from pharos.system import storage
 from pharos.system.memory import available_memory, kept_array, large_zeros, ranges_from_the_end
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -146,7 +146,8 @@ def start_eccentricity_interval(
     note, infinite, largest = "", False, 0
     for start, weight in zip(starts, weights, strict=True):
         if spending.is_over and spending.searches:
-            note = f"budget spent after the searches from {spending.searches} of {many(len(starts), 'start state')}"
+            num_starts = pluralize(len(starts), "start state")
+            note = f"budget spent after the searches from {spending.searches} of {num_starts}"
             break
         reached, largest, _ = graph.search_forward(int(start), distance)
         spending.searches += 1

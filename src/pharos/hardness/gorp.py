@@ -18,7 +18,7 @@ from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.interval import fields_of
 from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
 from pharos.mdp import TabularMDP, require_mdp, whole_number
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 METHODS = ("binomial", "bernstein", "exact")
 MOST_SAMPLES, MOST_BINOMIAL = 10**100, 10**6
@@ -140,9 +140,8 @@ class GorpRuns:
         }
 
     def __str__(self) -> str:
-        return (
-            f"{self.success_rate:.3g} of {many(len(self.returns), 'run')} optimal, {many(self.timesteps, 'step')} each"
-        )
+        num_runs, steps = pluralize(len(self.returns), "run"), pluralize(self.timesteps, "step")
+        return f"{self.success_rate:.3g} of {num_runs} optimal, {steps} each"
 
 
 @require_mdp

@@ -30,7 +30,7 @@ from pharos.kernels import graph as kernels
 from pharos.kernels import many_searches
 from pharos.mdp import TabularMDP
 from pharos.system.arrays import Indices
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 
 class Graph:
@@ -261,7 +261,8 @@ class SumSweep:
         self._sweep()
         upper = self._upper()
         if upper > self.best:
-            note = f"budget spent: {many(self._open()[0], 'state')} may have a larger eccentricity than {self.best}"
+            open_states = pluralize(self._open()[0], "state")
+            note = f"budget spent: {open_states} may have a larger eccentricity than {self.best}"
             if clock:
                 note += f"; {clock}"
         return self._result(self.best, upper, note)
@@ -511,7 +512,7 @@ def _infinite_diameter(graph: Graph, spending: BudgetClock) -> Interval:
     counted = done == size
     note = "some states cannot be reached from others"
     if not counted:
-        note += f"; counted for {spending.seconds:.0f} s: the pairs from {done} of {many(size, 'state')}"
+        note += f"; counted for {spending.seconds:.0f} s: the pairs from {done} of {pluralize(size, 'state')}"
         note += ", so the counts are lower bounds"
         unreachable = max(unreachable, 1)
     method = "searches from all states, many at once"

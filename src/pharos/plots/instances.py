@@ -22,7 +22,7 @@ from pharos.interaction import GymEnv
 from pharos.observations import render as render_state
 from pharos.plots.style import COLORS, INK, plain_log, single, styled
 from pharos.policies import PolicyAnswers, PolicyLike, TabularAgent
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -372,7 +372,7 @@ def growth(spaces: Mapping[str, "StateSpace"], *, axes: "Axes | None" = None) ->
     for number, (label, space) in enumerate(spaces.items()):
         within, color = states_by_depth(space).cumsum(), COLORS[number % len(COLORS)]
         distance = np.arange(1, len(within) + 1)
-        axis.plot(distance, within, color=color, label=f"{label}: {many(space.num_states, 'state')}")
+        axis.plot(distance, within, color=color, label=f"{label}: {pluralize(space.num_states, 'state')}")
         axis.plot(distance[-1:], within[-1:], "o", color=color, markersize=5)
     axis.set(xscale="log", yscale="log", xlabel="steps from the start + 1", ylabel="states")
     for side in (axis.xaxis, axis.yaxis):

@@ -123,9 +123,9 @@ class Batches:
         self.seen: dict[str, SimpleNamespace] = {}
         self.keys: dict[str, Hashable] = {}  # by id
         self.stored: dict[str, frozenset[str]] = {}
-        self.look()
+        self.scan_checkpoints()
 
-    def look(self) -> None:
+    def scan_checkpoints(self) -> None:
         """Which batches have checkpoints: their runs stay together."""
         self.stored = {id: ids for ids in self._checkpoints().values() for id in ids}
 
@@ -137,7 +137,7 @@ class Batches:
                 batches[file.parent] = frozenset(storage.read_json(file)["ids"])
         return batches
 
-    def unit(self, run: Run, pending: "deque[tuple[float, Run]]") -> tuple[Run, ...]:
+    def next_batch(self, run: Run, pending: "deque[tuple[float, Run]]") -> tuple[Run, ...]:
         """The runs that are trained with this one; they are taken from `pending`."""
         if run.engine != "batched":
             return (run,)
@@ -204,14 +204,14 @@ class Batches:
             self.seen[key] = SimpleNamespace(shape=shape, dtype=dtype, is_image=is_image, frames=frames)
         return self.seen[key]
 
-    def halve(self, unit: Sequence[Run]) -> None:
+    def halve(self, batch: Sequence[Run]) -> None:
         """The process of this batch was killed too often: its runs go on in halves, from the beginning."""
-        ids = {run.id for run in unit}
-        self.most |= dict.fromkeys(ids, max(1, len(unit) // 2))
+        ids = {run.id for run in batch}
+        self.most |= dict.fromkeys(ids, max(1, len(batch) // 2))
         for folder, others in self._checkpoints().items():
             if ids & others:
                 shutil.rmtree(folder, ignore_errors=True)
-        self.look()
+        self.scan_checkpoints()
 
 
 def most_states(environment: Environment) -> float:

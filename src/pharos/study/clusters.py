@@ -150,19 +150,19 @@ def _follow(ray: Any, remote: Any, execution: Execution) -> Status:
 
     def start() -> None:
         while execution.pending:
-            unit = execution.unit(execution.pending.popleft()[1])
-            started[remote.remote(*execution.job(unit))] = unit
+            batch = execution.next_batch(execution.pending.popleft()[1])
+            started[remote.remote(*execution.job(batch))] = batch
 
     start()
     while started:
         for reference in ray.wait(list(started), num_returns=1, timeout=STATUS_SECONDS)[0]:
-            unit = started.pop(reference)
+            batch = started.pop(reference)
             error = None
             try:
                 ray.get(reference)
             except Exception as raised:  # of Ray: `attempt` keeps those of the run itself
                 error = raised
-            left = [run for run in unit if not execution.note(run)]
+            left = [run for run in batch if not execution.record_result(run)]
             if error is not None and len(left) > 1:
                 execution.batches.halve(left)
             elif error is not None:

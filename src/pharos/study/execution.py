@@ -27,7 +27,7 @@ from pharos.study.specification import Source
 from pharos.study.status import Forecast, Status, claim, duration, opened, status
 from pharos.system.records import takes
 from pharos.system.storage import replace_json
-from pharos.system.wording import in_one_line, many
+from pharos.system.wording import in_one_line, pluralize
 from pharos.system.workers import Workers, one_thread, usable_workers
 from pharos.training import ExecutionOptions
 
@@ -145,7 +145,7 @@ class Execution:
         self.lost_servers = 0
         self.seconds_per_step: dict[tuple, tuple[float, int]] = {}
         for run in self.runs:
-            if not self.note(run, options.retry_failed):
+            if not self.record_result(run, options.retry_failed):
                 self.pending.append((0.0, run))
 
     def forecast(self) -> Forecast:
@@ -164,7 +164,7 @@ class Execution:
             with self.workers:
                 while self.pending or self.running:
                     if time.monotonic() - self.last_listing >= OTHERS_SECONDS:
-                        self._look_around()
+                        self._refresh()
                     self._start()
                     self.report()
                     self._await()
@@ -175,7 +175,7 @@ class Execution:
         _clear(self.folder, self.runs)
         return self.report(final=True)
 
-    def _look_around(self) -> None:
+    def _refresh(self) -> None:
         """Count what other runners have finished: one listing of the folder."""
         self.last_listing = time.monotonic()
         with contextlib.suppress(OSError):
@@ -183,7 +183,7 @@ class Execution:
             self.pending = deque(
                 (due, run)
                 for due, run in self.pending
-                if run.id not in there or run.id in self.repeated or not self.note(run)
+                if run.id not in there or run.id in self.repeated or not self.record_result(run)
             )
 
     def _start(self) -> None:
@@ -194,43 +194,44 @@ class Execution:
             if due > time.monotonic():
                 self.pending.append((due, run))
                 continue
-            if self.note(run, run.id in self.repeated):
+            if self.record_result(run, run.id in self.repeated):
                 continue
-            unit = self.unit(run)
+            batch = self.next_batch(run)
             try:
-                self._worker(unit)
+                self._worker(batch)
             except (EOFError, ConnectionError) as error:
                 self._server_lost(error)
-                self.pending.extendleft((due, each) for each in reversed(unit))
+                self.pending.extendleft((due, each) for each in reversed(batch))
                 return
-            self.running[run.id] = (unit, time.monotonic())
+            self.running[run.id] = (batch, time.monotonic())
 
     def _server_lost(self, error: Exception) -> None:
         """The process that forks workers is gone: wait a little, and the next start begins another."""
         self.lost_servers += 1
         if self.lost_servers > LOST_SERVERS:
             raise PharosError(
-                f"the process that starts runs died {many(self.lost_servers, 'time')} in a row "
+                f"the process that starts runs died {pluralize(self.lost_servers, 'time')} in a row "
                 f"({in_one_line(error)}); was there memory enough?"
             ) from error
         time.sleep(BUSY_SECONDS)
 
-    def _worker(self, unit: tuple[Run, ...]) -> None:
-        definitions = [each for run in unit for each in run.configuration.definitions]
+    def _worker(self, batch: tuple[Run, ...]) -> None:
+        of_runs = (each for run in batch for each in run.configuration.definitions)
+        definitions = (self.runner, self.batch_runner, *of_runs)
         with one_thread():
-            self.workers.start(unit[0].id, _worker.main, self.job(unit), (self.runner, self.batch_runner, *definitions))
+            self.workers.start(batch[0].id, _worker.main, self.job(batch), definitions)
 
-    def unit(self, run: Run) -> tuple[Run, ...]:
+    def next_batch(self, run: Run) -> tuple[Run, ...]:
         """The runs that are executed by one process with this one; they are taken from `pending`."""
-        return (run,) if self.batch_runner is None else self.batches.unit(run, self.pending)
+        return (run,) if self.batch_runner is None else self.batches.next_batch(run, self.pending)
 
-    def job(self, unit: Sequence[Run]) -> Job:
+    def job(self, batch: Sequence[Run]) -> Job:
         """The arguments of `worker.main` for these runs."""
         runner, resume = self.batch_runner, True
-        if runner is None or unit[0].engine != "batched":
+        if runner is None or batch[0].engine != "batched":
             runner, resume = partial(_worker.run_alone, self.runner), self.options.resume
-        ids = [run.id for run in unit]
-        configs, again = [dict(run.config) for run in unit], self.repeated.intersection(ids)
+        ids = [run.id for run in batch]
+        configs, again = [dict(run.config) for run in batch], self.repeated.intersection(ids)
         return runner, configs, ids, self.folder.absolute(), again, resume
 
     def _await(self) -> None:
@@ -240,39 +241,39 @@ class Execution:
         waiting = BUSY_SECONDS if self.pending and len(self.running) < self.num_workers else STATUS_SECONDS / 2
         for id, code in self.workers.events(waiting):
             self._ended(self.running.pop(id)[0], code)
-        for id, (unit, started) in self.running.items():
-            if self.options.timeout is not None and time.monotonic() - started > self.options.timeout * len(unit):
-                self.kills.update({run.id: ATTEMPTS for run in unit})
+        for id, (batch, started) in self.running.items():
+            if self.options.timeout is not None and time.monotonic() - started > self.options.timeout * len(batch):
+                self.kills.update({run.id: ATTEMPTS for run in batch})
                 self.workers.kill(id)
 
-    def _ended(self, unit: tuple[Run, ...], code: int) -> None:
+    def _ended(self, batch: tuple[Run, ...], code: int) -> None:
         """A process is over: what it has not left behind is done again."""
         is_killed = code not in (0, _worker.EXIT_BUSY)
-        left = [run for run in unit if not self.note(run, is_killed and run.id in self.repeated)]
+        left = [run for run in batch if not self.record_result(run, is_killed and run.id in self.repeated)]
         if code == SERVER_LOST and left and self.lost_servers < LOST_SERVERS:
             self.lost_servers += 1  # the worker may well live: the next attempt waits for it
-        elif is_killed or (code == 0 and unit[0].engine != "batched"):
+        elif is_killed or (code == 0 and batch[0].engine != "batched"):
             self._killed(left, code)
             return
         self.pending.extend((time.monotonic() + BUSY_SECONDS, run) for run in left)  # another process is at them
 
-    def _killed(self, unit: Sequence[Run], code: int) -> None:
+    def _killed(self, batch: Sequence[Run], code: int) -> None:
         """Without results: again, up to ATTEMPTS times; then a batch is halved, and a run has failed."""
-        for run in unit:
+        for run in batch:
             self.kills[run.id] += 1
-        most = max((self.kills[run.id] for run in unit), default=0)
+        most = max((self.kills[run.id] for run in batch), default=0)
         if most < ATTEMPTS:
-            self.batches.look()
-        elif len(unit) > 1 and most == ATTEMPTS:
-            self.batches.halve(unit)
-            self.kills.update({run.id: 0 for run in unit})
+            self.batches.scan_checkpoints()
+        elif len(batch) > 1 and most == ATTEMPTS:
+            self.batches.halve(batch)
+            self.kills.update({run.id: 0 for run in batch})
         else:
-            for run in unit:
-                self._give_up(run, code)
+            for run in batch:
+                self._mark_failed(run, code)
             return
-        self.pending.extend((0.0, run) for run in unit)
+        self.pending.extend((0.0, run) for run in batch)
 
-    def _give_up(self, run: Run, code: int) -> None:
+    def _mark_failed(self, run: Run, code: int) -> None:
         """A run has failed: its process was killed too often, or took too long."""
         if self.kills[run.id] > ATTEMPTS:
             self.fail(run, f"took longer than {self.options.timeout:g} s")
@@ -286,9 +287,9 @@ class Execution:
         folder.mkdir(parents=True, exist_ok=True)
         _worker.write_failure(folder, run.config, run.id, error, 0.0)
         _worker.publish(folder, self.folder, run.id)
-        self.note(run, False)
+        self.record_result(run, False)
 
-    def note(self, run: Run, again: bool = False) -> bool:
+    def record_result(self, run: Run, again: bool = False) -> bool:
         """Read the run's result, if it is over; False where it has to be executed, a damaged one again."""
         try:
             record = _worker.read_record(self.folder / "runs" / run.id)
@@ -317,8 +318,8 @@ class Execution:
         pace = {kind: seconds / steps for kind, (seconds, steps) in self.seconds_per_step.items()}
         usual = sum(pace.values()) / len(pace)
         seconds = sum(run.config["steps"] * pace.get(run.kind, usual) for _, run in self.pending)
-        for unit, started in self.running.values():
-            needed = sum(run.config["steps"] * pace.get(run.kind, usual) for run in unit)
+        for batch, started in self.running.values():
+            needed = sum(run.config["steps"] * pace.get(run.kind, usual) for run in batch)
             seconds += max(0.0, needed - (time.monotonic() - started))
         return seconds / self.num_workers
 
@@ -329,7 +330,7 @@ class Execution:
             total=len(self.runs),
             finished=len(self.finished),
             failed=len(self.errors),
-            running=sum(len(unit) for unit, _ in self.running.values()),
+            running=sum(len(batch) for batch, _ in self.running.values()),
             errors=dict(self.errors),
             elapsed=time.monotonic() - self.began,
             remaining=self._remaining(),

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -108,15 +108,15 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
     terms, columns, dropped = _independent(rows, predictors)
     needed = columns + 2
     if len(rows) < needed:
-        what = f"{many(columns - 1, 'predictor')}" if columns > 1 else "mean, as no predictor varies"
+        what = f"{pluralize(columns - 1, 'predictor')}" if columns > 1 else "mean, as no predictor varies"
         raise ParameterError(
-            f"the {model} model of {subset} has {many(len(rows), 'row')}; needs at least {needed} for its {what}: run "
-            f"more instances or fewer predictors"
+            f"the {model} model of {subset} has {pluralize(len(rows), 'row')}; needs at least {needed} for its {what}: "
+            f"run more instances or fewer predictors"
         )
     if np.ptp(rows["regret"]) == 0:
         raise ParameterError(
             f"the {model} model of {subset} has nothing to explain: the regret is {rows['regret'].iloc[0]:g} in all of "
-            f"its {many(len(rows), 'row')}"
+            f"its {pluralize(len(rows), 'row')}"
         )
     formula = "regret ~ " + (" + ".join(terms) if terms else "1")
     result = smf.ols(formula, rows).fit()

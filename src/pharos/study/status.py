@@ -26,7 +26,7 @@ from pharos.study.specification import (
     study_name,
 )
 from pharos.system.storage import read_json, replace_file
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 from pharos.training import read_record
 
 
@@ -68,7 +68,7 @@ class Status:
     def __str__(self) -> str:
         if self.preparing:
             return f"{self.name}: {self.preparing}"
-        text = f"{self.name}: {self.finished} of {many(self.total, 'run')} finished"
+        text = f"{self.name}: {self.finished} of {pluralize(self.total, 'run')} finished"
         if self.failed:
             text += f", {self.failed} failed"
         if self.damaged:
@@ -96,10 +96,10 @@ class Forecast:
     seconds: float | None
 
     def __str__(self) -> str:
-        text = f"{many(self.runs, 'run')} to come, {self.steps:,} steps"
+        text = f"{pluralize(self.runs, 'run')} to come, {self.steps:,} steps"
         if self.seconds is None:
             return f"{text}; how long they take is told once one is finished"
-        workers = many(self.workers, "worker")
+        workers = pluralize(self.workers, "worker")
         return f"{text}: about {duration(self.seconds)} with {workers}, at the pace of finished runs"
 
 

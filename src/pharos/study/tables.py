@@ -26,7 +26,7 @@ from pharos.study.blocks import Run, Specification
 from pharos.study.specification import Source
 from pharos.study.status import opened
 from pharos.system.storage import ResultCache
-from pharos.system.wording import in_one_line, many
+from pharos.system.wording import in_one_line, pluralize
 from pharos.training import CELL, ChanceSetting
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def _warned(runs: FinishedRuns) -> FinishedRuns:
     if runs.damaged:
         first = next(iter(runs.damaged.values()))
         warnings.warn(
-            f"{many(len(runs.damaged), 'run')} left out, {', '.join(runs.damaged)}: {first}; "
+            f"{pluralize(len(runs.damaged), 'run')} left out, {', '.join(runs.damaged)}: {first}; "
             f"`pharos study run` makes them again",
             RuntimeWarning,
             stacklevel=3,

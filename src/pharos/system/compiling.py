@@ -72,7 +72,7 @@ def prepare(kernels: Path) -> None:
         )
     if not os.environ.get("NUMBA_CACHE_DIR"):
         _forget_outdated(kernels)
-    _listen()
+    _start_timing()
 
 
 def _forget_outdated(kernels: Path) -> None:
@@ -95,7 +95,7 @@ def _can_be_written(folder: Path) -> bool:
         return False
 
 
-def _listen() -> None:
+def _start_timing() -> None:
     try:
         from numba.core import config, event
     except (ValueError, RuntimeError) as error:

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     import jinja2
 
 
-def many(count: int, one: str, several: str | None = None) -> str:
+def pluralize(count: int, one: str, several: str | None = None) -> str:
     """A count and its noun: "1 run", "1,200 runs", "2 classes"."""
     return f"{count:,} {one if count == 1 else several or one + 's'}"
 

@@ -23,7 +23,7 @@ from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosE
 from pharos.policies import is_small_table
 from pharos.system import compiling
 from pharos.system.storage import digest_of_json, lock, read_json, remove_leftovers, replace_json
-from pharos.system.wording import in_one_line, many
+from pharos.system.wording import in_one_line, pluralize
 from pharos.training import results as _results
 from pharos.training.curve import values_together
 from pharos.training.learners import FailedRun, Learner, Member, TaskCache, make_learner
@@ -281,7 +281,8 @@ class TrainingGroup:
         if reason not in self.jobs.reasons:
             self.jobs.reasons.add(reason)
             warnings.warn(
-                f"{reason}: {many(len(self.group), 'run')} at once; goes on with {many(middle, 'run')} at once",
+                f"{reason}: {pluralize(len(self.group), 'run')} at once; "
+                f"goes on with {pluralize(middle, 'run')} at once",
                 stacklevel=2,
             )
         self.jobs.done = before

@@ -194,14 +194,12 @@ def _curve_file(folder: Path) -> Path:
     return text if text.exists() and not (folder / CURVE).exists() else folder / CURVE
 
 
-def _read_text(path: Path) -> dict[str, "np.ndarray"]:
+def _read_text(path: Path) -> dict[str, np.ndarray]:
     """Name -> values, of a curve.csv.
 
     Raises:
         ResultCorrupted: it was cut short or changed.
     """
-    import numpy as np
-
     read: dict[str, Callable[[str], Any]] = {"int64": int, "float64": float, "bool": _TRUTHS.__getitem__}
     try:
         with open(path, encoding="utf-8", newline="") as file:
@@ -215,7 +213,7 @@ def _read_text(path: Path) -> dict[str, "np.ndarray"]:
         raise ResultCorrupted(f"{path}: cannot be read, it was cut short or changed: {reason}; {AGAIN}") from None
 
 
-def _check_digest(path: Path, columns: Mapping[str, "np.ndarray"]) -> None:
+def _check_digest(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     if (path.parent / RECORD).exists():
         expected = _expected_checksums(path.parent).get(path.name)
         if expected is not None and _digest_of_columns(columns) != expected:
@@ -279,12 +277,11 @@ def digest_of_curve(table: "pa.Table") -> str:
     return _digest_of_columns(_columns_of(table))
 
 
-def _columns_of(table: "pa.Table") -> dict[str, "np.ndarray"]:
+def _columns_of(table: "pa.Table") -> dict[str, np.ndarray]:
     return {name: table.column(name).to_numpy() for name in table.column_names}
 
 
-def _digest_of_columns(columns: Mapping[str, "np.ndarray"]) -> str:
-    import numpy as np
+def _digest_of_columns(columns: Mapping[str, np.ndarray]) -> str:
     import xxhash
 
     digest = xxhash.xxh3_128()

@@ -35,7 +35,7 @@ from pharos.errors import FileFormatError, FolderLocked, MissingExtra, Parameter
 from pharos.mdp import ChanceSetting
 from pharos.observations import OwnObservation, own_observation
 from pharos.system import storage
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 from pharos.training import results as _results
 from pharos.training.batch import TrainingProgress, train_configs
 from pharos.training.learners import FailedRun, TaskCache
@@ -200,7 +200,8 @@ def tune(  # noqa: PLR0913
             _write(folder, search, records)
     best = _best(records)
     if not best["hyperparameters"]:
-        raise ParameterError(f"none of {many(trials, 'trial')} was finished; give more trials, or look at tuning.json")
+        number = pluralize(trials, "trial")
+        raise ParameterError(f"none of {number} was finished; give more trials, or look at tuning.json")
     return TuningResult(
         agent=agent,
         environment=search.environment,
@@ -474,7 +475,8 @@ def _write(folder: Path, search: _Search, trials: Sequence[dict[str, Any]]) -> N
 
         mine = {**search.table, **hyperparameters}
         record["best"] = {"trial": best["number"], "score": best["score"], "hyperparameters": mine}
-        head = f"# Mean normalised regret {best['score']:.4f} after {many(len(trials), 'trial')}, see tuning.json\n"
+        number = pluralize(len(trials), "trial")
+        head = f"# Mean normalised regret {best['score']:.4f} after {number}, see tuning.json\n"
         text = head + yaml.safe_dump(
             {search.agent: {search.environment: {search.observation_name: mine}}}, sort_keys=False
         )

@@ -24,7 +24,7 @@ from pharos import training
 from pharos.environments import Environment
 from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCorrupted
 from pharos.system.storage import plain
-from pharos.system.wording import many
+from pharos.system.wording import pluralize
 from pharos.training import CELL
 from pharos.validation.learners import (
     POLICY_CURVES,
@@ -548,7 +548,7 @@ class PredictedCells:
         twice = cells[cells.duplicated(CELL)][CELL]
         if len(twice):
             raise ParameterError(
-                f"{many(len(twice), 'cell')} predicted twice, such as {', '.join(twice.iloc[0])}; "
+                f"{pluralize(len(twice), 'cell')} predicted twice, such as {', '.join(twice.iloc[0])}; "
                 "expected files of different cells"
             )
         object.__setattr__(self, "cells", cells.fillna({name: "" for name in POLICY_CURVES if name in cells}))

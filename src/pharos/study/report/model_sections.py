@@ -12,7 +12,7 @@ from pharos.study.figures import agents_figure
 from pharos.study.regression import Fit
 from pharos.study.report.page import Figures, ReportTable, Section, image, table
 from pharos.study.report.results import Results, coefficients
-from pharos.system.wording import in_words, many
+from pharos.system.wording import in_words, pluralize
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -101,7 +101,7 @@ def agreement_section(results: Results, figures: Figures, left_out: list[str]) -
             for value in ("return", "normalized_regret", "cumulative_regret"):
                 if (pair := agreement(results.cells, value, (one, two))) is not None:
                     names = f"{agent_name(one)} and {agent_name(two)}, {REGRETS.get(value, value)}"
-                    lines.append(f"{names}: r = {pair[0]:.2f} over {many(pair[1], 'cell')}")
+                    lines.append(f"{names}: r = {pair[0]:.2f} over {pluralize(pair[1], 'cell')}")
             caption = f"Normalised regret of {agent_name(two)} against that of {agent_name(one)}."
             drawn.append(image(figures, agents_figure(one, two), caption))
     if not lines:
@@ -177,8 +177,8 @@ def _text(judgement: "pd.DataFrame") -> list[str]:
         "Does a number that is known before training predict regret on classes that it has not met? Each class is "
         "predicted by a line through the others, classes weighing alike; baselines stand first, and a measure that "
         "does not beat them says nothing that is new. R² below 0 is worse than the mean of all classes.",
-        f"{many(number, 'test')} in all; p-values are corrected for that number (Holm). Intervals are over classes "
-        "drawn anew, and permutations exchange whole classes: instances and observations of a class are not "
+        f"{pluralize(number, 'test')} in all; p-values are corrected for that number (Holm). Intervals are over "
+        "classes drawn anew, and permutations exchange whole classes: instances and observations of a class are not "
         "independent. The floor is what 95 % of such permutations stay below; the ceiling is what noise over "
         "seeds leaves.",
     ]
@@ -213,7 +213,7 @@ def _said(results: Results, predictions: "PredictedCells | None") -> list[str]:
 def doubts(results: Results, predictions: "PredictedCells") -> list[str]:
     """Why predictions may be none: runs that had begun when they were written, or that do not say when they were."""
     before, unknown = predictions.late(results.runs)
-    total, reasons = f"of {many(len(results.runs), 'run')}", []
+    total, reasons = f"of {pluralize(len(results.runs), 'run')}", []
     if before:
         reasons.append(f"not a prediction: {before:,} {total} had begun when the predictions were written")
     if unknown:

@@ -19,7 +19,7 @@ from pharos.study.report.page import Figures, Section, data_url, image, table
 from pharos.study.report.results import Results
 from pharos.study.specification import Specification
 from pharos.study.status import duration
-from pharos.system.wording import in_words, many
+from pharos.system.wording import in_words, pluralize
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -53,10 +53,11 @@ def _summary(results: Results) -> Section:
     now, runs = results.status, results.runs
     failed = f", {now.failed} failed" if now.failed else ""
     lines = [
-        f"{now.finished:,} of {many(now.total, 'run')} {'is' if now.total == 1 else 'are'} finished{failed}: "
-        f"{many(runs['instance'].nunique(), 'instance')} of {many(runs['environment'].nunique(), 'class', 'classes')}, "
-        f"{many(runs['chance'].nunique(), 'kind')} of chance, {many(runs['agent'].nunique(), 'agent')}, "
-        f"{many(runs['seed'].nunique(), 'seed')}; {int(runs['steps'].sum()):,} steps, which took one processor "
+        f"{now.finished:,} of {pluralize(now.total, 'run')} {'is' if now.total == 1 else 'are'} finished{failed}: "
+        f"{pluralize(runs['instance'].nunique(), 'instance')} of "
+        f"{pluralize(runs['environment'].nunique(), 'class', 'classes')}, "
+        f"{pluralize(runs['chance'].nunique(), 'kind')} of chance, {pluralize(runs['agent'].nunique(), 'agent')}, "
+        f"{pluralize(runs['seed'].nunique(), 'seed')}; {int(runs['steps'].sum()):,} steps, which took one processor "
         f"{duration(runs['seconds'].sum())}."
     ]
     if (estimated := _estimated(runs)) is not None:
@@ -73,9 +74,8 @@ def _summary(results: Results) -> Section:
         returns = results.comparison.returns
         matched = int(returns["ours"].notna().sum())
         lines.append(f"{matched} of the {len(returns)} returns that the paper prints have their counterpart here.")
-    missing = (
-        f"{many(now.missing, 'run')} missing: every number below is of the runs that are there." if now.missing else ""
-    )
+    missing = f"{pluralize(now.missing, 'run')} missing: every number below is of the runs that are there."
+    missing = missing if now.missing else ""
     errors = [f"{count} × {error}" for error, count in Counter(now.errors.values()).items()]
     damaged = list({**now.damaged, **results.damaged}.values())
     return Section("Summary", "summary", lines=lines, missing=missing, errors=errors, damaged=damaged)
@@ -89,8 +89,8 @@ def _estimated(runs: "pd.DataFrame") -> str | None:
     groups = estimates.groupby(["environment", "agent"], sort=True).size()
     of = ", ".join(f"{agent_name(agent)} on {in_words(name)} ({count})" for (name, agent), count in groups.items())
     return (
-        f"The regret of {many(len(estimates), 'run')} of {len(runs):,} is estimated by playing, because the policy "
-        f"reaches too many states for an exact value: {of}. Their normalised regret may be off by up to ± "
+        f"The regret of {pluralize(len(estimates), 'run')} of {len(runs):,} is estimated by playing, because the "
+        f"policy reaches too many states for an exact value: {of}. Their normalised regret may be off by up to ± "
         f"{estimates['half_width'].max():.4f} if all errors of a run add up; tables mark them by ≈. All other regret "
         "is exact."
     )
