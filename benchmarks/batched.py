@@ -55,7 +55,7 @@ class Together:
     """As many runs of the batched engine as make a lane."""
 
     def __init__(self, agent: str, task: Task, options: dict, runs: int):
-        source = ObservationSource.of(task.space, task.sight.observe)
+        source = ObservationSource.of(task.space, task.observer.observe)
         made = [BatchRun(task.mdp, source, task.time_limit, options, STEPS, i, i) for i in range(runs)]
         self.batch, self.runs = make_batch(agent, made), runs
 

@@ -36,7 +36,7 @@ def peak() -> float:
 
 
 def runs_of(task: Task, options: dict, number: int, steps: int = STEPS) -> list[BatchRun]:
-    source = ObservationSource.of(task.space, task.sight.observe)
+    source = ObservationSource.of(task.space, task.observer.observe)
     return [BatchRun(task.mdp, source, task.time_limit, options, steps, i, i) for i in range(number)]
 
 

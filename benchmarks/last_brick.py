@@ -63,7 +63,7 @@ def main():
     env = make(INSTANCE)
     task = Task.of(env, observation="vector")
     observe = observation_of(env, "vector")
-    source = ObservationSource.of(task.space, task.sight.observe)
+    source = ObservationSource.of(task.space, task.observer.observe)
     table = hyperparameters("dqn", env.name, "vector")
     groups = {}
     for name, change in VARIANTS.items():

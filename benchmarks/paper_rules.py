@@ -323,7 +323,7 @@ def dqn(arguments):
         for name in wanted.values():
             env = variant_of(name, brick_rows=arguments.rows, **VARIANTS[variant])
             task = Task.of(env, observation="vector", horizon=limit)
-            source = ObservationSource.of(task.space, task.sight.observe)
+            source = ObservationSource.of(task.space, task.observer.observe)
             runs += [BatchRun(task.mdp, source, limit, table, arguments.steps, seed, seed) for seed in arguments.seeds]
         batch, late = make_batch("dqn", runs), []
         batch.learn(

@@ -45,7 +45,7 @@ SPACES = {
 
 def trained(agent, tasks, sets, steps, seeds):
     """(one mean return of the second half, one exact value without chance) for each set, task and seed."""
-    source = ObservationSource.of(tasks[0].space, tasks[0].sight.observe)
+    source = ObservationSource.of(tasks[0].space, tasks[0].observer.observe)
     places = [(i, j, seed) for i in range(len(sets)) for j in range(len(tasks)) for seed in seeds]
     runs = [
         BatchRun(tasks[j].mdp, source, tasks[j].time_limit, sets[i], steps, seed, (i << 40) + (j << 32) + seed)

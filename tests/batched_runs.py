@@ -9,7 +9,7 @@ RUN = 1  # the one of a lane that is looked at
 
 
 def runs_of(task, hyperparameters, number=3, steps=120, apart=2**40):
-    source = ObservationSource.of(task.space, task.sight.observe)
+    source = ObservationSource.of(task.space, task.observer.observe)
     keys = [apart + 977 * i for i in range(number)]
     return [BatchRun(task.mdp, source, task.time_limit, hyperparameters, steps, i, key) for i, key in enumerate(keys)]
 

@@ -71,7 +71,7 @@ def test_a_lane_has_at_most_three_idle_runs():
 
 def test_a_policy_asked_about_few_observations_answers_as_about_many(grid):
     batch = learned("ppo", runs_of(grid, PPO, 1))
-    seen = np.tile(grid.sight.observe.observation(grid.space.states(np.arange(grid.space.num_states))), (30, 1))
+    seen = np.tile(grid.observer.observe.observation(grid.space.states(np.arange(grid.space.num_states))), (30, 1))
     many = batch.policy(0).action_probabilities(seen)
     few = np.concatenate([batch.policy(0).action_probabilities(seen[i : i + 7]) for i in range(0, len(seen), 7)])
     assert np.allclose(many, few, rtol=0, atol=1e-6)

@@ -18,7 +18,7 @@ DQN = {"learning_rate": 0.001, "buffer_size": 200, "learning_starts": 40, "batch
 
 
 def batch_of(agent, task, hyperparameters):
-    source = ObservationSource.of(task.space, task.sight.observe)
+    source = ObservationSource.of(task.space, task.observer.observe)
     runs = [BatchRun(task.mdp, source, task.time_limit, hyperparameters, 10_000, i, 31 * i) for i in range(2)]
     return make_batch(agent, runs)
 
@@ -74,7 +74,7 @@ def test_updates_of_dqn_are_those_of_stable_baselines3(task, max_grad_norm):
 @pytest.mark.long
 def test_updates_of_the_three_convolutions_are_those_of_stable_baselines3():
     task = Task.of(make("frozen_lake/4x4"), observation="complex_image")
-    assert min(task.sight.observe.space.shape[:2]) >= 36
+    assert min(task.observer.observe.space.shape[:2]) >= 36
     check_updates_of_dqn(task, {**DQN, "batch_size": 4, "learning_starts": 59}, 2)
 
 

@@ -153,7 +153,7 @@ def mixed():
         Task.of(make("simple_grid"), random=0.25),
         Task.of(make("simple_grid", height=5, width=3, goal=(4, 2))),
     ]
-    sources = [ObservationSource.of(task.space, task.sight.observe) for task in tasks]
+    sources = [ObservationSource.of(task.space, task.observer.observe) for task in tasks]
     return [
         BatchRun(task.mdp, source, 9 + k, {**DQN, "gamma": 0.9 + 0.01 * k}, 60, k, 5 * k)
         for k, (task, source) in enumerate(zip(tasks, sources, strict=True))

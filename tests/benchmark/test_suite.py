@@ -120,7 +120,7 @@ def digest_of(monkeypatch):
     def digest(observation="index", **changes):
         mdp = TabularMDP.from_outcomes(**outcomes(**changes)).with_horizon(5)
         task = Task(importers.environment(mdp), observation=observation, horizon=5)
-        assert task.mdp.num_states == 3 and task.sight.observe.observation.space is not None
+        assert task.mdp.num_states == 3 and task.observer.observe.observation.space is not None
         with monkeypatch.context() as patch:  # its folder, which is named by what it holds
             patch.setattr(type(task.env), "parameters", {"folder": "world"})
             return digest_of_task(task)

@@ -153,7 +153,7 @@ def test_beyond_a_limit_the_value_is_estimated_over_histories():
     assert exact.exact
     assert not estimated.exact
     assert abs(exact.value - estimated.value) <= estimated.error_bound
-    answers = QueriedHistories(policy, task.mdp, task.sight)
+    answers = QueriedHistories(policy, task.mdp, task.observer)
     low, high = task.return_range
     value, width = estimate(answers, (low, high), 20_000, np.random.default_rng(0))
     assert abs(value - exact.value) <= width

@@ -115,7 +115,7 @@ def test_the_value_is_that_of_all_histories(mdp, seed, sharp, sees_previous, ste
 @pytest.mark.parametrize("name", ["simple_grid/4x4-decoy", "frozen_lake/4x4"])
 def test_a_policy_that_keeps_nothing_has_the_value_of_one_without_a_memory(name, chance):
     task = Task.of(name, **chance)
-    weights = np.random.default_rng(0).normal(size=(task.sight.observe.space.shape[0], task.mdp.num_actions))
+    weights = np.random.default_rng(0).normal(size=(task.observer.observe.space.shape[0], task.mdp.num_actions))
 
     def policy(observations):
         scores = np.exp(observations @ weights)
@@ -143,7 +143,7 @@ def test_a_memory_that_counts_steps_is_worth_what_its_actions_are():
 def test_estimates_agree_with_exact_values_within_their_bound(chance):
     task = Task.of("frozen_lake/4x4", horizon=6, **chance)
     for seed in range(5):
-        policy = Cell(seed, task.sight.observe.space.shape[0], 4, sharp=False)
+        policy = Cell(seed, task.observer.observe.space.shape[0], 4, sharp=False)
         exact = evaluate_agent(policy, task)
         estimate = evaluate_agent(policy, task, max_states=20, episodes=1000, seed=seed)
         assert exact.exact and not estimate.exact and estimate.episodes == 1000
@@ -154,7 +154,7 @@ def test_estimates_agree_with_exact_values_within_their_bound(chance):
 def test_a_policy_that_remembers_what_is_seen_first_has_no_regret(length):
     env = pharos.make("memory_chain", memory_length=length)
     task = Task(env, observation="one_hot", observation_options={"seen_first": ["bits"]})
-    (bit,) = [i for i, name in enumerate(task.sight.observe.names) if "bits" in name and name.endswith("1")]
+    (bit,) = [i for i, name in enumerate(task.observer.observe.names) if "bits" in name and name.endswith("1")]
     found = evaluate_agent(Rememberer(bit), task)
     assert found.exact and found.value == task.optimal.value_at_start == 1.0
     assert found.states == 2 * (length + 1)
@@ -164,7 +164,7 @@ def test_a_policy_that_remembers_what_is_seen_first_has_no_regret(length):
 
 def test_the_most_probable_action_of_a_memory_is_that_of_its_maximum():
     task = Task.of("simple_grid/4x4-decoy", random=0.2, horizon=5)
-    size = task.sight.observe.space.shape[0]
+    size = task.observer.observe.space.shape[0]
     sharp, soft = Cell(1, size, 4, sharp=True), Cell(1, size, 4, sharp=False)
     assert evaluate_agent(soft, task, deterministic=True).value == evaluate_agent(sharp, task).value
     assert evaluate_agent(soft, task).value != evaluate_agent(sharp, task).value
@@ -223,7 +223,7 @@ def test_recurrent_ppo_is_worth_what_it_plays_over_all_histories(tmp_path):
     states = task.space.states()
 
     def shown(s, b, is_first):
-        return task.sight.observe(states[s][None], np.array([-1]), np.array([0]))[0].tolist()
+        return task.observer.observe(states[s][None], np.array([-1]), np.array([0]))[0].tolist()
 
     expected, histories = value_of_memory(trained.agent, task.mdp, shown, task.horizon)
     found = evaluate_agent(trained.agent, task)

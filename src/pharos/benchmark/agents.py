@@ -195,7 +195,7 @@ class TrainedForm(Form):
                 continue
             if job.task.name not in kinds:
                 task = job.task.training_task(protocol)
-                kinds[job.task.name] = task.sight.observe.space.shape, task.env.num_actions
+                kinds[job.task.name] = task.observer.observe.space.shape, task.env.num_actions
             groups[kinds[job.task.name]].append(place)
         lanes = []
         for kind, group in groups.items():

@@ -118,12 +118,12 @@ class Snapshots:
         if isinstance(policy, SB3Model):
             policy = deep_policy(policy)
         has_no_table = isinstance(policy, np.ndarray | RecurrentPolicy)
-        if has_no_table or task.sight.frames > 1 or task.mdp.num_states > LARGEST:
+        if has_no_table or task.observer.frames > 1 or task.mdp.num_states > LARGEST:
             return evaluate_agent(policy, task)
-        answers = PolicyAnswers(policy, task.mdp, task.sight)
-        if task.sight.observe.observation.irrelevant:
+        answers = PolicyAnswers(policy, task.mdp, task.observer)
+        if task.observer.observe.observation.irrelevant:
             states = np.arange(task.mdp.num_states)
-            return answers.of(states * answers.width + (answers.width - 1))
+            return answers.query(states * answers.width + (answers.width - 1))
         return np.concatenate([answers.answer(observations, count) for count, observations in self._observations()])
 
     def _observations(self) -> Iterator[tuple[int, Any]]:
@@ -134,8 +134,8 @@ class Snapshots:
         blocks, size = [], 0
         for first in range(0, self.task.mdp.num_states, BLOCK):
             states = np.arange(first, min(first + BLOCK, self.task.mdp.num_states))
-            context = self.task.sight.space.states(states), np.full(len(states), -1), np.zeros(len(states), np.int64)
-            block = len(states), self.task.sight.observe(*context)
+            context = self.task.observer.space.states(states), np.full(len(states), -1), np.zeros(len(states), np.int64)
+            block = len(states), self.task.observer.observe(*context)
             size += getattr(block[1], "nbytes", KEPT)
             blocks.append(block)
             yield block

@@ -41,7 +41,7 @@ def compiled_curves(
         MissingExtra: JAX or gymnax is not installed.
         ParameterError: the task is none of tables alone; or the function returns something else.
     """
-    context = task.sight.observe
+    context = task.observer.observe
     lacking = [
         name
         for name, is_wanted in {
@@ -79,7 +79,7 @@ def compiled_curves(
         )
     (number,) = numbers
     ask = jax.jit(jax.vmap(functions[-1], (0, None)))
-    everything, answers = env.default_params.observations[:-1], PolicyAnswers(functions[-1], task.mdp, task.sight)
+    everything, answers = env.default_params.observations[:-1], PolicyAnswers(functions[-1], task.mdp, task.observer)
     places = [point * number // evaluations - 1 for point in range(evaluations + 1)]
     uniform, curves = np.full((count, env.num_actions), 1 / env.num_actions), []
     for i in range(len(seeds)):

@@ -116,7 +116,7 @@ def _suite(suite: Suite, seed: str, tasks: Mapping[str, BenchmarkTask]) -> Suite
 
 def _copy(task: BenchmarkTask, protocol: Protocol, draw: np.random.Generator, folder: Path) -> BenchmarkTask | None:
     public = task.training_task(protocol)
-    observation = public.sight.observe.observation
+    observation = public.observer.observe.observation
     shape = observation.space.shape or ()
     if len(shape) != 1 or observation.frames > 1 or observation.irrelevant:
         return None

@@ -265,7 +265,7 @@ def digest_of_task(task: Task) -> str:
     bits.
     """
     space, mdp = task.space, task.space.mdp(gamma=task.gamma)
-    env, observe = task.env, task.sight.observe.observation
+    env, observe = task.env, task.observer.observe.observation
     said = {
         "environment": env.name,
         "parameters": {} if env.name == "imported" else env.parameters,  # whose folder may lie anywhere

@@ -290,11 +290,11 @@ class Learnt:
             return evaluate_policy(mdp, policy)
         if space is None or space.environment is None:
             raise ParameterError("a policy of observations needs an environment that is known; give it as a table")
-        sight = StateObserver(
+        observer = StateObserver(
             space, space.environment, self.observation, dict(self.observation_options), self.previous_action
         )
         width = mdp.policy_width
-        if sight.frames > 1 or mdp.num_states * width > ASKED_EVERYWHERE or (self.previous_action and width == 1):
+        if observer.frames > 1 or mdp.num_states * width > ASKED_EVERYWHERE or (self.previous_action and width == 1):
             return evaluate_policy(
                 mdp,
                 policy,
@@ -302,8 +302,8 @@ class Learnt:
                 observation_options=self.observation_options,
                 previous_action=self.previous_action,
             )
-        answers = PolicyAnswers(policy, mdp, sight)
-        table = answers.of(np.arange(mdp.num_states * width))
+        answers = PolicyAnswers(policy, mdp, observer)
+        table = answers.query(np.arange(mdp.num_states * width))
         return evaluate_policy(mdp, table.reshape(mdp.num_states, width, -1) if width > 1 else table)
 
 

@@ -465,7 +465,7 @@ def _chooser(task: "Task", agent: PolicyLike, rng: np.random.Generator) -> Calla
             f"the policy has shape {table.shape}; expected ({task.space.num_states},) actions or "
             f"({task.space.num_states}, {task.env.num_actions}) probabilities"
         )
-    answers = None if table is not None else PolicyAnswers(agent, task.mdp, task.sight)
+    answers = None if table is not None else PolicyAnswers(agent, task.mdp, task.observer)
 
     def choose(observation: Observed, state: "State") -> int:
         if answers is not None:

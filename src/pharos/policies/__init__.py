@@ -1,4 +1,4 @@
-"""Policies: tables, and functions of observations; asked in the states that they reach, and evaluated."""
+"""Policies, as tables or as functions of observations: queried in the states that they reach, and evaluated."""
 
 from pharos.policies.policy import (
     DeepPolicy,

@@ -1,7 +1,7 @@
 """Kinds of policies: a table over the states, or a function of observations that returns probabilities or actions.
 
-A policy is queried once about each state that it reaches, in batches. Two kinds of policy are queried alike: functions
-of observations (`PolicyAnswers`) and tables (`TableAnswers`).
+A policy is queried once in each state that it reaches, in batches: `PolicyAnswers` queries functions of observations,
+`TableAnswers` tables.
 """
 
 import inspect
@@ -158,7 +158,7 @@ class RecurrentDeepPolicy:
         self.model = model
 
     def initial_state(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Zeros."""
+        """Hidden and cell states of n episodes that begin: zeros."""
         layers, _, size = self.model.policy.lstm_hidden_state_shape
         return np.zeros((n, layers, size), np.float32), np.zeros((n, layers, size), np.float32)
 
@@ -214,7 +214,7 @@ def _channel_first(observations: np.ndarray, space: "Space") -> np.ndarray:
     return observations
 
 
-# Policies asked -------------------------------------------------------------------------------------------------------
+# Queried policies -----------------------------------------------------------------------------------------------------
 
 
 # Observations in one query of a policy.
@@ -242,7 +242,7 @@ class StateObserver:
 
     @cached_property
     def observe(self) -> ObservationInContext:
-        """Makes a batch of observations of states, their previous actions and their steps."""
+        """Function from a batch of states, their previous actions and their steps to their observations."""
         observation = observe(self.env, self.observation, state_space=self.space, **self.options)
         return ObservationInContext(
             observation, previous_action=self.previous_action, remaining_time=False, limit=self.time_limit
@@ -258,7 +258,7 @@ class ReachableRows(NamedTuple):
     """Rows that every policy reaches in which each action has a positive probability.
 
     Attributes:
-        rows: (N,) in the order in which `QueriedPolicy.reach` meets them.
+        rows: (N,) in the order in which `QueriedPolicy.reach` visits them.
         is_whole: whether these are all; False: there are more than `reach` was allowed to visit.
     """
 
@@ -278,9 +278,9 @@ class QueriedPolicy:
         self.mdp, self.num_actions = mdp, mdp.num_actions
         self.width = mdp.num_actions + 1 if sees_previous_action else mdp.policy_width
         self.by_pairs = self.width > 1
-        # index + 1; memory is taken where something is written
+        # index + 1 of each row, 0: not queried; pages of zeros take no memory until they are written
         self._place = np.zeros(mdp.num_states * self.width, np.int32)
-        # number of filled entries of the two arrays that follow, which double when they are full
+        # number of filled entries of the next two arrays, which double when they are full
         self._count = 0
         self._rows, self._answers = np.empty(64, np.int64), np.empty((64, mdp.num_actions))
 
@@ -298,7 +298,7 @@ class QueriedPolicy:
         """(N,) place of each row in `rows` and `probabilities`; -1 for rows that were not queried."""
         return self._place[rows] - 1
 
-    def of(self, rows: np.ndarray) -> np.ndarray:
+    def query(self, rows: np.ndarray) -> np.ndarray:
         """(N, A) probabilities of distinct or repeated rows; only new ones are queried."""
         unknown = np.unique(rows[self._place[rows] == 0])
         if unknown.size:
@@ -328,16 +328,16 @@ class QueriedPolicy:
         return states * self.width + (self.num_actions if self.by_pairs else 0)
 
     def next_rows(self, rows: np.ndarray, executed: np.ndarray, next_states: np.ndarray) -> np.ndarray:
-        """(N,) where executing actions in rows leads that come to the states `next_states`."""
+        """(N,) rows of the states `next_states` that are reached by executing actions in `rows`."""
         return self._arrivals(next_states, executed)
 
     def reach(self, max_rows: int | None = None, steps: int | None = None) -> bool:
-        """Ask the policy in all rows that it reaches within `steps`, level by level; False beyond `max_rows` rows."""
+        """Query the policy in all rows that it reaches within `steps`, level by level; False beyond `max_rows` rows."""
         mdp, frontier, level = self.mdp, self._start_nodes(), 0
         while frontier.size and (steps is None or level < steps):
             level += 1
             rows, states, previous = self._parts(frontier)
-            probabilities = self.of(rows)
+            probabilities = self.query(rows)
             if max_rows is not None and len(self.rows) > max_rows:
                 return False
             weights = mdp.chance.weights(probabilities, previous)
@@ -346,10 +346,10 @@ class QueriedPolicy:
             live = outcomes.states < mdp.num_states
             live[live] = ~np.asarray(mdp.terminal)[outcomes.states[live]]
             origin = outcomes.which[live]
-            frontier = self._unmet(rows[which[origin]], actions[origin], outcomes.states[live])
+            frontier = self._new_nodes(rows[which[origin]], actions[origin], outcomes.states[live])
         return True
 
-    # Nodes: what is met, with all that decides what may come after: rows here.
+    # Nodes: what `reach` visits, with all that decides what may come after: rows here.
 
     def _start_nodes(self) -> np.ndarray:
         return np.unique(self.start_rows())
@@ -358,8 +358,8 @@ class QueriedPolicy:
         """(rows, states, previous actions) of nodes."""
         return (nodes, *np.divmod(nodes, self.width))
 
-    def _unmet(self, rows: np.ndarray, executed: np.ndarray, next_states: np.ndarray) -> np.ndarray:
-        """The nodes, not met before, that executing actions in rows leads to."""
+    def _new_nodes(self, rows: np.ndarray, executed: np.ndarray, next_states: np.ndarray) -> np.ndarray:
+        """Nodes, not visited before, to which executing actions in rows leads."""
         rows = np.unique(self.next_rows(rows, executed, next_states))
         return rows[self.index(rows) < 0]
 
@@ -392,7 +392,7 @@ class QueriedPolicy:
         return np.unique(states) if self.mdp.is_sticky else states
 
     def reached_mdp(self) -> tuple[TabularMDP, np.ndarray]:
-        """The MDP on what is reached, and the policy on it; what is not reached has probability 0, and is the end."""
+        """The MDP on the queried states, and the policy on it; other states have probability 0, and become the end."""
         mdp, states = self.mdp, self.reached_states()
         if not mdp.is_sticky:
             starts = self.index(self.start_rows())
@@ -402,7 +402,7 @@ class QueriedPolicy:
         place = np.full(mdp.num_states, -1, np.int64)
         place[states] = np.arange(states.size)
         policy = np.zeros((states.size, self.width, mdp.num_actions))
-        policy[:, :, 0] = 1.0  # of pairs that are not reached
+        policy[:, :, 0] = 1.0  # arbitrary, in pairs that are not reached
         policy[place[self.rows // self.width], self.rows % self.width] = self.probabilities
         return self._mdp_on(states, place[mdp.start_states], lambda next_states, *_: place[next_states]), policy
 
@@ -428,18 +428,18 @@ class QueriedPolicy:
         which = outcomes.which[inside]
         next_states[inside] = number(outcomes.states[inside], actions[which], which // num_actions)
         if mdp.dynamics.is_deterministic:
-            reached = TabularMDP.from_arrays(next_states.reshape(count, num_actions), rewards, **setting)
+            sub_mdp = TabularMDP.from_arrays(next_states.reshape(count, num_actions), rewards, **setting)
         else:
             from scipy import sparse
 
             stays = next_states >= 0
             entries = (outcomes.probabilities[stays], (outcomes.which[stays], next_states[stays]))
-            reached = TabularMDP.from_matrices(
+            sub_mdp = TabularMDP.from_matrices(
                 sparse.csr_matrix(entries, (count * num_actions, count)), rewards, **setting
             )
-        if mdp.horizon is not None:  # every step reads them
-            reached = replace(reached, reward_table=Rewards(np.asarray(rewards, np.float64), np.empty(0)))
-        return replace(reached, chance=mdp.chance)
+        if mdp.horizon is not None:  # every step reads the rewards: no palette
+            sub_mdp = replace(sub_mdp, reward_table=Rewards(np.asarray(rewards, np.float64), np.empty(0)))
+        return replace(sub_mdp, chance=mdp.chance)
 
 
 class AnyAnswers(QueriedPolicy):
@@ -468,22 +468,22 @@ class PolicyAnswers(QueriedPolicy):
         ParameterError: it is no policy, or was trained on other observations.
     """
 
-    def __init__(self, policy: PolicyLike, mdp: TabularMDP, sight: StateObserver, *, deterministic: bool = False):
-        super().__init__(mdp, sees_previous_action=sight.previous_action)
-        self.policy, self.sight, self.deterministic = policy_function(policy), sight, deterministic
-        check_observation(policy, sight.observe.space, sight.observation)
+    def __init__(self, policy: PolicyLike, mdp: TabularMDP, observer: StateObserver, *, deterministic: bool = False):
+        super().__init__(mdp, sees_previous_action=observer.previous_action)
+        self.policy, self.observer, self.deterministic = policy_function(policy), observer, deterministic
+        check_observation(policy, observer.observe.space, observer.observation)
 
     def _query(self, rows: np.ndarray) -> np.ndarray:
         states, previous = np.divmod(rows, self.width)
         previous = np.where(previous == self.num_actions, -1, previous) if self.by_pairs else np.full(len(rows), -1)
-        context = self.sight.space.states(states), previous, np.zeros(len(rows), np.int64)
-        irrelevant = self.sight.observe.observation.irrelevant
+        context = self.observer.space.states(states), previous, np.zeros(len(rows), np.int64)
+        irrelevant = self.observer.observe.observation.irrelevant
         if not irrelevant:
-            return self.answer(self.sight.observe(*context), len(rows))
+            return self.answer(self.observer.observe(*context), len(rows))
         total = np.zeros((len(rows), self.num_actions))  # coins are fair and thrown anew at each step
         for coins in np.ndindex(*(2,) * irrelevant):
             thrown = np.tile(np.array(coins, np.float32), (len(rows), 1))
-            total += self.answer(self.sight.observe(*context, coins=thrown), len(rows))
+            total += self.answer(self.observer.observe(*context, coins=thrown), len(rows))
         return total / 2**irrelevant
 
     def answer(self, observations: Observations, count: int = 1) -> np.ndarray:

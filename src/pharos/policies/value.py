@@ -1,4 +1,4 @@
-"""The value of a policy: it is asked in the states that it reaches, and evaluated there.
+"""Value of a policy, which is queried and evaluated in the states that it reaches.
 
 `evaluate_policy` gives the values of all states, `policy_value` that of the start; `table_values` and `walk_values`
 give the latter of many policies at once, to the same bits. A deterministic policy in a deterministic game of a million
@@ -6,7 +6,7 @@ states reaches some hundred of them; under chance it may reach many, and beyond 
 simulated episodes instead, and the answer says so.
 
 `estimate`: the value from simulated episodes, with an interval that holds it almost surely. `QueriedHistories`:
-policies that see the last k frames, or remember, are asked in histories, as far as they reach some.
+policies that see the last k frames, or remember, are queried in the histories that they reach.
 """
 
 import hashlib
@@ -50,21 +50,21 @@ class QueriedHistories(PolicyAnswers):
     without its first state and with the next state behind. So the value of the policy is exact where they are few.
     """
 
-    def __init__(self, policy: PolicyLike, mdp: TabularMDP, sight: StateObserver, *, deterministic: bool = False):
-        if sight.previous_action:
+    def __init__(self, policy: PolicyLike, mdp: TabularMDP, observer: StateObserver, *, deterministic: bool = False):
+        if observer.previous_action:
             raise ParameterError("the policy sees several frames and the previous action; expected one or the other")
-        super().__init__(policy, mdp, sight, deterministic=deterministic)
+        super().__init__(policy, mdp, observer, deterministic=deterministic)
         self._name_rows()
 
     def _name_rows(self) -> None:
-        """Rows are histories, whatever the previous action is; the last entry of a history is the state."""
+        """Number rows by history, whatever the previous action is; the last entry of a history is the state."""
         self.by_pairs, self.width = False, 1
         self._histories: list[tuple[int, ...]] = []
         self._number: dict[tuple[int, ...], int] = {}
         self._place = np.zeros(64, np.int32)
 
     def first_rows(self, states: np.ndarray) -> np.ndarray:
-        return self._numbers([(int(s),) * self.sight.frames for s in states])
+        return self._numbers([(int(s),) * self.observer.frames for s in states])
 
     def next_rows(self, rows: np.ndarray, executed: np.ndarray, next_states: np.ndarray) -> np.ndarray:
         pairs, inverse = np.unique(np.stack([rows, next_states], axis=1), axis=0, return_inverse=True)
@@ -72,32 +72,32 @@ class QueriedHistories(PolicyAnswers):
         return numbers[inverse.reshape(-1)]
 
     def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
-        """Never: rows are histories."""
+        """None, with nothing stored: rows are histories here, which `reach` does not list."""
         return None
 
     def states_of(self, rows: np.ndarray) -> np.ndarray:
         return np.array([self._histories[row][-1] for row in rows], np.int64)
 
     def _start_nodes(self) -> np.ndarray:
-        """Pairs of a row and the previous action: under sticky actions a history is met once with each of them."""
+        """Pairs of a row and the previous action: under sticky actions a history is visited once with each of them."""
         width = self.mdp.policy_width
         nodes = np.unique(self.start_rows()) * width + (width - 1)
-        self._met = set(nodes.tolist())
+        self._visited = set(nodes.tolist())
         return nodes
 
     def _parts(self, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         rows, previous = np.divmod(nodes, self.mdp.policy_width)
         return rows, self.states_of(rows), previous
 
-    def _unmet(self, rows: np.ndarray, executed: np.ndarray, next_states: np.ndarray) -> np.ndarray:
+    def _new_nodes(self, rows: np.ndarray, executed: np.ndarray, next_states: np.ndarray) -> np.ndarray:
         width = self.mdp.policy_width
         after = self.next_rows(rows, executed, next_states) * width + (executed if width > 1 else 0)
-        nodes = np.array([node for node in np.unique(after).tolist() if node not in self._met], np.int64)
-        self._met.update(nodes.tolist())
+        nodes = np.array([node for node in np.unique(after).tolist() if node not in self._visited], np.int64)
+        self._visited.update(nodes.tolist())
         return nodes
 
     def reached_mdp(self) -> tuple[TabularMDP, np.ndarray]:
-        """The MDP on the histories that are reached, and the policy on it."""
+        """The MDP on the visited histories, and the policy on it."""
         rows = self.rows
 
         def number(next_states: np.ndarray, executed: np.ndarray, origin: np.ndarray) -> np.ndarray:
@@ -109,29 +109,29 @@ class QueriedHistories(PolicyAnswers):
         self._make_room()
         return super().index(rows)
 
-    def of(self, rows: np.ndarray) -> np.ndarray:
+    def query(self, rows: np.ndarray) -> np.ndarray:
         self._make_room()
-        return super().of(rows)
+        return super().query(rows)
 
     def _make_room(self) -> None:
-        """`_place` has an entry for each history that has a number."""
+        """Grow `_place` to an entry for each numbered history."""
         if len(self._place) < len(self._histories):
             more = np.zeros(2 * len(self._histories) - len(self._place), np.int32)
             self._place = np.concatenate([self._place, more])
 
     def _query(self, rows: np.ndarray) -> np.ndarray:
         answers = []
-        context: Any = self.sight.observe
+        context: Any = self.observer.observe
         for start in range(0, len(rows), BATCH):
             histories = np.array([self._histories[row] for row in rows[start : start + BATCH]], np.int64)
             count, frames = histories.shape
-            states = self.sight.space.states(histories.ravel()).reshape(count, frames, -1)
+            states = self.observer.space.states(histories.ravel()).reshape(count, frames, -1)
             observations = context.observation.of_histories(states)
             answers.append(self.answer(observations, count))
         return np.concatenate(answers)
 
     def _numbers(self, histories: list[tuple[int, ...]]) -> np.ndarray:
-        """(N,) of histories, those that are new included."""
+        """Numbers (N,) of histories; new ones are appended."""
         for history in histories:
             if history not in self._number:
                 self._number[history] = len(self._histories)
@@ -143,7 +143,7 @@ class QueriedMemories(QueriedHistories):
     """Answers of a policy with a memory; a row is the number of (memory, previous action if it is seen, state).
 
     A memory is what the policy has kept of the observations before. It has one number where the observations before
-    were the same, and where what is kept is the same to the last bit: a policy that keeps nothing is asked once about
+    were the same, and where what is kept is the same to the last bit: a policy that keeps nothing is queried once about
     each state and once more at the start, one that counts steps once about each state and step.
 
     Raises:
@@ -151,20 +151,22 @@ class QueriedMemories(QueriedHistories):
     Cost: what the policy keeps is stored for each row.
     """
 
-    def __init__(self, policy: RecurrentPolicy, mdp: TabularMDP, sight: StateObserver, *, deterministic: bool = False):
-        observation = sight.observe.observation
+    def __init__(
+        self, policy: RecurrentPolicy, mdp: TabularMDP, observer: StateObserver, *, deterministic: bool = False
+    ):
+        observation = observer.observe.observation
         if observation.frames > 1 or observation.irrelevant:
             besides = "several frames" if observation.frames > 1 else "irrelevant entries"
             raise ParameterError(f"the policy has a memory and sees {besides}; expected one or the other")
         QueriedPolicy.__init__(self, mdp)
-        self.recurrent, self.sight, self.deterministic = policy, sight, deterministic
-        check_observation(policy, sight.observe.space, sight.observation)
+        self.recurrent, self.observer, self.deterministic = policy, observer, deterministic
+        check_observation(policy, observer.observe.space, observer.observation)
         self._name_rows()
-        # of each memory but the first, which is that of the start, what is kept; `_layout` says how to read it
+        # bytes of each memory but the first, which is that of the start; `_layout` gives their dtypes and shapes
         self._kept: list[bytes] = [b""]
         self._memory: dict[bytes, int] = {}
         self._layout: tuple[Arrays, list[tuple[np.dtype, tuple[int, ...]]]] | None = None
-        self._after: dict[int, int] = {}  # row -> memory when the policy has been asked there
+        self._after: dict[int, int] = {}  # row -> memory after the policy was queried there
         self._answered: dict[tuple[int, bytes], tuple[np.ndarray, int]] = {}
 
     def first_rows(self, states: np.ndarray) -> np.ndarray:
@@ -172,14 +174,14 @@ class QueriedMemories(QueriedHistories):
 
     def next_rows(self, rows: np.ndarray, executed: np.ndarray, next_states: np.ndarray) -> np.ndarray:
         after = np.array([self._after[row] for row in rows.tolist()], np.int64)
-        previous = executed if self.sight.previous_action else np.full(len(rows), self.num_actions)
+        previous = executed if self.observer.previous_action else np.full(len(rows), self.num_actions)
         keys, inverse = np.unique(np.stack([after, previous, next_states], axis=1), axis=0, return_inverse=True)
         return self._numbers([tuple(key) for key in keys.tolist()])[inverse.reshape(-1)]
 
     def _query(self, rows: np.ndarray) -> np.ndarray:
         memory, previous, states = np.array([self._histories[row] for row in rows], np.int64).T
         previous = np.where(previous == self.num_actions, -1, previous)
-        observations = self.sight.observe(self.sight.space.states(states), previous, np.minimum(memory, 1))
+        observations = self.observer.observe(self.observer.space.states(states), previous, np.minimum(memory, 1))
         digests = [hashlib.sha256(row).digest() for row in _packed(observations, len(rows))]
         pairs = list(zip(memory.tolist(), digests, strict=True))
         first = {pair: i for i, pair in reversed(list(enumerate(pairs))) if pair not in self._answered}
@@ -195,7 +197,7 @@ class QueriedMemories(QueriedHistories):
         return np.array([self._answered[pair][0] for pair in pairs])
 
     def _memories(self, state: Arrays, count: int) -> list[int]:
-        """Numbers of what the policy keeps of `count` episodes."""
+        """Numbers of the memories of `count` episodes, new ones appended; `state` is what the policy returned."""
         leaves = _leaves(state)
         layout = [(leaf.dtype, leaf.shape[1:]) for leaf in leaves]
         if any(leaf.dtype.hasobject or leaf.shape[:1] != (count,) for leaf in leaves):
@@ -212,7 +214,7 @@ class QueriedMemories(QueriedHistories):
         return numbers
 
     def _states(self, memory: np.ndarray) -> Arrays:
-        """What the policy has kept, as it gave it, of memories other than the first."""
+        """Batch of memories other than the first, in the structure in which the policy returned them."""
         joined = np.frombuffer(b"".join(self._kept[number] for number in memory), np.uint8).reshape(len(memory), -1)
         assert self._layout is not None
         template, layout = self._layout
@@ -235,7 +237,7 @@ def _leaves(tree: Arrays) -> list[np.ndarray]:
 
 
 def _rebuilt(template: Arrays, leaves: Iterator[np.ndarray]) -> Arrays:
-    """The same with other arrays."""
+    """Tree of the structure of `template`, with the next `leaves` in the places of its arrays."""
     if isinstance(template, dict):
         return {name: _rebuilt(part, leaves) for name, part in template.items()}
     if not isinstance(template, tuple | list):
@@ -252,15 +254,15 @@ def _packed(tree: Arrays, count: int) -> list[bytes]:
 
 
 def answers_of(
-    policy: PolicyLike, mdp: TabularMDP, sight: StateObserver, *, deterministic: bool = False
+    policy: PolicyLike, mdp: TabularMDP, observer: StateObserver, *, deterministic: bool = False
 ) -> PolicyAnswers:
-    """The answers of a policy that sees observations, of one state or of several, or remembers them."""
+    """Answers of a policy that sees observations: of the state alone, of the last frames, or with a memory."""
     if isinstance(policy, SB3Model) and not isinstance(policy, Policy):
         policy = deep_policy(policy)
     if isinstance(policy, RecurrentPolicy) and not isinstance(policy, Policy):
-        return QueriedMemories(policy, mdp, sight, deterministic=deterministic)
-    kind = QueriedHistories if sight.frames > 1 else PolicyAnswers
-    return kind(policy, mdp, sight, deterministic=deterministic)
+        return QueriedMemories(policy, mdp, observer, deterministic=deterministic)
+    kind = QueriedHistories if observer.frames > 1 else PolicyAnswers
+    return kind(policy, mdp, observer, deterministic=deterministic)
 
 
 # Values ---------------------------------------------------------------------------------------------------------------
@@ -269,7 +271,7 @@ def answers_of(
 # Part of a discounted value that is left out: of states that the policy reaches after so many steps.
 TAIL = 1e-9
 MOST_ROWS = 1 << 16  # pairs of a state and what came before, so that all of them may be reached by many policies
-MOST_TOGETHER = 1 << 18  # of the policies that are evaluated at once
+MOST_TOGETHER = 1 << 18  # such pairs of the policies that are evaluated at once
 _UNIT = 2.0**-53
 
 
@@ -297,7 +299,7 @@ class Evaluation:
 def policy_value(
     policy: PolicyLike,
     mdp: TabularMDP,
-    sight: Callable[[], StateObserver],
+    observer: Callable[[], StateObserver],
     return_range: Callable[[], tuple[float, float]],
     *,
     deterministic: bool = False,
@@ -309,11 +311,11 @@ def policy_value(
     """Return the value of a policy from the start: exact where it reaches few states, else estimated with a bound.
 
     Args:
-        sight: gives what the policy sees; called for policies over observations alone.
+        observer: gives what the policy sees; called for policies over observations alone.
         return_range: gives the lowest and the highest return of an episode; called where the value is estimated.
         deterministic, max_states, episodes, seed: as for `training.evaluate_agent`.
-        reach: (rows at most, steps) -> what every policy reaches that gives each action a chance, where more than one
-            policy is evaluated: those that do are asked at once. Changes no value.
+        reach: (rows at most, steps) -> the rows that every policy of positive probabilities reaches, where more than
+            one policy is evaluated: such policies are queried in all of them at once. Changes no value.
     """
     if isinstance(policy, TabularAgent):
         policy = policy.policy_table()
@@ -325,7 +327,7 @@ def policy_value(
             return Evaluation(solution.value_at_start, True, solution.error_bound, mdp.num_states)
         answers = TableAnswers(table, mdp)
     else:
-        answers = answers_of(policy, mdp, sight(), deterministic=deterministic)
+        answers = answers_of(policy, mdp, observer(), deterministic=deterministic)
     steps, error = steps_that_matter(mdp)
     is_whole = None if reach is None else answers.query_all(lambda: reach(max_states, steps))
     if answers.reach(max_states, steps) if is_whole is None else is_whole:
@@ -352,7 +354,7 @@ def evaluate_policy(
     horizon: int | None = None,
     observation: object = None,
     processes: int | str = 1,
-    **seeing: Unpack[ObserverOptions],
+    **observer_options: Unpack[ObserverOptions],
 ) -> Solution:
     """The values of a policy.
 
@@ -369,7 +371,7 @@ def evaluate_policy(
         horizon: number of steps to go, instead of the MDP's own.
         observation: what the policy sees, a name or an Observation; of models "vector" when not given.
         processes: that share the work, for policies over states; see `pharos.value_iteration`.
-        seeing: further options of policies that see observations: `observation_options`, a dictionary;
+        observer_options: further options of policies that see observations: `observation_options`, a dictionary;
             `previous_action`, whether they see it, under sticky actions; `deterministic`, whether the most probable
             action is taken.
     Returns:
@@ -387,9 +389,11 @@ def evaluate_policy(
         if processes != 1:
             raise ParameterError("a policy that sees observations is evaluated by one process; expected processes=1")
         timed = mdp if horizon is None else mdp.with_horizon(horizon)
-        return _solution_of_reached(timed, policy, tolerance, observation=observation or "vector", **seeing)
-    if seeing:
-        raise ParameterError(f"{', '.join(seeing)} given for a policy that sees no observations; name the observation")
+        return _solution_of_reached(timed, policy, tolerance, observation=observation or "vector", **observer_options)
+    if observer_options:
+        raise ParameterError(
+            f"{', '.join(observer_options)} given for a policy that sees no observations; name the observation"
+        )
     return solvers.evaluate_policy(mdp, policy, tolerance, horizon=horizon, processes=processes)
 
 
@@ -443,15 +447,15 @@ def _solution_of_reached(
             f"{mdp}: is not of a state space whose environment is known, so there is nothing to observe; "
             f"give the policy as a table"
         )
-    sight = StateObserver(
+    observer = StateObserver(
         space, space.environment, observation, dict(observation_options or {}), previous_action, mdp.horizon
     )
-    if sight.frames > 1:
+    if observer.frames > 1:
         raise ParameterError(
             "the policy sees several frames, so its values belong to no state; use `pharos evaluate`, or "
             "training.evaluate_agent"
         )
-    answers = PolicyAnswers(policy, mdp, sight, deterministic=deterministic)
+    answers = PolicyAnswers(policy, mdp, observer, deterministic=deterministic)
     answers.reach()
     sub, reached_policy = answers.reached_mdp()
     solution = solvers.evaluate_policy(sub, reached_policy, tolerance)
@@ -485,9 +489,9 @@ def _on_all_states(answers: QueriedPolicy, x: np.ndarray) -> np.ndarray:
 
 
 def steps_that_matter(mdp: TabularMDP) -> tuple[int, float]:
-    """The number of steps after which nothing changes the value at the start by more than a bound, and the bound.
+    """Number of steps whose rewards decide the value at the start up to an error, and a bound on that error.
 
-    Without a horizon 2 gamma^n max |r| / (1 - gamma), below TAIL; what a policy would do later is not asked.
+    Without a horizon 2 gamma^n max |r| / (1 - gamma), below TAIL; the policy is not queried about later steps.
     """
     if mdp.horizon is not None:
         return mdp.horizon, 0.0
@@ -513,7 +517,7 @@ def table_values(mdp: TabularMDP, policies: Sequence[np.ndarray]) -> list[Evalua
     They are evaluated as one policy of as many copies of the MDP: to the bits that `policy_value` gives.
 
     Args:
-        policies: (S,) actions each, evaluated in all states; or (S, A) probabilities, evaluated where they get to.
+        policies: (S,) actions each, evaluated in all states; or (S, A) probabilities, evaluated in states they reach.
     Cost: one backward induction for all, in some groups where they are large.
     """
     size, evaluations = max(1, MOST_TOGETHER // _rows(mdp)), []
@@ -534,12 +538,12 @@ def table_values(mdp: TabularMDP, policies: Sequence[np.ndarray]) -> list[Evalua
 
 
 def _rows(mdp: TabularMDP) -> int:
-    """Pairs of a state and, where that matters, a previous action."""
+    """Number of pairs of a state and, where that matters, a previous action."""
     return mdp.num_states * mdp.policy_width
 
 
 def _copies(mdp: TabularMDP, number: int) -> TabularMDP:
-    """The MDP beside itself: state s of copy i has the number i S + s."""
+    """Disjoint union of `number` copies of the MDP: state s of copy i has the number i S + s."""
     table, rewards = np.asarray(mdp.dynamics.deterministic_table(), np.int64), mdp.reward_table
     first = np.arange(number) * mdp.num_states
     next_states = np.where(table < 0, -1, table + first[:, None, None]).reshape(-1, mdp.num_actions)
@@ -557,7 +561,7 @@ def _copies(mdp: TabularMDP, number: int) -> TabularMDP:
 
 
 def is_walk(mdp: TabularMDP) -> bool:
-    """Whether a deterministic policy always meets the same states: one start, no chance."""
+    """Whether a deterministic policy always visits the same states: one start, no chance."""
     is_chosen = mdp.chance.triple[0] == 1.0 and not mdp.laziness
     return is_chosen and len(mdp.start_states) == 1 and mdp.dynamics.deterministic_table() is not None
 
@@ -567,14 +571,14 @@ def walk_values(
 ) -> list[Evaluation]:
     """The values of N deterministic policies from the start, exact, each in its own MDP of which `is_walk` holds.
 
-    Such a policy meets one state after the other, so that to ask it alone costs a call for each; here all are asked
-    together.
+    Such a policy visits one state after the other, so that evaluating it alone costs a call of `act` for each; here one
+    call serves a step of all policies.
 
     Args:
-        act: (N,) states -> (N,) actions, of the policies in their states; those whose episode is over are asked about
+        act: (N,) states -> (N,) actions, of the policies in their states; those whose episode is over are queried in
             their last state.
-        frames: k, how many states the policies see. If more than one, `act` gets histories (N, k): the last k states of
-            the episode, the oldest first, of which the first one stands for those before it.
+        frames: k, the number of states that the policies see. If more than one, `act` gets histories (N, k): the last
+            k states of the episode, the oldest first; the first state stands for those before it.
     Cost: the longest episode times a call of `act`.
     """
     worlds = {
@@ -635,7 +639,7 @@ def estimate(
     returns, alive = np.zeros(episodes), np.arange(episodes)
     for step in range(steps):
         s, b = states[alive], previous[alive]
-        probabilities = answers.of(rows[alive])
+        probabilities = answers.query(rows[alive])
         actions = (probabilities.cumsum(axis=1) < rng.random((alive.size, 1))).sum(axis=1).clip(max=mdp.num_actions - 1)
         executed = chance.draw(actions, b, mdp.num_actions, rng)
         returns[alive] += mdp.gamma**step * mdp.reward_table.rows(s)[np.arange(alive.size), executed]

@@ -67,7 +67,7 @@ def evaluate_agent(
     return policy_value(
         agent,
         task.mdp,
-        lambda: task.sight,
+        lambda: task.observer,
         lambda: task.return_range,
         deterministic=deterministic,
         max_states=max_states,
@@ -121,7 +121,7 @@ def _walks(member: "Member") -> bool:
 
 def _frames(member: "Member") -> int:
     """How many states the agent sees."""
-    return 1 if member.config.is_tabular else member.task.sight.frames
+    return 1 if member.config.is_tabular else member.task.observer.frames
 
 
 def _values_of_walks(batch: PolicyBatch, members: "Sequence[Member]", places: Sequence[int]) -> dict[int, Evaluation]:
@@ -146,13 +146,13 @@ def _values_of_tables(batch: PolicyBatch, task: Task, places: Sequence[int]) -> 
     actions = batch.greedy_actions(places)
     if actions is not None:
         return dict(zip(actions, table_values(task.mdp, list(actions.values())), strict=True))
-    mdp, sight = task.mdp, task.sight
-    answers = {i: PolicyAnswers(batch.policy(i), mdp, sight) for i in places}
+    mdp, observer = task.mdp, task.observer
+    answers = {i: PolicyAnswers(batch.policy(i), mdp, observer) for i in places}
     tables: dict[int, list[np.ndarray]] = {i: [] for i in places}
     for first in range(0, mdp.num_states, BLOCK):
         states = np.arange(first, min(first + BLOCK, mdp.num_states))
-        context = sight.space.states(states), np.full(len(states), -1), np.zeros(len(states), np.int64)
-        observations = sight.observe(*context)
+        context = observer.space.states(states), np.full(len(states), -1), np.zeros(len(states), np.int64)
+        observations = observer.observe(*context)
         for i in list(tables):
             try:
                 tables[i].append(answers[i].answer(observations, len(states)))

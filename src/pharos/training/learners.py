@@ -164,7 +164,7 @@ class TaskCache:
         task, chance = self.task(config), config.chance
         run = BatchRun(
             mdp=replace(chance, lazy=0.0).of(self._world(config, task)[1]) if chance.lazy else task.mdp,
-            observe=self._once("sight", config, SIGHT, lambda: ObservationSource.of(task.space, task.sight.observe)),
+            observe=self._once("sight", config, SIGHT, lambda: ObservationSource.of(task.space, task.observer.observe)),
             time_limit=task.time_limit,
             hyperparameters=chosen,
             steps=config.steps,

@@ -142,8 +142,8 @@ class Task:
         return build(self.env)
 
     @cached_property
-    def sight(self) -> StateObserver:
-        """What a policy sees of the states."""
+    def observer(self) -> StateObserver:
+        """Observations of the states, as a policy sees them."""
         return StateObserver(
             self.space,
             self.env,
