@@ -57,11 +57,11 @@ def drn(mdp: TabularMDP, path: str | os.PathLike) -> Path:
 def _choice(
     file: TextIO, outcomes: list, action: int, absorbing: bool, gamma: float, s: int, end: int, shift: int
 ) -> None:
-    """One action: its expected reward, then next states in increasing order with their probabilities."""
+    """Write one action: its expected reward, then next states in increasing order with their probabilities."""
     if absorbing:
         file.write(f"\taction {action} [0]\n\t\t{s + shift} : 1\n")
         return
-    reward = float(np.sum([p * paid for p, _, paid, _ in outcomes]))
+    reward = float(np.sum([p * r for p, _, r, _ in outcomes]))
     probabilities: dict[int, float] = {}
     for p, t, _, ended in outcomes:
         weight = p if ended else gamma * p

@@ -59,7 +59,7 @@ class PackedIndices:
 
     @staticmethod
     def of(values: object) -> "PackedIndices":
-        """From integers."""
+        """These integers, packed."""
         return PackedIndices(packed(np.asarray(values)))
 
     @property
@@ -120,7 +120,7 @@ def unpacked(entries: np.ndarray) -> np.ndarray:
 
 
 def as_array(indices: object) -> Indices:
-    """What is no `PackedIndices` as an array of NumPy."""
+    """Indices as an array of NumPy; `PackedIndices` stay as they are."""
     return indices if isinstance(indices, PackedIndices) else np.asarray(indices)
 
 
@@ -137,7 +137,7 @@ def rows_of(indices: Indices, start: int, stop: int) -> Indices:
 
 
 def room_for_indices(shape: tuple[int, ...], num_states: int) -> Indices:
-    """An array to write to, of the least bytes that can number so many states: int32, or packed."""
+    """An uninitialised array of the smallest type that numbers so many states: int32, or packed."""
     return np.empty(shape, np.int32) if num_states <= INT32_STATES else PackedIndices.empty(shape)
 
 
@@ -150,7 +150,7 @@ def holds_end(indices: Indices) -> bool:
 
 
 def dtype_of(name: str) -> np.dtype:
-    """The type of NumPy in which the numbers of a file are read, by what a manifest calls it."""
+    """The type of NumPy for the numbers of a file, by the name that a manifest gives it."""
     return PACKED if name == INT40 else np.dtype(name)
 
 
@@ -160,7 +160,7 @@ def as_stored(indices: np.ndarray, name: str) -> np.ndarray:
 
 
 def from_stored(stored: np.ndarray) -> Indices:
-    """What a file holds, to those who read indices."""
+    """Indices that read as integers, of the array that a file holds: `PackedIndices` where its type is `PACKED`."""
     return PackedIndices(stored) if stored.dtype == PACKED else stored
 
 
@@ -175,7 +175,7 @@ OutcomesOfState = list[tuple[np.ndarray, np.ndarray]]
 
 
 class OutcomeRows:
-    """What executing actions may lead to, for S states, A actions and at most K outcomes of each.
+    """Possible outcomes of executing actions, for S states, A actions and at most K outcomes of each pair.
 
     Attributes:
         successors: (S, A, K) int32, int64 or `PackedIndices`, -1 where the episode ends, of which impossible outcomes
@@ -197,7 +197,7 @@ class OutcomeRows:
         palette: Indices | None = None,
         probabilities: Indices | None = None,
     ):
-        """From arrays as files hold them: nothing is copied, so they may be memory maps.
+        """Keep arrays as files hold them: nothing is copied, so they may be memory maps.
 
         Raises:
             ParameterError: there is neither a palette with codes, nor probabilities.
@@ -227,7 +227,7 @@ class OutcomeRows:
         return self.successors.reshape(-1)
 
     def begins(self, rows: np.ndarray) -> np.ndarray:
-        """Where some rows begin among the successors."""
+        """(R,) positions of the first outcomes of some rows among the successors."""
         return rows * self.num_outcomes if self.offsets is None else self.offsets[rows].astype(np.int64)
 
     def places(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -240,23 +240,23 @@ class OutcomeRows:
     def possible(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(index in `rows`, next state, probability) of all possible outcomes of some rows, in order."""
         codes = None if self.codes is None else self.codes.reshape(-1)[rows]
-        palette, likely = np.asarray(self.palette), np.asarray(self.probabilities)  # one of which is there
+        palette, probabilities = np.asarray(self.palette), np.asarray(self.probabilities)  # one of which is there
         if self.offsets is None:
-            vectors = likely.reshape(-1, self.num_outcomes)[rows] if codes is None else palette[codes]
+            vectors = probabilities.reshape(-1, self.num_outcomes)[rows] if codes is None else palette[codes]
             which, k = np.nonzero(vectors)
             return which, self.successors.reshape(-1, self.num_outcomes)[rows][which, k], vectors[which, k]
         which, places = self.places(rows)
         if codes is None:
-            return which, self.flat[places], likely[places]
+            return which, self.flat[places], probabilities[places]
         first = np.searchsorted(which, np.arange(len(rows)))
         return which, self.flat[places], palette[codes[which], np.arange(len(which)) - first[which]]
 
     def of_states(self, states: np.ndarray, num_actions: int) -> dict[int, OutcomesOfState]:
         """The outcomes of some states."""
         rows = (states[:, None] * num_actions + np.arange(num_actions)).ravel()
-        which, successors, likely = self.possible(rows)
+        which, successors, probabilities = self.possible(rows)
         ends = np.searchsorted(which, np.arange(1, len(rows)))
-        pairs = list(zip(np.split(successors, ends), np.split(likely, ends), strict=True))
+        pairs = list(zip(np.split(successors, ends), np.split(probabilities, ends), strict=True))
         return {int(s): pairs[i * num_actions : (i + 1) * num_actions] for i, s in enumerate(states)}
 
 
@@ -273,7 +273,7 @@ class WrongOutcomes(ValueError):
 
 
 class OutcomeCheck:
-    """Looks at outcomes that anybody may have written, some states at a time.
+    """Validation of outcomes from files that anybody may have written, a block of states at a time.
 
     Attributes:
         most: the outcomes that a row may have, at most. least: the least index of a next state, -1 where episodes may
@@ -281,7 +281,7 @@ class OutcomeCheck:
     """
 
     def __init__(self, stored: OutcomeRows, shape: tuple[int, int], most: int, least: int):
-        """WrongOutcomes where what belongs to no state is wrong. shape: (S, A)."""
+        """Check the ends of the offsets and the palette; WrongOutcomes where they are wrong. shape: (S, A)."""
         self.stored, self.most, self.least = stored, most, least
         self.num_states, self.num_actions = shape
         offsets, size = stored.offsets, stored.successors.size
@@ -292,18 +292,20 @@ class OutcomeCheck:
             self._sizes_of_palette = self._sizes(stored.palette, "palette", lambda row: f"vector {row}")
 
     def block(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
-        """How many outcomes each row of states [start, stop) has, and the first one's next state.
+        """(number of outcomes, next state of the first outcome) of each row of states [start, stop).
 
         Raises:
             WrongOutcomes: they are no outcomes; the first row that is wrong is named.
         """
         stored, rows, counts = self.stored, np.arange(start * self.num_actions, stop * self.num_actions), None
+        # Codes: each names a vector of the palette, whose length is the number of outcomes
         if stored.codes is not None:
             codes = stored.codes[start:stop].ravel()
             if codes.max() >= len(self._sizes_of_palette):
                 row, last = int((codes >= len(self._sizes_of_palette)).argmax()), len(self._sizes_of_palette) - 1
                 self._refuse("codes", f"{self._pair(rows[row])} has the code {codes[row]}; expected 0 to {last}")
             counts = self._sizes_of_palette[codes]
+        # Offsets: rows have as many entries as outcomes, within the array
         begins = stored.begins(np.append(rows, rows[-1] + 1))
         lengths = np.diff(begins)
         if stored.offsets is not None:
@@ -315,46 +317,48 @@ class OutcomeCheck:
             if begins[0] < 0 or begins[-1] > stored.successors.size:
                 text = f"{self._pair(rows[0])} begins at {begins[0]}; expected 0 to {stored.successors.size}"
                 self._refuse("offsets", text)
-        following = np.asarray(stored.flat[int(begins[0]) : int(begins[-1])])  # unpacked, where indices are packed
-        self._check_range(following, np.repeat(rows, lengths))
+        # Next states and probabilities
+        next_states = np.asarray(stored.flat[int(begins[0]) : int(begins[-1])])  # unpacked, where indices are packed
+        self._check_range(next_states, np.repeat(rows, lengths))
         if counts is None:
-            likely = np.zeros((len(rows), self.most))
-            likely[np.arange(self.most) < lengths[:, None]] = np.asarray(stored.probabilities).reshape(-1)[
+            probabilities = np.zeros((len(rows), self.most))
+            probabilities[np.arange(self.most) < lengths[:, None]] = np.asarray(stored.probabilities).reshape(-1)[
                 begins[0] : begins[-1]
             ]
-            counts = self._sizes(likely, "probabilities", lambda row: self._pair(rows[row]))
+            counts = self._sizes(probabilities, "probabilities", lambda row: self._pair(rows[row]))
             if stored.offsets is not None and (counts != lengths).any():
                 row = int((counts != lengths).argmax())
                 self._refuse("probabilities", f"{self._pair(rows[row])} has an outcome of probability 0")
-        first = following[begins[:-1] - begins[0]]
+        # Padding of rows of equal length
+        first = next_states[begins[:-1] - begins[0]]
         if stored.offsets is None:
             padding = np.arange(self.most) >= counts[:, None]
-            wrong = (padding & (following.reshape(padding.shape) != first[:, None])).any(axis=1)
+            wrong = (padding & (next_states.reshape(padding.shape) != first[:, None])).any(axis=1)
             if wrong.any():
                 pair = self._pair(rows[int(wrong.argmax())])
                 self._refuse("successors", f"{pair} has padding that does not repeat its first outcome")
         return counts, first
 
-    def _sizes(self, likely: np.ndarray, name: str, whose: Callable[[int], str]) -> np.ndarray:
+    def _sizes(self, probabilities: np.ndarray, name: str, whose: Callable[[int], str]) -> np.ndarray:
         """(R,) how many of the probabilities (R, K) of each row are not 0; they come first and sum to 1."""
         with np.errstate(invalid="ignore", over="ignore"):
-            possible = likely > 0
-            total = np.cumsum(likely, axis=1)[:, -1]
-            good = (likely >= 0).all(axis=1) & (abs(total - 1) <= SUM_TOLERANCE)
+            possible = probabilities > 0
+            total = np.cumsum(probabilities, axis=1)[:, -1]
+            good = (probabilities >= 0).all(axis=1) & (abs(total - 1) <= SUM_TOLERANCE)
         good &= (possible[:, 1:] <= possible[:, :-1]).all(axis=1)
         if not good.all():
             row = int((~good).argmax())
-            shown = ", ".join(map(str, likely[row, :8].tolist())) + (", ..." if self.most > 8 else "")
+            shown = ", ".join(map(str, probabilities[row, :8].tolist())) + (", ..." if self.most > 8 else "")
             expected = "expected positive ones that sum to 1, then 0"
             self._refuse(name, f"{whose(row)} has the probabilities {shown}; {expected}")
         return np.asarray(possible.sum(axis=1))
 
-    def _check_range(self, following: np.ndarray, rows: np.ndarray) -> None:
-        if following.min() < self.least or following.max() >= self.num_states:
-            j = int(((following < self.least) | (following >= self.num_states)).argmax())
+    def _check_range(self, next_states: np.ndarray, rows: np.ndarray) -> None:
+        if next_states.min() < self.least or next_states.max() >= self.num_states:
+            j = int(((next_states < self.least) | (next_states >= self.num_states)).argmax())
             expected = f"expected {self.least} to {self.num_states - 1}"
             s, a = divmod(int(rows[j]), self.num_actions)
-            self._refuse("successors", f"action {a} leads from state {s} to state {following[j]}; {expected}")
+            self._refuse("successors", f"action {a} leads from state {s} to state {next_states[j]}; {expected}")
 
     def _pair(self, row: int) -> str:
         s, a = divmod(int(row), self.num_actions)

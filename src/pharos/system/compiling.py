@@ -1,4 +1,4 @@
-"""Where compiled code is kept, so that it is compiled once, and the seconds that compiling takes, told apart from work.
+"""Folders that keep compiled code, so that it is compiled once; and the seconds of compiling, apart from work.
 
 `pharos.kernels` calls `prepare` as it is loaded; before that nothing can have been compiled.
 """
@@ -55,7 +55,7 @@ class Stopwatch:
 
 
 def prepare(kernels: Path) -> None:
-    """Begin to measure, and see to it that Numba can keep the compiled code of the files in `kernels`; loads Numba.
+    """Start the timing, and give Numba a folder for the compiled code of the files in `kernels`; loads Numba.
 
     Numba keeps it beside the files. Where nothing can be written there (an installation for all users, a container), it
     goes into the private folder of the cache, for the processes that this one starts, too; where there is none, into a
@@ -76,7 +76,7 @@ def prepare(kernels: Path) -> None:
 
 
 def _forget_outdated(kernels: Path) -> None:
-    """Delete what was compiled of other texts: Numba looks at a kernel's own file, not at those of what it calls."""
+    """Delete compiled code of older sources: Numba checks a kernel's own file, not the files of what it calls."""
     files = [(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in sorted(kernels.glob("*.py"))]
     text, compiled = storage.json_text(files), kernels / "__pycache__"
     with contextlib.suppress(OSError):  # of a process that does the same at the same time
@@ -96,6 +96,7 @@ def _can_be_written(folder: Path) -> bool:
 
 
 def _start_timing() -> None:
+    """Register a listener of Numba that adds up the seconds of compiling."""
     try:
         from numba.core import config, event
     except (ValueError, RuntimeError) as error:
@@ -123,7 +124,7 @@ def _start_timing() -> None:
 
 
 def _tell(function: Callable) -> None:
-    """Why the first call takes some seconds, once, on a terminal."""
+    """Print once, on a terminal, that the first call compiles, which takes some seconds."""
     global is_told
     if not is_told and function.__module__.startswith("pharos.") and sys.stderr is not None and sys.stderr.isatty():
         is_told = True
@@ -155,7 +156,7 @@ def private_folder(cache_directory: Path) -> Path | None:
 
 
 def _problem_of(folder: Path) -> str:
-    """Make the folder where it is missing. Returns why it is not to be used, "" where it is."""
+    """Make the folder where it is missing. Returns the reason against its use, "" where there is none."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):

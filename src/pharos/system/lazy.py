@@ -1,4 +1,4 @@
-"""How packages load: a file when something in it is first used (PEP 562), and not from the folder of another project.
+"""Lazy packages, which load a file when something in it is first used (PEP 562); and a conflict of installations.
 
 `import pharos` and a script's first lines need few of the names that a package publishes; the others cost nothing then.
 
@@ -49,7 +49,7 @@ FOREIGN_FILE = "__version__.py"
 
 
 def conflict(folder: Path | None = None) -> str | None:
-    """What is wrong where the other project lies in the same folder, and how to mend it; None where it does not.
+    """Message about the other project in the same folder, and how to mend it; None where it is not there.
 
     Args:
         folder: of the package; None: that of pharos.

@@ -82,10 +82,10 @@ def read_arrays(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> dict[
     names = (*COMMON, *kind)
     version = manifest["format_version"]
     has_shown = version == OBSERVED_VERSION or (version == PAID_VERSION and OBSERVATIONS in checksums)
-    shown, paid = (OBSERVATIONS,) * has_shown, PAID * (version == PAID_VERSION)
-    if set(checksums) != {*names, *shown, *paid}:
-        raise ValueError(f"its arrays are {', '.join(checksums)}; expected {', '.join((*names, *shown, *paid))}")
-    return {name: read_array(folder, manifest, name) for name in (*names, *paid)}
+    shown, outcomes = (OBSERVATIONS,) * has_shown, PAID * (version == PAID_VERSION)
+    if set(checksums) != {*names, *shown, *outcomes}:
+        raise ValueError(f"its arrays are {', '.join(checksums)}; expected {', '.join((*names, *shown, *outcomes))}")
+    return {name: read_array(folder, manifest, name) for name in (*names, *outcomes)}
 
 
 def read_array(folder: str | os.PathLike, manifest: Mapping[str, Any], name: str) -> np.ndarray:

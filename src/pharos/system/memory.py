@@ -4,8 +4,9 @@ Large arrays lie in reserved address space: memory is taken as they are written,
 grow. Those that may be larger than memory are mapped files, of which the system keeps in memory what is used.
 
 Kept arrays are files of NumPy (.npy), mapped while they are worked on: they need no memory of their own, and outlive
-the process. They are for what may be left in the middle and is as good as ever: values that are swept, bounds that are
-tightened. Nobody else may write into such a file meanwhile: it is locked as long as its array is in use.
+the process. They are for results that stay valid when an interruption leaves them half updated: values that are swept,
+bounds that are tightened. Nobody else may write into such a file meanwhile: it is locked as long as its array is in
+use.
 """
 
 import contextlib
@@ -40,10 +41,10 @@ _PROC, _GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
 
 def available_memory() -> int:
-    """Bytes: free memory of the machine, or of a control group that this process is in (Slurm, containers) where that
+    """Free bytes of the machine's memory, or of a control group that this process is in (Slurm, containers) where that
     is less.
 
-    What files have left in memory counts as free: it goes when somebody needs the room.
+    The cache of files counts as free: the system drops it when memory is needed.
     """
     free = 1 << 62
     with contextlib.suppress(OSError, StopIteration, ValueError), open(_PROC / "meminfo") as file:
@@ -108,7 +109,7 @@ def reserved_states(num_words: int) -> np.ndarray:
 
 
 def reserved_table() -> np.ndarray:
-    """Bytes in which the table grows; an empty array where there is no address space."""
+    """(N,) zero bytes of reserved address space, in which the table grows; empty where there is no address space."""
     for size in (1 << 35, 1 << 33, 1 << 31):
         with contextlib.suppress(OSError, ValueError):
             return huge_pages(size, np.dtype("|u1"))
@@ -199,7 +200,7 @@ def ranges_from_the_end(rows: object, low: int, high: int, have_room: bool = Fal
 
 
 def rows_with_room(rows: object, low: int, high: int) -> int:
-    """Of rows [low, high) of an array, memory has room for those below this one: all, but for mapped files."""
+    """The row below which memory has room for rows [low, high) of an array: `high`, but for mapped files."""
     if sys.platform != "linux" or not isinstance(rows, np.memmap) or not isinstance(_mapping_of(rows), mmap.mmap):
         return high
     room = available_memory() * 3 // 4 // rows.strides[0]
@@ -215,6 +216,7 @@ def pieces_from_the_end(rows: R, low: int, high: int, border: int) -> Iterator[t
     """
     border = room = min(max(low, border), high)
     with contextlib.ExitStack() as stack:
+        # Rows from the border on: a thread reads the next piece while the caller works on this one
         try:
             file = stack.enter_context(_UncachedFile(rows)) if border < high else None
         except OSError:  # it has another name now, or none
@@ -228,6 +230,7 @@ def pieces_from_the_end(rows: R, low: int, high: int, border: int) -> Iterator[t
                 if start > border:
                     coming = pool.submit(file.read, cuts[i + 2], start, (i + 1) % 2)
                 yield array, start, stop
+    # Rows below the border: the mapped array itself
     for start, stop in ranges_from_the_end(rows, low, border, have_room=border == room):
         yield rows, start, stop
 
@@ -273,7 +276,7 @@ class _UncachedFile:
 
 
 class _Rows:
-    """What NumPy makes an array of that begins before its memory."""
+    """Array interface of an array that begins before its memory: only the rows that lie in it may be read."""
 
     def __init__(self, like: np.memmap, memory: np.ndarray, address: int):
         self._memory = memory
@@ -285,9 +288,7 @@ def _mapping_of(array: np.memmap) -> mmap.mmap | None:
 
 
 def _advise(array: np.memmap, start: int, stop: int, advice: int | None) -> None:
-    """Tell the system what becomes of rows of a mapped array: that they will be read soon, which it does while this
-    process works; or that they will not.
-    """
+    """`madvise` on some rows of a mapped array: needed soon, so that the system reads them meanwhile; or not needed."""
     mapping = _mapping_of(array)
     if start < stop and isinstance(mapping, mmap.mmap) and advice is not None:
         row = array.strides[0]
@@ -300,7 +301,7 @@ def _advise(array: np.memmap, start: int, stop: int, advice: int | None) -> None
 
 
 def kept_array(path: str | os.PathLike, shape: tuple[int, ...], dtype: DTypeLike, what: str = "values") -> np.ndarray:
-    """The array of a file: what is there, or zeros in a new one.
+    """The array of a file, mapped: its contents, or zeros in a new file.
 
     Args:
         what: it holds, for errors.
@@ -322,7 +323,7 @@ def kept_array(path: str | os.PathLike, shape: tuple[int, ...], dtype: DTypeLike
 
 
 def _make(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
-    """A file of zeros, its room on the disk taken: a full disk would kill the process later."""
+    """Write a file of zeros, its room on the disk taken: a full disk would kill the process later."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with storage.replacing(path, durable=False) as file:
         np.lib.format.write_array_header_1_0(file, {"descr": dtype.str, "fortran_order": False, "shape": shape})
@@ -331,7 +332,7 @@ def _make(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
 
 @contextlib.contextmanager
 def _locked(path: Path, file: BinaryIO, what: str) -> Iterator[contextlib.ExitStack]:
-    """The file held, by a claim beside it where the file system has no locks (`storage.lock`); what gives that back."""
+    """Lock the file, by a claim beside it where the file system has no locks (`storage.lock`); yield that claim."""
     with contextlib.ExitStack() as claim:
         try:
             if fcntl is not None:
@@ -346,7 +347,7 @@ def _locked(path: Path, file: BinaryIO, what: str) -> Iterator[contextlib.ExitSt
 
 
 def _checked_offset(path: Path, file: BinaryIO, shape: tuple[int, ...], dtype: np.dtype, what: str) -> int:
-    """Where the array begins."""
+    """The byte of the file at which the array begins; FileFormatError where the file holds something else."""
     try:
         np.lib.format.read_magic(file)
         file_shape, is_fortran, file_dtype = np.lib.format.read_array_header_1_0(file)

@@ -22,7 +22,7 @@ SHOWN = 60  # letters of a wrong entry, in errors
 
 
 def meanings(documented: object) -> dict[str, str]:
-    """Name -> text, of entries such as `height, width: of the grid` in the section Attributes or Args of a docstring;
+    """Texts by name, of entries such as `height, width: of the grid` in the section Attributes or Args of a docstring;
     also of the classes that a class extends.
     """
     texts: dict[str, str] = {}
@@ -101,12 +101,12 @@ def takes(cls: type, **defaults: object) -> Callable[[F], F]:
         *before, rest = signature.parameters.values()
         names = {each.name for each in before}
         values = {each.name: None if each.default is MISSING else each.default for each in leaves} | defaults
-        made = [
+        keywords = [
             inspect.Parameter(each.name, rest.KEYWORD_ONLY, default=values[each.name], annotation=each.type)
             for each in leaves
             if each.name not in names
         ]
-        function.__signature__ = signature.replace(parameters=[*before, *made, rest])  # type: ignore[attr-defined]
+        function.__signature__ = signature.replace(parameters=[*before, *keywords, rest])  # type: ignore[attr-defined]
         return function
 
     return shown

@@ -26,7 +26,7 @@ _LOADED: dict[str, tuple["Source", Any]] = {}
 
 @dataclass(frozen=True)
 class Source:
-    """Where a class or function of the user's own comes from.
+    """Origin of a class or function of the user's own: its name, its file, and the checksum of that.
 
     Attributes:
         name: "module:Name" or "file.py:Name", without a folder: the same on every machine.
@@ -40,7 +40,7 @@ class Source:
 
     @staticmethod
     def from_dict(entry: Mapping[str, Any]) -> "Source":
-        """Read what `to_dict` gave.
+        """Read the entries that `to_dict` returns.
 
         Raises:
             FileFormatError: it is damaged.
@@ -51,7 +51,7 @@ class Source:
         return source
 
     def to_dict(self) -> dict[str, str]:
-        """JSON-able."""
+        """The attributes, JSON-able."""
         return asdict(self)
 
     @property
@@ -80,7 +80,7 @@ def is_reference(name: object) -> TypeGuard[str]:
 
 
 def find(name: str, folder: str | Path | None = None) -> Source:
-    """Where `module:Name` or `file.py:Name` is; nothing but the parents of the module is imported.
+    """The source of `module:Name` or `file.py:Name`; nothing but the parents of the module is imported.
 
     Args:
         folder: relative files and modules are looked for there first; None: in the current directory.
@@ -124,7 +124,7 @@ def load(source: Source) -> Any:
 
 
 def resolve(source: Source, *, trust: bool = False, strict: bool = False) -> Any:
-    """What the source in a stored configuration names.
+    """The class or function that the source in a stored configuration names.
 
     Args:
         trust: whether it may be imported. Else what this process has imported already under that name is returned.
@@ -155,7 +155,7 @@ def resolve(source: Source, *, trust: bool = False, strict: bool = False) -> Any
 
 
 def source_of(value: object, attribute: str | None = None) -> Source | None:
-    """Where a class or function comes from, which others can import; None where they cannot, as in a notebook.
+    """The source by which others can import a class or function; None where they cannot, as in a notebook.
 
     Args:
         attribute: the name in its module; None: its own.

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all: replacement in one step, locks, JSON, digests. Knows no format of pharos.
+"""Files that are written whole or not at all: replacement in one step, locks, JSON, digests. Knows no format of pharos.
 
 Every writer of pharos replaces files by `replacing`, `replace_file` or `replace_json`: whoever reads, and whatever
 happens to the machine, finds the old file or the new one. A new file is written beside the old one under a name that
@@ -38,8 +38,8 @@ except ImportError:  # Windows
 
 LOCK = "lock"
 CLAIM = "lock.claim"
+"""File that stands in for a lock where the file system has none: the process that makes it holds the folder."""
 WAITING_SECONDS = 0.2
-"""Stands in for a lock where the file system has none: whoever makes it holds the folder."""
 CLAIM_ATTEMPTS = 200
 
 DIGEST = "digest"
@@ -115,7 +115,7 @@ def replace_array(path: str | os.PathLike, array: object) -> None:
 
 
 class _Writer:
-    """Something to write to, and nothing else."""
+    """The method `write` of a file, and nothing else."""
 
     def __init__(self, file: BinaryIO):
         self.write = file.write
@@ -278,7 +278,7 @@ def _is_at(path: Path, file: TextIO) -> bool:
 def waiting_lock(
     folder: Path, error: type[PharosError], activity: str, tell: Callable[[str], Any]
 ) -> contextlib.ExitStack:
-    """As `lock`, but where another process holds the folder it is waited for; `tell` is called once, with a line.
+    """Hold a folder as `lock` does, waiting while another process holds it; `tell` is called once, with a line.
 
     Returns:
         A context in which the folder is held, already entered: `with waiting_lock(...):`.
@@ -502,17 +502,17 @@ class ResultCache:
         return self.folder / f"{xxhash.xxh3_64_hexdigest(json.dumps(dependencies, sort_keys=True).encode())}.json"
 
     def get(self, dependencies: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The entries of a result; None where there is none, or not what was written there."""
+        """The entries of a result; None where there is none, or where its file was changed."""
         try:
             record = read_json(self.file(dependencies))
-            said = record.get("task", record)  # where values of 0.1.0 have it
-            is_ours = DIGEST in record and all(said.get(name) == value for name, value in dependencies.items())
+            entries = record.get("task", record)  # where values of 0.1.0 have it
+            is_ours = DIGEST in record and all(entries.get(name) == value for name, value in dependencies.items())
             return record if is_ours and is_intact(record) else None
         except (FileNotFoundError, FileFormatError, AttributeError, TypeError):
             return None
 
     def put(self, dependencies: Mapping[str, Any], **entries: object) -> None:
-        """Keep a result."""
+        """Write a result, sealed."""
         self.folder.mkdir(parents=True, exist_ok=True)
         replace_json(self.file(dependencies), sealed({**dependencies, **entries}))
 
@@ -529,8 +529,8 @@ def cache_directory() -> Path:
     Where there is no such folder and none can be made (no home, or one that cannot be written to, as in containers), it
     is a temporary one for this process and those that it starts.
     """
-    if chosen := os.environ.get("PHAROS_CACHE_DIR"):
-        return Path(chosen).expanduser()
+    if folder := os.environ.get("PHAROS_CACHE_DIR"):
+        return Path(folder).expanduser()
     try:
         place, problem = _of_user(), ""
     except RuntimeError:
@@ -575,7 +575,7 @@ def temporary_folder(prefix: str) -> Path:
 
 
 def _delete(folder: Path, process: int) -> None:
-    """Unless this is a fork of the process that made it."""
+    """Delete a temporary folder, unless this is a fork of the process that made it."""
     if os.getpid() == process:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -586,6 +586,6 @@ def is_cache_temporary() -> bool:
 
 
 def compiled_folders(cache: Path) -> list[Path]:
-    """Where compiled rules may be in a cache, the first choice first: `compiled-NUMBER` where another user has that."""
+    """Folders for compiled rules in a cache, best first: `compiled-NUMBER` is for where another user has the first."""
     users = [cache / f"compiled-{os.getuid()}"] if hasattr(os, "getuid") else []
     return [cache / "compiled", *users]

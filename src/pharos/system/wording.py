@@ -1,4 +1,4 @@
-"""How messages and tables say numbers, names and errors; and the templates of pages."""
+"""Texts of counts, names and errors in messages and tables; and the templates of pages."""
 
 from functools import cache
 from typing import TYPE_CHECKING

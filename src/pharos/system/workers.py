@@ -55,7 +55,7 @@ class Workers:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End processes cleanly; at once those that take too long."""
+        """Terminate the processes; kill those that take too long."""
         processes = [process for process, _ in self._running.values()]
         self._running.clear()
         for process in processes:
@@ -93,7 +93,7 @@ class Workers:
         self._running[key] = process, receiver
 
     def events(self, seconds: float | None = None) -> Iterator[tuple[str, Any]]:
-        """What happens next, or within so many seconds: (key, a message), or (key, exit code) of a process that ended.
+        """Yield the next events, within so many seconds: (key, a message), or (key, exit code) of a process that ended.
 
         Raises:
             ParameterError: a process has imported a script without a guard.
@@ -148,7 +148,7 @@ def _work(
 
 
 def end_cleanly() -> None:
-    """Leave interrupts to the process that started this one; on SIGTERM, end by way of what has to be given back.
+    """Leave interrupts to the process that started this one; on SIGTERM, raise SystemExit, so that `finally` runs.
 
     A process that SIGTERM kills leaves its semaphores behind, of which Python then warns.
     """
@@ -162,7 +162,7 @@ def end_cleanly() -> None:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """What starts here, and whatever it forks, uses one thread, unless the user's variables say otherwise.
+    """Give one thread to each process that starts within, and to its forks, unless the user's variables say otherwise.
 
     Numba reads its variable when it is loaded, which is before any line of the new process.
     """
@@ -181,7 +181,7 @@ NO_GUARD = 78
 
 @contextlib.contextmanager
 def without_main(*definitions: object) -> Iterator[None]:
-    """Processes that are started within do not import the user's script, which therefore needs no guard.
+    """Keep processes that are started within from importing the user's script, which then needs no guard.
 
     multiprocessing lets each new process import the `__main__` of the first one, under another name. Code of the user's
     own travels by its file (`sources`), so nothing is missing; but where one of the `definitions` (classes, functions)
@@ -203,7 +203,7 @@ def without_main(*definitions: object) -> Iterator[None]:
 
 
 def check_guard(exit_code: int | None) -> None:
-    """ParameterError where a process has ended since the script that it imported starts processes."""
+    """Raise ParameterError where a process has ended because the script that it imported starts processes."""
     if exit_code == NO_GUARD:
         raise ParameterError(
             "workers import this script, since it defines an environment, observation or function of the runs, and "
@@ -214,7 +214,7 @@ def check_guard(exit_code: int | None) -> None:
 
 @contextlib.contextmanager
 def without_interrupts() -> Iterator[None]:
-    """Programs that are started within leave interrupts to this one, from their first line on."""
+    """Let programs that are started within leave interrupts to this one, from their first line on."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
