@@ -76,7 +76,7 @@ def spearman(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def resampled_classes(count: int, resamples: int, seed: int) -> Counts:
-    """Classes drawn anew, with at least three different ones in each sample (two, of two)."""
+    """(R, C) counts of classes drawn anew, at least three different ones in each sample (two, of two)."""
     rng = np.random.default_rng(seed)
     drawn = rng.multinomial(count, np.full(count, 1 / count), resamples)
     return drawn[(drawn > 0).sum(axis=1) >= min(3, count)]
@@ -90,6 +90,7 @@ def held_out(x: np.ndarray, y: np.ndarray, classes: np.ndarray, counts: Counts) 
     """
     means = np.stack([x[classes == each].mean(axis=0) for each in range(classes.max() + 1)]).mean(axis=0)
     spread = x.std(axis=0)
+    # Squared errors of each class under the line through the others, from the moments of classes
     design = _with_one((x - means) / np.where(spread > 0, spread, 1.0))
     sizes = np.bincount(classes)
     products, targets = _moments(design, y, classes, sizes)
@@ -100,6 +101,7 @@ def held_out(x: np.ndarray, y: np.ndarray, classes: np.ndarray, counts: Counts) 
     total = counts.sum(axis=1)
     mean = counts @ (np.bincount(classes, y) / sizes) / total
     scores = 1 - (counts * errors).sum(axis=1) / total / (counts @ squares / total - mean**2)
+    # Rank correlations need the predictions themselves
     rho = np.full(len(counts), np.nan)
     for r, count in enumerate(counts[:MOST_RANKED]):
         some = count[classes] > 0
@@ -178,7 +180,7 @@ def percentiles(values: np.ndarray, *shares: float) -> np.ndarray:
 
 
 def p_of(value: float, permuted: np.ndarray) -> float:
-    """The share of permutations that are as large, the observed order among them; NaN without any."""
+    """P-value: the share of permutations that are as large, the observed order among them; NaN without any."""
     finite = permuted[np.isfinite(permuted)]
     if not np.isfinite(value) or len(finite) == 0:
         return np.nan

@@ -40,7 +40,7 @@ ACTOR_CRITICS: Mapping[str, Mapping[str, Any]] = {
     "ppo": {"gae_lambda": 0.95, "clip_range": 0.2},
     "a2c": {"gae_lambda": 1.0, "clip_range": None},
 }
-"""Agents that learn as actor-critics, and what their hyperparameters are where they are not said."""
+"""Agents that learn as actor-critics, with the hyperparameters that hold where none are given."""
 CURVE_POINTS = 40
 
 
@@ -107,7 +107,7 @@ def _options(task: "Task", network: Network, initialisation: str, landmarks: int
 
 
 def _sampled(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
-    """The regret of the learner that draws what a DQN draws."""
+    """Result of `sampled_regret`: the regret of the learner that draws what a DQN draws."""
     from pharos.hardness import report
 
     name = "sampled_regret"
@@ -117,7 +117,7 @@ def _sampled(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str,
 def _actor_critic(
     config: Mapping[str, Any], mdp: "TabularMDP", rollouts: "Rollouts", options: Mapping[str, Any]
 ) -> "Result":
-    """The regret of the idealised actor-critic with the steps and the discount of an agent."""
+    """Result of `kernel_policy_regret`, of the idealised actor-critic with the steps and the discount of an agent."""
     from pharos.hardness import Schedule, report
 
     name = "kernel_policy_regret"
@@ -126,7 +126,7 @@ def _actor_critic(
 
 
 def _of_walks(value: Mapping[str, Any] | None) -> dict[str, Any]:
-    """SAMPLED_PREDICTORS, of the learner that draws what the agent draws."""
+    """SAMPLED_PREDICTORS by name, from the value of `sampled_regret`; NaN where there is none."""
     if value is None:
         return dict.fromkeys(SAMPLED_PREDICTORS, math.nan)
     parts = (value["value"], value.get("deviation", math.nan), value["descent"], value["adam"], value["tabular"])
@@ -144,7 +144,7 @@ def sampling_of(config: Mapping[str, Any]) -> "Sampling":
 
 @dataclass(frozen=True, kw_only=True)
 class PrimaryRegret:
-    """The predictor that stands for an agent.
+    """Predicted regret of an agent, by the predictor that stands for it (PRIMARY).
 
     Attributes:
         network: its name.
@@ -235,7 +235,7 @@ def rollouts_of(config: Mapping[str, Any]) -> "Rollouts":
 
 
 def _evaluated(regret: Mapping[str, Any]) -> float:
-    """`LearningCurve.mean_evaluated`, which results that were kept before it was there do not have."""
+    """Mean regret as evaluated, `LearningCurve.mean_evaluated`, computed anew: results of older versions lack it."""
     from pharos.hardness import LearningCurve
 
     return LearningCurve(**{name: np.asarray(values) for name, values in regret["curve"].items()}).mean_evaluated

@@ -1,11 +1,11 @@
-"""Whether a measure predicts regret on classes that it has not seen: statistics of predictors, baselines beside them.
+"""Statistics of predictors of regret on classes that they have not seen, with baselines to compare.
 
 Cells of one class share more than any measure tells, so a class is held out as a whole, and classes weigh alike. The
-four classes of the paper tell nothing here: with four points every measure can be ordered well by luck.
+four classes of the paper are too few for that: any measure may order four points well by luck.
 
 Mixed models of an outcome: a slope for the predictor, random intercepts for classes and for the MDPs within them.
 
-Whether a predictor orders the observations of one MDP: the one question that no tabular measure can answer.
+Pairs of observations of one MDP: a predictor may order them rightly, which no tabular measure can do.
 """
 
 import warnings
@@ -17,7 +17,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.training import CELL
-from pharos.validation import cross_validation as _held_out
+from pharos.validation import cross_validation
 from pharos.validation.cross_validation import BLOCK, percentiles
 from pharos.validation.learners import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS
 
@@ -61,8 +61,8 @@ def outcomes(runs: "pd.DataFrame", points: "pd.DataFrame") -> "pd.DataFrame":
     regret = points["normalized_regret"]
     cells = runs[[*CELL, "id"]].copy()
     cells["greedy"] = cells["id"].map(regret.groupby(points["id"]).mean())
-    reached = points["step"].where(regret <= TENTH).groupby(points["id"]).min()
-    share = (reached / points.groupby("id")["step"].max()).fillna(1.0)
+    first_step = points["step"].where(regret <= TENTH).groupby(points["id"]).min()
+    share = (first_step / points.groupby("id")["step"].max()).fillna(1.0)
     cells["steps_to_tenth"] = cells["id"].map(share).where(cells["greedy"].notna())
     for name in ("played", "cumulative", "random_scale"):
         cells[name] = np.nan
@@ -78,12 +78,12 @@ def outcomes(runs: "pd.DataFrame", points: "pd.DataFrame") -> "pd.DataFrame":
 
 @dataclass(frozen=True)
 class Model:
-    """Predictors that are held against an outcome.
+    """A model of an outcome: one predictor, several together, or none.
 
     Attributes:
         name: of the predictor, or of several together.
         columns: of the table; none for the mean alone.
-        is_baseline: whether it stands there to be beaten.
+        is_baseline: whether others are to beat it.
     """
 
     name: str
@@ -92,7 +92,7 @@ class Model:
 
 
 def models_of(frame: "pd.DataFrame", predictors: Sequence[str], measures: Sequence[str]) -> list[Model]:
-    """Predictors with the baselines that the table has columns for.
+    """Models of the predictors, and of the baselines that the table has columns for.
 
     Args:
         measures: tabular ones; each alone too, where there are no predictions.
@@ -177,7 +177,7 @@ def unseen_classes(
 
 
 def _predictors_of(predictions: "pd.DataFrame") -> list[str]:
-    """Our predictors, and numbers of other names than those of our files."""
+    """Names of pharos' predictors, and of other columns of numbers, such as those of a user's measures."""
     ours = (*PREDICTORS, SAMPLED_PREDICTORS[0], *POLICY_PREDICTORS)
     others = {*CELL, *SAMPLED_PREDICTORS, "estimated_error"}
     added = [name for name in predictions if name not in (*ours, *others) and predictions[name].dtype.kind in "fiu"]
@@ -185,12 +185,12 @@ def _predictors_of(predictions: "pd.DataFrame") -> list[str]:
 
 
 def _corrected(table: "pd.DataFrame") -> "pd.DataFrame":
-    """With the number of tests and p-values corrected for it."""
+    """The table with the number of tests, and p-values corrected for it."""
     if len(table) == 0:
         return table
     p = table[list(P_VALUES)].to_numpy(float)
     table["tests"] = int(np.isfinite(p).sum())
-    corrected = _held_out.holm(p.ravel()).reshape(p.shape)
+    corrected = cross_validation.holm(p.ravel()).reshape(p.shape)
     for i, name in enumerate(P_VALUES):
         table[f"{name}_holm"] = corrected[:, i]
     return table
@@ -214,7 +214,7 @@ class Cells:
 
     @staticmethod
     def of(part: "pd.DataFrame", columns: Sequence[str], outcome: str) -> "Cells":
-        """The rows in which all of it is finite."""
+        """Cells of the rows in which the outcome and all columns are finite."""
         x = np.column_stack([np.zeros((len(part), 0)), *(scaled(part, name) for name in columns)])
         y = part[outcome].to_numpy(float)
         if outcome == ABSOLUTE:
@@ -238,7 +238,7 @@ class Cells:
 
 
 def scaled(part: "pd.DataFrame", name: str) -> np.ndarray:
-    """A predictor as it enters: its logarithm, unless it is one of LINEAR."""
+    """(N,) a predictor as models take it: its logarithm, unless it is one of LINEAR."""
     values = part[name].to_numpy(float)
     return values if name in LINEAR else np.log(np.maximum(values, 1e-12))
 
@@ -250,6 +250,7 @@ def _numbers(frame: "pd.DataFrame", columns: Sequence[str]) -> np.ndarray:
 def _line(
     part: "pd.DataFrame", model: Model, outcome: str, tabular: Sequence[str], permutations: int, seed: int
 ) -> dict[str, float] | None:
+    """Statistics of a model of an outcome, by column; None with fewer than two classes, or where nothing varies."""
     cells = Cells.of(part, model.columns, outcome)
     count = len(np.unique(cells.classes))
     if count < 2 or np.ptp(cells.y) == 0 or (model.columns and (np.ptp(cells.x, axis=0) == 0).all()):
@@ -264,21 +265,21 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
     """Statistics of classes and MDPs left out; rank correlations are NaN where there is no predictor."""
     x, y, classes = cells.x, cells.y, cells.classes
     count = classes.max() + 1
-    scores, rho = _held_out.held_out(x, y, classes, np.ones((1, count), int))
-    drawn = _held_out.resampled_classes(count, RESAMPLES, seed)
-    ends = np.full((2, 2), np.nan)
+    scores, rho = cross_validation.held_out(x, y, classes, np.ones((1, count), int))
+    drawn = cross_validation.resampled_classes(count, RESAMPLES, seed)
+    ends = np.full((2, 2), np.nan)  # of the intervals of R2 and of rho
     if count >= 3:
-        ends = np.array([percentiles(each, 2.5, 97.5) for each in _held_out.held_out(x, y, classes, drawn)])
-    predicted = _held_out.class_predictions(x, y, classes, classes)
+        ends = np.array([percentiles(each, 2.5, 97.5) for each in cross_validation.held_out(x, y, classes, drawn)])
+    predicted = cross_validation.class_predictions(x, y, classes, classes)
     dummies = np.eye(count)[classes][:, 1:] if not x.shape[1] else x
-    by_mdp = _held_out.class_predictions(dummies, y, cells.instances, classes)
-    slope, offset = _held_out.calibration(y, predicted, classes)
+    by_mdp = cross_validation.class_predictions(dummies, y, cells.instances, classes)
+    slope, offset = cross_validation.calibration(y, predicted, classes)
     noise = _noise(cells, outcome)
     floors, p = [np.nan, np.nan], np.nan
     if permutations and x.shape[1] and count >= 3:
-        shuffled = _held_out.permuted_classes(x, y, classes, cells.places, permutations, seed)
+        shuffled = cross_validation.permuted_classes(x, y, classes, cells.places, permutations, seed)
         floors = [float(percentiles(each[1:], 95)[0]) for each in shuffled]
-        p = _held_out.p_of(shuffled[1][0], shuffled[1][1:])
+        p = cross_validation.p_of(shuffled[1][0], shuffled[1][1:])
     return {
         "r_squared": scores[0],
         "r_squared_lower": ends[0, 0],
@@ -289,10 +290,10 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
         "floor_r_squared": floors[0],
         "floor_rho": floors[1],
         "p_rho": p,
-        "r_squared_mdp": _held_out.r_squared(y, by_mdp, classes) if cells.instances.max() else np.nan,
+        "r_squared_mdp": cross_validation.r_squared(y, by_mdp, classes) if cells.instances.max() else np.nan,
         "calibration": slope if x.shape[1] else np.nan,
         "calibration_offset": offset if x.shape[1] else np.nan,
-        "ceiling": np.nan if noise is None else _held_out.ceiling(y, noise, classes),
+        "ceiling": np.nan if noise is None else cross_validation.ceiling(y, noise, classes),
     }
 
 
@@ -311,9 +312,11 @@ def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[st
     if cells.x.shape[1] != 1:
         return row
     x, y, classes = cells.x[:, 0], cells.y, cells.classes
-    within = [_held_out.spearman(x[classes == each], y[classes == each]) for each in range(classes.max() + 1)]
+    # Rank correlation within classes
+    within = [cross_validation.spearman(x[classes == each], y[classes == each]) for each in range(classes.max() + 1)]
     if np.isfinite(within).any():
         row["rho_within"] = float(np.nanmean(within))
+    # Pairs of observations: all, then those of an image and a vector
     pairs = Pairs.of(y, cells.mdps)
     row |= {"pairs": len(pairs.first), "agreement": pairs.agreement(x)}
     noise = _noise(cells, outcome)
@@ -325,13 +328,14 @@ def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[st
     first, second = pairs.first, pairs.second
     of_both = pairs.only((is_image[first] & is_vector[second]) | (is_vector[first] & is_image[second]))
     row |= {"image_pairs": len(of_both.first), "image_agreement": of_both.agreement(x)}
+    # Interval and p-value, where the predictor tells observations apart
     if (x[pairs.first] == x[pairs.second]).all():
         return row
-    drawn = _held_out.resampled_classes(classes.max() + 1, RESAMPLES, seed)
+    drawn = cross_validation.resampled_classes(classes.max() + 1, RESAMPLES, seed)
     row["agreement_lower"], row["agreement_upper"] = pairs.interval(x, classes, drawn)
     if permutations:
         shuffled = pairs.permuted(x, classes, cells.mdps, names, permutations, seed)
-        row["p_agreement"] = _held_out.p_of(pairs.agreement(x), shuffled)
+        row["p_agreement"] = cross_validation.p_of(pairs.agreement(x), shuffled)
     return row
 
 
@@ -357,9 +361,9 @@ def _mixed(cells: Cells, model: Model, tabular: Sequence[str], seed: int) -> dic
         if some.sum() < len(columns) + 4 or len(np.unique(classes[some])) < 3:
             continue
         numbers = np.unique(classes[some], return_inverse=True)[1]
-        drawn = _held_out.resampled_classes(numbers.max() + 1, RESAMPLES // 2, seed)
+        drawn = cross_validation.resampled_classes(numbers.max() + 1, RESAMPLES // 2, seed)
         counts = np.vstack([np.ones((1, drawn.shape[1]), int), drawn])
-        values = _held_out.partial_correlation(x[some], y[some], others[some], numbers, counts)
+        values = cross_validation.partial_correlation(x[some], y[some], others[some], numbers, counts)
         row |= zip(
             (name, f"{name}_lower", f"{name}_upper"), (values[0], *percentiles(values[1:], 2.5, 97.5)), strict=True
         )
@@ -371,7 +375,7 @@ def _mixed(cells: Cells, model: Model, tabular: Sequence[str], seed: int) -> dic
 
 @dataclass(frozen=True)
 class MixedFit:
-    """y = intercept + slope z + class + MDP + residual, by restricted maximum likelihood.
+    """Fit of y = intercept + slope z + class + MDP + residual, by restricted maximum likelihood.
 
     Attributes:
         slope: of the standardised predictor z, in units of the outcome; error: its standard error.
@@ -438,7 +442,7 @@ class Pairs:
 
     @staticmethod
     def of(y: np.ndarray, mdps: np.ndarray, clear: float = CLEAR) -> "Pairs":
-        """Pairs of outcomes y (N,) and MDPs (N,)."""
+        """Pairs of the cells with outcomes y (N,) and MDPs (N,)."""
         first, second = np.triu_indices(len(y), 1)
         same = mdps[first] == mdps[second]
         first, second = first[same], second[same]
@@ -447,7 +451,7 @@ class Pairs:
         return Pairs(first, second, np.sign(y[first] - y[second]))
 
     def only(self, mask: np.ndarray) -> "Pairs":
-        """Some of them: chosen (M,) bool."""
+        """The pairs where the mask (M,) is true."""
         return Pairs(self.first[mask], self.second[mask], self.sign[mask])
 
     def right(self, x: np.ndarray) -> np.ndarray:

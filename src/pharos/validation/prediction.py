@@ -51,7 +51,7 @@ TAKEN = {"chance", "sticky", "random", "lazy", "reward_noise", "horizon", "hyper
 
 @dataclass(frozen=True, eq=False)
 class Published:
-    """Cells of one agent.
+    """Published cells of one agent: the regret that was predicted, and that of the runs.
 
     Attributes:
         classes: (N,) names of the classes of environments, which weigh alike.
@@ -82,9 +82,9 @@ class Published:
         errors, classes = np.abs(self.observed - self.predicted)[use], self.classes[use]
         names, number, counts = np.unique(classes, return_inverse=True, return_counts=True)
         order = np.argsort(errors, kind="stable")
-        reached = np.cumsum((1 / (counts[number] * len(names)))[order])
+        cumulative = np.cumsum((1 / (counts[number] * len(names)))[order])
         aim = min(1.0, level * (len(names) + 1) / len(names))
-        place = min(int(np.searchsorted(reached, aim - 1e-12)), len(errors) - 1)
+        place = min(int(np.searchsorted(cumulative, aim - 1e-12)), len(errors) - 1)
         return float(errors[order][place])
 
     def coverage(self, level: float = LEVEL) -> float:
@@ -157,13 +157,13 @@ class PredictedRegret(PrimaryRegret):
         return f"{self.observation}, {self.network}"
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
+        """The attributes, JSON-able."""
         return plain(vars(self))
 
 
 @dataclass(frozen=True)
 class PairOrder:
-    """Which of two cells is predicted to be easier, and how often such an order was right.
+    """Predicted order of two cells, and how often such an order was right.
 
     Attributes:
         easier, harder: labels. difference: of the predicted regrets.
@@ -195,7 +195,7 @@ class PairOrder:
         return f"{self.easier} or {self.harder}: too close to call ({share})"
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
+        """The attributes, whether the order is called, and its text, JSON-able."""
         return {**vars(self), "called": self.is_called, "text": str(self)}
 
 
@@ -229,7 +229,7 @@ class Prediction:
 
     @property
     def orders(self) -> list[PairOrder]:
-        """Each cell beside the easiest one; the easiest is named first."""
+        """Orders of the easiest cell and each other one; the easiest is named first."""
         calibration, ranked = published(self.agent), sorted(self.cells, key=lambda cell: cell.value)
         easiest, orders = ranked[0], []
         for cell in ranked[1:]:
@@ -247,7 +247,7 @@ class Prediction:
         return (first.label, second.label) if is_named_by_both else (first.observation, second.observation)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
+        """The attributes, the orders and the level, JSON-able."""
         return {
             **vars(self),
             "cells": [cell.to_dict() for cell in self.cells],
@@ -377,7 +377,7 @@ def regret_predictor(
 
 
 def _observations(observations: Any) -> list[tuple[str, dict[str, Any]]]:
-    """Names with their options."""
+    """(name, options) of each observation."""
     is_pair = isinstance(observations, tuple) and len(observations) == 2 and isinstance(observations[1], Mapping)
     if isinstance(observations, str) or is_pair:
         observations = [observations]
@@ -432,7 +432,7 @@ _KEY = b"pharos.predictions"
 _SAID = ("study", "sha256", "date", "version")
 
 Predictions: TypeAlias = "tuple[pd.DataFrame, Mapping[str, str]]"
-"""Rows, and what their file says of itself."""
+"""Rows, and the description in their file: study, hash, date and version."""
 
 
 class NamedStudy(Protocol):
@@ -471,12 +471,12 @@ def write_predictions(study: "NamedStudy", predictions: "pd.DataFrame", file: st
     if older is None:
         training.write_table(Path(file), table)
         return about
-    beside = _place_beside(Path(file), older["date"])
-    os.replace(file, beside)
+    older_file = _place_beside(Path(file), older["date"])
+    os.replace(file, older_file)
     try:
         training.write_table(Path(file), table)
     except BaseException:
-        os.replace(beside, file)
+        os.replace(older_file, file)
         raise
     return about
 
@@ -497,7 +497,7 @@ def _place_beside(file: Path, date: str) -> Path:
 
 
 def read_predictions(file: str | os.PathLike) -> "tuple[pd.DataFrame, dict[str, str]]":
-    """Read what `write_predictions` wrote: the rows; study, hash, date and version.
+    """Read a file of `write_predictions`: the rows; study, hash, date and version.
 
     Raises:
         FileFormatError: it is no file of predictions. ResultCorrupted: it was changed after it was written.
@@ -555,14 +555,14 @@ class PredictedCells:
 
     @staticmethod
     def of(predictions: "Predictions | Sequence[Predictions] | None") -> "PredictedCells | None":
-        """Predictions of one file or of several; None of none."""
+        """Predictions of one file or of several; None where there are none."""
         parts = [predictions] if isinstance(predictions, tuple) else list(predictions or ())
         return PredictedCells(parts) if parts else None
 
     def late(self, runs: "pd.DataFrame") -> tuple[int, int]:
-        """(runs that had begun when the predictions were written, runs that do not say when they began): numbers.
+        """Numbers of (runs that had begun when the predictions were written, runs that do not say when they began).
 
-        Where there are several parts, of the runs that they are about, each.
+        Where there are several parts, each is compared with the runs that it predicts.
         """
         if len(self.parts) == 1:
             return late(runs, self.parts[0][1])
@@ -571,6 +571,6 @@ class PredictedCells:
 
 
 def late(runs: "pd.DataFrame", about: Mapping[str, str]) -> tuple[int, int]:
-    """(runs that had begun when predictions were written, runs that do not say when they began): numbers."""
+    """Numbers of (runs that had begun when predictions were written, runs that do not say when they began)."""
     began = runs["began"] if "began" in runs else runs["id"].map(lambda _: "")
     return int(((began != "") & (began <= about["date"])).sum()), int((began == "").sum())
