@@ -40,7 +40,7 @@ def test_runs_that_see_more_or_less_share_a_lane_and_learn_what_they_learn_alone
     runs = grids(agent, observation, (4, 6))
     batch = learned(agent, runs, device=ELSEWHERE)
     (lane,) = batch.lanes
-    assert len({sight.shape for sight in lane.seen.sights}) == 2
+    assert len({view.shape for view in lane.seen.views}) == 2
     for first in (0, 2):
         alone = learned(agent, runs[first : first + 2])
         for i in (0, 1):

@@ -73,14 +73,14 @@ class Scripted(VecEnvWrapper):
 def recorded(agent, task, hyperparameters, steps):
     """A lane that has taken its steps, without updates; and the environment in which Stable-Baselines3 takes them."""
     (lane,) = make_batch(agent, runs_of(task, hyperparameters, steps=steps)).lanes
-    script, flags, move = [], set(), lane.move
+    script, flags, move = [], set(), lane.execute_actions
 
     def record():
         move()
         script.append(lane.actions[RUN].copy())
         flags.update(lane.worlds.flags[RUN].tolist())
 
-    lane.move = record
+    lane.execute_actions = record
     env = make_sb3_vec(task.env, lane.copies, seed=0, **task.interaction)
     return lane, Scripted(env, script), flags
 

@@ -131,13 +131,13 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
         check_hyperparameters(code, setting)
         return TrainedForm(agent, "class", setting, source, sha256(source.file))
     defaults = {**hyperparameters_of(agent, "", ""), **ALSO.get(agent, {})} if agent in AGENTS else {}
-    chosen = {**defaults, **suite.hyperparameters.get(agent, {}), **setting}
-    lacking = batched.supports(agent, chosen) if agent in BATCHED else None
+    values = {**defaults, **suite.hyperparameters.get(agent, {}), **setting}
+    lacking = batched.supports(agent, values) if agent in BATCHED else None
     if lacking is not None:
         raise ParameterError(f"the batched engine: {lacking}")
     if agent not in AGENTS or not AGENTS[agent].is_tabular:
-        check_hyperparameters(agent, chosen, batched.OURS if agent in BATCHED else ())
-    return TrainedForm(agent, "engine" if agent in AGENTS else "class", chosen)
+        check_hyperparameters(agent, values, batched.OURS if agent in BATCHED else ())
+    return TrainedForm(agent, "engine" if agent in AGENTS else "class", values)
 
 
 def sha256(file: str | os.PathLike) -> str:
@@ -160,8 +160,8 @@ class TrainedForm(Form):
         folders, parts = [job.folder for job in jobs], self._parts(jobs, configs, protocol, workers)
 
         def progress(now: Any) -> None:
-            said = f", {now.failed} failed" if now.failed else ""
-            tell(now.done / now.total, f"{now.finished} of {len(jobs)} runs{said}")
+            failures = f", {now.failed} failed" if now.failed else ""
+            tell(now.done / now.total, f"{now.finished} of {len(jobs)} runs{failures}")
 
         if len(parts) > 1:
             train_parts(configs, folders, parts, checkpoints=checkpoints, device="cpu", progress=progress)
@@ -260,17 +260,17 @@ class GeneratedForm(Form):
     def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
         missing, failed = [job for job in jobs if not _is_finished(job)], 0
 
-        def told(left: int) -> None:
-            said = f"{len(jobs) - left - failed} of {len(jobs)} runs{f', {failed} failed' * (failed > 0)}"
-            tell(1 - left / len(jobs), said)
+        def report_progress(left: int) -> None:
+            text = f"{len(jobs) - left - failed} of {len(jobs)} runs{f', {failed} failed' * (failed > 0)}"
+            tell(1 - left / len(jobs), text)
 
-        told(len(missing))
+        report_progress(len(missing))
         ends = (
             self._in_processes(missing, protocol, workers) if self.source is not None else self._here(missing, protocol)
         )
         for left, error in zip(range(len(missing) - 1, -1, -1), ends, strict=False):
             failed += error is not None
-            told(left)
+            report_progress(left)
 
     def _here(self, jobs: Sequence[Job], protocol: Protocol) -> Iterator[str | None]:
         assert self.learn is not None
@@ -337,9 +337,9 @@ def _record(label: str, job: Job, protocol: Protocol, end: Curve | Exception) ->
     job.folder.mkdir(parents=True, exist_ok=True)
     record = {"format": 1, "id": run_id(config), "config": config}
     if isinstance(end, Exception):
-        said = f"{label} on {job.task.name}, seed {job.seed}: {type(end).__name__}: {in_one_line(end)}"
-        write_record(job.folder, {**record, "status": "failed", "error": said})
-        return said
+        message = f"{label} on {job.task.name}, seed {job.seed}: {type(end).__name__}: {in_one_line(end)}"
+        write_record(job.folder, {**record, "status": "failed", "error": message})
+        return message
     if end.table is not None:
         write_policy(job.folder, end.table)
     write_curve(job.folder, end.rows)

@@ -54,26 +54,26 @@ def benchmark_board(
     if not files:
         raise ParameterError("a board has no files; expected submissions of `pharos benchmark submit`")
     by_digest = {suite.digest: suite for suite in suites}
-    made = Board[Judged](Path(out))
+    board = Board[Judged](Path(out))
 
     def judged(file: Path) -> tuple[Judged, str]:
         verdict, suite = _verified(file, by_digest)
         audit = audit_of(verdict)
         score(verdict.submission.results, suite)  # or why there is none
         wrong = [f"{each.name}: regret {each.found:.6g}, claimed {each.claimed:.6g}" for each in verdict.wrong]
-        said = "; ".join((*(f"{name}: {why}" for name, why in verdict.refused.items()), *wrong))[:400]
-        return (verdict, audit, suite), said
+        reasons = "; ".join((*(f"{name}: {why}" for name, why in verdict.refused.items()), *wrong))[:400]
+        return (verdict, audit, suite), reasons
 
-    made.judge([(Path(file).name, Path(file)) for file in files], judged, progress)
+    board.judge([(Path(file).name, Path(file)) for file in files], judged, progress)
     rankings = [
         Ranking(
-            f"{suite.name}: {kind.lower()}", f"Digest of the suite: {suite.digest}", _rows(made.verified, suite, kind)
+            f"{suite.name}: {kind.lower()}", f"Digest of the suite: {suite.digest}", _rows(board.verified, suite, kind)
         )
         for suite in suites
         for kind in (AUDITED, CLAIMED)
     ]
-    write_page(out, title, rankings, COLUMNS, made.refused, len(made.verified), introduction=INTRODUCTION)
-    return Board(made.file, tuple(verdict for verdict, _, _ in made.verified), made.refused)
+    write_page(out, title, rankings, COLUMNS, board.refused, len(board.verified), introduction=INTRODUCTION)
+    return Board(board.file, tuple(verdict for verdict, _, _ in board.verified), board.refused)
 
 
 def audit_of(verdict: SubmissionVerdict) -> Audit | None:

@@ -160,8 +160,8 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
         if not isinstance(policies, Iterator):
             raise ParameterError(f"learn(env, steps, seed) returned {policies!r}; expected a generator: yield policies")
         for policy in policies:
-            passed = (budget.steps - 1) // budget.interval  # points before this step
-            counting += [last] * (passed + 1 - len(counting))
+            num_points = (budget.steps - 1) // budget.interval  # evaluation points before this step
+            counting += [last] * (num_points + 1 - len(counting))
             last = snapshots.taken(policy)
     except BudgetSpent:
         pass

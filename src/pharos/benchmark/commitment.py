@@ -57,8 +57,8 @@ class Commitment:
             ResultCorrupted: it was changed.
         """
         entry = read_object(file, "commitment", "commit", "ask for it again")
-        said = {name: value for name, value in entry.items() if name not in ("format", "sha256")}
-        commitment = records.read(Commitment, said, f"{file}: the commitment")
+        fields = {name: value for name, value in entry.items() if name not in ("format", "sha256")}
+        commitment = records.read(Commitment, fields, f"{file}: the commitment")
         if commitment.digest != entry.get("sha256"):
             raise ResultCorrupted(f"{file}: what it says was changed after it was written; ask for it again")
         return commitment

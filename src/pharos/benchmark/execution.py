@@ -101,25 +101,25 @@ def run(
             agent, setting or suite. AllRunsFailed: no run has finished. FolderLocked: another process is at it.
     Cost: of v1, 30,000 steps a task and seed.
     """
-    chosen = suite if isinstance(suite, Suite) else load_suite(suite)
-    form = agent_form(agent, chosen, hyperparameters)
+    suite = suite if isinstance(suite, Suite) else load_suite(suite)
+    form = agent_form(agent, suite, hyperparameters)
     numbers = [int(seed) for seed in seeds][: QUICK if quick else None]
     if not numbers or len(set(numbers)) < len(numbers) or min(numbers) < 0:
         raise ParameterError(f"seeds are {numbers}; expected whole numbers of at least 0, each once")
-    entries = selected(chosen, CORE if quick and tasks is None else tasks)
-    folder, protocol = Path(out), chosen.protocol
+    entries = selected(suite, CORE if quick and tasks is None else tasks)
+    folder, protocol = Path(out), suite.protocol
     if protocol.steps % protocol.evaluations:
         raise ParameterError(
-            f"suite {chosen.name}: {protocol.steps} steps with {protocol.evaluations} evaluations; expected a multiple"
+            f"suite {suite.name}: {protocol.steps} steps with {protocol.evaluations} evaluations; expected a multiple"
         )
     for task in entries:
         task.check(protocol)
     folder.mkdir(parents=True, exist_ok=True)
     with storage.lock(folder, FolderLocked, "running a benchmark"):
-        record = _claimed(folder, form, chosen, name or form.label)
+        record = _claimed(folder, form, suite, name or form.label)
         jobs = [Job(task, seed, folder / "runs" / task.name / f"seed-{seed}") for task in entries for seed in numbers]
         form.train(jobs, protocol, usable_workers(workers), folder / "checkpoints", progress or (lambda *_: None))
-        return _collected(folder, form, chosen, record, jobs)
+        return _collected(folder, form, suite, record, jobs)
 
 
 def selected(suite: Suite, tasks: str | Iterable[str] | None) -> tuple[BenchmarkTask, ...]:
@@ -150,7 +150,7 @@ def _claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str,
     numbers = versions()
     if form.label.startswith("sb3_contrib"):
         numbers["sb3-contrib"] = metadata.version("sb3-contrib")
-    said: dict[str, dict[str, Any]] = storage.plain(
+    contents: dict[str, dict[str, Any]] = storage.plain(
         {
             SUITE: {"suite": suite.name, "suite_digest": suite.digest, "protocol": vars(suite.protocol)},
             AGENT: {
@@ -162,7 +162,7 @@ def _claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str,
             },
         }
     )
-    for file, entry in said.items():
+    for file, entry in contents.items():
         try:
             stored = storage.read_json(folder / file)
         except FileNotFoundError:
@@ -175,7 +175,7 @@ def _claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str,
                 f"{folder}: holds runs with another {different[0]}: {str(before.get(different[0]))[:SHOWN]}, now "
                 f"{str(entry[different[0]])[:SHOWN]}; choose another folder, or delete it"
             )
-    return said[AGENT]
+    return contents[AGENT]
 
 
 def _collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any], jobs: Iterable[Job]) -> Outcome:
@@ -194,8 +194,8 @@ def _collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any]
         curves.setdefault(task, []).append(curve)
         exact[task] = exact.get(task, True) and is_exact
     whole = {task: np.stack(each) for task, each in curves.items() if len(each) == len(seeds)}
-    said = {**record, "exact": {task: exact[task] for task in whole}}
-    results = AgentResults(str(record["agent"]), suite.name, suite.digest, seeds, whole, said)
+    full_record = {**record, "exact": {task: exact[task] for task in whole}}
+    results = AgentResults(str(record["agent"]), suite.name, suite.digest, seeds, whole, full_record)
     outcome = Outcome(results, folder, missing, suite)
     if not whole:
         reason, _ = Counter(missing.values()).most_common(1)[0]

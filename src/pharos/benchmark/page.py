@@ -107,8 +107,8 @@ def _lead(contents: Contents) -> list[Element]:
     rest = {"Final score": own.final, "interquartile mean": own.iqm}
     parts = [*(f"{name} {number(interval)}" for name, interval in rest.items()), unclipped_regret(contents)]
     scale = "A score is 1 for the oracle and 0 for random play. Intervals are of 95 %, over seeds."
-    said = f"{f'{core}. ' if own.axes else ''}{', '.join(filter(None, parts))}."
-    lines.append(element("p", f"{said if own.has_core else 'The core was not run.'} {scale}"))
+    scores = f"{f'{core}. ' if own.axes else ''}{', '.join(filter(None, parts))}."
+    lines.append(element("p", f"{scores if own.has_core else 'The core was not run.'} {scale}"))
     if own.preliminary:
         seeds = pluralize(len(contents.agent.results.seeds), "seed")
         missing = f", and {pluralize(len(own.missing), 'task')} without results" if own.missing else ""

@@ -106,11 +106,11 @@ class Audit:
         entry = read_object(file, "audit", "audit", "audit again")
         if storage.DIGEST not in entry or not storage.is_intact(entry):
             raise ResultCorrupted(f"{file}: what it says was changed after it was written; audit again")
-        said = {name: entry[name] for name in entry if name not in ("format", "holds", storage.DIGEST)}
-        repeats = said.get("repeats")
+        fields = {name: entry[name] for name in entry if name not in ("format", "holds", storage.DIGEST)}
+        repeats = fields.get("repeats")
         if not isinstance(repeats, list):
             raise FileFormatError(f"{file}: its repeats are {repeats!r}; expected a list; audit again")
-        audit = records.read(Audit, {**said, "repeats": ()}, f"{file}: the audit")
+        audit = records.read(Audit, {**fields, "repeats": ()}, f"{file}: the audit")
         return replace(audit, repeats=tuple(records.read(Repeat, each, f"{file}: a repeat") for each in repeats))
 
 
@@ -118,8 +118,8 @@ def drawn_runs(digest: str, submission: Submission, number: int = PAIRS) -> tupl
     """The (task, seed) that an audit repeats: drawn from the SHA-256 of a submission, hexadecimal; no task twice."""
     results, draw = submission.results, np.random.default_rng(int(digest, 16))
     tasks = sorted(results.curves)
-    chosen = draw.permutation(len(tasks))[:number]
-    return tuple((tasks[i], results.seeds[int(draw.integers(len(results.seeds)))]) for i in chosen)
+    places = draw.permutation(len(tasks))[:number]
+    return tuple((tasks[i], results.seeds[int(draw.integers(len(results.seeds)))]) for i in places)
 
 
 def make_audit(

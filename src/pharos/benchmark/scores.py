@@ -305,10 +305,10 @@ def _crossing(levels: np.ndarray, regrets: np.ndarray) -> tuple[float, str]:
     """First level where increasing regrets reach 0.5, and how it is censored."""
     if regrets[0] > CROSSING:
         return float(levels[0]), "below"
-    reached = int(np.searchsorted(regrets, CROSSING))
-    if reached == len(regrets):
+    crossing = int(np.searchsorted(regrets, CROSSING))
+    if crossing == len(regrets):
         return float(levels[-1]), "above"
-    if reached == 0:
+    if crossing == 0:
         return float(levels[0]), ""
-    below, above = regrets[reached - 1 : reached + 1]
-    return float(np.interp(CROSSING, (below, above), levels[reached - 1 : reached + 1])), ""
+    below, above = regrets[crossing - 1 : crossing + 1]
+    return float(np.interp(CROSSING, (below, above), levels[crossing - 1 : crossing + 1])), ""

@@ -58,11 +58,11 @@ def sealed_copies(suite: Suite, seed: str, folder: str | os.PathLike) -> Suite:
         ParameterError: no task can be copied; the folder holds something else.
     Cost: as building the states of each task; of those with chance, another pass over their outcomes.
     """
-    made = {
+    copies = {
         task.name: _copy(task, suite.protocol, _generator(seed, task.name), Path(folder) / task.name)
         for task in suite.tasks
     }
-    return _suite(suite, seed, {name: task for name, task in made.items() if task is not None})
+    return _suite(suite, seed, {name: task for name, task in copies.items() if task is not None})
 
 
 def write_suite(suite: Suite, file: str | os.PathLike) -> None:
@@ -90,8 +90,8 @@ def sealed_instances(suite: Suite, seed: str) -> Suite:
         ParameterError: no task of the core has a generator.
     Cost: as solving the tasks.
     """
-    made = {task.name: _instance(task, suite.protocol, _generator(seed, task.name)) for task in suite.core}
-    return _suite(suite, seed, {name: task for name, task in made.items() if task is not None})
+    instances = {task.name: _instance(task, suite.protocol, _generator(seed, task.name)) for task in suite.core}
+    return _suite(suite, seed, {name: task for name, task in instances.items() if task is not None})
 
 
 def _generator(seed: str, name: str) -> np.random.Generator:
@@ -105,13 +105,13 @@ def _suite(suite: Suite, seed: str, tasks: Mapping[str, BenchmarkTask]) -> Suite
     ladders = [
         replace(each, tasks=tuple(tasks[t.name] for t in each.tasks if t.name in tasks)) for each in suite.ladders
     ]
-    made = replace(
+    half = replace(
         suite,
         name=f"{suite.name}-{seed[:8]}",
         core=tuple(tasks[task.name] for task in suite.core if task.name in tasks),
         ladders=tuple(each for each in ladders if each.tasks),
     )
-    return replace(made, digest=digest_of_suite(made))
+    return replace(half, digest=digest_of_suite(half))
 
 
 def _copy(task: BenchmarkTask, protocol: Protocol, draw: np.random.Generator, folder: Path) -> BenchmarkTask | None:
@@ -181,11 +181,11 @@ def _instance(task: BenchmarkTask, protocol: Protocol, draw: np.random.Generator
             {**task.observation_options, "seed": number} if task.observation == "hash" else task.observation_options
         )
         parameters = {**task.parameters, **dict.fromkeys(seeds, number)}
-        made = frozen(
+        instance = frozen(
             replace(task, parameters=parameters, observation_options=options, predicted={}, axis=CORE), protocol
         )
-        if made.value_optimal - made.value_uniform > 1e-6 * max(1.0, abs(made.value_optimal)):
-            return made
+        if instance.value_optimal - instance.value_uniform > 1e-6 * max(1.0, abs(instance.value_optimal)):
+            return instance
     raise ParameterError(f"task {task.name}: uniform play is optimal in {DRAWS} draws; leave it out of the suite")
 
 

@@ -98,7 +98,7 @@ def sha256_of_source(results: AgentResults) -> str:
 
 def _submission(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Submission:
     kinds = {"name": str, "author": str, "note": str, "suite": str, "suite_digest": str, "seeds": list, "record": dict}
-    name, author, note, suite, digest, seeds, said = entries_of(record, kinds, WHAT)
+    name, author, note, suite, digest, seeds, provenance = entries_of(record, kinds, WHAT)
     curves, policies = {}, {}
     for key, array in arrays.items():
         kind, *words = key.split("/")
@@ -110,7 +110,7 @@ def _submission(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> 
             raise FileFormatError(f"its array {key!r} is neither a curve nor a policy of one of its seeds")
     entry = record.get("commitment")
     commitment = None if entry is None else records.read(Commitment, entry, "its commitment")
-    results = AgentResults(name, suite, digest, tuple(seeds), curves, said)
+    results = AgentResults(name, suite, digest, tuple(seeds), curves, provenance)
     if {task for task, _ in policies} - {*results.curves}:
         raise FileFormatError("it has policies of tasks without a curve")
     return Submission(results, policies, author, note, commitment)
@@ -150,13 +150,13 @@ def submit(
         policy = final_policy(folder / "runs" / name / f"seed-{seed}", suite.task(name).training_task(suite.protocol))
         if policy is not None:
             policies[name, seed] = policy
-    made = Submission(results, policies, author, note, commitment)
-    if commitment is not None and not made.fits():
+    submission = Submission(results, policies, author, note, commitment)
+    if commitment is not None and not submission.fits():
         raise ParameterError(
             f"{folder}: is of another source or other hyperparameters than the commitment to {commitment.agent} says; "
             f"leave the commitment out, or run what was committed"
         )
-    return write_checked(target, lambda: made.write(target), lambda: Submission.read(target))
+    return write_checked(target, lambda: submission.write(target), lambda: Submission.read(target))
 
 
 def final_policy(run: Path, task: Task) -> np.ndarray | None:

@@ -266,7 +266,7 @@ def digest_of_task(task: Task) -> str:
     """
     space, mdp = task.space, task.space.mdp(gamma=task.gamma)
     env, observe = task.env, task.observer.observe.observation
-    said = {
+    description = {
         "environment": env.name,
         "parameters": {} if env.name == "imported" else env.parameters,  # whose folder may lie anywhere
         "rules_version": env.version,
@@ -275,7 +275,7 @@ def digest_of_task(task: Task) -> str:
         "chance": {name: float(value) for name, value in task.chance.to_dict().items()},
         **task.conventions,
     }
-    digest = hashlib.sha256(_canonical(said))
+    digest = hashlib.sha256(_canonical(description))
     for array in (*_arrays(mdp), observe(space.states())):
         kind = "<f8" if array.dtype.kind == "f" else "<i8"
         values = (rounded(array) if kind == "<f8" else array).astype(kind)
@@ -288,8 +288,8 @@ def _arrays(mdp: TabularMDP) -> Iterable[np.ndarray]:
     """Rows s A + a, next states and probabilities of all that can happen; rewards, start, ends."""
     num_states, num_actions = mdp.num_states, mdp.num_actions
     pairs = np.arange(num_states * num_actions)
-    which, following, probabilities = mdp.dynamics.entries(pairs // num_actions, pairs % num_actions)
-    keys, inverse = np.unique(which * (num_states + 1) + following + 1, return_inverse=True)
+    which, next_states, probabilities = mdp.dynamics.entries(pairs // num_actions, pairs % num_actions)
+    keys, inverse = np.unique(which * (num_states + 1) + next_states + 1, return_inverse=True)
     yield keys // (num_states + 1)
     yield keys % (num_states + 1) - 1
     yield np.bincount(inverse, probabilities, len(keys))

@@ -129,11 +129,11 @@ def seal(folder: Folder, *, season: str, beacon: str, suite: SuiteFile = "v1") -
 
     public, seed = load_suite(suite), season_seed(season, beacon)
     copies = sealed_copies(public, seed, folder / "copies")
-    made = {"copies": copies, "instances": sealed_instances(public, seed)}
-    for name, each in made.items():
+    halves = {"copies": copies, "instances": sealed_instances(public, seed)}
+    for name, each in halves.items():
         write_suite(each, folder / f"{name}.yaml")
-    answer = {name: {"file": folder / f"{name}.yaml", "digest": each.digest} for name, each in made.items()}
-    facts = [(name, f"{pluralize(len(each.tasks), 'task')}, {each.digest}") for name, each in made.items()]
+    answer = {name: {"file": folder / f"{name}.yaml", "digest": each.digest} for name, each in halves.items()}
+    facts = [(name, f"{pluralize(len(each.tasks), 'task')}, {each.digest}") for name, each in halves.items()]
     return Answer({"season": season, "seed": seed, **answer}, (str(folder), facts))
 
 
@@ -180,9 +180,10 @@ def commit(
     """
     from pharos.benchmark import load_suite, make_commitment
 
-    made = make_commitment(agent, load_suite(suite), hyperparameters, date=date.today().isoformat())
-    made.write(out)
-    return Answer({"file": out, "sha256": made.digest, "commitment": made}, (str(out), [("publish", made.digest)]))
+    commitment = make_commitment(agent, load_suite(suite), hyperparameters, date=date.today().isoformat())
+    commitment.write(out)
+    answer = {"file": out, "sha256": commitment.digest, "commitment": commitment}
+    return Answer(answer, (str(out), [("publish", commitment.digest)]))
 
 
 @app.command("submit")
@@ -211,10 +212,10 @@ def submit(
     bound = None if commitment is None else benchmark.Commitment.read(commitment)
     loaded = benchmark.load_suite(suite)
     with counted_bar("policies") as tell:
-        made = benchmark.submit(results, file, loaded, author=author, note=note, commitment=bound, progress=tell)
-    runs = sum(map(len, made.results.curves.values()))
-    facts = [("runs", f"{runs:,}"), ("policies", f"{len(made.policies):,}"), ("committed", "yes" if bound else "no")]
-    return Answer({"file": file, "runs": runs, "policies": len(made.policies)}, (str(file), facts))
+        submission = benchmark.submit(results, file, loaded, author=author, note=note, commitment=bound, progress=tell)
+    runs, policies = sum(map(len, submission.results.curves.values())), len(submission.policies)
+    facts = [("runs", f"{runs:,}"), ("policies", f"{policies:,}"), ("committed", "yes" if bound else "no")]
+    return Answer({"file": file, "runs": runs, "policies": policies}, (str(file), facts))
 
 
 @app.command("verify")
@@ -273,7 +274,7 @@ def audit(
 
     loaded, target = benchmark.load_suite(suite), out or file.with_name(f"{file.name}.audit.json")
     with counted_bar("runs") as tell:
-        made = benchmark.make_audit(
+        audit = benchmark.make_audit(
             *(file, source, loaded),
             date=date.today().isoformat(),
             published=published,
@@ -282,13 +283,13 @@ def audit(
             workers=workers,
             progress=tell,
         )
-    made.write(target)
-    facts = [("source", "is the one named" if made.is_source else "is another one, and was not run")]
-    for each in made.repeats:
-        said = "equal" if each.equal else f"{each.again} for {each.claimed:.6g}, from {each.low:.4g} to {each.high:.4g}"
-        facts.append((f"{each.task}, seed {each.seed}", each.error or said))
-    answer = {"file": target, "holds": made.holds, "audit": made}
-    return Answer(answer, (f"{file}: {'repeats' if made.holds else 'does not repeat'}", facts), not made.holds)
+    audit.write(target)
+    facts = [("source", "is the one named" if audit.is_source else "is another one, and was not run")]
+    for each in audit.repeats:
+        text = "equal" if each.equal else f"{each.again} for {each.claimed:.6g}, from {each.low:.4g} to {each.high:.4g}"
+        facts.append((f"{each.task}, seed {each.seed}", each.error or text))
+    answer = {"file": target, "holds": audit.holds, "audit": audit}
+    return Answer(answer, (f"{file}: {'repeats' if audit.holds else 'does not repeat'}", facts), not audit.holds)
 
 
 @app.command("board")
@@ -311,9 +312,9 @@ def board(
 
     suites = [benchmark.load_suite(each) for each in suite or ["v1"]]
     with counted_bar("verifying") as tell:
-        made = benchmark.benchmark_board(files, out, suites, title=title, progress=tell)
-    facts = [("verified", f"{len(made.verified):,}"), ("refused", f"{len(made.refused):,}"), *made.refused.items()]
-    return Answer({"file": out, "verified": len(made.verified), "refused": made.refused}, (str(out), facts))
+        page = benchmark.benchmark_board(files, out, suites, title=title, progress=tell)
+    facts = [("verified", f"{len(page.verified):,}"), ("refused", f"{len(page.refused):,}"), *page.refused.items()]
+    return Answer({"file": out, "verified": len(page.verified), "refused": page.refused}, (str(out), facts))
 
 
 def _entry(task: "BenchmarkTask") -> dict[str, Any]:

@@ -167,20 +167,20 @@ def counts_of_table(mdp: "TabularMDP") -> dict[str, int]:
     import numpy as np
 
     terminal = np.asarray(mdp.terminal)
-    reached, transitions, depth = np.zeros(mdp.num_states + 1, np.bool_), 0, -1
-    reached[-1] = True
+    visited, transitions, depth = np.zeros(mdp.num_states + 1, np.bool_), 0, -1
+    visited[-1] = True
     frontier = mdp.starts
     while frontier.size:
         depth += 1
-        reached[frontier] = True
+        visited[frontier] = True
         live = frontier[~terminal[frontier]]
         actions = np.tile(np.arange(mdp.num_actions), len(live))
         outcomes = mdp.dynamics.outcomes(np.repeat(live, mdp.num_actions), actions)
         transitions += int((outcomes.probabilities > 0).sum())
-        frontier = np.unique(outcomes.states[(outcomes.probabilities > 0) & ~reached[outcomes.states]])
+        frontier = np.unique(outcomes.states[(outcomes.probabilities > 0) & ~visited[outcomes.states]])
     return {
         "num_states": mdp.num_states,
-        "num_reachable_states": int(reached[:-1].sum()),
+        "num_reachable_states": int(visited[:-1].sum()),
         "num_terminal_states": int(terminal.sum()),
         "num_actions": mdp.num_actions,
         "num_transitions": transitions,
@@ -216,7 +216,7 @@ def _values(env: "Environment") -> tuple[dict[str, float] | None, str]:
     except PharosError as error:
         return None, f"not solved: {error}"
     numbers = {"optimal": values.optimal, "uniform": values.uniform, "worst": values.worst}
-    said = f"an episode is worth {values.optimal:.6g} at best, {values.uniform:.6g} by uniform play"
+    text = f"an episode is worth {values.optimal:.6g} at best, {values.uniform:.6g} by uniform play"
     if math.isnan(values.spread()):
-        return numbers, f"{said}: no policy beats uniform play, so there is nothing to learn"
-    return numbers, f"{said}, {values.worst:.6g} at worst"
+        return numbers, f"{text}: no policy beats uniform play, so there is nothing to learn"
+    return numbers, f"{text}, {values.worst:.6g} at worst"

@@ -46,11 +46,11 @@ class Commands(typer.Typer):
     ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
         register = super().command(name, **options)
 
-        def made(function: Callable[..., Any]) -> Callable[..., Any]:
+        def decorator(function: Callable[..., Any]) -> Callable[..., Any]:
             register(command(function))
             return function
 
-        return made
+        return decorator
 
 
 def command(function: Callable[..., Any]) -> Callable[..., None]:
@@ -61,10 +61,10 @@ def command(function: Callable[..., Any]) -> Callable[..., None]:
     for each in signature.parameters.values():
         cls, *names = get_args(each.annotation) if get_origin(each.annotation) is Annotated else (each.annotation,)
         if isinstance(cls, type) and dataclasses.is_dataclass(cls):
-            made = [*_of_fields(cls, None if each.default is each.empty else each.default, texts)]
-            made = [one for one in made if not names or one.name in names[0].split()]
-            objects[each.name] = (each, cls, [one.name for one in made])
-            parameters += made
+            group = [*_of_fields(cls, None if each.default is each.empty else each.default, texts)]
+            group = [one for one in group if not names or one.name in names[0].split()]
+            objects[each.name] = (each, cls, [one.name for one in group])
+            parameters += group
         elif each.annotation is typer.Context:
             parameters.append(each)
         elif each.name != "json":
@@ -93,23 +93,23 @@ def command(function: Callable[..., Any]) -> Callable[..., None]:
     return run
 
 
-def _of_fields(cls: "type[DataclassInstance]", values: object, said: Mapping[str, str]) -> Iterator[inspect.Parameter]:
+def _of_fields(cls: "type[DataclassInstance]", values: object, docs: Mapping[str, str]) -> Iterator[inspect.Parameter]:
     """A parameter for each field of a dataclass, and of those of its fields that are dataclasses.
 
     Args:
-        values: the defaults. said: help texts that go before those of the class.
+        values: the defaults. docs: help texts that go before those of the class.
     """
     texts, declared = meanings(cls), declared_parameters(cls)
     for field in dataclasses.fields(cls):
         default = getattr(values, field.name) if values is not None else field.default
         if isinstance(field.type, type) and dataclasses.is_dataclass(field.type):
-            yield from _of_fields(field.type, None if default is dataclasses.MISSING else default, said)
+            yield from _of_fields(field.type, None if default is dataclasses.MISSING else default, docs)
         elif field.init:
-            text = said.get(field.name) or first_sentence(texts.get(field.name, ""))
-            made = _typed(field.name, field.type, ... if default is dataclasses.MISSING else default, text)
+            text = docs.get(field.name) or first_sentence(texts.get(field.name, ""))
+            parameter = _typed(field.name, field.type, ... if default is dataclasses.MISSING else default, text)
             if (limits := declared.get(field.name)) is not None:
-                made.default.min, made.default.max = limits.low, limits.high
-            yield made
+                parameter.default.min, parameter.default.max = limits.low, limits.high
+            yield parameter
 
 
 def _typed(name: str, hint: object, default: object, text: str | None, is_argument: bool = False) -> inspect.Parameter:

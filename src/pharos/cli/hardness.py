@@ -155,19 +155,19 @@ def _print(title: str, report: "Report", chance: str, definitions: bool) -> None
         f"{pluralize(conventions['num_states'], 'state')} x {pluralize(conventions['num_actions'], 'action')}, "
         f"discount {conventions['gamma']:g}, horizon {horizon}, chance: {chance}"
     )
-    said = []
+    remarks = []
     error = conventions.get("error_bound")
     if error is not None and math.isfinite(error):
-        said.append(f"values are within {error:.2g} of the optimal ones (proven)")
-    said += [*_ties(report), *(f"compiling: {how_long}" for _, how_long in compiling_fact()), *notes]
+        remarks.append(f"values are within {error:.2g} of the optimal ones (proven)")
+    remarks += [*_ties(report), *(f"compiling: {how_long}" for _, how_long in compiling_fact()), *notes]
     if not {*IDEALISED}.isdisjoint(report.results):
-        said.append(
+        remarks.append(
             "prediction: regret of an idealised learner, 0 is optimal, 1 is uniform play; kernel_regret has "
             "expectations in the place of draws. `pharos predict` has the form that agrees best "
             "with runs, and an interval"
         )
     columns = ["measure", "value", "exact", ">seconds", *(["definition", "source"] if definitions else [])]
-    print_table(title, columns, rows, before=[setting], notes=said)
+    print_table(title, columns, rows, before=[setting], notes=remarks)
 
 
 def _ties(report: "Report") -> list[str]:

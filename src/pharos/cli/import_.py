@@ -87,8 +87,8 @@ def gymnasium(
     try:
         env = package.make(name, disable_env_checker=True, **option)
     except Exception as error:  # whatever an environment does with options that are none of its own
-        said = " ".join(str(error).split())
-        raise ParameterError(f"{name}: Gymnasium cannot make it: {said or type(error).__name__}") from None
+        message = " ".join(str(error).split())
+        raise ParameterError(f"{name}: Gymnasium cannot make it: {message or type(error).__name__}") from None
     mdp = importers.gymnasium(env, gamma=gamma, horizon=horizon, check=check)
     words = " ".join((name, *(f"{key}={written(value)}" for key, value in option.items())))
     limit, outcomes = env.spec.max_episode_steps if env.spec else None, importers.gymnasium_outcomes(env)

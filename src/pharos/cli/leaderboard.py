@@ -80,9 +80,9 @@ def verify(
         except Exception as error:
             if len(files) == 1:
                 raise
-            said = leaderboard.reason(error)
-            complain(said if str(file) in said else f"{file}: {said}")
-            answers.append({"file": file, "holds": False, "error": said})
+            reason_text = leaderboard.reason(error)
+            complain(reason_text if str(file) in reason_text else f"{file}: {reason_text}")
+            answers.append({"file": file, "holds": False, "error": reason_text})
             holds = False
             continue
         holds = holds and verdict.holds
@@ -162,11 +162,11 @@ def board(
     if out.suffix.lower() not in (".html", ".htm"):
         raise ParameterError(f"--out {out}; expected a file name that ends in .html")
     with counted_bar("verifying") as tell:
-        made = leaderboard.board(folder, out, title=title, trust=trust, progress=tell, **vars(limits))
+        page = leaderboard.board(folder, out, title=title, trust=trust, progress=tell, **vars(limits))
 
     def text() -> None:
-        for name, reason in made.refused.items():
+        for name, reason in page.refused.items():
             complain(f"{name}: {reason}")
-        print_facts(str(made.file), [("verified", f"{len(made.verified):,}"), ("refused", f"{len(made.refused):,}")])
+        print_facts(str(page.file), [("verified", f"{len(page.verified):,}"), ("refused", f"{len(page.refused):,}")])
 
-    return Answer({"file": made.file, "verified": len(made.verified), "refused": made.refused}, text)
+    return Answer({"file": page.file, "verified": len(page.verified), "refused": page.refused}, text)

@@ -223,10 +223,10 @@ class Game:
         elif key in self.keys and not self.over:
             action = self.keys[key]
             outcome = self.env.drawn_outcome(self.state, action, self.rng.random()) if self.env.has_chance else 0
-            following = self.env.next_state(self.state, action, outcome)
-            paid = float(self.env.reward_of(self.state, action, following, outcome))
-            self.history.append((self.state, action, paid))
-            self.state = following
+            next_state = self.env.next_state(self.state, action, outcome)
+            reward = float(self.env.reward_of(self.state, action, next_state, outcome))
+            self.history.append((self.state, action, reward))
+            self.state = next_state
 
 
 def _picture(game: Game) -> "RenderableType":

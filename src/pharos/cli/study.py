@@ -239,17 +239,17 @@ def predict(
         predictions = study.predict(
             opened, place, blocks=block or None, agents=agent or None, observations=observation or None, progress=tell
         )
-    said = study.write_predictions(opened, predictions, out)
+    record = study.write_predictions(opened, predictions, out)
     absent = predictions["kernel_regret"].isna()
     missing = int(absent.sum())
 
     def text() -> None:
-        print(f"{out}: {pluralize(len(predictions), 'cell')}, {said['date']}, sha256 {said['sha256']}")
+        print(f"{out}: {pluralize(len(predictions), 'cell')}, {record['date']}, sha256 {record['sha256']}")
         if missing:
             reason = predictions.loc[absent, "notes"].iloc[0]
             complain(f"{pluralize(missing, 'cell')} without a prediction, such as: {reason}")
 
-    return Answer({"file": str(out), "cells": len(predictions), "missing": missing, **said}, text)
+    return Answer({"file": str(out), "cells": len(predictions), "missing": missing, **record}, text)
 
 
 @app.command("pack")
@@ -283,8 +283,8 @@ def unpack(
     from pharos import study
 
     folder, number = study.unpack(file, out, into=into, trust=trust)
-    said = f"{folder}: {pluralize(number, 'run')} added; `pharos study report {folder}` reports on them"
-    return Answer({"folder": str(folder), "added": number}, said)
+    text = f"{folder}: {pluralize(number, 'run')} added; `pharos study report {folder}` reports on them"
+    return Answer({"folder": str(folder), "added": number}, text)
 
 
 def _answer(status: "Status", failed: bool = False) -> Answer:

@@ -79,8 +79,8 @@ def train(
             raise ParameterError("--seeds goes with neither --seed nor --tensorboard; expected one of them")
         from pharos.system.workers import usable_workers
 
-        together: dict[str, Any] = {"device": device, "workers": usable_workers(workers), **vars(training)}
-        return _train_many(title, seeds=parse_seeds(seeds), environment=env, out=out, **together)
+        options: dict[str, Any] = {"device": device, "workers": usable_workers(workers), **vars(training)}
+        return _train_many(title, seeds=parse_seeds(seeds), environment=env, out=out, **options)
     with progress_bar("training", training.steps, BEFORE) as show:
         options = {**vars(training), "seed": seed, "out": out, "tensorboard": tensorboard}
         result = learn(environment=env, progress=_telling(show), **options)
@@ -164,11 +164,11 @@ def _telling_of_many(show: Callable[[int, str], None]) -> "Callable[[TrainingPro
     def tell(now: "TrainingProgress") -> None:
         if not began:
             began.append((time.perf_counter(), now.done))
-        passed, before = time.perf_counter() - began[0][0], began[0][1]
-        pace = f", {(now.done - before) / passed:,.0f} agent-steps/s" if passed else ""
+        elapsed, before = time.perf_counter() - began[0][0], began[0][1]
+        pace = f", {(now.done - before) / elapsed:,.0f} agent-steps/s" if elapsed else ""
         regrets = [row["expected_regret"] for row in now.rows.values()]
-        said = f"mean regret {sum(regrets) / len(regrets):.4g}" if regrets else "finished before"
-        show(now.done, f"{said}{pace}{f', {now.failed} failed' if now.failed else ''}")
+        text = f"mean regret {sum(regrets) / len(regrets):.4g}" if regrets else "finished before"
+        show(now.done, f"{text}{pace}{f', {now.failed} failed' if now.failed else ''}")
 
     return tell
 

@@ -220,9 +220,9 @@ def episode(
             break
         action = int(policy(state))
         outcome = env.drawn_outcome(state, action, rng.random()) if env.has_chance else 0
-        following = env.next_state(state, action, outcome)
-        played.append((state, action, float(env.reward_of(state, action, following, outcome))))
-        state = following
+        next_state = env.next_state(state, action, outcome)
+        played.append((state, action, float(env.reward_of(state, action, next_state, outcome))))
+        state = next_state
     played.append((state, -1, 0.0))
     return played
 

@@ -212,8 +212,8 @@ def outcomes_of(
     """
     number = states * actions
     if mdp_files.PAID[0] in arrays:
-        offsets, successors, likely, _ = (arrays[name] for name in mdp_files.PAID)
-        return np.repeat(np.arange(number), np.diff(offsets)), successors, likely
+        offsets, successors, probabilities, _ = (arrays[name] for name in mdp_files.PAID)
+        return np.repeat(np.arange(number), np.diff(offsets)), successors, probabilities
     if mdp_files.TABLE[0] in arrays:
         successors = arrays[mdp_files.TABLE[0]].reshape(number)
         return np.arange(number), successors, np.ones(number)
@@ -231,27 +231,24 @@ def outcomes_of(
 def written_out(
     rows: np.ndarray,
     successors: np.ndarray,
-    likely: np.ndarray,
+    p: np.ndarray,
     states: int,
     actions: int,
-    paid: np.ndarray | None = None,
+    outcome_rewards: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """(S, A, K) successors, probabilities that sum to 1, and rewards, what is impossible left out.
 
-    S is the end, where there is one. paid (N,): the reward of each outcome, if known.
+    S is the end, where there is one. p (N,): probabilities; outcome_rewards (N,): the reward of each outcome, if known.
 
     Raises:
         ParameterError: they are more than MOST_ENTRIES numbers. ValueError: they are no table of an MDP.
     """
-    payments = likely if paid is None else paid
-    if (
-        not len(rows) == len(successors) == len(likely) == len(payments)
-        or not (np.isfinite(likely) & (likely >= 0)).all()
-    ):
+    payments = p if outcome_rewards is None else outcome_rewards
+    if not len(rows) == len(successors) == len(p) == len(payments) or not (np.isfinite(p) & (p >= 0)).all():
         raise ValueError("successors and probabilities do not fit")
     order = np.argsort(rows, kind="stable")
-    order = order[likely[order] > 0]
-    rows, successors, likely, payments = rows[order], successors[order].astype(np.int64), likely[order], payments[order]
+    order = order[p[order] > 0]
+    rows, successors, p, payments = rows[order], successors[order].astype(np.int64), p[order], payments[order]
     if len(successors) == 0 or successors.min() < -1 or successors.max() >= states:
         raise ValueError(f"a successor is not among the {states} states")
     counts = np.bincount(rows, minlength=states * actions)
@@ -266,11 +263,11 @@ def written_out(
     table = np.zeros((count * actions, most), np.int64)
     chances = np.zeros((count * actions, most))
     table[rows, place] = np.where(successors == -1, states, successors)
-    chances[rows, place] = likely / np.bincount(rows, likely, minlength=states * actions)[rows]
+    chances[rows, place] = p / np.bincount(rows, p, minlength=states * actions)[rows]
     if has_end:
         table[states * actions :], chances[states * actions :, 0] = states, 1.0
     shape = (count, actions, most)
-    if paid is None:
+    if outcome_rewards is None:
         return table.reshape(shape), chances.reshape(shape), None
     rewards = np.zeros((count * actions, most))
     rewards[rows, place] = payments

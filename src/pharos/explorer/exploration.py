@@ -162,25 +162,25 @@ class Exploration:
         solution = self.solutions[name]
         if not self.mdp.is_sticky:
             return np.asarray(solution.x[states, 0])
-        chosen = self.chosen_values(name, states)
-        return (self.chances(name, states, chosen) * chosen).sum(axis=1) * ~self.mdp.terminal[states]
+        q = self.chosen_values(name, states)
+        return (self.chances(name, states, q) * q).sum(axis=1) * ~self.mdp.terminal[states]
 
     def chosen_values(self, name: str, states: np.ndarray, previous: int | None = None) -> np.ndarray:
         """(N, A) values of choosing each action, and following a policy afterwards."""
         executed = self.solutions[name].q_of(states)
         return self.mdp.chance.chosen_values(executed, self._before(states, previous))
 
-    def chances(self, name: str, states: np.ndarray, chosen: np.ndarray, previous: int | None = None) -> np.ndarray:
-        """(N, A) how often a policy chooses each action; `chosen`: optimal values of choosing, for the optimal one."""
+    def chances(self, name: str, states: np.ndarray, q: np.ndarray, previous: int | None = None) -> np.ndarray:
+        """(N, A) how often a policy chooses each action; `q`: optimal values of choosing, for the optimal one."""
         if name == UNIFORM:
-            return np.full(chosen.shape, 1 / self.mdp.num_actions)
+            return np.full(q.shape, 1 / self.mdp.num_actions)
         if name == LEARNT:
             return probabilities(self.solutions[LEARNT], states, self._before(states, previous))
-        return np.eye(self.mdp.num_actions)[self.best_actions(chosen)]
+        return np.eye(self.mdp.num_actions)[self.best_actions(q)]
 
-    def best_actions(self, chosen: np.ndarray) -> np.ndarray:
+    def best_actions(self, q: np.ndarray) -> np.ndarray:
         """(N,) the first of the actions whose values (N, A) are within the tie tolerance of the best."""
-        return (chosen >= chosen.max(axis=1, keepdims=True) - self.tie_tolerance).argmax(axis=1)
+        return (q >= q.max(axis=1, keepdims=True) - self.tie_tolerance).argmax(axis=1)
 
     def _before(self, states: np.ndarray, previous: int | None) -> np.ndarray:
         return np.full(len(states), self.mdp.num_actions if previous is None else previous)
@@ -224,14 +224,12 @@ class Exploration:
         }
         if is_over:
             return answer
-        chosen = {name: self.chosen_values(name, here, previous) for name in self.solutions}
-        chances = {name: self.chances(name, here, chosen[OPTIMAL], previous)[0] for name in self.solutions}
-        best = float(chosen[OPTIMAL].max())
-        answer["v"] = {
-            name: best if name == OPTIMAL else number(chances[name] @ chosen[name][0]) for name in self.solutions
-        }
+        q = {name: self.chosen_values(name, here, previous) for name in self.solutions}
+        chances = {name: self.chances(name, here, q[OPTIMAL], previous)[0] for name in self.solutions}
+        best = float(q[OPTIMAL].max())
+        answer["v"] = {name: best if name == OPTIMAL else number(chances[name] @ q[name][0]) for name in self.solutions}
         for action, executed in enumerate(self._executed(previous)):
-            gap = best - float(chosen[OPTIMAL][0, action])
+            gap = best - float(q[OPTIMAL][0, action])
             outcomes = self._outcomes(state, executed)
             answer["actions"].append(
                 {
@@ -239,7 +237,7 @@ class Exploration:
                     "gap": gap,
                     "best": gap <= self.tie_tolerance,
                     "policies": {name: number(chances[name][action]) for name in self.solutions},
-                    "q_of": {name: number(chosen[name][0, action]) for name in self.solutions},
+                    "q_of": {name: number(q[name][0, action]) for name in self.solutions},
                     "reward": sum(probability * reward for _, _, probability, reward in outcomes),
                     "outcomes": outcomes,
                 }
@@ -330,8 +328,8 @@ class Exploration:
                 break
             pairs.add(at)
             here = np.array([at[0]])
-            chosen = self.chosen_values(OPTIMAL, here, at[1])
-            chances = self.chances(policy, here, chosen, at[1])
+            q = self.chosen_values(OPTIMAL, here, at[1])
+            chances = self.chances(policy, here, q, at[1])
             if np.isnan(chances).any():
                 why = "unknown"
                 break
@@ -341,7 +339,7 @@ class Exploration:
             if new is None:
                 why = "circle"
                 break
-            steps.append([*at, action, *new[2:], float(chosen.max() - chosen[0, action])])
+            steps.append([*at, action, *new[2:], float(q.max() - q[0, action])])
             at = new[0], new[1]
         return {"steps": steps, "stops": list(at), "why": why}
 

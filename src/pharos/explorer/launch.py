@@ -98,19 +98,19 @@ class Explorer:
         if path == "":
             return HTTPStatus.OK, "text/html; charset=utf-8", self._page
         if path not in QUESTIONS or len(query) > LONGEST_QUERY:
-            return _said(HTTPStatus.NOT_FOUND, "there is nothing there")
+            return _plain_text(HTTPStatus.NOT_FOUND, "there is nothing there")
         words = {name: values[-1] for name, values in parse_qs(query, keep_blank_values=True).items()}
         try:
             with self.lock:
                 answer = QUESTIONS[path](self.exploration, words)
         except PharosError as error:
-            return _said(HTTPStatus.BAD_REQUEST, str(error))
+            return _plain_text(HTTPStatus.BAD_REQUEST, str(error))
         except MemoryError:
-            return _said(HTTPStatus.INSUFFICIENT_STORAGE, "out of memory")
+            return _plain_text(HTTPStatus.INSUFFICIENT_STORAGE, "out of memory")
         return HTTPStatus.OK, "application/json", json.dumps(answer, allow_nan=False).encode()
 
 
-def _said(status: HTTPStatus, text: str) -> tuple[HTTPStatus, str, bytes]:
+def _plain_text(status: HTTPStatus, text: str) -> tuple[HTTPStatus, str, bytes]:
     return status, "application/json", json.dumps({"error": text}).encode()
 
 
@@ -196,7 +196,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def refuse(self) -> None:
         """Any other method."""
-        self._send(*_said(HTTPStatus.METHOD_NOT_ALLOWED, "this server answers GET alone"), with_content=True)
+        self._send(*_plain_text(HTTPStatus.METHOD_NOT_ALLOWED, "this server answers GET alone"), with_content=True)
 
     do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = do_CONNECT = refuse
 
@@ -221,17 +221,17 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, owner: Explorer) -> tuple[HTTPStatus, str, bytes]:
         hosts = self.headers.get_all("Host", [])
         if len(hosts) != 1 or hosts[0].lower() not in owner.hosts:
-            return _said(HTTPStatus.MISDIRECTED_REQUEST, "this server answers to its own address alone")
+            return _plain_text(HTTPStatus.MISDIRECTED_REQUEST, "this server answers to its own address alone")
         origin = self.headers.get("Origin")
         if origin is not None and origin.lower().removeprefix("http://") not in owner.hosts:
-            return _said(HTTPStatus.FORBIDDEN, "this server answers to its own page alone")
+            return _plain_text(HTTPStatus.FORBIDDEN, "this server answers to its own page alone")
         try:
             parts = urlsplit(self.path)
         except ValueError:
-            return _said(HTTPStatus.BAD_REQUEST, "what was asked for is no address")
+            return _plain_text(HTTPStatus.BAD_REQUEST, "what was asked for is no address")
         token, _, rest = parts.path.removeprefix("/").partition("/")
         if not hmac.compare_digest(token.encode(), owner.token.encode()):
-            return _said(HTTPStatus.FORBIDDEN, "the address lacks the token that `pharos explore` printed")
+            return _plain_text(HTTPStatus.FORBIDDEN, "the address lacks the token that `pharos explore` printed")
         return owner.answer(rest, parts.query)
 
     def log_message(self, format: str, *args: object) -> None:

@@ -57,10 +57,10 @@ def quantity(world: Exploration, name: str, states: np.ndarray) -> np.ndarray:
     elif kind == "regret":
         result = world.values(OPTIMAL, states) - world.values(policy, states)
     else:
-        chosen = world.chosen_values(OPTIMAL, states)
-        gaps = chosen.max(axis=1, keepdims=True) - chosen
+        q = world.chosen_values(OPTIMAL, states)
+        gaps = q.max(axis=1, keepdims=True) - q
         if name == "best_action":
-            result = world.best_actions(chosen).astype(np.float64)
+            result = world.best_actions(q).astype(np.float64)
         elif name == "largest_gap":
             result = gaps.max(axis=1)
         else:

@@ -215,7 +215,7 @@ def storm_recording(
     return _mdp(model, outcomes, gamma, horizon), outcomes if _differ(outcomes) else None
 
 
-def _outcomes(model: Any, ended: np.ndarray, paid: Any) -> ImportedOutcomes:
+def _outcomes(model: Any, ended: np.ndarray, reward_model: Any) -> ImportedOutcomes:
     """What every state and action may lead to and what that pays; of states that end the episode, its end."""
     matrix, states = model.transition_matrix, model.nr_states
     first = [matrix.get_row_group_start(s) for s in range(states)]
@@ -223,35 +223,35 @@ def _outcomes(model: Any, ended: np.ndarray, paid: Any) -> ImportedOutcomes:
     actions = max(stop - start for start, stop in zip(first, last, strict=True))
     offsets: list[int] = [0]
     successors: list[int] = []
-    likely: list[float] = []
+    probabilities: list[float] = []
     rewards: list[float] = []
     for s in range(states):
         for a in range(actions):
             choice = first[s] + a if first[s] + a < last[s] else first[s]
             row = [] if ended[s] else [(int(entry.column), float(entry.value)) for entry in matrix.get_row(choice)]
             row = row or [(-1, 1.0)]
-            successors += [following for following, _ in row]
-            likely += [p for _, p in row]
-            rewards += [0.0] if ended[s] else _rewards(paid, s, choice, successors[offsets[-1] :], ended)
+            successors += [successor for successor, _ in row]
+            probabilities += [p for _, p in row]
+            rewards += [0.0] if ended[s] else _rewards(reward_model, s, choice, successors[offsets[-1] :], ended)
             offsets.append(len(successors))
     return ImportedOutcomes(
-        np.array(offsets), np.array(successors, np.int64), np.array(likely), np.array(rewards, np.float64)
+        np.array(offsets), np.array(successors, np.int64), np.array(probabilities), np.array(rewards, np.float64)
     )
 
 
-def _rewards(paid: Any, state: int, choice: int, successors: list[int], ended: np.ndarray) -> list[float]:
+def _rewards(reward_model: Any, state: int, choice: int, successors: list[int], ended: np.ndarray) -> list[float]:
     """What a choice pays with each of its successors: for the state, for the choice, and for the transition."""
-    if paid is None:
-        return [float(following >= 0 and ended[following]) for following in successors]
+    if reward_model is None:
+        return [float(successor >= 0 and ended[successor]) for successor in successors]
     always = 0.0
-    if paid.has_state_rewards:
-        always += float(paid.get_state_reward(state))
-    if paid.has_state_action_rewards:
-        always += float(paid.get_state_action_reward(choice))
-    if not paid.has_transition_rewards:
+    if reward_model.has_state_rewards:
+        always += float(reward_model.get_state_reward(state))
+    if reward_model.has_state_action_rewards:
+        always += float(reward_model.get_state_action_reward(choice))
+    if not reward_model.has_transition_rewards:
         return [always] * len(successors)
-    of = {entry.column: float(entry.value) for entry in paid.transition_rewards.get_row(choice)}
-    return [always + of.get(following, 0.0) for following in successors]
+    of = {entry.column: float(entry.value) for entry in reward_model.transition_rewards.get_row(choice)}
+    return [always + of.get(successor, 0.0) for successor in successors]
 
 
 def _differ(outcomes: ImportedOutcomes) -> bool:
@@ -270,8 +270,8 @@ def _mdp(model: Any, outcomes: ImportedOutcomes, gamma: float, horizon: int | No
         (outcomes.probabilities[goes_on], (rows[goes_on], outcomes.next_states[goes_on])), shape=(len(counts), states)
     )
     means = np.add.reduceat(outcomes.probabilities * outcomes.rewards, begin)
-    alike = np.minimum.reduceat(outcomes.rewards, begin) == np.maximum.reduceat(outcomes.rewards, begin)
-    rewards = np.where(alike, outcomes.rewards[begin], means).reshape(states, -1)
+    is_constant = np.minimum.reduceat(outcomes.rewards, begin) == np.maximum.reduceat(outcomes.rewards, begin)
+    rewards = np.where(is_constant, outcomes.rewards[begin], means).reshape(states, -1)
     starts = list(model.initial_states)
     initial = starts[0] if len(starts) == 1 else starts
     return TabularMDP.from_matrices(table, rewards, gamma=gamma, initial=initial, horizon=horizon)

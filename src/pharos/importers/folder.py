@@ -76,7 +76,7 @@ def save(
             loading); or names, limit, observations or outcomes do not fit it.
     """
     description = _description(mdp, actions, time_limit, observations, observed)
-    paid = {} if outcomes is None else _checked_outcomes(mdp, outcomes)
+    outcome_arrays = {} if outcomes is None else _checked_outcomes(mdp, outcomes)
     folder = Path(folder)
     _check_without_chance(mdp)
     # Asked again, as another process may have begun there, or ended, in between
@@ -84,8 +84,8 @@ def save(
         raise ParameterError(f"{folder}{FOREIGN}")
     folder.mkdir(parents=True, exist_ok=True)
     shown = {} if observations is None else {OBSERVATIONS: np.asarray(observations)}
-    arrays = _arrays_of(mdp) | shown | paid
-    version = mdp_files.PAID_VERSION if paid else mdp_files.OBSERVED_VERSION if shown else mdp_files.VERSION
+    arrays = _arrays_of(mdp) | shown | outcome_arrays
+    version = mdp_files.PAID_VERSION if outcome_arrays else mdp_files.OBSERVED_VERSION if shown else mdp_files.VERSION
     with storage.waiting_lock(folder, FolderLocked, "importing", _warn):
         if _is_foreign(folder):
             raise ParameterError(f"{folder}{FOREIGN}")
@@ -181,8 +181,8 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
         return make("imported", folder=os.fspath(mdp.folder))
     place = storage.cache_directory() / "imported"
     parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
-    said = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon, str(mdp.chance), sorted(parts.items())]
-    folder = place / storage.digest_of_json(said)
+    contents = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon, str(mdp.chance), sorted(parts.items())]
+    folder = place / storage.digest_of_json(contents)
     return make("imported", folder=os.fspath(folder if is_folder(folder) else save(mdp, folder)))
 
 

@@ -59,11 +59,11 @@ def gymnasium(env: object, *, gamma: float = 0.99, horizon: int | None = None, c
         for a in range(actions):
             outcomes = _checked(env, s, a, rows[s][a], states)
             single &= len(outcomes) == 1
-            for (following, ended), (p, paid) in outcomes.items():
-                rewards[s, a] += paid
+            for (next_state, ended), (p, reward_share) in outcomes.items():
+                rewards[s, a] += reward_share
                 if not ended:
-                    entries.append((s * actions + a, following, p))
-                    next_states[s, a] = following
+                    entries.append((s * actions + a, next_state, p))
+                    next_states[s, a] = next_state
     start = _start(env, inner, states)
     if check and hasattr(inner, "step") and hasattr(inner, "reset"):
         _compare_with_steps(env, inner, rows)
@@ -87,7 +87,7 @@ def gymnasium_outcomes(env: object) -> ImportedOutcomes | None:
     """
     _, rows = _rows(env)
     entries = [
-        [(-1 if ended else int(following), p, float(reward)) for p, following, reward, ended in row if p > 0]
+        [(-1 if ended else int(next_state), p, float(reward)) for p, next_state, reward, ended in row if p > 0]
         for state in rows
         for row in state
     ]
@@ -121,14 +121,14 @@ def _checked(env: object, s: int, a: int, outcomes: list, states: int) -> dict[t
     merged: dict[tuple[int, bool], tuple[float, float]] = {}
     total = 0.0
     for outcome in outcomes:
-        p, following, reward, ended = outcome
-        if not 0 <= following < states or not np.isfinite(reward) or not 0 <= p <= 1:
+        p, next_state, reward, ended = outcome
+        if not 0 <= next_state < states or not np.isfinite(reward) or not 0 <= p <= 1:
             raise FileFormatError(
                 f"{env}: P[{s}][{a}] has {outcome}; expected a probability, a state below {states}, a finite reward"
             )
         total += p
         if p > 0:
-            key = (-1, True) if ended else (int(following), False)
+            key = (-1, True) if ended else (int(next_state), False)
             before = merged.get(key, (0.0, 0.0))
             merged[key] = (before[0] + p, before[1] + p * reward)
     if abs(total - 1) > 1e-6:
@@ -153,8 +153,8 @@ def _compare_with_steps(env: object, inner: object, rows: list[list[list]]) -> N
     Each state's actions are tried in turn, so that few steps try many of them.
     """
     stepped = _copy(inner)
-    likely = [[_likely(options) for options in row] for row in rows]
-    met: dict[tuple[int, int], Counter] = {}
+    probabilities = [[_probabilities(options) for options in row] for row in rows]
+    samples: dict[tuple[int, int], Counter] = {}
     tries = np.zeros((len(rows), len(rows[0])), np.int64)
     rng = np.random.default_rng(0)
     state = None
@@ -167,30 +167,30 @@ def _compare_with_steps(env: object, inner: object, rows: list[list[list]]) -> N
         action = int(least[rng.integers(len(least))])
         tries[state, action] += 1
         observation, reward, ended, _, _ = stepped.step(action)
-        following = _state_number(observation, len(rows))
-        outcome = (following, float(reward), bool(ended))
-        if outcome not in likely[state][action]:
+        next_state = _state_number(observation, len(rows))
+        outcome = (next_state, float(reward), bool(ended))
+        if outcome not in probabilities[state][action]:
             raise FileFormatError(
-                f"{env}: in state {state}, action {action} led to state {following} with reward {reward}, which its "
+                f"{env}: in state {state}, action {action} led to state {next_state} with reward {reward}, which its "
                 f"table P[{state}][{action}] does not hold; its chance is not in the table (as that of Taxi with "
                 f"fickle_passenger=True), so the table is another MDP: switch that chance off{_native(inner)}"
             )
-        met.setdefault((state, action), Counter())[outcome] += 1
-        state = None if ended else following
-    _compare_frequencies(env, inner, likely, met)
+        samples.setdefault((state, action), Counter())[outcome] += 1
+        state = None if ended else next_state
+    _compare_frequencies(env, inner, probabilities, samples)
 
 
-def _likely(options: list) -> dict[tuple[int, float, bool], float]:
+def _probabilities(options: list) -> dict[tuple[int, float, bool], float]:
     """Outcome (next state, reward, terminated) -> probability, of the possible ones."""
-    likely: dict[tuple[int, float, bool], float] = {}
-    for p, following, reward, ended in options:
+    probabilities: dict[tuple[int, float, bool], float] = {}
+    for p, next_state, reward, ended in options:
         if p > 0:
-            outcome = (int(following), float(reward), bool(ended))
-            likely[outcome] = likely.get(outcome, 0.0) + float(p)
-    return likely
+            outcome = (int(next_state), float(reward), bool(ended))
+            probabilities[outcome] = probabilities.get(outcome, 0.0) + float(p)
+    return probabilities
 
 
-def _compare_frequencies(env: object, inner: object, likely: list, met: dict[tuple[int, int], Counter]) -> None:
+def _compare_frequencies(env: object, inner: object, table: list, samples: dict[tuple[int, int], Counter]) -> None:
     """FileFormatError where the sampled frequencies of a state and action, or of all with the same probabilities in the
     table, are too unlikely.
 
@@ -201,8 +201,8 @@ def _compare_frequencies(env: object, inner: object, likely: list, met: dict[tup
     groups: dict[tuple[float, ...], np.ndarray] = {}
     named: dict[tuple[float, ...], tuple[int, int]] = {}
     tests: list[tuple[int, int, tuple[float, ...], np.ndarray]] = []
-    for (state, action), counts in met.items():
-        expected = likely[state][action]
+    for (state, action), counts in samples.items():
+        expected = table[state][action]
         if len(expected) == 1:
             continue
         shares = tuple(expected.values())
@@ -370,12 +370,12 @@ class _Driver:
 
         if isinstance(env, str):
             try:
-                made = gymnasium.make(env, disable_env_checker=True)
+                instance = gymnasium.make(env, disable_env_checker=True)
             except gymnasium.error.Error as error:
                 raise ParameterError(f"{env!r}: Gymnasium cannot make it: {' '.join(str(error).split())}") from None
         else:
-            made = env
-        self.env: Any = getattr(made, "unwrapped", made)
+            instance = env
+        self.env: Any = getattr(instance, "unwrapped", instance)
         if not isinstance(self.env, MiniGridEnv):
             raise ParameterError(f"{env!r}: is no environment of MiniGrid {package.__version__}")
         self.name = str(env)
@@ -383,18 +383,18 @@ class _Driver:
         self.remember_carried = remember_carried
         self.fixed_types = (gymnasium.spaces.Space, np.random.Generator)
         self.fixed: list[Any] = []
-        made.reset(seed=seed)
+        instance.reset(seed=seed)
         vars(self.env)["gen_obs"] = dict  # partial views cost most of a step, and nothing here looks at them
         self.snapshots: list[bytes] = []
 
-    def explore(self, chosen: Sequence[int] | None, max_states: int) -> tuple[np.ndarray, np.ndarray]:
+    def explore(self, selection: Sequence[int] | None, max_states: int) -> tuple[np.ndarray, np.ndarray]:
         """(next states (S, A), rewards (S, A)), breadth first."""
         num_actions = int(self.env.action_space.n)
-        actions = list(range(num_actions)) if chosen is None else [int(action) for action in chosen]
+        actions = list(range(num_actions)) if selection is None else [int(action) for action in selection]
         if not actions or not set(actions) <= set(range(num_actions)) or len(set(actions)) < len(actions):
             raise ParameterError(f"actions are {actions}; expected different ones from 0 to {num_actions - 1}")
         try:
-            return self._explore(actions, max_states, drop_done=chosen is None and num_actions == DONE + 1)
+            return self._explore(actions, max_states, drop_done=selection is None and num_actions == DONE + 1)
         finally:
             del self.env.gen_obs
 
@@ -403,7 +403,7 @@ class _Driver:
         numbers = {self.key(): 0}
         self.snapshots = [snapshot]
         rows: list[list[int]] = []
-        paid: list[list[float]] = []
+        reward_rows: list[list[float]] = []
         while len(rows) < len(self.snapshots):
             row, pay = [], []
             for action in actions:
@@ -423,8 +423,8 @@ class _Driver:
                     self.snapshots.append(self.save())
                 row.append(number)
             rows.append(row)
-            paid.append(pay)
-        table, rewards = np.array(rows, np.int64), np.array(paid)
+            reward_rows.append(pay)
+        table, rewards = np.array(rows, np.int64), np.array(reward_rows)
         if drop_done and (table[:, DONE] == np.arange(len(table))).all() and (rewards[:, DONE] == 0).all():
             table, rewards = table[:, :DONE], rewards[:, :DONE]
         return table, rewards

@@ -89,8 +89,8 @@ class GymnaxEnv(environment.Environment):
         successors, probabilities = _outcomes(mdp)
         ends = np.append(np.asarray(mdp.terminal, np.bool_), True)
         rewards = np.vstack([np.where(ends[:-1, None], 0.0, mdp.rewards), np.zeros((1, mdp.num_actions))])
-        made: Any = EnvParams  # whose fields flax declares
-        self._params = made(
+        params_class: Any = EnvParams  # whose fields flax declares
+        self._params = params_class(
             max_steps_in_episode=time_limit,
             successors=jnp.asarray(successors, jnp.int32),
             cumulative=jnp.asarray(probabilities, jnp.float32),
@@ -126,11 +126,11 @@ class GymnaxEnv(environment.Environment):
     def step_env(self, key: jax.Array, state: EnvState, action: jax.Array, params: EnvParams) -> tuple[Any, ...]:
         """One step: (observation, state, reward, whether a terminal state was reached, info)."""
         key_which, key_uniform, key_outcome = jax.random.split(key, 3)
-        chosen, previous, _, first_chosen = params.chance
+        p_action, p_previous, _, p_first_action = params.chance
         u = jax.random.uniform(key_which)
         uniform = jax.random.randint(key_uniform, (), 0, self._num_actions)
-        later = jnp.where(u < chosen, action, jnp.where(u < chosen + previous, state.previous, uniform))
-        first = jnp.where(u < first_chosen, action, uniform)
+        later = jnp.where(u < p_action, action, jnp.where(u < p_action + p_previous, state.previous, uniform))
+        first = jnp.where(u < p_first_action, action, uniform)
         executed = jnp.where(state.previous == self._num_actions, first, later).astype(jnp.int32)
         outcome = _drawn(params.cumulative[state.index, executed], jax.random.uniform(key_outcome))
         next_index = params.successors[state.index, executed, outcome]

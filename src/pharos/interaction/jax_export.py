@@ -71,9 +71,9 @@ def to_gymnax(
         raise ParameterError(f"to_gymnax: {mdp} was not made from a state space; give an array (S, ...) as observation")
     else:
         observations, low, high = _observed(space, env, observation, dict(observation_options or {}))
-    made = JoinedEnds if joined_ends else GymnaxEnv
+    env_class = JoinedEnds if joined_ends else GymnaxEnv
     name = str(env if env is not None else mdp)
-    return made(mdp, observations, low, high, int(limit), name, reward_noise)
+    return env_class(mdp, observations, low, high, int(limit), name, reward_noise)
 
 
 def _observed(

@@ -112,9 +112,9 @@ class Simulator:
             return 0
         return int(np.searchsorted(self.start_cumulative, rng.random(), side="right"))
 
-    def executed(self, chosen: int, previous: int, u: float) -> int:
-        """The executed action, by one uniform number u in [0, 1): chosen, then previous, then uniform."""
-        return stepping.executed_by_number.py_func(chosen, previous, self._weights, self.env.num_actions, u)
+    def executed(self, action: int, previous: int, u: float) -> int:
+        """The executed action, by one uniform number u in [0, 1): `action`, then `previous`, then a uniform one."""
+        return stepping.executed_by_number.py_func(action, previous, self._weights, self.env.num_actions, u)
 
     def checked_state(self, state: object) -> np.ndarray:
         """(D,) int64 from what a user gave; ParameterError unless every component is in its range."""

@@ -103,8 +103,8 @@ class Entry:
 
 def write(entry: Entry, file: str | os.PathLike) -> None:
     """Replace a file by an entry, in one step; the same entry gives the same bytes."""
-    said = {name: value for name, value in vars(entry).items() if name != _ARRAYS}
-    record = {**said, "format": FORMAT, "id": entry.id, "config": entry.config.to_dict(), "claim": asdict(entry.claim)}
+    body = {name: value for name, value in vars(entry).items() if name != _ARRAYS}
+    record = {**body, "format": FORMAT, "id": entry.id, "config": entry.config.to_dict(), "claim": asdict(entry.claim)}
     write_sealed(file, record, entry.arrays)
 
 
@@ -183,8 +183,8 @@ def _check_sizes(path: Path) -> None:
 
 def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
     check_values(record)
-    said = {name: value for name, value in record.items() if name not in ("format", "id", storage.DIGEST)}
-    entry = records.read(Entry, {**said, _ARRAYS: arrays}, "its record")
+    fields = {name: value for name, value in record.items() if name not in ("format", "id", storage.DIGEST)}
+    entry = records.read(Entry, {**fields, _ARRAYS: arrays}, "its record")
     if record["id"] != run_id(record["config"]):
         raise ValueError("its configuration is not that of its run")
     if entry.claim.error_bound < 0:

@@ -136,15 +136,15 @@ def board(
     if not files:
         raise ParameterError(f"{place}: expected a folder with entries, *{SUFFIX}; `pharos submit RUN` makes one")
     _template()  # or what is missing for it is told before anything is verified
-    made, values = Board[Verdict](Path(out)), dict[str, TaskValues]()
+    results, values = Board[Verdict](Path(out)), dict[str, TaskValues]()
 
     def judged(path: Path) -> tuple[Verdict, str]:
         verdict = verify(path, trust=trust, values=values, **options)
         return verdict, "" if verdict.holds else why_not(verdict)
 
-    made.judge([(path.relative_to(place).as_posix(), path) for path in files], judged, progress)
-    write_page(made.file, title, _rankings(made.verified), COLUMNS, made.refused, len(made.verified))
-    return made
+    results.judge([(path.relative_to(place).as_posix(), path) for path in files], judged, progress)
+    write_page(results.file, title, _rankings(results.verified), COLUMNS, results.refused, len(results.verified))
+    return results
 
 
 def write_page(
@@ -235,7 +235,7 @@ def _row(rank: int, verdict: Verdict, copies: str) -> list[Cell]:
     learning = entry.training.get("normalized_regret")
     learning = learning if isinstance(learning, int | float) and math.isfinite(learning) else math.nan
     observation = observation_title(config.observation, config.observation_options)
-    made_by = f"{entry.id}, seed {config.seed}, pharos {entry.versions.get('pharos', 'unknown')}"
+    origin = f"{entry.id}, seed {config.seed}, pharos {entry.versions.get('pharos', 'unknown')}"
     certainty = "exact" if verdict.exact else f"estimated ± {verdict.error_bound:.2g}"
     return [
         _number(rank, "d"),
@@ -251,7 +251,7 @@ def _row(rank: int, verdict: Verdict, copies: str) -> list[Cell]:
         else Cell("–"),
         Cell(certainty, certainty),
         _number(learning, ".4g") if math.isfinite(learning) else Cell("–"),
-        Cell(entry.id[:8], entry.id, made_by),
+        Cell(entry.id[:8], entry.id, origin),
     ]
 
 

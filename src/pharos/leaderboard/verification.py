@@ -334,18 +334,18 @@ def verify(
 
 def _objections(claim: Claim, reference: ReferenceValues, spread: float, slack: float) -> tuple[str, ...]:
     """What cannot be true of a claim."""
-    said = []
+    objections = []
     bound = min(claim.error_bound, slack) if claim.exact else claim.error_bound
     if claim.value - bound > reference.optimal + slack:
-        said.append(
+        objections.append(
             f"the value claimed, {claim.value:.8g}, is above that of the optimal policy, {reference.optimal:.8g}"
         )
     if claim.error_bound > spread + slack:
-        said.append(
+        objections.append(
             f"the error bound claimed, {claim.error_bound:.3g}, is larger than the values of policies are apart, "
             f"{spread:.3g}"
         )
-    return tuple(said)
+    return tuple(objections)
 
 
 @contextlib.contextmanager

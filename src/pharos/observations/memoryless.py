@@ -114,14 +114,14 @@ class _PolicySearch:
     def relaxed(self, fixed: np.ndarray) -> TabularMDP:
         """The MDP in which all actions do the same where the observation has a fixed one."""
         mdp, actions = self.mdp, np.arange(self.mdp.num_actions)
-        chosen = np.where(self.live, fixed[self.classes], -1)
-        executed = np.where(chosen[:, None] < 0, actions, chosen[:, None])
+        fixed_actions = np.where(self.live, fixed[self.classes], -1)
+        executed = np.where(fixed_actions[:, None] < 0, actions, fixed_actions[:, None])
         rows = np.arange(mdp.num_states)[:, None]
         setting: dict[str, Any] = {"gamma": mdp.gamma, "initial": mdp.initial, "horizon": mdp.horizon}
         table = mdp.dynamics.deterministic_table()
         if table is not None and not mdp.is_random:
-            chosen_rewards = mdp.rewards[rows, executed]
-            return TabularMDP.from_arrays(table[rows, executed], chosen_rewards, terminal=mdp.terminal, **setting)
+            rewards = mdp.rewards[rows, executed]
+            return TabularMDP.from_arrays(table[rows, executed], rewards, terminal=mdp.terminal, **setting)
         matrix, rewards = self.chosen
         pairs = (rows * mdp.num_actions + executed).ravel()
         return TabularMDP.from_matrices(matrix[pairs], rewards[rows, executed], **setting)

@@ -350,7 +350,7 @@ class _Convolved:
         value, slope = (np.empty((self.positions, *shape), np.float32) for _ in range(2))
         weight, bias = self.constants[0]
         for p in range(self.positions):
-            (of_x, codes_x, squares_x), (of_y, codes_y, squares_y) = self.x[p].met(rows), self.y[p].met(columns)
+            (of_x, codes_x, squares_x), (of_y, codes_y, squares_y) = self.x[p].subset(rows), self.y[p].subset(columns)
             variances = weight * squares_x + bias, weight * squares_y + bias
             observation_kernels.patches(of_x @ of_y.T, codes_x, codes_y, *variances, weight, bias, value[p], slope[p])
         q, theta = np.empty(shape), np.empty(shape)
@@ -378,7 +378,7 @@ class _Patches:
         self.codes = codes.ravel()
         self.squares = np.einsum("uk,uk->u", self.different, self.different)
 
-    def met(self, block: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def subset(self, block: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(different patches, codes, squares) of a block of images alone."""
         codes = self.codes[block]
         used = np.zeros(len(self.different), np.bool_)

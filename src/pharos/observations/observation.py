@@ -213,18 +213,18 @@ def observe(
     if not isinstance(env, Environment):
         raise ParameterError(f"env is {env!r}; expected a pharos Environment, or a name such as 'breakout/12x8x1'")
     if not isinstance(observation, Observation):
-        made, keywords = _made(_maker(observation), env, state_space, options)
+        instance, keywords = _observation_and_keywords(_maker(observation), env, state_space, options)
     elif observation.env != env:
         raise ParameterError(f"observation {observation.name!r} belongs to {observation.env}; expected one of {env}")
     else:
-        made, keywords = observation, []
+        instance, keywords = observation, []
     for option in options:
         if option not in keywords:
-            raise UnknownName(f"option of observation {made.name!r}", option, keywords)
-    return made
+            raise UnknownName(f"option of observation {instance.name!r}", option, keywords)
+    return instance
 
 
-def _made(
+def _observation_and_keywords(
     make: Callable[..., Observation], env: Environment, state_space: "StateSpace | None", options: Mapping[str, Any]
 ) -> tuple[Observation, list[str]]:
     """The observation, and the options that it knows: the keywords of `make`."""

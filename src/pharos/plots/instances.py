@@ -344,15 +344,15 @@ def states_by_depth(space: "StateSpace") -> np.ndarray:
 
     Cost: one read of the successors in blocks; 8 bytes a state of memory.
     """
-    reached = np.zeros(space.num_states, np.bool_)
+    visited = np.zeros(space.num_states, np.bool_)
     frontier = np.unique(space.start_states)
-    reached[frontier] = True
+    visited[frontier] = True
     counts = []
     while frontier.size:
         counts.append(frontier.size)
         next_states = space.dynamics.successors_of(frontier)
-        frontier = next_states[~reached[next_states]]
-        reached[frontier] = True
+        frontier = next_states[~visited[next_states]]
+        visited[frontier] = True
     return np.array(counts, np.int64)
 
 

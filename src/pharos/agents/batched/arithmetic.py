@@ -181,9 +181,9 @@ class TensorArithmetic(CompiledArithmetic):
             mirror.tensor.copy_(part.mean(1))
             mirror.fetch()
         of_log_p = torch.where(free <= bound, -free / number, torch.zeros_like(free))[..., None]
-        chosen = torch.zeros_like(p).scatter_(2, actions[..., None], 1.0)
+        one_hot = torch.zeros_like(p).scatter_(2, actions[..., None], 1.0)
         torch.mul(p, log_p + entropy[..., None], out=dscores).mul_(of_entropy[..., None] / number)
-        dscores.add_(of_log_p * (chosen - p))
+        dscores.add_(of_log_p * (one_hot - p))
         dvalues.copy_((2.0 * of_value * error / number)[..., None])
 
     def plan(

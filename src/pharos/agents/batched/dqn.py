@@ -104,7 +104,7 @@ class DQNLane(Lane[QNetworks]):
         size, rows = int(self.shared["batch_size"]), int(self.shared["buffer_size"])
         self.replay = Replay(self.keys, self.number, rows, self.copies, size, device, runs[0].observe.frames)
         self._dq = torch.zeros((width, size, self.num_actions), device=device)
-        self._descend = CudaGraph(self.descend, device)
+        self._recorded_step = CudaGraph(self.gradient_step, device)
         self.epsilon = np.zeros(width)
         names = ("initial_eps", "final_eps", "fraction")
         self._exploration = tuple(self.own[f"exploration_{name}"] for name in names)
@@ -114,7 +114,7 @@ class DQNLane(Lane[QNetworks]):
         self._known: torch.Tensor | None = None  # (W, S, A) values of the target networks, where they are remembered
         self._target_calls = np.maximum(self.own["target_update_interval"].astype(np.int64) // self.copies, 1)
 
-    def network_seeing(self, shape: tuple[int, ...]) -> QNetworks:
+    def network_for(self, shape: tuple[int, ...]) -> QNetworks:
         """See `Lane`."""
         return QNetworks(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions)
 
@@ -131,7 +131,7 @@ class DQNLane(Lane[QNetworks]):
             scores = self.scores_of(worlds.seen)
         kernels.choose(self.keys, self.calls, self._explores, scores, self.actions)
         before = worlds.state.copy()
-        self.move()
+        self.execute_actions()
         self.replay.add(self.calls, before, worlds.next_state, self.actions, worlds.reward, worlds.flags)
         self.steps += self.copies
         self.calls += 1
@@ -148,9 +148,9 @@ class DQNLane(Lane[QNetworks]):
         copied = np.flatnonzero(self.calls % self._target_calls == 0)
         if len(copied):
             self.copy_to_targets(copied)
-        passed = 1.0 - (1.0 - self.steps / self.total)
+        progress = 1.0 - (1.0 - self.steps / self.total)
         first, last, share = self._exploration
-        kernels.anneal(first, last, share, passed, self.epsilon)
+        kernels.anneal(first, last, share, progress, self.epsilon)
 
     def copy_to_targets(self, runs: np.ndarray) -> None:
         """Move the target networks of some runs towards the online ones, all the way where tau is 1."""
@@ -172,9 +172,9 @@ class DQNLane(Lane[QNetworks]):
     def learn_minibatch(self) -> None:
         """One step of gradient descent on the minibatch that the replay memory has drawn."""
         self.plan(self._learns())
-        self._descend()
+        self._recorded_step()
 
-    def descend(self) -> None:
+    def gradient_step(self) -> None:
         """The step; a GPU records this."""
         batch = self.replay
         for part in batch.drawn:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from pharos.agents.batched.arithmetic import CompiledArithmetic, CudaGraph, PinnedBuffer, TensorArithmetic, is_gpu, wait
-from pharos.agents.batched.networks import KERNEL, MASK, BatchedNetwork, Values, names_of, room, spread, whole
+from pharos.agents.batched.networks import KERNEL, MASK, BatchedNetwork, Values, aligned_zeros, flat_view, names_of, pad
 from pharos.agents.batched.runs import BLOCK, BatchRun, ObservationSource, as_networks_see, is_small, resolved
 from pharos.kernels import batched as kernels
 
@@ -82,7 +82,7 @@ class ObservationTable:
     put together for those who ask.
 
     Attributes:
-        sights: of the distinct sources; which: (W,) the number of each run's.
+        views: of the distinct sources; which: (W,) the place in `views` of each run's.
         frames: k, how many states are seen at once.
         shape: of an observation as the lane's network takes it.
         size: numbers that its first layer takes.
@@ -96,23 +96,23 @@ class ObservationTable:
         self.device, self.is_image = device, runs[0].observe.is_image
         sources = list({id(run.observe): run.observe for run in runs}.values())
         place = {id(source): i for i, source in enumerate(sources)}
-        self.sights = [NetworkView(source) for source in sources]
+        self.views = [NetworkView(source) for source in sources]
         self.which = np.array([place[id(run.observe)] for run in runs])
         self._ends = np.cumsum([0, *(source.num_states for source in sources)])
         self._begins = self._ends[self.which]
-        self.shape, self.size, self.frames = self.sights[0].shape, self.sights[0].size, self.sights[0].frames
-        self._take_room()
+        self.shape, self.size, self.frames = self.views[0].shape, self.views[0].size, self.views[0].frames
+        self._allocate_table()
 
-    def _take_room(self) -> None:
+    def _allocate_table(self) -> None:
         kind = torch.uint8 if self.is_image else torch.float32
         self._table: torch.Tensor | None = None
         length = self.size // self.frames
         if self._ends[-1] * length * kind.itemsize > LARGEST_TABLE:
             return
         self._table = torch.empty((int(self._ends[-1]), length), dtype=kind)
-        for sight, begin in zip(self.sights, self._ends, strict=False):
-            for first, block in sight.in_blocks():
-                rows = sight.raw(block)[:, sight.of_a_frame]
+        for view, begin in zip(self.views, self._ends, strict=False):
+            for first, block in view.in_blocks():
+                rows = view.raw(block)[:, view.of_a_frame]
                 self._table[begin + first : begin + first + len(block)] = torch.from_numpy(rows)
 
     def at(self, states: PinnedBuffer, out: torch.Tensor) -> torch.Tensor:
@@ -120,21 +120,21 @@ class ObservationTable:
 
         Where k frames are seen states are (W, B, k), the last ones of the episode, the oldest first.
         """
-        target = whole(out).numpy()
+        target = flat_view(out).numpy()
         if self._table is not None and self.frames > 1:
-            kernels.look_up_frames(self._table.numpy(), self._begins, states.array, self.sights[0].piece, target)
+            kernels.look_up_frames(self._table.numpy(), self._begins, states.array, self.views[0].piece, target)
         elif self._table is not None:
             kernels.look_up(self._table.numpy(), self._begins, states.array, target)
         else:
-            for i, sight in enumerate(self.sights):
+            for i, view in enumerate(self.views):
                 members = np.flatnonzero(self.which == i)
                 rows = states.array[members].reshape(-1, *states.array.shape[2:])
-                kernels.write_drawn(sight.raw(sight.source.at(rows)), sight.places, members, target)
+                kernels.write_drawn(view.raw(view.source.at(rows)), view.places, members, target)
         return out
 
     def encoded(self, observations: np.ndarray, i: int) -> torch.Tensor:
         """(N, size) float32 of observations (N, ...) as the environment of run i gives them."""
-        rows = torch.from_numpy(self.sights[self.which[i]].encoded(observations)).float()
+        rows = torch.from_numpy(self.views[self.which[i]].encoded(observations)).float()
         return torch.nn.functional.pad(rows, (0, self.size - rows.shape[1])).to(self.device)
 
 
@@ -150,19 +150,19 @@ class DeviceObservationTable(ObservationTable):
 
     def __init__(self, runs: Sequence[BatchRun], device: str = "cpu"):
         super().__init__(runs, device)
-        if len({sight.shape for sight in self.sights}) == 1:
+        if len({view.shape for view in self.views}) == 1:
             return
-        self.size = max(sight.size for sight in self.sights)
+        self.size = max(view.size for view in self.views)
         channels = self.shape[0] * KERNEL**2
         self.shape = (self.shape[0], 1, self.size // channels) if self.is_image else (self.size,)
         if self.is_image:
-            pixels = np.array([sight.size // channels for sight in self.sights])[self.which]
+            pixels = np.array([view.size // channels for view in self.views])[self.which]
             is_there = np.arange(self.size // channels) < pixels[:, None]
             self.mask = torch.from_numpy(is_there.astype(np.float32)).to(device)
 
-    def _take_room(self) -> None:
+    def _allocate_table(self) -> None:
         kind, total = torch.uint8 if self.is_image else torch.float32, int(self._ends[-1])
-        length = max(sight.length for sight in self.sights) + 1
+        length = max(view.length for view in self.views) + 1
         needed = total * length * kind.itemsize
         if is_gpu(self.device) and needed > SHARE_OF_DEVICE * torch.cuda.mem_get_info()[0]:
             raise MemoryError(
@@ -170,12 +170,12 @@ class DeviceObservationTable(ObservationTable):
                 f"more than {SHARE_OF_DEVICE:.0%} of what is free; a run alone that is too large trains on cpu"
             )
         table = torch.zeros((total, length), dtype=kind)
-        places = np.full((len(self.sights), max(sight.size for sight in self.sights)), length - 1)
-        for sight, row, begin in zip(self.sights, places, self._ends, strict=False):
-            frame, inside = np.divmod(sight.places, sight.length)
-            row[: sight.size] = np.where(frame < sight.frames, frame * length + inside, length - 1)
-            for first, block in sight.in_blocks():
-                raw = sight.raw(block)[:, :-1]
+        places = np.full((len(self.views), max(view.size for view in self.views)), length - 1)
+        for view, row, begin in zip(self.views, places, self._ends, strict=False):
+            frame, inside = np.divmod(view.places, view.length)
+            row[: view.size] = np.where(frame < view.frames, frame * length + inside, length - 1)
+            for first, block in view.in_blocks():
+                raw = view.raw(block)[:, :-1]
                 table[begin + first : begin + first + len(raw), : raw.shape[1]] = torch.from_numpy(raw)
         self._table = table.to(self.device)
         offsets = self._begins[:, None] if self.frames == 1 else self._begins[:, None, None]
@@ -230,11 +230,10 @@ class Lane(Generic[Net]):
         self.depth = self.worlds.depth
         self.actions = np.zeros((width, self.copies), np.int64)
         self.seen = (ObservationTable if device == "cpu" else DeviceObservationTable)(self.runs, device)
-        self._rooms: dict[int, torch.Tensor] = {}
-        self.network = self.network_seeing(self.seen.shape)
+        self._buffers: dict[int, torch.Tensor] = {}
+        self.network = self.network_for(self.seen.shape)
         self._own_networks = [
-            self.network if sight.shape == self.seen.shape else self.network_seeing(sight.shape)
-            for sight in self.seen.sights
+            self.network if view.shape == self.seen.shape else self.network_for(view.shape) for view in self.seen.views
         ]
         self.parameters = torch.from_numpy(self._initial()).to(device)
         self.gradients = torch.zeros_like(self.parameters)
@@ -251,7 +250,7 @@ class Lane(Generic[Net]):
 
     # What an agent says of itself -----------------------------------------------------------------------------------
 
-    def network_seeing(self, shape: tuple[int, ...]) -> Net:
+    def network_for(self, shape: tuple[int, ...]) -> Net:
         """The network for observations of a shape."""
         raise NotImplementedError
 
@@ -299,9 +298,9 @@ class Lane(Generic[Net]):
     def observed(self, states: PinnedBuffer) -> torch.Tensor:
         """(W, B, size) float32 observations of states (W, B, *depth); they stay until the next call with as many."""
         number = states.array.shape[1]
-        if number not in self._rooms:
-            self._rooms[number] = room(self.width, number, self.seen.size, device=self.device)
-        return self.seen.at(states, self._rooms[number])
+        if number not in self._buffers:
+            self._buffers[number] = aligned_zeros(self.width, number, self.seen.size, device=self.device)
+        return self.seen.at(states, self._buffers[number])
 
     def answer(self) -> None:
         """Write the scores of the states that were asked about; a GPU records this."""
@@ -324,7 +323,7 @@ class Lane(Generic[Net]):
         best: np.ndarray = self.scores_of(rows)[: self.number, 0].argmax(axis=1)
         return best
 
-    def move(self) -> None:
+    def execute_actions(self) -> None:
         """Execute `actions`; episodes that end after the last step of the training do not count."""
         self.worlds.step(self.calls, self.actions, counts=self.steps + self.copies <= self.total)
 
@@ -352,7 +351,7 @@ class Lane(Generic[Net]):
             members = np.flatnonzero(self.seen.which == i)
             keys = self.keys[members]
             drawn = network.initial(partial(self._draws, keys))
-            rows[members] = spread(network.parameters, drawn, self.network.parameters)
+            rows[members] = pad(network.parameters, drawn, self.network.parameters)
         return rows
 
     @staticmethod

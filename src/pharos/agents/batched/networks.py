@@ -89,14 +89,14 @@ class Parameters:
         return {**views, ROWS: rows}
 
 
-def room(width: int, *shape: int, device: str | torch.device | None = None) -> Tensor:
+def aligned_zeros(width: int, *shape: int, device: str | torch.device | None = None) -> Tensor:
     """(W, ...) float32 whose runs begin at multiples of 64 bytes, so that a run's place changes nothing."""
     size = math.prod(shape)
     rows = torch.zeros((width, -(-size // ALIGNED) * ALIGNED), device=device)
     return rows[:, :size].view(width, *shape)
 
 
-def whole(y: Tensor) -> Tensor:
+def flat_view(y: Tensor) -> Tensor:
     """All the memory of a `room`, in which each run has a multiple of 64 bytes: none is at a loop's ragged end."""
     return y.as_strided((y.shape[0], y.stride(0)), (y.stride(0), 1))
 
@@ -116,14 +116,14 @@ class NetworkLayer:
         """Write the gradients of the parameters, after `forward` of x; return that of x where it goes `onward`."""
         raise NotImplementedError
 
-    def _room(self, x: Tensor, *, onward: bool = False) -> tuple[Tensor, Tensor]:
+    def _buffers(self, x: Tensor, *, onward: bool = False) -> tuple[Tensor, Tensor]:
         """Room for y and for the gradient of x."""
         key = (x.shape[0], x.shape[1])
         y, dx = self._rooms.get(key, (None, None))
         if y is None:
-            y = room(*key, self.outputs, device=x.device)
+            y = aligned_zeros(*key, self.outputs, device=x.device)
         if dx is None or (onward and not dx.numel()):
-            dx = room(*key, self.inputs, device=x.device) if onward else y[:0]
+            dx = aligned_zeros(*key, self.inputs, device=x.device) if onward else y[:0]
         self._rooms[key] = y, dx
         return y, dx
 
@@ -131,7 +131,7 @@ class NetworkLayer:
         if self.activation == RELU:
             y.clamp_(min=0.0)
         elif self.activation == TANH:
-            whole(y).tanh_()
+            flat_view(y).tanh_()
 
     def _before_activation(self, dy: Tensor, y: Tensor) -> Tensor:
         """The gradient before the activation, in the place of dy."""
@@ -168,7 +168,7 @@ class LinearLayer(NetworkLayer):
 
     def forward(self, values: Values, x: Tensor) -> Tensor:
         """The outputs."""
-        y, _ = self._room(x)
+        y, _ = self._buffers(x)
         if x.shape[1] == 1 and x.device.type == "cpu" and self.activation != TANH:
             # to act once is to read all weights; those of inputs that a ReLU made 0 need not be
             rows = values[ROWS].numpy()
@@ -181,7 +181,7 @@ class LinearLayer(NetworkLayer):
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> Tensor | None:
         """See `NetworkLayer`."""
-        y, dx = self._room(x, onward=onward)
+        y, dx = self._buffers(x, onward=onward)
         dy = self._before_activation(dy, y)
         torch.sum(dy, 1, keepdim=True, out=gradients[f"{self.name}.bias"])
         torch.bmm(x.transpose(1, 2), dy, out=gradients[f"{self.name}.weight"])
@@ -212,7 +212,7 @@ class PatchConvolutionLayer(NetworkLayer):
 
     def forward(self, values: Values, x: Tensor) -> Tensor:
         """The outputs."""
-        y, _ = self._room(x)
+        y, _ = self._buffers(x)
         weights = values[f"{self.name}.weight"] * (1 / 255)
         torch.baddbmm(values[f"{self.name}.bias"], self._rows(x), weights, out=self._rows(y))
         self._activate(y)
@@ -222,7 +222,7 @@ class PatchConvolutionLayer(NetworkLayer):
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
         """See `NetworkLayer`; there is no gradient of the input."""
-        y, _ = self._room(x)
+        y, _ = self._buffers(x)
         rows = self._rows(self._before_activation(dy, y))
         torch.sum(rows, 1, keepdim=True, out=gradients[f"{self.name}.bias"])
         gradient = gradients[f"{self.name}.weight"]
@@ -259,7 +259,7 @@ class ConvolutionLayer(NetworkLayer):
 
     def forward(self, values: Values, x: Tensor) -> Tensor:
         """The outputs."""
-        y, _ = self._room(x)
+        y, _ = self._buffers(x)
         weights, bias = values[f"{self.name}.weight"] * self.scale, values[f"{self.name}.bias"]
         if is_one_by_one(x):
             for i in range(len(x)):
@@ -274,7 +274,7 @@ class ConvolutionLayer(NetworkLayer):
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> Tensor | None:
         """See `NetworkLayer`."""
-        y, dx = self._room(x, onward=onward)
+        y, dx = self._buffers(x, onward=onward)
         dy = self._before_activation(dy, y)
         if is_one_by_one(x):
             for i in range(len(x)):
@@ -352,13 +352,13 @@ def extractor(parameters: Parameters, name: str, shape: tuple[int, ...], is_imag
     convolutions: list[NetworkLayer] = []
     for i, (filters, kernel, stride) in enumerate(((32, 8, 4), (64, 4, 2), (64, 3, 1))):
         scale = 1 / 255 if i == 0 else 1.0
-        made = ConvolutionLayer(parameters, f"{name}.layers.0.{2 * i}", shape, filters, kernel, stride, scale)
-        convolutions.append(made)
-        shape = made.shape_out
+        layer = ConvolutionLayer(parameters, f"{name}.layers.0.{2 * i}", shape, filters, kernel, stride, scale)
+        convolutions.append(layer)
+        shape = layer.shape_out
     return [*convolutions, LinearLayer(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
 
 
-def spread(own: Parameters, rows: np.ndarray, common: Parameters) -> np.ndarray:
+def pad(own: Parameters, rows: np.ndarray, common: Parameters) -> np.ndarray:
     """(N, P) parameters of networks in the places that a larger network of the same layers has for them; 0 elsewhere.
 
     The larger one has more inputs in its first layers, which follow those that both have.

@@ -47,9 +47,9 @@ class PPOLane(Lane[ActorCritics]):
         for mirror, name in zip(self.weights, WEIGHTS, strict=True):
             mirror.array[:] = self.own[name]
             mirror.send()
-        self._lessons: dict[int, MinibatchUpdate] = {}
+        self._minibatch_updates: dict[int, MinibatchUpdate] = {}
 
-    def network_seeing(self, shape: tuple[int, ...]) -> ActorCritics:
+    def network_for(self, shape: tuple[int, ...]) -> ActorCritics:
         """See `Lane`."""
         return ActorCritics(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions)
 
@@ -71,7 +71,7 @@ class PPOLane(Lane[ActorCritics]):
         scores = self.scores_of(worlds.seen)
         kernels.act(self.keys, self.calls, scores, self.actions, self._log_p)
         self.states[:, t] = worlds.seen
-        self.move()
+        self.execute_actions()
         self.next_states[:, t], self.actions_taken[:, t] = worlds.next_seen, self.actions
         self.log_probabilities[:, t], self.kept_values[:, t] = self._log_p, self._valued.array[..., 0]
         self.rewards[:, t], self.begins[:, t] = worlds.reward, self.begin
@@ -135,20 +135,20 @@ class PPOLane(Lane[ActorCritics]):
                 (W, B, *depth).
         """
         size = minibatch[0].shape[1]
-        if size not in self._lessons:
-            self._lessons[size] = MinibatchUpdate(self, size)
-        lesson = self._lessons[size]
+        if size not in self._minibatch_updates:
+            self._minibatch_updates[size] = MinibatchUpdate(self, size)
+        update = self._minibatch_updates[size]
         wait(self.device)
-        for mirror, part in zip(lesson.minibatch, minibatch, strict=True):
+        for mirror, part in zip(update.minibatch, minibatch, strict=True):
             mirror.array[:] = part
         if self.shared["normalize_advantage"] and size > 1:
-            kernels.normalize(lesson.minibatch[3].array)
-        lesson.assess()
+            kernels.normalize(update.minibatch[3].array)
+        update.forward()
         if self.shared["target_kl"] is not None:
             wait(self.device)
             is_active = is_active & ~(self.divergence.array > 1.5 * float(self.shared["target_kl"]))
         self.plan(is_active)
-        lesson.descend()
+        update.optimizer_step()
         return is_active
 
     def own_arrays(self) -> dict[str, np.ndarray]:
@@ -172,9 +172,9 @@ class MinibatchUpdate:
         self.minibatch = tuple(PinnedBuffer(each, kind, device) for each, kind in zip(shapes, kinds, strict=True))
         self._lane = lane
         self._gradients = tuple(torch.zeros((*shape, last), device=device) for last in (lane.num_actions, 1))
-        self.assess, self.descend = CudaGraph(self._assess, device), CudaGraph(self._descend, device)
+        self.forward, self.optimizer_step = CudaGraph(self._forward, device), CudaGraph(self._optimizer_step, device)
 
-    def _assess(self) -> None:
+    def _forward(self) -> None:
         lane = self._lane
         for part in self.minibatch:
             part.send()
@@ -183,7 +183,7 @@ class MinibatchUpdate:
         parts, weights = tuple(part.tensor for part in others), tuple(part.tensor for part in lane.weights)
         lane.arithmetic.clipped_loss(scores, values, parts, weights, self._gradients, lane.loss, lane.divergence)
 
-    def _descend(self) -> None:
+    def _optimizer_step(self) -> None:
         lane = self._lane
         lane.network.backward(lane.values, lane.gradient_views, *self._gradients)
         lane.adam()

@@ -152,7 +152,7 @@ class Rooms(Canvas):
         """Doors between rooms, until every room can be reached; locked rooms get no further ones."""
         start = (self.player[0] // (self.size - 1), self.player[1] // (self.size - 1))
         for _ in range(CONNECTIONS + 1):
-            if len(self._reached(start)) == self.rows * self.columns:
+            if len(self._reachable(start)) == self.rows * self.columns:
                 return
             column, row, side = self.integer(0, self.columns), self.integer(0, self.rows), self.integer(0, 4)
             neighbour = self.across(column, row, side)[:2]
@@ -161,17 +161,17 @@ class Rooms(Canvas):
                 self.add_door(column, row, side)
         raise ParameterError("MiniGrid: this seed connects the rooms in no way; choose another seed")
 
-    def _reached(self, start: Place) -> set[Place]:
-        reached, frontier = {start}, [start]
+    def _reachable(self, start: Place) -> set[Place]:
+        reachable, frontier = {start}, [start]
         while frontier:
             room = frontier.pop()
             for side in range(4):
                 if (*room, side) in self.doors:
                     neighbour = self.across(*room, side)[:2]
-                    if neighbour not in reached:
-                        reached.add(neighbour)
+                    if neighbour not in reachable:
+                        reachable.add(neighbour)
                         frontier.append(neighbour)
-        return reached
+        return reachable
 
 
 # The kinds ------------------------------------------------------------------------------------------------------------
@@ -353,9 +353,9 @@ def _chain(canvas: Canvas, size: int, rooms: int) -> list[Room]:
     while tries > 0 and len(chain) < rooms:
         tries -= 1
         side, entry = _exit(canvas, chain[-1])
-        following = _room(canvas, size, (side + 2) % 4, entry)
-        if _fits(canvas, following, chain[:-1]):
-            chain.append(following)
+        room = _room(canvas, size, (side + 2) % 4, entry)
+        if _fits(canvas, room, chain[:-1]):
+            chain.append(room)
             tries = TRIES
     return chain
 

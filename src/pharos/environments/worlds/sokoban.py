@@ -255,15 +255,15 @@ def within_reach(text: str) -> tuple[list[Cell], dict[Cell, str]]:
     """The cells that a player without boxes could walk to, row by row, and every letter of the level by its cell."""
     letters = {(y, x): letter for y, row in enumerate(text.split("/")) for x, letter in enumerate(row)}
     frontier = [cell for cell, letter in letters.items() if letter in "@+"]
-    reached = set(frontier)
+    reachable = set(frontier)
     while frontier:
         row, column = frontier.pop()
         for down, right in WAYS:
             cell = row + down, column + right
-            if letters.get(cell, WALL) != WALL and cell not in reached:
-                reached.add(cell)
+            if letters.get(cell, WALL) != WALL and cell not in reachable:
+                reachable.add(cell)
                 frontier.append(cell)
-    return sorted(reached), letters
+    return sorted(reachable), letters
 
 
 def random_level(height: int, width: int, boxes: int, seed: int) -> str:
