@@ -199,7 +199,7 @@ class AgentKind:
     is_tabular: bool = False
 
     def observation(self, requested: str) -> str:
-        """The observation that it gets where `requested` was asked for: tables see the index of the state."""
+        """The observation that the agent gets if `requested` is asked for: tables see the index of the state."""
         return TABULAR_OBSERVATION if self.is_tabular else requested
 
 

@@ -85,12 +85,12 @@ class QLearning:
 
     @property
     def episodes(self) -> int:
-        """Finished episodes so far."""
+        """Number of finished episodes so far."""
         return int(self.place[4])
 
     @property
     def sum_of_returns(self) -> float:
-        """Returns of the finished episodes, discounted as the MDP says."""
+        """Sum of the returns of finished episodes, with the discount of the MDP."""
         return float(self.sums[2])
 
     def learn(self, steps: int) -> "QLearning":
@@ -146,14 +146,14 @@ class QLearning:
         return np.eye(num_actions)[greedy].reshape(self.mdp.num_states, num_actions + 1, num_actions)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that `restore` needs to go on, as plain arrays."""
+        """State of the learner for `restore`, as plain arrays."""
         arrays = {"q": self.q, "visits": self.visits, "place": self.place, "sums": self.sums, "word": self.word}
         if len(self.pending):
             arrays["pending"] = self.pending
         return arrays | ({"noise_word": self.noise_word} if self.reward_noise else {})
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go on from what `state` returned."""
+        """Restore a state that `state` returned."""
         for name, array in self.state().items():
             if state[name].shape != array.shape or state[name].dtype != array.dtype:
                 raise ParameterError(

@@ -70,7 +70,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Form:
-    """An agent, and how it is run.
+    """An agent and the way to train it; base class of the forms.
 
     Attributes:
         label: of the agent, for tables. kind: of form, as in the table above.
@@ -86,7 +86,7 @@ class Form:
     checksum: str = ""
 
     def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
-        """Let each run leave a finished run.json and a curve in its folder, or a run.json that says why not."""
+        """Train all runs. Each leaves a finished run.json and a curve in its folder, or a run.json with its error."""
         raise NotImplementedError
 
     def curve(self, job: Job, protocol: Protocol) -> tuple[np.ndarray, bool]:
@@ -186,7 +186,7 @@ class TrainedForm(Form):
     def _parts(
         self, jobs: Sequence[Job], configs: Sequence[RunConfig], protocol: Protocol, workers: int
     ) -> list[list[int]]:
-        """Places by process: whole lanes of runs that fit together, the longest first, each to the least busy."""
+        """Indices of runs by process: lanes of runs that share a batch, longest first, to the least busy process."""
         kinds: dict[str, Hashable] = {}
         groups: dict[Hashable, list[int]] = defaultdict(list)
         for place, (job, config) in enumerate(zip(jobs, configs, strict=True)):
@@ -249,7 +249,7 @@ def _text_checksum(code: Callable[..., Any]) -> str:
 
 @dataclass(frozen=True)
 class GeneratedForm(Form):
-    """A generator, run in processes of its own with one thread each; in this one where no other can import it.
+    """A generator, run in processes of its own with one thread each; in this process if no other can import it.
 
     Attributes:
         learn: the function.
@@ -278,7 +278,7 @@ class GeneratedForm(Form):
             yield _generate(self.learn, self.label, job, protocol)
 
     def _in_processes(self, jobs: Sequence[Job], protocol: Protocol, workers: int) -> Iterator[str | None]:
-        """Ends of the runs, in the order in which they end."""
+        """Yield None or an error message for each run, in the order in which the runs end."""
         if not jobs:
             return
         assert self.source is not None
@@ -301,7 +301,7 @@ class GeneratedForm(Form):
 
 
 def _begin(variables: Mapping[str, str]) -> None:
-    """What a process begins with: it ends with its parent, and what user code prints goes where errors go."""
+    """Prepare a worker process: it ends with its parent, and its standard output goes to standard error."""
     end_with_parent()
     os.environ.update(variables)
     os.dup2(2, 1)
@@ -316,7 +316,7 @@ def _generate_from(source: Source, label: str, job: Job, protocol: Protocol) -> 
 
 
 def _generate(learn: Learn, label: str, job: Job, protocol: Protocol) -> str | None:
-    """One run, into its folder; None, or why it failed."""
+    """Train one run and write its folder. Returns None, or an error message if the run failed."""
     try:
         task = job.task.training_task(protocol)
         curve = generated_curve(learn, task, steps=protocol.steps, evaluations=protocol.evaluations, seed=job.seed)
@@ -326,7 +326,7 @@ def _generate(learn: Learn, label: str, job: Job, protocol: Protocol) -> str | N
 
 
 def _record(label: str, job: Job, protocol: Protocol, end: Curve | Exception) -> str | None:
-    """What a run has led to, into its folder; None, or why it failed."""
+    """Write the result of a run, or its error, into its folder. Returns None, or the error message."""
     config = {
         "benchmark": {"task": job.task.name, "digest": job.task.digest},
         "agent": label,
@@ -396,7 +396,7 @@ class ExactForm(Form):
     regrets: dict[str, float] = field(default_factory=dict)
 
     def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
-        """Nothing is to be learnt."""
+        """Do nothing: there is nothing to learn."""
 
     def curve(self, job: Job, protocol: Protocol) -> tuple[np.ndarray, bool]:
         if job.task.name not in self.regrets:

@@ -1,4 +1,4 @@
-"""The page of a benchmark: what was audited, and what is only claimed, in two lists.
+"""The page of a benchmark, with two lists: audited submissions, and submissions that are only claimed.
 
 A submission is verified anew, and stands among the audited ones where the keeper of the board has the record of an
 audit for this very file, beside it: FILE.audit.json. Scores are computed from the curves, which are claims in both
@@ -77,7 +77,7 @@ def benchmark_board(
 
 
 def audit_of(verdict: SubmissionVerdict) -> Audit | None:
-    """The audit that lies beside a submission, where it is of this very file; raises as `Audit.read`."""
+    """The audit beside a submission if it is of this very file, else None; raises as `Audit.read`."""
     file = verdict.file.with_name(verdict.file.name + SUFFIX)
     audit = Audit.read(file) if file.is_file() else None
     return audit if audit is not None and audit.submission == verdict.sha256 else None

@@ -77,14 +77,14 @@ class CountedEnv(gymnasium.Wrapper):
         return CountedEnv(self.task, self.budget, int(child.generate_state(1)[0]))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """As Gymnasium's; the seed of the run, where the first reset has none."""
+        """Reset as in Gymnasium; a first reset without a seed takes the seed of the run."""
         if seed is None and not self._is_seeded:
             seed = self.seed
         self._return, self._is_seeded = 0.0, True
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """As Gymnasium's. BudgetSpent: all steps are taken."""
+        """Step as in Gymnasium. Raises BudgetSpent if no steps are left."""
         budget = self.budget
         if budget.steps >= budget.limit:
             raise BudgetSpent(f"{budget.limit:,} steps are taken")
@@ -101,7 +101,7 @@ class CountedEnv(gymnasium.Wrapper):
 
 
 class Snapshots:
-    """Policies of a task as tables: each is asked about all states at once."""
+    """Policies of a task as tables; each policy is queried about all states at once."""
 
     def __init__(self, task: Task):
         self.task = task

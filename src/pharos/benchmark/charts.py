@@ -109,7 +109,7 @@ def path(points: Sequence[tuple[float, float]]) -> str:
 
 
 def marker(x: float, y: float, agent: int, title: str = "") -> Element:
-    """The marker of an agent, with a title that shows when one points at it."""
+    """The marker of an agent, with a tooltip."""
     tip = [element("title", title)] if title else []
     shape, place = MARKERS[agent % len(MARKERS)], f"translate({x:.1f} {y:.1f})"
     return element("path", *tip, d=shape, class_=f"f{agent % 6}", transform=place)
@@ -299,7 +299,7 @@ def plane(points: Sequence[tuple[str, float, float, float]], below: str, beside:
 
 
 def shade(share: float) -> str:
-    """The colour of a share of 1 in the scale cividis, which people see alike whatever their sight."""
+    """Colour of a number in [0, 1] in the scale cividis, readable with colour vision deficiencies."""
     place = np.linspace(0, 1, len(CIVIDIS))
     red, green, blue = (round(float(np.interp(share, place, [color[k] for color in CIVIDIS]))) for k in range(3))
     return f"#{red:02x}{green:02x}{blue:02x}"
@@ -318,7 +318,7 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 def shortened(text: str, letters: int) -> str:
-    """A text of at most so many letters."""
+    """The text, shortened to a maximum number of letters."""
     return text if len(text) <= letters else text[: letters - 1] + "…"
 
 

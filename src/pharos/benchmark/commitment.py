@@ -1,4 +1,4 @@
-"""Commitment: what will be submitted, said before the tasks are drawn.
+"""Commitment: a digest of what will be submitted, published before the tasks are drawn.
 
 A commitment names SHA-256 digests of an agent's source and of its hyperparameters. Whoever publishes it before a round
 of the beacon cannot have chosen them by the tasks of that round. It needs no salt: a salt hides what could be guessed,
@@ -23,7 +23,7 @@ FORMAT = 1
 
 @dataclass(frozen=True, kw_only=True)
 class Commitment:
-    """What an author binds themself to.
+    """An agent and its hyperparameters, to which an author commits before the tasks are drawn.
 
     Attributes:
         agent: its label, such as "my_file.py:learn" or "dqn".
@@ -41,11 +41,11 @@ class Commitment:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all that it says: the line to publish."""
+        """SHA-256 of the commitment: the line to publish."""
         return sha256_of_json(asdict(self))
 
     def write(self, file: str | os.PathLike) -> None:
-        """Replace a file by it, in one step."""
+        """Write the commitment to a file, replacing it atomically."""
         storage.replace_json(file, {"format": FORMAT, **asdict(self), "sha256": self.digest})
 
     @staticmethod

@@ -207,7 +207,7 @@ def least_difference(variances: np.ndarray, seeds: int) -> float:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Return p-values after Holm's step-down correction; NaN, of what has one seed, stays and does not count."""
+    """Return p-values after Holm's step-down correction; NaN (tasks with one seed) stays NaN and does not count."""
     values = np.asarray(p_values, np.float64)
     order = [index for index in np.argsort(values, kind="stable") if not np.isnan(values[index])]
     adjusted, largest = values.copy(), 0.0
@@ -272,10 +272,10 @@ def _seeds_for(variances: np.ndarray, difference: float) -> int | None:
 
 
 def results_of(results: AgentResults | str | os.PathLike) -> AgentResults:
-    """Results as they are, or read."""
+    """Results as given, or read from a folder or file."""
     return results if isinstance(results, AgentResults) else AgentResults.read(results)
 
 
 def suite_of_results(results: AgentResults, suite: Suite | str | None) -> Suite:
-    """The suite that is given, or the one that results name."""
+    """The given suite, or the one that the results name."""
     return suite if isinstance(suite, Suite) else load_suite(suite or results.suite)

@@ -56,7 +56,7 @@ class Agent:
 
 @dataclass(frozen=True)
 class Contents:
-    """Everything that a report says, computed once.
+    """Data of a report, computed once: an agent, its baselines, comparisons and predictions.
 
     Attributes:
         suite: of the results. agent: the one that it is about. beside: baselines.
@@ -72,7 +72,7 @@ class Contents:
 
     @property
     def agents(self) -> list[Agent]:
-        """The agent, then those beside it."""
+        """The agent of the report, then its baselines."""
         return [self.agent, *self.beside]
 
     def predicted(self, task: BenchmarkTask) -> float | None:
@@ -83,7 +83,7 @@ class Contents:
         return task.predicted.get(self.predictor)
 
     def num_run(self, tasks: Sequence[BenchmarkTask]) -> int:
-        """How many of these tasks the agent ran."""
+        """Number of these tasks that the agent ran."""
         return sum(task.name in self.agent.score.tasks for task in tasks)
 
 
@@ -112,13 +112,13 @@ def contents_of(
 
 
 def kind_of(results: AgentResults) -> str:
-    """The idealised learner that an agent is a kind of, by its name and source; "both" where these say nothing."""
+    """The idealised learner that an agent is a kind of, by its name and source; "both" if these do not tell."""
     names = f"{results.agent} {results.record.get('source')}".lower()
     return next((kind for word, kind in KINDS.items() if word in names), "both")
 
 
 def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:
-    """Names for an agent, the best first: as pharos spells its own, with the folder of its results, with a number.
+    """Candidate names of an agent, best first: pharos' spelling, then with the folder of its results, with a number.
 
     The agent that the report is about, and those of a file or a module, have the label that they ran with.
     """

@@ -35,7 +35,7 @@ SHOWN = 200  # characters of what differs
 
 @dataclass(frozen=True)
 class Outcome:
-    """What `run` gave.
+    """Result of `run`: curves of finished tasks, and the runs that are missing.
 
     Attributes:
         results: curves of the tasks of which all runs have finished.
@@ -56,7 +56,7 @@ class Outcome:
 
     @property
     def score(self) -> ConfidenceInterval:
-        """That of the core."""
+        """Score of the core."""
         return self.scores.core
 
     @property
@@ -141,7 +141,7 @@ def selected(suite: Suite, tasks: str | Iterable[str] | None) -> tuple[Benchmark
 
 
 def _claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str, Any]:
-    """What agent.json says: of this agent, with this setting; it is written where there is none.
+    """Contents of agent.json for this agent and setting; the file is written if it does not exist.
 
     Raises:
         ParameterError: the folder is of another agent, setting, suite or installation.
@@ -179,7 +179,7 @@ def _claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str,
 
 
 def _collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any], jobs: Iterable[Job]) -> Outcome:
-    """The curves of all runs, in a file."""
+    """Collect the curves of all runs into one results file, and write the scores."""
     curves: dict[str, list[np.ndarray]] = {}
     exact: dict[str, bool] = {}
     missing: dict[str, str] = {}

@@ -288,7 +288,7 @@ def _residuals(contents: Contents) -> Element:
 
 
 def _task(task: BenchmarkTask) -> Element:
-    """The name of a task, which shows what it is when one points at it."""
+    """The name of a task, with its description as a tooltip."""
     return element("span", task.name, title=description(task))
 
 

@@ -1,4 +1,4 @@
-"""Audit: a few runs of a submission, chosen by its own digest, are trained again from the source.
+"""Audit: a few runs of a submission, drawn by its own digest, are trained again from the source.
 
 Whoever hands in cannot know which runs these are before the submission is whole, since its SHA-256 draws them, and a
 change of one digit draws others. Curves of the engine, of tables and of exact agents must be equal to the last bit; for
@@ -63,7 +63,7 @@ class Repeat:
 
 @dataclass(frozen=True, kw_only=True)
 class Audit:
-    """What an auditor found; a board shows what its keeper has the record of.
+    """Result of an audit; a board shows the audits that its keeper has on record.
 
     Attributes:
         submission: SHA-256 of the file. suite: SHA-256 of the suite.
@@ -93,7 +93,7 @@ class Audit:
         return self.is_source and bool(self.repeats) and all(each.holds for each in self.repeats)
 
     def write(self, file: str | os.PathLike) -> None:
-        """Replace a file by it, in one step."""
+        """Write the audit to a file, replacing it atomically."""
         storage.replace_json(file, storage.sealed({"format": FORMAT, **asdict(self), "holds": self.holds}))
 
     @staticmethod
@@ -184,7 +184,7 @@ def make_audit(
 def _repeat(
     results: AgentResults, task: str, seed: int, to_the_bit: bool, train: Callable[..., AgentResults]
 ) -> Repeat:
-    """A run beside the curve that was handed in; `train` has the options of `run`."""
+    """Comparison of a repeated run with the submitted curve; `train` has the options of `run`."""
     row, scores = results.seeds.index(seed), results.curves[task].mean(axis=1)
     claimed, others = float(scores[row]), np.delete(scores, row)
     low, high = (claimed, claimed) if to_the_bit else prediction_interval(others)
@@ -199,7 +199,7 @@ def _repeat(
 
 
 def prediction_interval(scores: np.ndarray) -> tuple[float, float]:
-    """Where a further run lies with probability 0.99, of n normal ones: mean -+ t s sqrt(1 + 1/n), at least FLOOR.
+    """Prediction interval (0.99) of one more run after n normal ones: mean -+ t s sqrt(1 + 1/n), half width >= FLOOR.
 
     Args:
         scores: (n,) of the other seeds.

@@ -23,7 +23,7 @@ BASELINES = Path(__file__).parent / "baselines"
 
 @dataclass(frozen=True, eq=False)
 class AgentResults:
-    """What one agent, with one setting, did on the tasks of a suite.
+    """Learning curves of one agent, with one setting, on the tasks of a suite.
 
     Attributes:
         agent: label of the agent.

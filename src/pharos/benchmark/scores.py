@@ -116,7 +116,7 @@ class BenchmarkScore:
 
     @property
     def rank(self) -> tuple[bool, float]:
-        """Key by which boards sort: the best core first, those without one last."""
+        """Sort key of boards: the best core score first, agents without one last."""
         return not self.has_core, -self.core.value
 
 
@@ -182,7 +182,7 @@ def check_suite(results: "AgentResults", suite: "Suite", whose: str = "") -> Non
 
 
 def run_regrets(results: "AgentResults", *, last: bool = False) -> dict[str, np.ndarray]:
-    """Return for each task the mean over evaluations of its runs' normalised regret, (seeds,); or its last one."""
+    """Return for each task the normalised regret of its runs, (seeds,): mean over evaluations, or at the last one."""
     return {name: curves[:, -1] if last else curves.mean(axis=1) for name, curves in results.curves.items()}
 
 

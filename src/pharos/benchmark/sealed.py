@@ -1,4 +1,4 @@
-"""Sealed halves of a suite: tasks that nobody has seen before a public lot is drawn, as hard as the public ones.
+"""Sealed halves of a suite: tasks unknown until a public random draw, and as hard as the public ones.
 
 A *copy* of a task is the same MDP with other names: its actions are permuted, and so are the entries of what is seen.
 Values, gaps, diameter and the regret of learners with fully connected networks are those of the public task, since a
@@ -190,7 +190,7 @@ def _instance(task: BenchmarkTask, protocol: Protocol, draw: np.random.Generator
 
 
 def frozen(task: BenchmarkTask, protocol: Protocol) -> BenchmarkTask:
-    """The task with its digest and values. Cost: as solving it."""
+    """A copy of the task with its digest and values. Cost: as solving it."""
     solved: Task = task.training_task(protocol)
     reference = solved.reference
     return replace(

@@ -1,4 +1,4 @@
-"""Submissions: curves, final policies and a commitment in one file; what of them is true is computed again.
+"""Submissions: curves, final policies and a commitment in one file, which `verify` checks by computing regret again.
 
 The file has the layout of an entry of the leaderboard (`leaderboard/entry.py`): a record as JSON, and arrays
 
@@ -40,7 +40,7 @@ Tell = Callable[[int, int, str], None]
 
 @dataclass(frozen=True, eq=False)
 class Submission:
-    """What an author hands in.
+    """A submission: curves, final policies, and the texts and commitment of its author.
 
     Attributes:
         results: curves of the agent. policies: (task, seed) -> final policy; those of some runs may be missing.
@@ -54,7 +54,7 @@ class Submission:
     commitment: Commitment | None = None
 
     def write(self, file: str | os.PathLike) -> None:
-        """Replace a file by it, in one step; the same submission gives the same bytes."""
+        """Write the submission to a file, replacing it atomically; the same submission gives the same bytes."""
         results = self.results
         record = {
             "format": FORMAT,
@@ -83,7 +83,7 @@ class Submission:
         return in_file(Path(file), lambda: _submission(record, arrays))
 
     def fits(self) -> bool:
-        """Whether source and hyperparameters are those of its commitment."""
+        """Whether source and hyperparameters of the submission are those of its commitment."""
         source = sha256_of_source(self.results)
         settings = sha256_of_json(self.results.record.get("hyperparameters"))
         committed = self.commitment
@@ -160,9 +160,9 @@ def submit(
 
 
 def final_policy(run: Path, task: Task) -> np.ndarray | None:
-    """What the agent of a finished run plays at the end: (S,) actions or (S, A) probabilities.
+    """Final policy of a finished run: (S,) actions or (S, A) probabilities.
 
-    None where it sees more than the state, or the run kept none.
+    None if the policy sees more than the state, or the run kept none.
     """
     table: Any
     if (run / "policy.npy").is_file():
@@ -180,7 +180,7 @@ def final_policy(run: Path, task: Task) -> np.ndarray | None:
 
 @dataclass(frozen=True, eq=False)
 class SubmissionVerdict:
-    """What was computed of a submission.
+    """Result of verifying a submission.
 
     Attributes:
         file, submission: what was verified. sha256: of the file.

@@ -36,7 +36,7 @@ TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Protocol:
-    """How agents are run on the tasks of a suite.
+    """Training and evaluation protocol of a suite: steps, evaluations, seeds, discount and horizon.
 
     Attributes:
         steps: of an agent, on each task. evaluations: points of the curve, equally far apart, the last one at the end.
@@ -58,7 +58,7 @@ class Protocol:
 
 @dataclass(frozen=True)
 class BenchmarkTask:
-    """One task of a suite: a world, what is seen of it, and what is known of it before any run.
+    """One task of a suite: an environment, an observation, and facts known before any run (values, predictions).
 
     Attributes:
         name: unique in its suite, and fit for a file name.
@@ -88,7 +88,7 @@ class BenchmarkTask:
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     def training_task(self, protocol: Protocol) -> Task:
-        """What an agent learns; nothing is built before it is needed."""
+        """The task as agents are trained on it; nothing is built before it is needed."""
         return Task.of(
             self.environment,
             self.parameters,
@@ -100,7 +100,7 @@ class BenchmarkTask:
         )
 
     def check(self, protocol: Protocol) -> Task:
-        """What an agent learns; ParameterError where that is another task on this installation.
+        """The task as agents are trained on it; ParameterError if it is another task on this installation.
 
         Cost: its states are built and solved.
         """
@@ -141,7 +141,7 @@ class Ladder:
 
 @dataclass(frozen=True)
 class Suite:
-    """Tasks that stay what they are, and the protocol of runs on them.
+    """A frozen list of tasks, and the protocol of runs on them.
 
     Attributes:
         name: such as "v1". protocol: of all tasks.
@@ -173,7 +173,7 @@ class Suite:
         return self._by_name[name]
 
     def check(self) -> None:
-        """ParameterError, by name, for the first task that is another one on this installation. Cost: seconds."""
+        """Raise ParameterError for the first task that is another one on this installation. Cost: seconds."""
         for task in self.tasks:
             task.check(self.protocol)
 
@@ -203,7 +203,7 @@ def load_suite(name_or_file: str | Path = "v1") -> Suite:
 
 
 def suite_of(entry: object, whose: str) -> Suite:
-    """A suite from its entries, as a file has them, whole and of the digest that it names.
+    """A suite from the entries of its file; checked to be complete and to have the digest that it names.
 
     Raises:
         FileFormatError: an entry is missing, unknown, of another type or damaged; `whose` says of which file.
@@ -255,7 +255,7 @@ def digest_of_suite(suite: Suite) -> str:
 
 
 def digest_of_task(task: Task) -> str:
-    """SHA-256 of a task as it is solved: what it is made of, by name, and its arrays.
+    """SHA-256 of a task as it is solved: its components by name, and its arrays.
 
     The names: environment, all its parameters (of an imported MDP none: it is its arrays), version of its rules,
     observation with its options, chance, gamma and time limit. The arrays, little-endian: of each state and action the
@@ -285,7 +285,7 @@ def digest_of_task(task: Task) -> str:
 
 
 def _arrays(mdp: TabularMDP) -> Iterable[np.ndarray]:
-    """Rows s A + a, next states and probabilities of all that can happen; rewards, start, ends."""
+    """Yield the arrays of an MDP: rows s A + a, next states, probabilities of outcomes; rewards, start, terminal."""
     num_states, num_actions = mdp.num_states, mdp.num_actions
     pairs = np.arange(num_states * num_actions)
     which, next_states, probabilities = mdp.dynamics.entries(pairs // num_actions, pairs % num_actions)

@@ -60,7 +60,7 @@ def print_json(answer: Mapping[str, Any]) -> None:
 
 
 def _plain(value: object) -> object:
-    """What is neither a number nor text, as JSON has it: sets and objects; text of all else."""
+    """JSON form of a value that is neither a number nor text: sets, dataclasses; text of all else."""
     if isinstance(value, set | frozenset):
         return storage.plain(list(value))
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

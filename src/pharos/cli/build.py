@@ -71,7 +71,7 @@ def build(building: SharedBuilding, target: Target, *, out: Path | None = None) 
 
 
 def _outcomes(space: "StateSpace") -> list[tuple[str, str]]:
-    """How many outcomes actions have, where the rules have chance."""
+    """Numbers of outcomes of actions as a fact; none if the rules have no chance."""
     if not space.has_chance:
         return []
     manifest = space.manifest

@@ -39,7 +39,7 @@ FLAGS = {"observation_options": "option", "evaluation_interval": "interval", "hy
 
 
 class Commands(typer.Typer):
-    """An application, or a group of it, whose commands are made of functions."""
+    """A Typer application or group whose commands are made from functions."""
 
     def command(  # type: ignore[override]
         self, name: str | None = None, **options: Any
@@ -94,7 +94,7 @@ def command(function: Callable[..., Any]) -> Callable[..., None]:
 
 
 def _of_fields(cls: "type[DataclassInstance]", values: object, docs: Mapping[str, str]) -> Iterator[inspect.Parameter]:
-    """A parameter for each field of a dataclass, and of those of its fields that are dataclasses.
+    """Yield a parameter for each field of a dataclass, and for the fields of nested dataclasses.
 
     Args:
         values: the defaults. docs: help texts that go before those of the class.

@@ -139,7 +139,7 @@ ACTING = ("sticky", "random", "lazy")
 
 @dataclass(frozen=True)
 class Given:
-    """A policy that a command names: how `pharos.evaluate_policy` is to take it, and the task that it was trained on.
+    """A policy that a command names, with its observation options and the task that it was trained on.
 
     Attributes:
         task: None for a file.

@@ -171,7 +171,7 @@ def _print(title: str, report: "Report", chance: str, definitions: bool) -> None
 
 
 def _ties(report: "Report") -> list[str]:
-    """How many gaps count as ties, and at which tolerance, where a measure of gaps is among them."""
+    """Number of gaps that count as ties, with the tolerance, as a note; none without a measure of gaps."""
     for result in report.results.values():
         details = {} if result.undefined else result.certificate.details
         if "ties" in details:

@@ -178,7 +178,7 @@ def check_format(path: Path, suffixes: Sequence[str], option: str = "--out") -> 
 
 @dataclass(frozen=True, kw_only=True)
 class Building:
-    """How a state space is built.
+    """Options of building a state space.
 
     Attributes:
         memory: memory to use at most, such as 2GiB or 500MB.
@@ -201,7 +201,7 @@ class Building:
 
 @dataclass(frozen=True, kw_only=True)
 class SharedBuilding(Building):
-    """The same by several processes; made before anything is said, as all but the first are silent from then on.
+    """Options of building by several processes; made before any output, as all but the first then fall silent.
 
     Attributes:
         processes: processes that share the work and the memory, by MPI; under mpiexec: those that it has started.
@@ -264,7 +264,7 @@ class Target:
 
     @property
     def title(self) -> str:
-        """As it was typed."""
+        """The target as typed."""
         return " ".join((self.target, *(self.parameters or ())))
 
     def space(self, building: Building | None = None, out: Path | None = None, **options: Any) -> "StateSpace":

@@ -44,7 +44,7 @@ class Study:
     trust: Trust = False
 
     def opened(self) -> "tuple[Specification, Path]":
-        """Its specification, and the folder of its results."""
+        """The specification of the study, and the folder of its results."""
         from pharos import study
 
         return study.opened(self.spec, self.out, trust=self.trust or None, environments=self.environments)
@@ -146,13 +146,13 @@ def run(
 
 
 def _say(forecast: object) -> None:
-    """How long it will take, on standard error."""
+    """Print the forecast of the duration on standard error."""
     console(stderr=True).print(str(forecast), soft_wrap=True)
 
 
 @app.command("status")
 def status(source: Study) -> Answer:
-    """How many runs are finished, running, missing and failed, and why."""
+    """Count the runs that are finished, running, missing and failed, with the reasons."""
     from pharos import study
 
     return _answer(study.status(*source.opened()))

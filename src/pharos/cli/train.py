@@ -100,7 +100,7 @@ def train(
 
 
 def _train_many(title: str, *, seeds: list[int], steps: int, out: Path | None, **setting: Any) -> Answer:
-    """A run for each seed; what they have in common is told, and what went wrong."""
+    """Train one run per seed; answers with quartiles over the runs, and with errors of failed runs."""
     from pharos.training import FailedRun, train_many
 
     began = time.perf_counter()

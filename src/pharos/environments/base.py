@@ -278,7 +278,7 @@ def _truth(env: object, name: str, value: object) -> bool:
 
 
 def as_tuples(value: object) -> Any:
-    """Lists as tuples, all the way down: parameters as JSON or YAML writes them become those of a class."""
+    """Convert nested lists to tuples: parameters as JSON or YAML writes them become those of a class."""
     return tuple(as_tuples(item) for item in value) if isinstance(value, list | tuple) else value
 
 
@@ -303,7 +303,7 @@ Shape = Callable[[np.ndarray, int, str], np.ndarray]
 
 @dataclass(frozen=True)
 class Layer:
-    """How one kind of thing looks. `draw` puts it on its plane; every picture is made from the planes.
+    """Appearance of one kind of thing. `draw` puts it on its plane; every picture is made from the planes.
 
     Attributes:
         glyph: one character for text drawings; several, one for each value 1, 2, ... on the plane.
@@ -323,7 +323,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Scenery:
-    """How complex images of a class look, in pixels of their natural size.
+    """Layout and sprites of complex images of a class, in pixels of their natural size.
 
     Attributes:
         cell: (height, width) of a cell.
@@ -342,7 +342,7 @@ class Scenery:
 
 @dataclass(frozen=True)
 class Look:
-    """How a class of environments looks beside its layers.
+    """Appearance of a class of environments beside its layers: ground, scenery, and colour in plots.
 
     Attributes:
         ground: of pictures for people: a name in `pharos.drawing.GROUNDS`, or a function (see `Ground`).
@@ -638,13 +638,13 @@ class Environment:
         return tuple(int(value) for value in out)
 
     def reward_of(self, state: object, action: int, next_state: object, outcome: int = 0) -> float:
-        """What a step pays, whichever form of `reward` the class has; interpreted."""
+        """Reward of a step, for either form of `reward` that a class may have; interpreted."""
         if type(self).pays_by_outcome():
             return self.reward(state, action, next_state, outcome)
         return self.reward(state, action, next_state)
 
     def drawn_outcome(self, state: Sequence[int], action: int, u: float) -> int:
-        """The outcome that a number drawn from [0, 1) stands for: those before it add up to u at most; interpreted."""
+        """Outcome drawn by a uniform number u in [0, 1): those before it have total probability <= u; interpreted."""
         drawn, passed = 0, 0.0
         for outcome in range(self.outcomes if self.has_chance else 0):
             likely = float(self.probability(tuple(state), action, outcome))
@@ -659,7 +659,7 @@ class Environment:
 
 @cache
 def num_arguments(rule: Callable[..., object]) -> int:
-    """How many arguments a rule takes by their places, `self` among them; 0 where Python cannot tell."""
+    """Number of positional arguments of a rule, `self` among them; 0 if Python cannot tell."""
     try:
         parameters = inspect.signature(rule).parameters.values()
     except (TypeError, ValueError):

@@ -28,12 +28,12 @@ class BuiltIn(NamedTuple):
 
     @property
     def file(self) -> str:
-        """Its module, below `pharos.environments`."""
+        """Module of the class, below `pharos.environments`."""
         return f"{'mini_grid' if self.name.startswith('mini_grid') else 'worlds'}.{self.name}"
 
     @property
     def instance_names(self) -> tuple[str, ...]:
-        """One by one."""
+        """Names of the instances."""
         return tuple(self.instances.split())
 
 
@@ -89,11 +89,11 @@ _LISTENERS: list[Callable[[type["Environment"]], None]] = []
 
 
 def on_registration(hear: Callable[[type["Environment"]], None]) -> None:
-    """Call `hear` with every class of a user's own that is registered from now on."""
+    """Call `hear` with every user class that is registered from now on."""
     _LISTENERS.append(hear)
 
 
 def announce(cls: type["Environment"]) -> None:
-    """Tell everyone who wants to hear of a class that it is registered now."""
+    """Call the functions of `on_registration` with a class that has just been registered."""
     for hear in _LISTENERS:
         hear(cls)

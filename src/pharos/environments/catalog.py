@@ -136,7 +136,7 @@ def class_of(source: Source, *, trust: bool = False, strict: bool = False) -> ty
 
 
 def source_of(cls: type[Environment]) -> Source | None:
-    """Where a user's class comes from; None for built-in classes, and for those that no other process can import."""
+    """Module or file of a user's class; None for built-in classes, and for those that no other process can import."""
     return None if _is_built_in(cls) else sources.source_of(cls)
 
 

@@ -72,12 +72,12 @@ class ImportedWorld(Environment):
 
     @cached_property
     def manifest(self) -> Mapping[str, Any]:
-        """What the folder says of itself."""
+        """Manifest of the folder."""
         return mdp_files.read_manifest(self.folder)
 
     @property
     def actions(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Their names."""
+        """Names of the actions."""
         return tuple(self.manifest.get("actions") or map(str, range(self.manifest["num_actions"])))
 
     @property
@@ -123,7 +123,7 @@ class ImportedWorld(Environment):
             rest = rest // 10
 
     def picture(self, state) -> np.ndarray | None:
-        """What the source shows of a state, (H, W, 3) uint8, where the import recorded images or grids; else None.
+        """Picture of a state from the source, (H, W, 3) uint8, if the import recorded images or grids; else None.
 
         Codes of a grid are shown as colours.
         """
@@ -165,7 +165,7 @@ class ImportedWorld(Environment):
 
     @cached_property
     def recorded(self) -> np.ndarray | None:  # type: ignore[override]
-        """(S, ...) what the source shows of each state, zeros for the end; None where the import recorded nothing."""
+        """(S, ...) recorded observation of each state, zeros for the end; None if the import recorded nothing."""
         if mdp_files.OBSERVATIONS not in self.manifest["arrays"]:
             return None
         shown = mdp_files.read_array(self.folder, self.manifest, mdp_files.OBSERVATIONS)
@@ -199,7 +199,7 @@ class ImportedWorld(Environment):
 
 
 def is_name(value: object) -> bool:
-    """Whether it can be the name of an action."""
+    """Whether a value can be the name of an action."""
     return isinstance(value, str) and value != ""
 
 

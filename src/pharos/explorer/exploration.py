@@ -193,7 +193,7 @@ class Exploration:
     # Of one state ---------------------------------------------------------------------------------------------------
 
     def position(self, state: int, previous: int | None = None) -> dict[str, Any]:
-        """All about a state.
+        """Data of one state.
 
         Args:
             state: its number.

@@ -1,4 +1,4 @@
-"""Which key does which action, for whoever plays: in the terminal and in the page."""
+"""Keys for actions when playing, in the terminal and on the page."""
 
 ARROWS = {"up": "w", "left": "a", "down": "s", "right": "d"}  # action -> letter
 

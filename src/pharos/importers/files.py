@@ -216,7 +216,7 @@ def storm_recording(
 
 
 def _outcomes(model: Any, ended: np.ndarray, reward_model: Any) -> ImportedOutcomes:
-    """What every state and action may lead to and what that pays; of states that end the episode, its end."""
+    """Outcomes of every state and action with their rewards; states in `ended` lead to the end of the episode."""
     matrix, states = model.transition_matrix, model.nr_states
     first = [matrix.get_row_group_start(s) for s in range(states)]
     last = [matrix.get_row_group_end(s) for s in range(states)]
@@ -240,7 +240,7 @@ def _outcomes(model: Any, ended: np.ndarray, reward_model: Any) -> ImportedOutco
 
 
 def _rewards(reward_model: Any, state: int, choice: int, successors: list[int], ended: np.ndarray) -> list[float]:
-    """What a choice pays with each of its successors: for the state, for the choice, and for the transition."""
+    """Reward of a choice with each successor: the sum of the rewards of state, choice and transition."""
     if reward_model is None:
         return [float(successor >= 0 and ended[successor]) for successor in successors]
     always = 0.0

@@ -28,7 +28,7 @@ from pharos.system.mdp_files import (
 
 
 class ImportedOutcomes(NamedTuple):
-    """What each state and action may lead to, and what that pays.
+    """Outcomes of each state and action: next state, probability and reward.
 
     Attributes:
         offsets: (S A + 1,) where the outcomes of row s A + a begin. next_states: (N,), -1 for the end of the episode.
@@ -123,7 +123,7 @@ def _warn(text: str) -> None:
 
 
 def _checked_outcomes(mdp: TabularMDP, outcomes: ImportedOutcomes) -> dict[str, np.ndarray]:
-    """Their arrays by their names; ParameterError where they are not those of the MDP."""
+    """Arrays of the outcomes by name; ParameterError if they do not belong to the MDP."""
     offsets, successors, probabilities, rewards = (np.asarray(each) for each in outcomes)
     pairs = mdp.num_states * mdp.num_actions
     fits = offsets.shape == (pairs + 1,) and offsets[0] == 0 and offsets[-1] == len(successors)
@@ -143,7 +143,7 @@ def _description(
     observations: np.ndarray | None,
     observed: str | None,
 ) -> dict[str, Any]:
-    """What the manifest says beside the MDP; ParameterError where it does not fit."""
+    """Entries of the manifest on actions, time limit and observations; ParameterError if they do not fit the MDP."""
     description: dict[str, Any] = {}
     if actions is not None:
         if len(actions) != mdp.num_actions or not all(isinstance(name, str) and name for name in actions):

@@ -225,7 +225,7 @@ def _compare_frequencies(env: object, inner: object, table: list, samples: dict[
 
 
 def _native(inner: object) -> str:
-    """What pharos has in place of an environment, for the end of a message."""
+    """Hint at pharos' own version of an environment, for the end of a message; empty if there is none."""
     name = type(inner).__name__.removesuffix("Env")
     if name not in NATIVE:
         return ""
@@ -445,7 +445,7 @@ class _Driver:
         return (1.0 if reward > 0 else float(reward)), bool(terminated)
 
     def save(self) -> bytes:
-        """The state, to be put back."""
+        """Snapshot of the state, for `restore`."""
         stored = io.BytesIO()
         pickler = pickle.Pickler(stored, protocol=5)
         pickler.persistent_id = self._number_of_fixed  # type: ignore[method-assign]
@@ -462,7 +462,7 @@ class _Driver:
         vars(self.env).update(attributes)
 
     def _number_of_fixed(self, value: object) -> int | None:
-        """What is no part of a state and stays where it is: the environment itself, its spaces, its generator."""
+        """Number of a value outside the state (the environment itself, its spaces, its generator); None for others."""
         if value is not self.env and not isinstance(value, self.fixed_types):
             return None
         for number, constant in enumerate(self.fixed):
@@ -482,7 +482,7 @@ class _Driver:
         return image
 
     def key(self) -> bytes:
-        """Equal for equal states, and for no others."""
+        """Key of the state: equal for equal states, and for no others."""
         flat: list[Any] = []
         places: dict[int, int] = {}
         for name, value in self._attributes():
@@ -491,7 +491,7 @@ class _Driver:
         return repr(flat).encode()
 
     def _attributes(self) -> Iterator[tuple[str, Any]]:
-        """What the environment keeps; the grid first, so that objects are numbered by where they lie."""
+        """Yield the attributes that make up the state; the grid first, so that objects are numbered by position."""
         attributes = vars(self.env)
         for name in sorted(attributes, key=lambda name: (name != "grid", name)):
             if name not in _NOT_STATE:

@@ -95,7 +95,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._successors = None if space is None or self._has_outcomes else space.successors
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without compiled functions: where the copy is made they are taken from the cache, not compiled anew."""
+        """State without compiled functions: the process of the copy takes them from the cache, without compiling."""
         return {**self.__dict__, "_step_one": None, "_outcome_one": None, "_step_and_draw": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -140,7 +140,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         return observation, self._info(self._state)
 
     def step(self, action: SupportsIndex) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Choose an action. After a terminal state nothing changes and nothing is paid."""
+        """Choose an action. After a terminal state nothing changes and the reward is 0."""
         executed = operator.index(action)
         if not 0 <= executed < self._num_actions:
             raise ParameterError(f"{self.environment}: action {action!r}; expected 0 to {self._num_actions - 1}")

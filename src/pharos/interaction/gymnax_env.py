@@ -120,7 +120,7 @@ class GymnaxEnv(environment.Environment):
 
     @property
     def num_actions(self) -> int:
-        """A."""
+        """Number of actions A."""
         return self._num_actions
 
     def step_env(self, key: jax.Array, state: EnvState, action: jax.Array, params: EnvParams) -> tuple[Any, ...]:
@@ -179,7 +179,7 @@ class GymnaxEnv(environment.Environment):
 
 
 class JoinedEnds(GymnaxEnv):
-    """The same for agents of gymnax before 1.0, such as rejax 0.1: `step` joins terminated and truncated to `done`."""
+    """`GymnaxEnv` for agents of gymnax before 1.0, such as rejax 0.1: `step` joins both kinds of end to `done`."""
 
     @partial(jax.jit, static_argnames=("self",))
     def step(

@@ -1,4 +1,4 @@
-"""An environment made ready for interaction: what single and vector environments share.
+"""An environment prepared for interaction: the part that single and vector environments share.
 
 Their options (`Interaction`), rules and chance (`Simulator`), observations beyond the current state (`FrameStack`: the
 frames before, irrelevant coins), and how rewards are paid (`RewardChannel`).
@@ -58,7 +58,7 @@ class Interaction:
 
 
 class Simulator:
-    """An environment made ready for interaction: rules as compiled functions, observation, chance, time limit.
+    """An environment prepared for interaction: rules as compiled functions, observation, chance, time limit.
 
     Attributes:
         env, state_space, context, limit: as the options say; `context` maps states to what the agent gets.
@@ -107,7 +107,7 @@ class Simulator:
         return Setting(ranges, scale, self._weights, limit, mode, self.first_previous, starts, self.start_cumulative)
 
     def drawn_start(self, rng: "np.random.Generator | Stream") -> int:
-        """Which of the start states; draws one number where there are several."""
+        """Index of a drawn start state; draws a random number only if there are several."""
         if len(self.start_states) == 1:
             return 0
         return int(np.searchsorted(self.start_cumulative, rng.random(), side="right"))
@@ -283,7 +283,7 @@ class FrameStack:
         seed_streams(self._rng, seeds, 2)
 
     def push(self, states: np.ndarray, moves: np.ndarray, begins: np.ndarray) -> None:
-        """Environments are in states (N, D) now; (N,) bool: `moves` by a step, `begins` at the start of an episode."""
+        """Add frames of states (N, D); (N,) bool: `moves` after a step, `begins` at the start of an episode."""
         if self.observation.frames > 1:
             frames = self.observation.frame(states)
             self._frames[moves, :-1] = self._frames[moves, 1:]
@@ -291,12 +291,11 @@ class FrameStack:
             self._frames[begins] = frames[begins, None]
 
     def current(self, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        """A batch of N observations of where they are; after `push`."""
+        """Observations of the N current states; called after `push`."""
         return self._in_context(self._frames, slice(None), states, previous, elapsed)
 
     def terminal(self, rows: np.ndarray, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        """The last observations of the episodes of environments `rows`, in states (len(rows), D) that `push` is not
-        told.
+        """Terminal observations of environments `rows`, in states (len(rows), D); `push` never sees these states.
         """
         frames = self._frames[rows]
         if self.observation.frames > 1:
@@ -317,7 +316,7 @@ class FrameStack:
 
 
 class RewardChannel:
-    """Pay of N environments: the reward of `delay` steps before, and noise. Values and regret are of what is earned.
+    """Delayed and noisy rewards of N environments. Values and regret are of the rewards without delay and noise.
 
     At step t of an episode of n steps, t = 1 .. n, r_t being what is earned:
 
@@ -346,12 +345,12 @@ class RewardChannel:
         seed_streams(self._rng, seeds, 1)
 
     def restart(self, mask: np.ndarray) -> None:
-        """Forget what is due in some environments (N,) bool, whose episodes begin."""
+        """Drop the pending rewards of the environments of mask (N,) bool, whose episodes begin."""
         self._pending[mask] = 0.0
         self._steps[mask] = 0
 
     def pay(self, earned: np.ndarray, is_step: np.ndarray, ended: np.ndarray) -> np.ndarray:
-        """Return the pay (N,) of a step.
+        """Return the rewards (N,) that agents get in a step.
 
         Args:
             earned: (N,), 0 where nothing is played.

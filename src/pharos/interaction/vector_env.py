@@ -43,7 +43,7 @@ _NO_VECTORS = np.empty((0, 0), np.float32)
 
 
 class Stepper(ABC):
-    """Where the N environments are, and how a step advances them.
+    """Current states of N environments, and the step that advances them.
 
     Kernels get Setting and Batch as plain tuples: named ones cost Numba a microsecond a call more.
 
@@ -61,7 +61,7 @@ class Stepper(ABC):
         self.final_elapsed = np.zeros(len(current), np.int64)
 
     def restart(self, mask: np.ndarray, rng: np.ndarray, state: object) -> None:
-        """Begin episodes in the environments of mask (N,): in `state`, or where they are drawn."""
+        """Begin episodes in the environments of mask (N,): in `state`, or in drawn start states."""
         if state is not None:
             self.current[mask] = self.places(_states_of(self.simulator, state, len(mask))[mask])
             return
@@ -78,7 +78,7 @@ class Stepper(ABC):
         """States (n, D) of places (n, ...)."""
 
     def vectors(self) -> np.ndarray:
-        """Room for the vectors of the next step; without rows where the compiled step does not write them."""
+        """Buffer for vector observations of the next step; empty if the compiled step does not write them."""
         return _NO_VECTORS
 
     @abstractmethod
@@ -373,7 +373,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         return info
 
     def _add_final(self, info: dict[str, Any], done: np.ndarray) -> None:
-        """The last observations and infos, as Gymnasium's own vector environments give them."""
+        """Add terminal observations and infos, as Gymnasium's own vector environments do."""
         rows, executed = np.flatnonzero(done), info["executed_action"]
         context, places = (executed[rows], self._walk.final_elapsed[rows]), self._walk.final[rows]
         if self._frame_stack is None:

@@ -50,7 +50,7 @@ _AGAIN = "fetch it again, or ask for it again"
 
 @dataclass(frozen=True)
 class Claim:
-    """What an entry says of the policy in it, in the setting of its configuration.
+    """Claimed value and regret of the policy of an entry, in the setting of its configuration.
 
     Attributes:
         value: expected return of an episode.
@@ -70,7 +70,7 @@ class Claim:
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """What the file of an entry holds.
+    """Contents of an entry: configuration, claim, and the arrays that were learnt.
 
     Attributes:
         name, author, note: as whoever submitted it wrote them.
@@ -102,7 +102,7 @@ class Entry:
 
 
 def write(entry: Entry, file: str | os.PathLike) -> None:
-    """Replace a file by an entry, in one step; the same entry gives the same bytes."""
+    """Write an entry to a file, replacing it atomically; the same entry gives the same bytes."""
     body = {name: value for name, value in vars(entry).items() if name != _ARRAYS}
     record = {**body, "format": FORMAT, "id": entry.id, "config": entry.config.to_dict(), "claim": asdict(entry.claim)}
     write_sealed(file, record, entry.arrays)
@@ -111,7 +111,7 @@ def write(entry: Entry, file: str | os.PathLike) -> None:
 def write_sealed(
     file: str | os.PathLike, record: Mapping[str, Any], arrays: Mapping[str, np.ndarray], what: str = ENTRY
 ) -> None:
-    """Replace a file by a record and arrays with their digests, in one step; the same ones give the same bytes."""
+    """Write a record and arrays, with their digests, to a file, replacing it atomically; same input, same bytes."""
     checked = {name: _checked(name, array) for name, array in arrays.items()}
     digests = {name: _digest(array) for name, array in checked.items()}
     text = json.dumps(storage.sealed({**record, _ARRAYS: digests}), sort_keys=True, allow_nan=False)
@@ -134,7 +134,7 @@ def read(file: str | os.PathLike) -> Entry:
 
 
 def in_file(path: Path, make: Callable[[], T]) -> T:
-    """What is made of the record of a file; whatever is wrong with that, as one line that names the file."""
+    """Call `make` on the record of a file; its errors become FileFormatError, one line that names the file."""
     try:
         return make()
     except (FileFormatError, ParameterError) as error:
@@ -193,7 +193,7 @@ def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
 
 
 def check_values(value: object, name: str = "record", depth: int = 0) -> None:
-    """Refuse texts that would do something to a terminal, or hide what they say, and numbers that no float holds."""
+    """Refuse texts with unprintable or invisible characters, and numbers that are not finite."""
     if depth > DEEPEST:
         raise ValueError(f"its {name} is nested deeper than {DEEPEST} times")
     if isinstance(value, Mapping):
@@ -213,7 +213,7 @@ def check_values(value: object, name: str = "record", depth: int = 0) -> None:
 
 
 def _check_shown(text: str, name: str) -> None:
-    """Refuse what a page shows as nothing, or as a heap of accents."""
+    """Refuse text that a page would show as nothing, or as a heap of accents."""
     if len(text) > LONGEST_TEXT:
         raise ValueError(f"its {name} has {len(text):,} characters; expected at most {LONGEST_TEXT:,}")
     kinds = [unicodedata.category(character)[0] for character in unicodedata.normalize("NFC", text)]
@@ -320,14 +320,14 @@ def submit(
 
 
 def check_ending(target: Path) -> Path:
-    """The file, whose name ends in SUFFIX; else ParameterError."""
+    """Return the file if its name ends in SUFFIX; else ParameterError."""
     if target.suffix.lower() != SUFFIX:
         raise ParameterError(f"{target}: expected a file name that ends in {SUFFIX}")
     return target
 
 
 def write_checked(target: Path, write: Callable[[], None], read: Callable[[], T]) -> T:
-    """What is read of a file once it is written; ParameterError, and no file, where it is one that `read` refuses."""
+    """Write a file, read it back and return the result; if `read` refuses it, delete it and raise ParameterError."""
     target.parent.mkdir(parents=True, exist_ok=True)
     write()
     try:
@@ -338,7 +338,7 @@ def write_checked(target: Path, write: Callable[[], None], read: Callable[[], T]
 
 
 def _rules_version(run: Path, record: dict[str, Any], config: RunConfig) -> int:
-    """The version of the rules that the run says; of older runs, which say none, that of the class here."""
+    """Version of the rules that the run recorded; for older runs, without one, the version of the class here."""
     stored = record.get("rules_version")
     if isinstance(stored, int) and not isinstance(stored, bool):
         return stored
@@ -366,7 +366,7 @@ def stored_table(run: Path) -> np.ndarray:
 
 
 def _network(run: Path) -> dict[str, np.ndarray]:
-    """The parameters of the policy, by name; optimisers stay behind."""
+    """The parameters of the policy by name, without optimiser state."""
     from pharos.errors import MissingExtra
 
     try:

@@ -37,7 +37,7 @@ BoardProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table: its text, and the number or the text that it is sorted by."""
+    """A cell of a table: its text, and its sort key."""
 
     text: str
     key: str = ""
@@ -55,7 +55,7 @@ class Ranking:
 
 @dataclass
 class Board(Generic[T]):
-    """What was made of files.
+    """Verdicts on a set of files, and the page that shows them.
 
     Attributes:
         file: the page.
@@ -180,12 +180,12 @@ def _template() -> "Template":
 
 
 def reason(error: Exception) -> str:
-    """An error in a line of LONGEST_REASON letters."""
+    """Message of an error as one line of at most LONGEST_REASON letters."""
     return in_one_line(error)[:LONGEST_REASON].removesuffix(": ") or type(error).__name__
 
 
 def why_not(verdict: Verdict) -> str:
-    """Why a claim does not hold, in a line."""
+    """The reason why a claim does not hold, in one line."""
     wrong = [
         f"{in_words(check.name)} is {check.found:.8g}, the entry claims {check.claimed:.8g}"
         for check in verdict.checks
@@ -218,7 +218,7 @@ def _rankings(verdicts: Sequence[Verdict]) -> list[Ranking]:
 
 
 def _copies(entry: Entry, group: Sequence[Verdict]) -> str:
-    """The other entries of the same run with the same arrays to the last bit; nobody can say whose it is."""
+    """Other entries of the same run with bitwise equal arrays; their author cannot be determined."""
     same = [
         f"{other.name} by {other.author or 'nobody'}"
         for other in (verdict.entry for verdict in group)

@@ -118,7 +118,7 @@ def _known_agent(name: str) -> str:
 
 
 def _network_options(entry: Entry) -> dict[str, Any]:
-    """Of the hyperparameters, those that shape the network; plain numbers and truths alone."""
+    """Hyperparameters that shape the network; FileFormatError if some are not plain numbers and truths."""
     hyperparameters = entry.hyperparameters
     options = {name: hyperparameters[name] for name in ("net_arch", "policy_kwargs") if name in hyperparameters}
     kwargs = options.get("policy_kwargs", {})
@@ -153,7 +153,7 @@ def _check_sizes(entry: Entry, task: Task, hyperparameters: dict[str, Any]) -> N
 
 
 def _architectures(hyperparameters: Mapping[str, Any]) -> Iterator[Any]:
-    """The widths of layers that hyperparameters ask for, of each part of the network, as they say them."""
+    """Yield the widths of layers that hyperparameters ask for, for each part of the network, unchecked."""
     for options in (hyperparameters, hyperparameters.get("policy_kwargs", {})):
         architecture = options.get("net_arch", [])
         yield from architecture.values() if isinstance(architecture, dict) else [architecture]
@@ -193,7 +193,7 @@ SEED = 1
 
 @dataclass(frozen=True)
 class Check:
-    """A number of the claim beside what was computed.
+    """A claimed number beside the computed one.
 
     Attributes:
         name: "value", "regret", "value_optimal" or "value_uniform".
@@ -208,13 +208,13 @@ class Check:
 
     @property
     def holds(self) -> bool:
-        """Whether they are no farther apart than that."""
+        """Whether claimed and computed number differ by at most `within`."""
         return abs(self.claimed - self.found) <= self.within
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What was computed of an entry.
+    """Result of verifying an entry.
 
     Attributes:
         file, entry: what was verified.
@@ -333,7 +333,7 @@ def verify(
 
 
 def _objections(claim: Claim, reference: ReferenceValues, spread: float, slack: float) -> tuple[str, ...]:
-    """What cannot be true of a claim."""
+    """Sentences on parts of a claim that cannot be true."""
     objections = []
     bound = min(claim.error_bound, slack) if claim.exact else claim.error_bound
     if claim.value - bound > reference.optimal + slack:
@@ -350,7 +350,7 @@ def _objections(claim: Claim, reference: ReferenceValues, spread: float, slack: 
 
 @contextlib.contextmanager
 def _time_limit(seconds: float) -> Iterator[None]:
-    """Raise TimeLimit within the block after so many seconds by the clock, and each second after that until it ends.
+    """Raise TimeLimit in the block after that many seconds of wall-clock time, and every second until the block ends.
 
     A compiled kernel is not interrupted; it raises when it returns. Only the main thread can be stopped, by SIGALRM:
     elsewhere, and on Windows, there is no limit.
@@ -442,7 +442,7 @@ def _as_floats(value: object) -> object:
 
 
 def _check_code(config: RunConfig, trust: bool) -> None:
-    """Refuse whatever is not part of pharos; agents are looked at where they are made."""
+    """Refuse code, environments and observations that are not part of pharos, unless trusted; not agents."""
     if trust:
         return
     if config.sources:

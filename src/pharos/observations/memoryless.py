@@ -112,7 +112,7 @@ class _PolicySearch:
         return lower, lower + TOLERANCE
 
     def relaxed(self, fixed: np.ndarray) -> TabularMDP:
-        """The MDP in which all actions do the same where the observation has a fixed one."""
+        """The MDP in which all actions act as the fixed one in states whose observation has one."""
         mdp, actions = self.mdp, np.arange(self.mdp.num_actions)
         fixed_actions = np.where(self.live, fixed[self.classes], -1)
         executed = np.where(fixed_actions[:, None] < 0, actions, fixed_actions[:, None])
@@ -164,7 +164,7 @@ class _PolicySearch:
         return value, conflict
 
     def best(self, q: np.ndarray, weights: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-        """(C,): of each observation the action with the largest weighted value; a fixed one as it is."""
+        """(C,): for each observation the action with the largest weighted value; a fixed one as it is."""
         actions = self.sums(np.asarray(q), weights).argmax(axis=1)
         return np.where(fixed < 0, actions, fixed)
 

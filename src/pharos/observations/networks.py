@@ -1,4 +1,4 @@
-"""The networks that agents are made of, by name: what their tangent kernels follow from. Loads no PyTorch.
+"""The networks of agents, by name, and their tangent kernels. Loads no PyTorch.
 
     mlp128      one hidden layer of 128 units
     mlp128x2    two of them: what agents of pharos learn from vectors with

@@ -227,7 +227,7 @@ def observe(
 def _observation_and_keywords(
     make: Callable[..., Observation], env: Environment, state_space: "StateSpace | None", options: Mapping[str, Any]
 ) -> tuple[Observation, list[str]]:
-    """The observation, and the options that it knows: the keywords of `make`."""
+    """The observation that `make` returns, and the names of its options: the keywords of `make`."""
     parameters = inspect.signature(make).parameters
     keywords = [name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY]
     space = {"state_space": state_space} if "state_space" in parameters else {}

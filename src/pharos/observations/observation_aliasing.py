@@ -1,4 +1,4 @@
-"""Which states look alike: an observation that some states share does not tell the agent the state."""
+"""Aliasing: states that share an observation with other states, so that the agent cannot tell them apart."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

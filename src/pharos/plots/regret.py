@@ -127,7 +127,7 @@ def _labels(configs: list[dict[str, Any]]) -> list[str]:
 
 
 def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
-    """Who learnt what, for how long, in words, and what else tells this group of runs from the others."""
+    """Label of a group of runs: agent, environment, steps, and the settings that differ from other groups."""
 
     def differ(*keys: str) -> bool:
         return any(len({json.dumps(other[key], sort_keys=True) for other in configs}) > 1 for key in keys)
@@ -336,7 +336,7 @@ def _learner(part: "pd.DataFrame") -> str:
 
 
 def _spread(groups: list[Any], max_panels: int = MOST_PANELS) -> list[Any]:
-    """All of them, or as many, one class after the other, so that each class has some; in their order."""
+    """Up to `max_panels` groups, taken from each class in turn, in their original order."""
     if len(groups) <= max_panels:
         return groups
     by_class: dict[str, list[int]] = {}

@@ -1,4 +1,4 @@
-"""What W runs compute on a device: pinned buffers and recorded CUDA graphs; losses, their gradients and Adam.
+"""Arithmetic of W runs on a device: pinned buffers and recorded CUDA graphs; losses, their gradients and Adam.
 
 The arithmetic is there in two ways: compiled loops on the processor, tensor operations elsewhere. Both take and give
 tensors; the loops see them as arrays. What they compute is in kernels/batched.py.
@@ -16,7 +16,7 @@ from pharos.kernels import batched as kernels
 
 
 class PinnedBuffer:
-    """An array of the processor's, and the tensor on a device that it is sent to or fetched from.
+    """A host array and its tensor on a device, with copies in both directions.
 
     On the processor both are one. Elsewhere the array lies where a GPU can reach it, so that neither waits; whoever
     writes into it, or reads from it, waits for the device first (`wait`).
@@ -78,12 +78,12 @@ class CudaGraph:
 
 
 def is_gpu(device: str) -> bool:
-    """Whether a device of torch records programs."""
+    """Whether a device of torch is a GPU, which records CUDA graphs."""
     return torch.device(device).type == "cuda"
 
 
 def wait(device: str) -> None:
-    """Until the device has done what it was told."""
+    """Synchronize with the device; returns at once on the processor."""
     if is_gpu(device):
         torch.cuda.current_stream().synchronize()
 
@@ -92,7 +92,7 @@ def wait(device: str) -> None:
 
 
 class CompiledArithmetic:
-    """On the processor: one pass over memory each."""
+    """Losses and Adam as compiled loops on the processor, one pass over memory each."""
 
     def __init__(self, device: str, width: int):
         self.device = device
@@ -101,7 +101,7 @@ class CompiledArithmetic:
     def huber(
         self, q: Tensor, q_next: Tensor, q_choice: Tensor, minibatch: Sequence[Tensor], dq: Tensor, loss: PinnedBuffer
     ) -> None:
-        """The loss of DQN (W,) and its gradient; minibatch: (actions, rewards, discounts) (W, B)."""
+        """Write the Huber loss of DQN (W,) and its gradient; minibatch: (actions, rewards, discounts) (W, B)."""
         q_arrays = q.numpy(), q_next.numpy(), q_choice.numpy()
         actions, rewards, discounts = (part.numpy() for part in minibatch)
         kernels.huber(*q_arrays, actions, rewards, discounts, dq.numpy(), loss.array)
@@ -110,7 +110,7 @@ class CompiledArithmetic:
         self, scores: Tensor, values: Tensor, minibatch: Sequence[Tensor], weights: Sequence[Tensor],
         gradients: Sequence[Tensor], loss: PinnedBuffer, divergence: PinnedBuffer,
     ) -> None:  # fmt: skip
-        """The loss of PPO and its gradients; minibatch: (actions, old log p, advantages, returns) (W, B).
+        """Write the clipped loss of PPO and its gradients; minibatch: (actions, old log p, advantages, returns) (W, B).
 
         Args:
             weights: (clip range, of the entropy, of the value), (W,) float64 each.
@@ -125,7 +125,7 @@ class CompiledArithmetic:
     def plan(
         self, counts: np.ndarray, is_active: np.ndarray, rates: np.ndarray, max_norms: np.ndarray, eps: float
     ) -> None:
-        """Say what the next `adam` does: a step for the active runs (W,), which `counts` (W,) goes up for.
+        """Set learning rates and active runs (W,) of the next `adam`; it increments `counts` (W,) of active runs.
 
         Args:
             rates, max_norms: (W,).
@@ -133,14 +133,14 @@ class CompiledArithmetic:
         self._steps = counts, is_active, rates, max_norms, eps
 
     def adam(self, state: Sequence[Tensor]) -> None:
-        """The step that was planned; state: (parameters, gradients, means, squares), (W, P) each."""
+        """Adam step set by `plan`; state: (parameters, gradients, means, squares), (W, P) each."""
         assert self._steps is not None
         parameters, gradients, means, squares = (tensor.numpy() for tensor in state)
         kernels.adam(parameters, gradients, means, squares, *self._steps)
 
 
 class TensorArithmetic(CompiledArithmetic):
-    """The same by operations of torch, on any device."""
+    """Losses and Adam as operations of torch, on any device."""
 
     def __init__(self, device: str, width: int):
         super().__init__(device, width)

@@ -55,7 +55,7 @@ class Batch:
         return np.concatenate([lane.worlds.returns[: lane.number] for lane in self.lanes])
 
     def learn(self, points: Sequence[int], at_point: Callable[[int], object]) -> None:
-        """Go on from `steps`, and call `at_point` at each of the points.
+        """Train from `steps` on, and call `at_point` at each of the points.
 
         As in Stable-Baselines3's callbacks that is before the update that is due then; at the last step of the
         training it is after it.
@@ -70,16 +70,16 @@ class Batch:
             at_point(point)
 
     def best_actions(self, states: np.ndarray) -> np.ndarray:
-        """(N,) the action that each run likes best in its own state (N,), or history (N, k) where it sees k frames."""
+        """(N,) the best action of each run in its own state (N,), or history (N, k) if it sees k frames."""
         return np.concatenate(
             [lane.best_actions(states[k * self.width : (k + 1) * self.width]) for k, lane in enumerate(self.lanes)]
         )
 
     def greedy_actions(self, places: Sequence[int]) -> None:
-        """None: these policies are no tables of states, and are asked about observations."""
+        """None: these policies are no tables of states; they are queried about observations."""
 
     def policy(self, i: int) -> RunPolicy:
-        """The policy of run i, as it is when it is asked: greedy for DQN, probabilities for PPO."""
+        """The current policy of run i: greedy for DQN, probabilities for PPO."""
         return RunPolicy(self.lanes[i // self.width], i % self.width)
 
     def parameters(self, i: int) -> dict[str, np.ndarray]:
@@ -87,11 +87,11 @@ class Batch:
         return self.lanes[i // self.width].stored(i % self.width)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that `restore` needs to go on, bit for bit; the arrays are copies."""
+        """State of the batch for `restore`, which goes on bit for bit; the arrays are copies."""
         return joined_states({name: array.copy() for name, array in lane.arrays().items()} for lane in self.lanes)
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go on from what `state` gave, in a batch of the same runs."""
+        """Restore a state that `state` returned, in a batch of the same runs."""
         for k, lane in enumerate(self.lanes):
             lane.restore(state_of(state, k))
 

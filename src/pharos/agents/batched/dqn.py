@@ -76,7 +76,7 @@ class Replay:
         draws(keys, calls, draw, calls % self.rows, filled, gammas, num_steps, self.memory, batch)
 
     def arrays(self, calls: int) -> dict[str, np.ndarray]:
-        """The rows that are filled, by name."""
+        """The filled rows of the memory, by name."""
         names = ("replay_state", "replay_next", "replay_action", "replay_reward", "replay_flags")
         filled = min(calls, self.rows)
         return {name: array[:, :filled] for name, array in zip(names, self.memory, strict=True)}
@@ -119,7 +119,7 @@ class DQNLane(Lane[QNetworks]):
         return QNetworks(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions)
 
     def probabilities(self, scores: np.ndarray) -> np.ndarray:
-        """One for the best action."""
+        """One-hot probabilities of the greedy action."""
         return np.eye(self.num_actions)[scores.argmax(axis=1)]
 
     def step(self) -> None:
@@ -140,11 +140,11 @@ class DQNLane(Lane[QNetworks]):
         self.is_due = self.collected == 0 and bool(self._learns().any())
 
     def _learns(self) -> np.ndarray:
-        """(W,) which runs have begun to learn."""
+        """(W,) bool: runs that have begun to learn."""
         return (self.steps > self.own["learning_starts"]) & ~self.is_idle
 
     def _follow_schedules(self) -> None:
-        """After each step: copy to the targets where it is time, and move the exploration rates."""
+        """Copy to target networks that are due and anneal the exploration rates; called after each step."""
         copied = np.flatnonzero(self.calls % self._target_calls == 0)
         if len(copied):
             self.copy_to_targets(copied)
@@ -175,7 +175,7 @@ class DQNLane(Lane[QNetworks]):
         self._recorded_step()
 
     def gradient_step(self) -> None:
-        """The step; a GPU records this."""
+        """Forward pass, loss, backward pass and Adam on the drawn minibatch; a GPU records this."""
         batch = self.replay
         for part in batch.drawn:
             part.send()
@@ -208,7 +208,7 @@ class DQNLane(Lane[QNetworks]):
         return scores
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Go on from what `arrays` gave."""
+        """Restore a state that `arrays` returned."""
         super().restore(arrays)
         self._known = None
 

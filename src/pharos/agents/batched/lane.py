@@ -1,4 +1,4 @@
-"""A lane: a fixed number of runs that advance together. What DQN and PPO have in common.
+"""A lane: a fixed number of runs that advance together; the common part of DQN and PPO.
 
 Observations of W runs are tensors: gathered from one table where it fits, else drawn for those who ask.
 
@@ -47,7 +47,7 @@ class NetworkView:
         self.piece = self.shape[0] // self.frames * KERNEL**2 if self.is_small else self.length
 
     def raw(self, observations: np.ndarray) -> np.ndarray:
-        """(N, M + 1) observations, or single frames, with their channels first, and a 0."""
+        """(N, M + 1) observations, or single frames, channels first, followed by a 0."""
         turned = np.moveaxis(observations, -1, 1) if self._turns else observations
         return np.pad(turned.reshape(len(turned), -1), ((0, 0), (0, 1)))
 
@@ -56,7 +56,7 @@ class NetworkView:
         return self.raw(observations)[:, self.places]
 
     def in_blocks(self) -> Iterator[tuple[int, np.ndarray]]:
-        """(first state, single frames) of all states, a block at a time."""
+        """Yield (first state, single frames) of all states in blocks."""
         look = self.source.at if self.frames == 1 else self.source.frame
         for first in range(0, self.source.num_states, BLOCK):
             yield first, look(np.arange(first, min(first + BLOCK, self.source.num_states)))
@@ -74,7 +74,7 @@ def places_of(shape: tuple[int, ...], is_small: bool) -> np.ndarray:
 
 
 class ObservationTable:
-    """The observations of runs that see alike.
+    """Observations of runs whose observations have the same shape.
 
     Images are kept as bytes, those of the small convolution with the 9 C neighbours of each pixel, so that nothing is
     unfolded while runs learn. Where they do not fit, minibatches are drawn: 0.3 us an image of a small Breakout, and
@@ -139,7 +139,7 @@ class ObservationTable:
 
 
 class DeviceObservationTable(ObservationTable):
-    """The same on another device than the processor, for runs that see alike but for the size of what they see.
+    """Observations on a device other than the processor, for runs whose observations may differ in size.
 
     A table of all observations lies there. Smaller observations are filled up with zeros, and a mask says which pixels
     of the small convolution there are.
@@ -248,22 +248,22 @@ class Lane(Generic[Net]):
         self.steps = self.calls = self.collected = 0
         self.is_due = False
 
-    # What an agent says of itself -----------------------------------------------------------------------------------
+    # Interface of an agent ------------------------------------------------------------------------------------------
 
     def network_for(self, shape: tuple[int, ...]) -> Net:
         """The network for observations of a shape."""
         raise NotImplementedError
 
     def evaluate(self, x: torch.Tensor) -> torch.Tensor:
-        """(W, E, A) scores of actions in what is seen, by the networks as they are."""
+        """(W, E, A) scores of actions for observations x, by the current networks."""
         return self.network.scores(self.values, x)
 
     def step(self) -> None:
-        """One step of each copy; sets `is_due` at the end of a rollout."""
+        """Step each copy once; sets `is_due` at the end of a rollout."""
         raise NotImplementedError
 
     def update(self) -> None:
-        """Learn from what was collected."""
+        """Learn from the collected transitions."""
         raise NotImplementedError
 
     def own_arrays(self) -> dict[str, np.ndarray]:
@@ -277,7 +277,7 @@ class Lane(Generic[Net]):
     # Learning -------------------------------------------------------------------------------------------------------
 
     def advance(self, point: int) -> None:
-        """Go on until `point` steps. The update that is due then waits, unless it is the last."""
+        """Train until `point` steps. The update that is due then waits, unless it is the last."""
         is_last = point >= self.total
         while self.steps < point or (is_last and self.collected):
             self._learn_what_is_due()
@@ -303,7 +303,7 @@ class Lane(Generic[Net]):
         return self.seen.at(states, self._buffers[number])
 
     def answer(self) -> None:
-        """Write the scores of the states that were asked about; a GPU records this."""
+        """Write the scores of the requested states; a GPU records this."""
         self._asked.send()
         self._scores.tensor.copy_(self.evaluate(self.observed(self._asked)))
         self._scores.fetch()
@@ -317,14 +317,14 @@ class Lane(Generic[Net]):
         return self._scores.array
 
     def best_actions(self, states: np.ndarray) -> np.ndarray:
-        """(number,) the action with the highest score in what each run sees, states (number, *depth)."""
+        """(number,) the action with the highest score of each run, in states (number, *depth)."""
         rows = np.zeros((self.width, self.copies, *self.depth), np.int64)
         rows[: self.number, 0] = states
         best: np.ndarray = self.scores_of(rows)[: self.number, 0].argmax(axis=1)
         return best
 
     def execute_actions(self) -> None:
-        """Execute `actions`; episodes that end after the last step of the training do not count."""
+        """Execute `actions`; episodes that end after the last step of the training are not counted."""
         self.worlds.step(self.calls, self.actions, counts=self.steps + self.copies <= self.total)
 
     @property
@@ -334,16 +334,16 @@ class Lane(Generic[Net]):
         return self.loss.array
 
     def plan(self, is_active: np.ndarray) -> None:
-        """Say that the next step down the gradients is for the runs (W,) that are active."""
+        """Set the active runs (W,) of the next `adam`."""
         rates, max_norms = self.own["learning_rate"], self.own["max_grad_norm"]
         self.arithmetic.plan(self.updates, is_active, rates, max_norms, self.network.eps)
 
     def adam(self) -> None:
-        """The step that was planned, down the clipped gradients."""
+        """Adam step set by `plan`, with clipped gradients."""
         self.arithmetic.adam((self.parameters, self.gradients, self.means, self.squares))
 
     def _initial(self) -> np.ndarray:
-        """(W, P) the first parameters; each run draws those of its own network."""
+        """(W, P) initial parameters; each run draws those of its own network."""
         if all(network is self.network for network in self._own_networks):
             return self.network.initial(partial(self._draws, self.keys))
         rows = np.zeros((self.width, self.network.parameters.length), np.float32)
@@ -356,21 +356,21 @@ class Lane(Generic[Net]):
 
     @staticmethod
     def _draws(keys: np.ndarray, number: int) -> np.ndarray:
-        """(N, number) uniform in (0, 1) for keys (N,), for the first parameters."""
+        """(N, number) uniform numbers in (0, 1) for keys (N,), for the initial parameters."""
         words = np.empty((len(keys), -(-number // 4), 4), np.uint32)
         kernels.words(keys, kernels.WEIGHTS, 0, words)
         return (words.reshape(len(keys), -1)[:, :number] + 0.5) * 2.0**-32
 
-    # What is kept ---------------------------------------------------------------------------------------------------
+    # Training state -------------------------------------------------------------------------------------------------
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All that changes, by name; those of more than one number are changed in place."""
+        """Arrays of the training state by name; those of more than one number are changed in place."""
         tensors = {name: getattr(self, name).cpu().numpy() for name in self.tensors}
         counters = np.array([self.steps, self.calls, self.collected, self.is_due], np.int64)
         return {**tensors, "updates": self.updates, "counters": counters, **self.worlds.arrays(), **self.own_arrays()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Go on from what `arrays` gave."""
+        """Restore a state that `arrays` returned."""
         self.steps, self.calls, self.collected, is_due = map(int, arrays["counters"])
         self.is_due = bool(is_due)
         for name, array in self.arrays().items():
@@ -393,7 +393,7 @@ class Lane(Generic[Net]):
 
 
 class RunPolicy:
-    """The policy of one run of a lane, as it is when it is asked."""
+    """The current policy of one run of a lane."""
 
     def __init__(self, lane: Lane, i: int):
         self.lane, self.i = lane, i
@@ -418,7 +418,7 @@ class RunPolicy:
 
 
 class World:
-    """One MDP, and the runs that walk it."""
+    """One MDP, and the runs on it."""
 
     def __init__(self, run: BatchRun, members: Sequence[int]):
         mdp, dynamics = run.mdp, run.mdp.dynamics
@@ -475,12 +475,12 @@ class BatchedEpisodes:
 
     @property
     def seen(self) -> np.ndarray:
-        """(W, E, *depth): the numbers of the states that agents see now."""
+        """(W, E, *depth): numbers of the states that agents see now."""
         return self.history if self.depth else self.state
 
     @property
     def next_seen(self) -> np.ndarray:
-        """(W, E, *depth): of those that the last step led to, before a new episode begins."""
+        """(W, E, *depth): numbers of the states that the last step led to, before a new episode begins."""
         return self.next_history if self.depth else self.next_state
 
     def step(self, step: int, actions: np.ndarray, *, counts: bool) -> None:
@@ -499,7 +499,7 @@ class BatchedEpisodes:
             self.history[:] = np.where(ended[..., None], self.state[..., None], self.next_history)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All that changes."""
+        """Arrays of the state of all episodes."""
         names = ["state", "previous", "elapsed", "running", "discount", "episodes", "returns"]
         more = [*(["pending"] if self.pending.size else []), *(["history"] if self.depth else [])]
         return {name: getattr(self, name) for name in [*names, *more]}

@@ -76,7 +76,7 @@ class Parameters:
         stored: Callable[[np.ndarray], np.ndarray],
         own: Callable[[np.ndarray], np.ndarray],
     ) -> None:
-        """Make room for one more."""
+        """Append a parameter."""
         self.shapes.append(Shape(name, shape, self.length, fan_in, stored, own))
         self.length += -(-self.shapes[-1].size // ALIGNED) * ALIGNED
 
@@ -90,19 +90,19 @@ class Parameters:
 
 
 def aligned_zeros(width: int, *shape: int, device: str | torch.device | None = None) -> Tensor:
-    """(W, ...) float32 whose runs begin at multiples of 64 bytes, so that a run's place changes nothing."""
+    """(W, ...) float32 zeros; each run begins at a multiple of 64 bytes, so that its place changes no result."""
     size = math.prod(shape)
     rows = torch.zeros((width, -(-size // ALIGNED) * ALIGNED), device=device)
     return rows[:, :size].view(width, *shape)
 
 
 def flat_view(y: Tensor) -> Tensor:
-    """All the memory of a `room`, in which each run has a multiple of 64 bytes: none is at a loop's ragged end."""
+    """(W, padded size) view of `aligned_zeros` with the padding of each run: no run is at a loop's ragged end."""
     return y.as_strided((y.shape[0], y.stride(0)), (y.stride(0), 1))
 
 
 class NetworkLayer:
-    """x (W, B, in) -> (W, B, out); keeps room for the results of each number of rows until it is called again."""
+    """x (W, B, in) -> (W, B, out); keeps its buffers for each number of rows, overwritten by the next call."""
 
     def __init__(self, name: str, inputs: int, outputs: int, activation: str):
         self.name, self.inputs, self.outputs, self.activation = name, inputs, outputs, activation
@@ -117,7 +117,7 @@ class NetworkLayer:
         raise NotImplementedError
 
     def _buffers(self, x: Tensor, *, onward: bool = False) -> tuple[Tensor, Tensor]:
-        """Room for y and for the gradient of x."""
+        """Buffers for y and for the gradient of x."""
         key = (x.shape[0], x.shape[1])
         y, dx = self._rooms.get(key, (None, None))
         if y is None:
@@ -134,7 +134,7 @@ class NetworkLayer:
             flat_view(y).tanh_()
 
     def _before_activation(self, dy: Tensor, y: Tensor) -> Tensor:
-        """The gradient before the activation, in the place of dy."""
+        """Gradient before the activation, written over dy."""
         if self.activation == RELU:
             return torch.ops.aten.threshold_backward.grad_input(dy, y, 0, grad_input=dy)
         if self.activation == TANH:
@@ -288,7 +288,7 @@ class ConvolutionLayer(NetworkLayer):
     def _gradients(
         self, values: Values, gradients: Values, runs: slice, images: Tensor, out: Tensor, dx: Tensor | None
     ) -> None:
-        """Write those of some runs, whose images (B, runs x C, H, W) and gradients of outputs are side by side."""
+        """Write the gradients of some runs, whose images (B, runs x C, H, W) and output gradients are side by side."""
         own = values[f"{self.name}.weight"][runs]
         weights, steps = own.flatten(0, 1), [self.stride] * 2
         of_x, of_weights, of_bias = torch.ops.aten.convolution_backward(
@@ -307,7 +307,7 @@ class ConvolutionLayer(NetworkLayer):
 
     @staticmethod
     def _apart(x: Tensor, like: Tensor) -> Tensor:
-        """The reverse, as a view: (W, B, C H W')."""
+        """Inverse of `_side_by_side`, as a view: (W, B, C H W')."""
         return x.reshape(like.shape[1], like.shape[0], -1).transpose(0, 1)
 
 
@@ -359,9 +359,9 @@ def extractor(parameters: Parameters, name: str, shape: tuple[int, ...], is_imag
 
 
 def pad(own: Parameters, rows: np.ndarray, common: Parameters) -> np.ndarray:
-    """(N, P) parameters of networks in the places that a larger network of the same layers has for them; 0 elsewhere.
+    """(N, P) parameters of networks, zero-padded to a larger network of the same layers.
 
-    The larger one has more inputs in its first layers, which follow those that both have.
+    The larger network has more inputs in its first layers, after those that both have.
     """
     result = np.zeros((len(rows), common.length), np.float32)
     for each, place in zip(own.shapes, common.shapes, strict=True):
@@ -386,7 +386,7 @@ def sizes_of(net_arch: NetArch, head: str = "pi") -> list[int]:
 
 
 def names_of(name: str) -> list[str]:
-    """All the names that a parameter has in Stable-Baselines3: parts of a network that are shared have several."""
+    """All names of a parameter in Stable-Baselines3; parameters of shared parts have several."""
     extractors = [name]
     if name.startswith("features_extractor."):
         extractors += [f"{whose}_{name}" for whose in ("pi", "vf")]
@@ -394,7 +394,7 @@ def names_of(name: str) -> list[str]:
 
 
 class BatchedNetwork(Protocol):
-    """W networks of one shape, as a lane asks them.
+    """W networks of one shape; interface to a lane.
 
     Attributes:
         parameters: their places. eps: of Adam.
@@ -408,7 +408,7 @@ class BatchedNetwork(Protocol):
         ...
 
     def initial(self, draws: Draws) -> np.ndarray:
-        """(W, P): the first parameters."""
+        """(W, P): initial parameters."""
         ...
 
 
@@ -430,7 +430,7 @@ class QNetworks:
         return self.stack.forward(values, x)
 
     def backward(self, values: Values, gradients: Values, dq: Tensor) -> None:
-        """The gradients, after `scores`."""
+        """Write the gradients; called after `scores`."""
         self.stack.backward(values, gradients, dq)
 
     def initial(self, draws: Draws) -> np.ndarray:
@@ -471,7 +471,7 @@ class ActorCritics:
         return self.critic.forward(values, self.trunk.forward(values, x))
 
     def backward(self, values: Values, gradients: Values, dscores: Tensor, dvalues: Tensor) -> None:
-        """The gradients, after `both`."""
+        """Write the gradients; called after `both`."""
         features = self.actor.backward(values, gradients, dscores, onward=True)
         features.add_(self.critic.backward(values, gradients, dvalues, onward=True))
         self.trunk.backward(values, gradients, features)

@@ -158,7 +158,9 @@ class PPOLane(Lane[ActorCritics]):
 
 
 class MinibatchUpdate:
-    """Update of PPO from minibatches of one size: forwards with the loss, backwards with Adam; a GPU records both.
+    """Update of PPO on minibatches of one size; a GPU records both parts.
+
+    `forward`: scores, values, loss and its gradients. `optimizer_step`: backward pass and Adam.
 
     Attributes:
         minibatch: states (W, B, *depth), actions (W, B) int64, old logarithms of probabilities, advantages, returns

@@ -83,7 +83,7 @@ BLOCK = 4096  # states that are observed at once
 
 
 class ObservationSource:
-    """Observations of the states of a space, by their numbers.
+    """Observations of the states of a space, by state number.
 
     Attributes:
         frames: k, how many states an observation shows, the last ones of the episode.
@@ -136,7 +136,7 @@ class ObservationSource:
 
 @dataclass(frozen=True, eq=False)
 class BatchRun:
-    """One run, before it exists.
+    """Specification of one run.
 
     Attributes:
         mdp: with its chance, apart from lazy actions; runs of one task share the same.
@@ -168,7 +168,7 @@ class BatchRun:
 
 
 def supports(agent: str, hyperparameters: Mapping[str, Any]) -> str | None:
-    """None where the engine has the agent and its hyperparameters; else the first that it lacks, and why."""
+    """None if the engine has the agent and its hyperparameters; else the first that it lacks, and why."""
     if agent not in OF_A_RUN:
         return f"agent {agent!r}: the batched engine has {' and '.join(OF_A_RUN)}"
     for name, value in hyperparameters.items():
@@ -206,7 +206,7 @@ def resolved(agent: str, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def group_key(agent: str, run: BatchRun, device: str = "cpu") -> Hashable:
-    """Runs with equal keys can share a batch.
+    """Key of a run; runs with equal keys can share a batch.
 
     On the processor they see observations of one shape. Elsewhere, where a wide lane costs hardly more than a narrow
     one, vectors share a batch with others of about their length, and small images with those of as many channels and
@@ -227,7 +227,7 @@ def group_key(agent: str, run: BatchRun, device: str = "cpu") -> Hashable:
 
 
 def _scale(number: int) -> int:
-    """The same for 1 to 64, 65 to 512, 513 to 4,096, ..."""
+    """Size class of a number: one for 1 to 64, one for 65 to 512, one for 513 to 4,096, ..."""
     return max(2, ((number - 1).bit_length() + 2) // 3)
 
 
@@ -237,7 +237,7 @@ def is_small(shape: tuple[int, ...], is_image: bool) -> bool:
 
 
 def as_networks_see(shape: tuple[int, ...], is_image: bool) -> tuple[tuple[int, ...], bool]:
-    """(shape as networks take it, whether images are turned): their channels come first.
+    """(shape as networks take it, whether images are transposed): channels come first.
 
     Stable-Baselines3 takes the smallest side of an image for its channels, and turns it unless that comes first.
     """
@@ -247,7 +247,7 @@ def as_networks_see(shape: tuple[int, ...], is_image: bool) -> tuple[tuple[int, 
 
 
 def remembers_targets(run: BatchRun) -> bool:
-    """Whether DQN asks its target network about every state once a copy, as that is less than all minibatches ask.
+    """Whether DQN queries its target network for every state once per copy: fewer queries than all minibatches make.
 
     Never where several frames are seen: there are more histories than states.
     """
@@ -270,7 +270,7 @@ def _is_in_steps(value: Any) -> bool:
 
 
 def lane_width(is_image: bool, device: str = "cpu") -> int:
-    """The most runs of a lane, chosen by measurement on the processor (docs/decisions/0013-batched-training.md)."""
+    """Maximum runs of a lane, chosen by measurement on the processor (docs/decisions/0013-batched-training.md)."""
     if device != "cpu":
         return WIDTHS_ELSEWHERE[-1]
     return WIDTH_OF_IMAGES if is_image else WIDTH_OF_VECTORS

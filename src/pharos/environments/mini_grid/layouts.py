@@ -47,21 +47,21 @@ class Canvas:
         self.direction = RIGHT
 
     def integer(self, low: int, high: int) -> int:
-        """One of low, ..., high - 1."""
+        """Random integer in low, ..., high - 1."""
         return int(self.rng.integers(low, high))
 
     def color(self) -> str:
-        """One of the six colours."""
+        """Random one of the six colours."""
         return COLORS[self.integer(0, len(COLORS))]
 
     def walls_around(self, left: int, top: int, width: int, height: int) -> None:
-        """The outline of a rectangle."""
+        """Draw walls along the outline of a rectangle."""
         right, bottom = left + width - 1, top + height - 1
         self.cells[left : right + 1, [top, bottom]] = WALL
         self.cells[[left, right], top : bottom + 1] = WALL
 
     def free_cell(self, corner: Place, size: Place, *, away: bool = False, attempts: float = math.inf) -> Place:
-        """A cell of floor in a rectangle without the player; with `away` none beside the player either."""
+        """Random cell of floor in a rectangle without the player; with `away`, not beside the player either."""
         left, top = corner
         right, bottom = min(left + size[0], self.width), min(top + size[1], self.height)
         tried = 0
@@ -74,13 +74,13 @@ class Canvas:
         raise ParameterError(f"MiniGrid: this seed finds no free cell in {ATTEMPTS} attempts; choose another seed")
 
     def put_player(self, corner: Place = (0, 0), size: Place | None = None, attempts: float = math.inf) -> None:
-        """The player onto a free cell, looking anywhere."""
+        """Put the player onto a random free cell, with a random direction."""
         self.player = (-1, -1)
         self.player = self.free_cell(corner, size or (self.width, self.height), attempts=attempts)
         self.direction = self.integer(0, 4)
 
     def layout(self, target: str | None = None) -> GridLayout:
-        """What was drawn, with the player in it."""
+        """The drawn grid, with the player in it."""
         self.cells[self.player] = PLAYER[self.direction]
         return GridLayout(tuple("".join(row) for row in self.cells.T), target)
 
@@ -115,11 +115,11 @@ class Rooms(Canvas):
         return column * (self.size - 1), row * (self.size - 1)
 
     def across(self, column: int, row: int, side: int) -> tuple[int, int, int]:
-        """The same side, seen from the neighbouring room."""
+        """The shared side, as the neighbouring room and its side."""
         return column + AHEAD[side][0], row + AHEAD[side][1], (side + 2) % 4
 
     def add_door(self, column: int, row: int, side: int, *, locked: bool = False) -> str:
-        """A door of a random colour; its colour."""
+        """Add a door of a random colour; return the colour."""
         color = self.color()
         self.cells[self.doorways[column, row, side]] = ("L" if locked else "D") + color
         self.doors |= {(column, row, side), self.across(column, row, side)}
@@ -128,7 +128,7 @@ class Rooms(Canvas):
         return color
 
     def add_thing(self, column: int, row: int, letter: str, color: str | None = None) -> str:
-        """A key K, a ball A or a box B somewhere in a room; with its colour, which is drawn unless given."""
+        """Put a key K, ball A or box B on a random cell of a room; return it with its colour, drawn unless given."""
         thing = letter + (color or self.color())
         size = (self.size, self.size)
         self.cells[self.free_cell(self.corner(column, row), size, away=True, attempts=ATTEMPTS)] = thing
@@ -141,7 +141,7 @@ class Rooms(Canvas):
         self.doors |= {(column, row, side), self.across(column, row, side)}
 
     def put_player_into(self, column: int, row: int) -> None:
-        """The player into a room, with floor or a wall before it."""
+        """Put the player into a room, with floor or a wall in front."""
         while True:
             self.put_player(self.corner(column, row), (self.size, self.size), attempts=ATTEMPTS)
             ahead = AHEAD[self.direction]
@@ -149,7 +149,7 @@ class Rooms(Canvas):
                 return
 
     def connect(self) -> None:
-        """Doors between rooms, until every room can be reached; locked rooms get no further ones."""
+        """Add doors between rooms until every room is reachable; locked rooms get no further doors."""
         start = (self.player[0] // (self.size - 1), self.player[1] // (self.size - 1))
         for _ in range(CONNECTIONS + 1):
             if len(self._reachable(start)) == self.rows * self.columns:
@@ -345,7 +345,7 @@ def multi_room(size: int, rooms: int, seed: int) -> GridLayout:
 
 
 def _chain(canvas: Canvas, size: int, rooms: int) -> list[Room]:
-    """As many rooms as find their place, at most `rooms`, each entered from the one before."""
+    """A chain of rooms, as many as fit, at most `rooms`, each entered from the one before."""
     entry = (canvas.integer(0, canvas.width - 2), canvas.integer(0, canvas.width - 2))
     first = _room(canvas, size, LEFT, entry, is_first=True)
     chain = [first] if _fits(canvas, first, []) else []
@@ -398,7 +398,7 @@ def _fits(canvas: Canvas, room: Room, others: list[Room]) -> bool:
 
 
 class ParameterRange(NamedTuple):
-    """What a parameter may be: its default, its lowest and highest value; the highest by the size."""
+    """Range of a parameter: default, lowest and highest value (a function of the size), and whether it must be odd."""
 
     default: int
     low: int

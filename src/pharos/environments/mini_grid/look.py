@@ -1,4 +1,4 @@
-"""How MiniGrid looks: colours, and shapes of walls, lava, doors, things and the player, close in spirit to the package.
+"""Appearance of MiniGrid: colours, shapes of walls, lava, doors, things and the player, in the spirit of the package.
 
 Shapes are functions of (colour, pixels of a cell, glyph), see `look.Shape`; x goes right and y down, from 0 to 1.
 """

@@ -22,7 +22,7 @@ Place = tuple[int, int]
 
 
 class Drawn(NamedTuple):
-    """What Colosseum draws by its seed, in its coordinates: (x, y), y upwards.
+    """Goal and start states that Colosseum draws by its seed, in its coordinates: (x, y), y upwards.
 
     Attributes:
         goal: the cell that pays.
@@ -59,7 +59,7 @@ class RoomGrid(Environment):
 
     @cached_property
     def drawn(self) -> Drawn:
-        """Goal and starts."""
+        """Goal and start states, as Colosseum draws them."""
         raise NotImplementedError
 
     @property
