@@ -1,4 +1,4 @@
-"""Algorithms of Stable-Baselines3 on tasks of pharos: the same network everywhere, apart from what extracts features.
+"""Algorithms of Stable-Baselines3 on tasks of pharos: the same network everywhere, apart from the feature extractor.
 
 Vectors go through one hidden layer, images through one convolution and one hidden layer (the network of MinAtar: Young
 and Tian, 2019), both to 128 features; then follows one hidden layer. So a difference between observations is one

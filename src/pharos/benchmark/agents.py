@@ -356,7 +356,7 @@ def _is_finished(job: Job) -> bool:
 
 @dataclass(frozen=True)
 class CompiledForm(Form):
-    """A function of JAX: one program for all seeds of a task, which is run again where one of them is missing.
+    """A function of JAX: one program for all seeds of a task; it runs again if the result of a seed is missing.
 
     Attributes:
         learn: the function.

@@ -72,7 +72,7 @@ class CountedEnv(gymnasium.Wrapper):
         self._return, self._is_seeded = 0.0, False
 
     def copy(self) -> "CountedEnv":
-        """Another environment of the same task and budget, with random numbers of its own."""
+        """A new environment of the same task and budget, with random numbers of its own."""
         (child,) = self.seeds.spawn(1)
         return CountedEnv(self.task, self.budget, int(child.generate_state(1)[0]))
 
@@ -108,8 +108,8 @@ class Snapshots:
         self._kept: list[tuple[int, Any]] | None = None
 
     def taken(self, policy: PolicyLike) -> PolicyLike | Evaluation:
-        """The policy as it is now: (S, A) probabilities, or its value where it sees more than the state, or there are
-        too many.
+        """The current policy as (S, A) probabilities; or its value if it sees more than the state, or there are too
+        many states.
 
         Raises:
             ParameterError: it answers something else than actions or probabilities.

@@ -88,7 +88,7 @@ def _text(value: object) -> str:
 
 
 def drawing(width: int, height: int, title: str, *shapes: Element) -> Element:
-    """An SVG with a title for readers of screens; hidden from them where that is empty, since words say the same."""
+    """An SVG with a title for screen readers; without a title it is hidden from them, as nearby text says the same."""
     name = {"role": "img", "aria_label": title} if title else {"aria_hidden": "true"}
     return element("svg", *shapes, viewBox=f"0 0 {width} {height}", **name)
 
@@ -174,7 +174,7 @@ def ladder_panel(
     unit: str,
     title: str,
 ) -> Element:
-    """Normalised regret along the rungs of a ladder: the first line with whiskers, and where its frontier lies.
+    """Normalised regret along the rungs of a ladder: the first line with whiskers and its frontier.
 
     Args:
         levels: of the rungs, which stand equally far apart; between them the frontier is interpolated.

@@ -50,7 +50,7 @@ class Commitment:
 
     @staticmethod
     def read(file: str | os.PathLike) -> "Commitment":
-        """Read what `write` wrote.
+        """Read a commitment that `write` wrote.
 
         Raises:
             ParameterError: there is no such file. FileFormatError: it is no commitment.

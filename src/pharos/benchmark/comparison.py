@@ -158,7 +158,7 @@ def compare(
 def power(
     results: AgentResults | Path | str, *, suite: Suite | str | None = None, difference: float | None = None
 ) -> dict[str, Power]:
-    """Return for the core ("core") and each axis how precise the score is, and what a comparison would find.
+    """Return the precision of the score and the detectable difference, for the core ("core") and each axis.
 
         t = difference / se,  se^2 = 2 sum of w_t^2 s_t^2 / n: noncentral t with power 0.8 at a level of 0.05
 

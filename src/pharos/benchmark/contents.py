@@ -1,4 +1,4 @@
-"""Contents of a report: an agent's scores, those beside it, comparisons, and what theory expected of it."""
+"""Contents of a report: scores of an agent and of baselines, comparisons, and predictions of theory."""
 
 import json
 import math
@@ -170,7 +170,7 @@ def _core_sentence(contents: Contents) -> str:
 
 
 def _split(text: str) -> tuple[str, str]:
-    """A value and, without its parentheses, what stands in them at the end."""
+    """A text split into the part before its final parentheses and the part inside them."""
     value, _, ends = text.partition(" (")
     return value, ends.removesuffix(")")
 

@@ -1,4 +1,4 @@
-"""Runs of an agent on a suite: all tasks and seeds into one folder; what is finished stays, what is missing goes on.
+"""Runs of an agent on a suite: all tasks and seeds in one folder; finished runs are kept, missing ones continue.
 
 DIR/suite.json             name, digest and protocol of the suite
 DIR/agent.json             form, source, hyperparameters, versions

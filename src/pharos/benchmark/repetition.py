@@ -98,7 +98,7 @@ class Audit:
 
     @staticmethod
     def read(file: str | os.PathLike) -> "Audit":
-        """Read what `write` wrote.
+        """Read an audit that `write` wrote.
 
         Raises:
             ParameterError: there is no such file. FileFormatError: it is no audit. ResultCorrupted: it was changed.

@@ -73,7 +73,7 @@ class Submission:
 
     @staticmethod
     def read(file: str | os.PathLike) -> "Submission":
-        """Read what `write` wrote; nothing is executed, and sizes are held against the file before they are allocated.
+        """Read a submission that `write` wrote; executes nothing, and checks sizes against the file before allocating.
 
         Raises:
             ParameterError: there is no such file. FileFormatError: it is no submission.

@@ -1,4 +1,4 @@
-"""Suites: frozen lists of tasks in a file, with a digest of what each task is once it is solved.
+"""Suites: frozen lists of tasks in a file, with a digest of each solved task.
 
     name: v1
     digest: ...                 of the protocol and of the digests of all tasks

@@ -55,7 +55,7 @@ class Answer(NamedTuple):
 
 
 def print_json(answer: Mapping[str, Any]) -> None:
-    """One JSON object on standard output; what JSON cannot say (infinity, not a number) is null."""
+    """Print one JSON object on standard output; infinity and NaN become null."""
     print(json.dumps(storage.plain(answer), default=_plain, allow_nan=False))
 
 
@@ -138,7 +138,7 @@ def counted_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
 
 
 def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:
-    """A table of two columns: what, and how much."""
+    """Print a table of two columns: name and value."""
     print_table(title, ("", ""), ((name, str(value)) for name, value in facts))
 
 
@@ -153,7 +153,7 @@ def print_table(
     before: Iterable[str] = (),
     notes: Iterable[str] = (),
 ) -> None:
-    """A table below its title and what is said `before` it, with notes below.
+    """Print a table below its title and the lines `before`, with notes below.
 
     Args:
         columns: their names; `>name` has numbers, which end at one place.
@@ -210,14 +210,14 @@ def written(value: object) -> str:
 
 
 def compiling_fact() -> list[tuple[str, str]]:
-    """Seconds of compiling in this command as a fact, or none where they are few."""
+    """Seconds of compiling in this command as a fact; none if they are few."""
     seconds = compiling.seconds()
     suffix = "" if storage.is_cache_temporary() else ", kept for the next time"
     return [("compiling", f"{seconds:.1f} s{suffix}")] if seconds >= NOTABLE_SECONDS else []
 
 
 def peak_memory_bytes() -> int:
-    """The most memory that this process has held so far."""
+    """Peak memory of this process so far, in bytes."""
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -231,7 +231,7 @@ def bytes_of(folder: Path) -> int:
 
 @contextlib.contextmanager
 def termination() -> Iterator[None]:
-    """SIGTERM ends what runs before it ends this process, and says that the same command goes on."""
+    """Turn SIGTERM into SystemExit in the block, so that running work ends first; prints that the command resumes."""
 
     def leave(*_: object) -> None:
         complain(INTERRUPTED)
@@ -245,5 +245,5 @@ def termination() -> Iterator[None]:
 
 
 def complain(message: object) -> None:
-    """One line on standard error."""
+    """Print one line on standard error."""
     print(f"pharos: {' '.join(str(message).split())}", file=sys.stderr)

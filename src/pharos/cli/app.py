@@ -1,4 +1,4 @@
-"""The application: which verbs there are, and how whatever goes wrong becomes one line and an exit code."""
+"""The application: its commands, and the conversion of errors to one line and an exit code."""
 
 import os
 import sys
@@ -85,7 +85,7 @@ def _hide_types_of_flags(command: Any) -> None:
 
 
 def _exit_code(error: Exception) -> int | None:
-    """The exit code for an error, said in one line on standard error; None for one that is a bug of pharos."""
+    """Print an error as one line on standard error and return its exit code; None for a bug of pharos."""
     if isinstance(error, BrokenPipeError):  # the reader had enough, as in `pharos list | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_FAILED

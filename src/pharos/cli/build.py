@@ -79,7 +79,7 @@ def _outcomes(space: "StateSpace") -> list[tuple[str, str]]:
 
 
 def _is_there(folder: Path) -> bool:
-    """Whether the finished state space lies there already."""
+    """Whether the folder already holds the finished state space."""
     from pharos.state_space import read_manifest
 
     manifest = read_manifest(folder)

@@ -120,7 +120,7 @@ def hardness(
 def _represented(
     goal: Target, mdp: "TabularMDP", observation: str, building: Building, options: dict[str, Any]
 ) -> "tuple[TabularMDP, Representation]":
-    """The MDP with its states numbered as in the state space, and what is seen of them."""
+    """The MDP with states numbered as in the state space, and their representation by the observation."""
     from pharos.observations import representation
 
     space = goal.space(building)

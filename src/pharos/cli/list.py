@@ -59,7 +59,7 @@ def _overview(name: str, cls: type["Environment"]) -> dict[str, Any]:
 
 
 def _parameters(cls: type["Environment"]) -> dict[str, dict[str, Any]]:
-    """Name -> default, what it may be, and what it means: the line under *Attributes* in the docstring of the class."""
+    """Name -> default, range and meaning of a parameter: the line under *Attributes* in the docstring of the class."""
     declared, texts = declared_parameters(cls), meanings(cls)
     return {
         field.name: {
@@ -72,7 +72,7 @@ def _parameters(cls: type["Environment"]) -> dict[str, dict[str, Any]]:
 
 
 def rules_of(cls: type["Environment"]) -> list[tuple[str, str]]:
-    """(title, text) of what the docstring of a class says before its attributes; the title of a paragraph is empty.
+    """(title, text) of each part of the docstring of a class before its attributes; a plain paragraph has no title.
 
     An entry has its title in the first nine columns, `State    (row, column)`, and goes on in lines that are indented.
     """

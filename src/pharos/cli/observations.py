@@ -77,13 +77,13 @@ def observations(
 
 
 class _Price:
-    """Cost of observations for an agent without memory; the space is solved once, when it is first asked."""
+    """Cost of observations for an agent without memory; the space is solved once, at the first query."""
 
     def __init__(self, space: "StateSpace", gamma: float, chance: ChanceSetting, budget: float):
         self.space, self.gamma, self.chance, self.budget = space, gamma, chance, budget
 
     def of(self, classes: "np.ndarray | None", num_confused: int) -> dict[str, Any] | None:
-        """Bounds of the loss; None where they were not wanted, the space is too large, or there are several frames."""
+        """Bounds of the loss; None if not requested, if the space is too large, or with several frames."""
         if num_confused == 0:
             return {"lower": 0.0, "upper": 0.0, "exact": True}
         if classes is None or self.budget <= 0 or self.gamma >= 1 or self.space.num_states > MOST_SOLVED:

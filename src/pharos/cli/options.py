@@ -1,4 +1,4 @@
-"""The options that verbs share: their declarations, what a shell proposes for them, and how their texts are read.
+"""Options shared by commands: declarations, shell completion, and parsers.
 
 TARGET is what a command works on: an environment, or a folder or file that holds something already made.
 """
@@ -344,7 +344,7 @@ class Target:
 
     @property
     def is_imported(self) -> bool:
-        """Whether it is an imported MDP, a file or a folder, which has a gamma and a horizon of its own."""
+        """Whether the target is an imported MDP (file or folder), which has a gamma and a horizon of its own."""
         from pharos.importers import is_folder
 
         return self.path is not None and (self.path.is_file() or is_folder(self.path))

@@ -231,7 +231,7 @@ def explore(
 
 
 def _serve(explorer: "Explorer", with_browser: bool) -> None:
-    """Answer until the user interrupts; that is how it ends, so it is no error."""
+    """Serve requests until the user interrupts, which is not an error."""
     from pharos.explorer import open_browser
 
     with explorer, contextlib.suppress(KeyboardInterrupt):

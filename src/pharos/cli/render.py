@@ -191,7 +191,7 @@ def play(target: Target, *, state: str | None = None, seed: Seed | None = None) 
 
 
 class Game:
-    """A game being played: what has happened, and which key does what."""
+    """A game in progress: its history, and the keys for actions."""
 
     def __init__(self, env: "Environment", start: "State", seed: int | None = None):
         self.env, self.rng = env, random.Random(seed)
@@ -215,7 +215,7 @@ class Game:
         return bool(self.env.is_terminal(self.state))
 
     def press(self, key: str) -> None:
-        """Do what a key says: an action, AGAIN from the start, BACK one step; nothing for any other key."""
+        """Execute the command of a key: an action, AGAIN (restart), BACK (undo one step); other keys do nothing."""
         if key == AGAIN:
             self.state, self.history = self.start, []
         elif key == BACK and self.history:
@@ -253,7 +253,7 @@ def _picture(game: Game) -> "RenderableType":
 
 @contextlib.contextmanager
 def _screen() -> Iterator:
-    """A function that shows something on the other screen of the terminal, which is left as it was."""
+    """Yield a function that draws on the alternate screen of the terminal; the main screen is restored at the end."""
     to = console(stderr=True)
     with to.screen(hide_cursor=True) as screen:
         yield screen.update
@@ -261,7 +261,7 @@ def _screen() -> Iterator:
 
 @contextlib.contextmanager
 def _keys() -> Iterator:
-    """A function that waits for a key and names it; the terminal is given back as it was, whatever happens."""
+    """Yield a function that waits for a key and returns its name; the terminal is restored in any case."""
     import termios
     import tty
 
@@ -275,7 +275,7 @@ def _keys() -> Iterator:
 
 
 def _key_named(typed: str) -> str:
-    """The name of a key from what the terminal sends for it."""
+    """The name of a key from the characters that the terminal sends."""
     if typed == "\x1b":
         return "escape"
     if typed.startswith("\x1b"):

@@ -1,4 +1,4 @@
-"""Environment: what a class of environments defines. Small deterministic rules on integer states, nothing else.
+"""Environment: the interface of a class of environments. Small deterministic rules on integer states, nothing else.
 
 A state is a vector of D integers. Chance of the world's own is said by outcomes: which ones there are, how likely each
 is, and where each leads. Chance of acting (sticky and random actions), time limits, observations and pixels are added
@@ -79,7 +79,7 @@ class Parameter:
 
     @property
     def text(self) -> str:
-        """The type, and the range where it is constant: "integer >= 1", "number in [0, 1]", "true or false"."""
+        """Type and, if constant, range as text: "integer >= 1", "number in [0, 1]", "true or false"."""
         if self.kind is bool:
             return "true or false"
         if isinstance(self.kind, Kind):
@@ -91,7 +91,7 @@ class Parameter:
         return name + (f" >= {low:g}" if low is not None else f" <= {high:g}" if high is not None else "")
 
     def checked(self, env: object, name: str, value: object) -> object:
-        """The value as it is stored; ParameterError where it is out of range."""
+        """The value converted to its stored form; ParameterError if it is out of range."""
         if value is None and self.optional:
             return None
         low, high = (bound(env) if callable(bound) else bound for bound in (self.low, self.high))
@@ -122,7 +122,7 @@ def parameter(
 
 
 def declared_parameters(cls: type) -> dict[str, Parameter]:
-    """Name -> what `parameter` declared. A subclass that gives another default keeps the declaration."""
+    """Name -> declaration by `parameter`. A subclass that gives another default keeps the declaration."""
     declared: dict[str, Parameter] = {}
     for base in reversed(cls.__mro__):
         for name, entry in vars(base).get("__dataclass_fields__", {}).items():
@@ -139,7 +139,7 @@ def check_parameters(env: object) -> None:
 
 
 def store(env: object, name: str, value: T) -> T:
-    """Set a field of a frozen dataclass while it is being made."""
+    """Set a field of a frozen dataclass during its construction."""
     object.__setattr__(env, name, value)
     return value
 

@@ -236,7 +236,7 @@ def written_out(
     actions: int,
     outcome_rewards: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """(S, A, K) successors, probabilities that sum to 1, and rewards, what is impossible left out.
+    """(S, A, K) successors, probabilities that sum to 1, and rewards; impossible outcomes are left out.
 
     S is the end, where there is one. p (N,): probabilities; outcome_rewards (N,): the reward of each outcome, if known.
 

@@ -105,7 +105,7 @@ ERRORS_PER_TIE = 2.5  # the gap of a tie is at most this times the bound on erro
 
 
 class Exploration:
-    """An MDP without a horizon, solved, and what its states stand for.
+    """A solved MDP without a horizon, and the meaning of its states.
 
     Args:
         mdp: with its chance. A horizon is left out: values are discounted.
@@ -250,7 +250,7 @@ class Exploration:
         return self.mdp.chance.weights(choices, self._before(choices, previous))
 
     def _outcomes(self, state: int, executed: np.ndarray) -> list[list[Any]]:
-        """(state, previous, probability, reward) of what may follow, the likeliest first; executed (A,) chances."""
+        """(state, previous, probability, reward) of possible outcomes, likeliest first; `executed`: (A,) probabilities."""
         merged: dict[tuple[int | None, int | None, float], float] = {}
         for action in np.flatnonzero(executed).tolist():
             for after, probability, reward in self._of_executing(state, action):
@@ -260,7 +260,7 @@ class Exploration:
         return sorted(listed, key=lambda each: (-each[2], -1 if each[0] is None else each[0]))
 
     def _of_executing(self, state: int, action: int) -> list[tuple[int | None, float, float]]:
-        """(state, probability, reward) of what executing an action may lead to.
+        """(state, probability, reward) of possible outcomes of executing an action.
 
         Outcomes have rewards of their own where the rules are known; else, and with lazy actions, each has the mean.
         """
@@ -350,7 +350,7 @@ class Exploration:
     # Layers ---------------------------------------------------------------------------------------------------------
 
     def layer(self, layer: int, first: int = 0) -> dict[str, Any]:
-        """Some states of a breadth-first layer, from the number `first` among them on.
+        """Some states of a breadth-first layer, from position `first` on.
 
         Returns:
             `layer`, `first`, `count` of all, and `states`: a list of state, optimal value, terminal.

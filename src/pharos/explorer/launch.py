@@ -94,7 +94,7 @@ class Explorer:
         return f"Explorer({self.exploration.title}, {self.url})"
 
     def answer(self, path: str, query: str) -> tuple[HTTPStatus, str, bytes]:
-        """Status, type and content for what stands behind the token."""
+        """HTTP status, content type and content for the path after the token."""
         if path == "":
             return HTTPStatus.OK, "text/html; charset=utf-8", self._page
         if path not in QUESTIONS or len(query) > LONGEST_QUERY:
@@ -118,7 +118,7 @@ def _plain_text(status: HTTPStatus, text: str) -> tuple[HTTPStatus, str, bytes]:
 
 
 def _whole(words: Mapping[str, str], name: str, otherwise: int | None = None) -> int:
-    """A whole number of a query; `otherwise` where it is not there."""
+    """An integer from a query; `otherwise` if absent."""
     text = words.get(name, "")
     if text == "":
         if otherwise is None:
@@ -195,7 +195,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._reply(with_content=False)
 
     def refuse(self) -> None:
-        """Any other method."""
+        """Refuse every HTTP method other than GET."""
         self._send(*_plain_text(HTTPStatus.METHOD_NOT_ALLOWED, "this server answers GET alone"), with_content=True)
 
     do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = do_CONNECT = refuse
@@ -235,7 +235,7 @@ class _Handler(BaseHTTPRequestHandler):
         return owner.answer(rest, parts.query)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Nothing is logged."""
+        """Log nothing."""
 
 
 # Launch ---------------------------------------------------------------------------------------------------------------
@@ -352,7 +352,7 @@ def _of_run(
     title: str,
     progress: Callable[[str], None],
 ) -> Exploration:
-    """The environment of a run with its chance, and what it has learnt."""
+    """The environment of a run with its chance, and its learned policy."""
     if chance:
         raise ParameterError(f"{folder}: a run has its chance already; leave out sticky, random and lazy")
     progress("what was learnt")

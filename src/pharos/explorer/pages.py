@@ -31,7 +31,7 @@ GROUPS = {"column", "x"}, {"row", "y"}  # words in the names of variables that a
 
 
 def quantities(world: Exploration) -> dict[str, str]:
-    """Name -> what it says, of all quantities of a state."""
+    """Name -> description, of all quantities of a state."""
     names = {"value": "optimal value V*"}
     names |= {f"value_{name}": f"value of the {name} policy" for name in world.policies if name != OPTIMAL}
     names |= {f"regret_{name}": f"regret of the {name} policy, V* - V" for name in world.policies if name != OPTIMAL}
@@ -167,7 +167,7 @@ def about_maps(world: Exploration) -> dict[str, Any]:
 
 
 def _first_axes(axes: Mapping[str, Axis]) -> list[str]:
-    """The axes x, y that are drawn first: what is called a column and a row, else the longest that are left."""
+    """Default axes x, y: variables named column and row, else the longest remaining ones."""
     words = {name: set(name.lower().replace("[", "_").split("_")) for name in axes}
     column, row = (next((name for name in axes if words[name] & group), None) for group in GROUPS)
     longest = sorted(axes, key=lambda name: -axes[name].count)
@@ -279,7 +279,7 @@ def _place(state: int, previous: int | None) -> str:
 
 
 def _shortened(data: object) -> Any:
-    """The same with numbers of DIGITS significant digits."""
+    """The value with its numbers rounded to DIGITS significant digits."""
     if isinstance(data, dict):
         return {name: _shortened(value) for name, value in data.items()}
     if isinstance(data, list | tuple):

@@ -1,4 +1,4 @@
-"""States of an MDP as the page shows them: their variables, their layers, and what a learnt policy does there.
+"""States of an MDP as the page shows them: variables, layers, and actions of a learned policy.
 
 `States`: the variables of a state space, or where there are none the number itself. `StateLayers`, breadth-first: the
 states whose shortest way from a start state has 0, 1, 2, ... steps. `Learnt`: the policy of a run, its table, its
@@ -85,7 +85,7 @@ class SpaceStates:
 
 
 class NumberedStates:
-    """States that are known by their number alone, the one variable they have."""
+    """States with one variable: their number."""
 
     names = ("state",)
 
@@ -263,7 +263,7 @@ ASKED_EVERYWHERE = 200_000  # states and, where it matters, previous actions; ab
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """A policy to look at.
+    """A policy to explore.
 
     Attributes:
         policy: a table, or what sees observations.
@@ -280,7 +280,7 @@ class Learnt:
     facts: Mapping[str, str] = field(default_factory=dict)
 
     def solution(self, mdp: TabularMDP, space: StateSpace | None) -> Solution:
-        """Its values; NaN where it does not get to and was not asked.
+        """Values of the policy; NaN in states that it never reaches and was not asked about.
 
         Raises:
             ParameterError: it does not fit the MDP, or its values belong to no state, as it sees more than the state.
@@ -308,7 +308,7 @@ class Learnt:
 
 
 def probabilities(solution: Solution, states: np.ndarray, previous: np.ndarray) -> np.ndarray:
-    """(N, A) what a given policy does in states after executing actions (N,), A where there was none before."""
+    """(N, A) action probabilities of a given policy in states after executing actions (N,); A: no action before."""
     table, num_actions = np.asarray(solution.given_policy), solution.mdp.num_actions
     if table.ndim == 1:
         return np.eye(num_actions)[table[states]]

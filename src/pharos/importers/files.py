@@ -1,4 +1,4 @@
-"""Files of other programs: BRIDGE's npz, and what Storm builds.
+"""Files of other programs: BRIDGE's npz, and models that Storm builds.
 
 Tabular MDPs of the BRIDGE dataset (Laidlaw, Russell and Dragan 2023): `consolidated.npz` and the like.
 

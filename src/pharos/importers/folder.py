@@ -222,7 +222,7 @@ def load(folder: str | os.PathLike) -> TabularMDP:
 
 
 def _mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> TabularMDP:
-    """The MDP of these arrays, whoever wrote them; ValueError where they do not fit."""
+    """The MDP of arrays read from a folder; ValueError if they do not fit each other."""
     rewards = arrays["rewards"]
     if rewards.shape != (manifest["num_states"], manifest["num_actions"]):
         raise ValueError(

@@ -148,7 +148,7 @@ def _start(env: object, inner: object, states: int) -> np.ndarray:
 
 
 def _compare_with_steps(env: object, inner: object, rows: list[list[list]]) -> None:
-    """FileFormatError where the environment, stepped, does what its table does not say.
+    """Step the environment; raise FileFormatError if a transition is not in its table.
 
     Each state's actions are tried in turn, so that few steps try many of them.
     """
@@ -324,7 +324,7 @@ def minigrid(
 def minigrid_recording(
     env: object, *, seed: int = 0, horizon: int | None = MINIGRID_STEPS, remember_carried: bool = False
 ) -> tuple[TabularMDP, np.ndarray, tuple[str, ...]]:
-    """Return the MDP of `minigrid`, what one sees of each of its states, and the names of its actions.
+    """Return the MDP of `minigrid`, an observation of each state, and the names of the actions.
 
     Args, errors and cost: as of `minigrid`, with all actions.
     Returns:
@@ -347,7 +347,7 @@ def minigrid_grids(
     max_states: int = MOST_STATES,
     remember_carried: bool = False,
 ) -> np.ndarray:
-    """Return what one sees of each state of `minigrid` with the same arguments, as `minigrid_recording` gives it.
+    """Return the observation of each state of `minigrid` with the same arguments, as in `minigrid_recording`.
 
     Args, errors and cost: as of `minigrid`.
     """
@@ -357,7 +357,7 @@ def minigrid_grids(
 
 
 class _Driver:
-    """An environment that can be put into any state that it has been in."""
+    """An environment of MiniGrid that can be restored to any state it has visited."""
 
     def __init__(self, env: Any, seed: int, remember_carried: bool):
         try:

@@ -352,7 +352,7 @@ def _rules_version(run: Path, record: dict[str, Any], config: RunConfig) -> int:
 
 
 def stored_table(run: Path) -> np.ndarray:
-    """The policy of a run that kept a table, actions in as few bytes as they take.
+    """The policy of a run that kept a table; actions in the smallest integer type that holds them.
 
     Raises:
         ResultCorrupted: policy.npy cannot be read.

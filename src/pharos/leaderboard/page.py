@@ -1,4 +1,4 @@
-"""The page of a leaderboard: every entry of a folder verified, and ranked by what was computed, not by what is claimed.
+"""The page of a leaderboard: every entry of a folder verified, and ranked by the computed regret, not the claimed one.
 
 The page loads nothing and executes nothing but its own few lines, which sort tables; its policy of contents says so to
 the browser. Whatever comes from entries is escaped.
@@ -156,7 +156,7 @@ def write_page(
     verified: int,
     introduction: str = "",
 ) -> None:
-    """Write the page of a board; the introduction goes in the place of the usual one."""
+    """Write the page of a board; `introduction` replaces the default one."""
     import pharos
 
     script = (Path(__file__).parent / "templates" / "sort.js.j2").read_text(encoding="utf-8")

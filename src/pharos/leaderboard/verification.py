@@ -160,9 +160,9 @@ def _architectures(hyperparameters: Mapping[str, Any]) -> Iterator[Any]:
 
 
 def _check_arrays(entry: Entry, env: "VecEnv", hyperparameters: dict[str, Any]) -> None:
-    """Refuse a network that is not the one in the file before it takes memory: each layer is found among the arrays.
+    """Refuse hyperparameters whose network does not match the arrays of the file, before it takes memory.
 
-    The extractor of features is made without numbers (on PyTorch's device "meta"), which tells its shapes.
+    The feature extractor is made on PyTorch's device "meta", without numbers, to get its shapes.
     """
     import torch
 
@@ -374,7 +374,7 @@ def _time_limit(seconds: float) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _memory_limit() -> Iterator[None]:
-    """Raise MemoryError within the block where it asks for more than is free, before the system ends the process.
+    """Raise MemoryError if the block requests more memory than is free, before the system kills the process.
 
     On Linux, by RLIMIT_DATA of the whole process; elsewhere there is no limit.
     """
@@ -427,7 +427,7 @@ def _task(entry: Entry, trust: bool, max_states: int, values: MutableMapping[str
 
 
 def task_key(config: RunConfig) -> str:
-    """A digest of what an entry is compared in: environment, chance, and the setting of values; 1 and 1.0 are one."""
+    """Digest of the task by which entries are compared: environment, chance, setting of values; 1 and 1.0 are equal."""
     chance = {name: value for name, value in config.chance.to_dict().items() if value}
     task = [config.environment, config.parameters, chance, config.gamma, config.horizon]
     return storage.digest_of_json(_as_floats(storage.plain(task)))

@@ -1,4 +1,4 @@
-"""Instances drawn: values and policies over cells, policies at play, and where they lie in the plane of hardness.
+"""Plots of instances: values and policies over cells, policies at play, and the plane of hardness.
 
 `value_map`: values and a policy over the cells of a grid world, or over any two variables of its states.
 `hardness_plane`: instances in the plane of hardness: how long it takes to get around, against how hard it is to tell
@@ -155,7 +155,7 @@ def _letters(actions: Sequence[str]) -> list[str]:
 
 
 def _ticks(count: int, first: int) -> tuple[list[int], list[str]]:
-    """(where, what): at most a dozen values of a variable."""
+    """(positions, labels) of ticks: at most a dozen values of a variable."""
     places = list(range(0, count, -(-count // 12)))
     return places, [str(first + place) for place in places]
 
@@ -285,7 +285,7 @@ def hardness_plane(
 
 
 def _label(axis: Any, points: Mapping[str, tuple[float, float]]) -> None:
-    """Names beside their points, on the side and at the height where the fewest others are in the way."""
+    """Draw names beside their points, on the side and at the height where the fewest others are in the way."""
     axis.figure.draw_without_rendering()  # the layout decides where points are
     scale = 72 / axis.figure.dpi
     at = {name: scale * axis.transData.transform(point) for name, point in points.items()}

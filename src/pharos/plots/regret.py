@@ -246,7 +246,7 @@ def unseen_figures(
 
 
 def predicted_by_class(part: "pd.DataFrame", predictor: str | None = None) -> "Figure | None":
-    """A panel for each class: regret against what a line through the other classes predicts for it."""
+    """A panel for each class: regret against the prediction by a line through the other classes."""
     from pharos.validation import Cells, class_predictions
 
     predictor = predictor or _learner(part)

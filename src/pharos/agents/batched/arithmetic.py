@@ -43,7 +43,7 @@ class PinnedBuffer:
 
 
 class CudaGraph:
-    """Operations on tensors that stay in their places. A GPU records them, and runs them as one launch.
+    """Operations on tensors with fixed addresses, recorded as a CUDA graph on a GPU and run as one launch.
 
     The first call runs them one by one, which also takes all the room that they need; the second one records them.
     Where that fails they are run one by one, with a warning, as recording changes no result.

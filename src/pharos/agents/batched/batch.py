@@ -41,7 +41,7 @@ class Batch:
 
     @property
     def steps(self) -> int:
-        """Steps of each run so far; those of a rollout that goes beyond the last one are not counted."""
+        """Steps of each run so far, without the steps of a rollout beyond the end of the training."""
         return min(self.lanes[-1].steps, self.lanes[-1].total)
 
     @property

@@ -116,7 +116,7 @@ class ObservationTable:
                 self._table[begin + first : begin + first + len(block)] = torch.from_numpy(rows)
 
     def at(self, states: PinnedBuffer, out: torch.Tensor) -> torch.Tensor:
-        """Write what is seen in states (W, B) into out (W, B, size) float32; images from 0 to 255.
+        """Write the observations of states (W, B) into out (W, B, size) float32; images from 0 to 255.
 
         Where k frames are seen states are (W, B, k), the last ones of the episode, the oldest first.
         """
@@ -198,7 +198,7 @@ ASKED = (16, 64, 256)  # rows of the blocks in which a policy is asked
 
 
 class Lane(Generic[Net]):
-    """W runs of one group, the last ones idle where there are fewer: they repeat the first one.
+    """W runs of one group. If there are fewer, the last rows are idle: they repeat the first run.
 
     The same run has the same bits whoever else is there: each run's part of every buffer and product is apart.
 
@@ -277,7 +277,7 @@ class Lane(Generic[Net]):
     # Learning -------------------------------------------------------------------------------------------------------
 
     def advance(self, point: int) -> None:
-        """Train until `point` steps. The update that is due then waits, unless it is the last."""
+        """Train until `point` steps. An update due at `point` waits for the next call, unless it is the last."""
         is_last = point >= self.total
         while self.steps < point or (is_last and self.collected):
             self._learn_what_is_due()
@@ -291,12 +291,12 @@ class Lane(Generic[Net]):
             self.is_due = False
 
     def views(self, rows: torch.Tensor) -> Values:
-        """name -> (W, ...) view of parameters (W, P), with the mask of what is seen, where there is one."""
+        """name -> (W, ...) view of parameters (W, P), with the mask of observations if there is one."""
         views = self.network.parameters.views(rows)
         return views if self.seen.mask is None else {**views, MASK: self.seen.mask}
 
     def observed(self, states: PinnedBuffer) -> torch.Tensor:
-        """(W, B, size) float32 observations of states (W, B, *depth); they stay until the next call with as many."""
+        """(W, B, size) float32 observations of states (W, B, *depth), in a buffer reused for this B."""
         number = states.array.shape[1]
         if number not in self._buffers:
             self._buffers[number] = aligned_zeros(self.width, number, self.seen.size, device=self.device)
@@ -309,7 +309,7 @@ class Lane(Generic[Net]):
         self._scores.fetch()
 
     def scores_of(self, states: np.ndarray) -> np.ndarray:
-        """(W, E, A) scores of states (W, E, *depth), which stay until the next call."""
+        """(W, E, A) scores of states (W, E, *depth), in a buffer that the next call reuses."""
         wait(self.device)
         self._asked.array[:] = states
         self._answer()

@@ -1,4 +1,4 @@
-"""W networks of one shape as one: those of agents/deep.py, with the heads that Stable-Baselines3 puts on them.
+"""W networks of one shape as one: the networks of agents/deep.py with the heads of Stable-Baselines3.
 
 Layers have parameters with a leading axis of runs, and their gradients are written out.
 
@@ -113,7 +113,7 @@ class NetworkLayer:
         raise NotImplementedError
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> Tensor | None:
-        """Write the gradients of the parameters, after `forward` of x; return that of x where it goes `onward`."""
+        """Write the gradients of the parameters, after `forward` of x; return the gradient of x if `onward`."""
         raise NotImplementedError
 
     def _buffers(self, x: Tensor, *, onward: bool = False) -> tuple[Tensor, Tensor]:
@@ -332,7 +332,7 @@ class Stack:
         return x
 
     def backward(self, values: Values, gradients: Values, dy: Tensor, *, onward: bool = False) -> Tensor:
-        """Write the gradients of all parameters, after `forward`; return that of the input where it goes `onward`."""
+        """Write the gradients of all parameters, after `forward`; return the gradient of the input if `onward`."""
         for i in range(len(self.layers) - 1, -1, -1):
             dx = self.layers[i].backward(values, gradients, self._inputs[i], dy, onward=onward or i > 0)
             dy = dy if dx is None else dx

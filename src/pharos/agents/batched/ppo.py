@@ -128,7 +128,7 @@ class PPOLane(Lane[ActorCritics]):
         return self._valued.array[..., 0].copy()
 
     def learn_minibatch(self, minibatch: tuple[np.ndarray, ...], is_active: np.ndarray) -> np.ndarray:
-        """One step of gradient descent for the active runs, unless the policy has moved too far; (W,) those that did.
+        """One gradient step of the active runs whose policy stays within `target_kl`; returns these runs, (W,) bool.
 
         Args:
             minibatch: (states, actions, logarithms of probabilities, advantages, returns), (W, B) each, states

@@ -30,14 +30,14 @@ Place = tuple[int, int]
 
 
 class GridLayout(NamedTuple):
-    """A grid, row by row, and what is to be picked up or opened in it, such as "BR"; None: only goals are."""
+    """A grid, row by row, and the target: a thing to pick up or a door to open, such as "BR"; None: only goals."""
 
     rows: tuple[str, ...]
     target: str | None = None
 
 
 class Canvas:
-    """A grid that is being drawn, and where the player stands; made of floor alone."""
+    """A grid under construction, at first all floor, with the position of the player."""
 
     def __init__(self, width: int, height: int, seed: int | None = None):
         self.rng = np.random.Generator(np.random.PCG64(seed))

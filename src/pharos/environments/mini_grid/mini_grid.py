@@ -25,7 +25,7 @@ CELLS = {FLOOR: FREE, WALL: BLOCKED, GOAL: WON, LAVA: LOST}
 
 @dataclass(frozen=True)
 class Level:
-    """A layout as numbers: what its text says of cells, doors, things and the player; checked.
+    """A layout as numbers: cells, doors, things and the player, parsed from its text and checked.
 
     Attributes:
         start: (row, column, direction) of the player.
