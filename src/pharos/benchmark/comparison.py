@@ -125,6 +125,7 @@ def compare(
     suite = suite_of_results(ours, suite)
     for each in (ours, theirs):
         check_suite(each, suite)
+    # Scores of the tasks that both have run
     x, y = run_scores(ours), run_scores(theirs)
     common = [task.name for task in suite.tasks if task.name in x and task.name in y]
     if not common:
@@ -133,6 +134,7 @@ def compare(
         )
     left_out = tuple(task.name for task in suite.tasks if task.name not in common)
     x, y = ({name: runs[name] for name in common} for runs in (x, y))
+    # Differences on the core and on each ladder
     core = sorted(task.name for task in suite.core if task.name in common)
     axes, differences = {}, {}
     for ladder in suite.ladders:

@@ -54,6 +54,7 @@ def compiled_curves(
     ]
     if lacking:
         raise ParameterError(f"agents in JAX learn from tables, which have no {', '.join(lacking)}; leave it out")
+    # The task as an environment of gymnax, with the observations of all states
     count = task.mdp.num_states
     blocks = [np.arange(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
     observations = np.concatenate([context.observation(task.space.states(block)) for block in blocks])

@@ -273,11 +273,13 @@ def frontier(levels: np.ndarray, regrets: Sequence[np.ndarray]) -> ConfidenceInt
     from scipy.optimize import isotonic_regression
     from scipy.special import stdtrit
 
+    # The level where increasing means cross 0.5
     means = np.array([own.mean() for own in regrets])
     value, censored = _crossing(levels, isotonic_regression(means).x)
     sizes = np.array([len(own) for own in regrets])
     if sizes.min() < 2:
         return ConfidenceInterval(value, censored=censored)
+    # Mean and half width of Student's interval on a fine grid of levels, interpolated between neighbouring rungs
     variances = np.array([np.var(own, ddof=1) / len(own) for own in regrets])
     variances[variances < 1e-30] = 0.0
     grid, position = levels, np.arange(len(levels), dtype=np.float64)
@@ -293,6 +295,7 @@ def frontier(levels: np.ndarray, regrets: Sequence[np.ndarray]) -> ConfidenceInt
         degrees = total**2 / (parts[0] ** 2 / (sizes[left] - 1) + parts[1] ** 2 / (sizes[right] - 1))
         half = np.where(total > 0.0, stdtrit(degrees, (1.0 + CONFIDENCE) / 2.0) * np.sqrt(total), 0.0)
     mean = (1.0 - share) * means[left] + share * means[right]
+    # Levels whose interval contains 0.5; open beyond the ends of the ladder
     reaching, staying = np.flatnonzero(mean + half >= CROSSING), np.flatnonzero(mean - half <= CROSSING)
     low = -math.inf if reaching.size and reaching[0] == 0 else grid[reaching[0]] if reaching.size else levels[-1]
     high = (

@@ -246,6 +246,7 @@ def written_out(
     payments = p if outcome_rewards is None else outcome_rewards
     if not len(rows) == len(successors) == len(p) == len(payments) or not (np.isfinite(p) & (p >= 0)).all():
         raise ValueError("successors and probabilities do not fit")
+    # Possible outcomes, sorted by row s A + a
     order = np.argsort(rows, kind="stable")
     order = order[p[order] > 0]
     rows, successors, p, payments = rows[order], successors[order].astype(np.int64), p[order], payments[order]
@@ -259,6 +260,7 @@ def written_out(
             f"the table has {count:,} states, {actions} actions and up to {most:,} outcomes of each; expected at most "
             f"{MOST_ENTRIES:,} numbers in all: it can be solved and measured, but not stepped"
         )
+    # Tables with K columns, filled up with probability 0
     place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     table = np.zeros((count * actions, most), np.int64)
     chances = np.zeros((count * actions, most))

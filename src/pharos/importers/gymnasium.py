@@ -404,6 +404,7 @@ class _Driver:
         self.snapshots = [snapshot]
         rows: list[list[int]] = []
         reward_rows: list[list[float]] = []
+        # Breadth first: every action in the next state without a row; unknown states join the end of the queue
         while len(rows) < len(self.snapshots):
             row, pay = [], []
             for action in actions:
@@ -424,6 +425,7 @@ class _Driver:
                 row.append(number)
             rows.append(row)
             reward_rows.append(pay)
+        # Without the action `done` where it does nothing in any state
         table, rewards = np.array(rows, np.int64), np.array(reward_rows)
         if drop_done and (table[:, DONE] == np.arange(len(table))).all() and (rewards[:, DONE] == 0).all():
             table, rewards = table[:, :DONE], rewards[:, :DONE]

@@ -147,14 +147,17 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         state = self._state
         if state is None or self._terminated:
             return self._step_after_the_end()
+        # Executed action: sticky and random actions
         if self._has_chance and (u := (self._stream or self.np_random).random()) >= self._stays:
             executed = self.simulator.executed(executed, self._previous, u)
+        # Outcome of the executed action; a negative branch is a lazy step
         branch, probability = executed, 1.0
         if self._lazy and (self._stream or self.np_random).random() < self._lazy:
             branch, probability = -1 - executed, self._lazy
         elif self._stream is not None:
             outcome, probability = self._outcome_one(self._parameters, state, executed, self._stream.random())
             branch, probability = executed * self._num_outcomes + outcome, probability * (1.0 - self._lazy)
+        # Next state, reward and observation in one compiled call; code 1 is a terminal state, above 1 a fault
         next_state = self._spare
         written = self._blank.copy()
         if self._step_and_draw is not None:
@@ -172,6 +175,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._state, self._spare = next_state, state
         self._previous = executed
         self._elapsed += 1
+        # Infos, and delay and noise of the reward
         info: dict[str, Any] = {"state": next_state.copy(), "executed_action": executed}
         if self._successors is not None:
             if branch >= 0:

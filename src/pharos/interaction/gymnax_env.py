@@ -103,7 +103,7 @@ class GymnaxEnv(environment.Environment):
         )
 
     def joined_ends(self) -> "JoinedEnds":
-        """The same environment with the `step` of gymnax before 1.0, whose fourth part is one `done`."""
+        """This environment with the `step` of gymnax before 1.0, which returns one `done`."""
         other = object.__new__(JoinedEnds)
         other.__dict__.update(self.__dict__)
         return other

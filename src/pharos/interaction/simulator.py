@@ -117,7 +117,7 @@ class Simulator:
         return stepping.executed_by_number.py_func(action, previous, self._weights, self.env.num_actions, u)
 
     def checked_state(self, state: object) -> np.ndarray:
-        """(D,) int64 from what a user gave; ParameterError unless every component is in its range."""
+        """(D,) int64 from a user's state; ParameterError unless every component is in its range."""
         values = np.asarray(state)
         if values.shape != (len(self.env.components),) or values.dtype.kind not in "iub":
             raise ParameterError(
@@ -279,7 +279,7 @@ class FrameStack:
             self._frames = np.zeros((num_envs, self.observation.frames, *one.shape[1:]), one.dtype)
 
     def seed(self, seeds: Sequence[int | None]) -> None:
-        """Seed the coins of each environment; None leaves a stream as it is."""
+        """Seed the random stream of irrelevant entries of each environment; None leaves a stream as it is."""
         seed_streams(self._rng, seeds, 2)
 
     def push(self, states: np.ndarray, moves: np.ndarray, begins: np.ndarray) -> None:
@@ -295,8 +295,7 @@ class FrameStack:
         return self._in_context(self._frames, slice(None), states, previous, elapsed)
 
     def terminal(self, rows: np.ndarray, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        """Terminal observations of environments `rows`, in states (len(rows), D); `push` never sees these states.
-        """
+        """Terminal observations of environments `rows`, in states (len(rows), D); `push` never sees these states."""
         frames = self._frames[rows]
         if self.observation.frames > 1:
             frames = np.concatenate([frames[:, 1:], self.observation.frame(states)[:, None]], axis=1)

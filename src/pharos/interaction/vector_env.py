@@ -400,7 +400,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             info["prob"] = np.where(done, 1.0, info["prob"])
 
     def _seeded(self, seed: int | Sequence[int | None] | None) -> np.ndarray:
-        """The streams of random numbers (N,) uint64, seeded where that is asked for."""
+        """Streams of random numbers (N,) uint64; those with a seed are seeded anew."""
         n = self.num_envs
         if seed is None and self._rng is not None:
             return self._rng

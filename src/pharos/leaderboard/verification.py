@@ -288,6 +288,7 @@ def verify(
     for name, steps in (("horizon", entry.config.horizon or 0), ("reward_delay", entry.config.chance.reward_delay)):
         if steps > limits.max_horizon:
             raise FileFormatError(f"{path}: its {name} is {steps:,} steps; expected at most {limits.max_horizon:,}")
+    # Value of the policy and reference values, computed again within limits of time and memory
     try:
         with _time_limit(limits.max_seconds), _memory_limit():
             task = _task(entry, trust, limits.max_states, values)
@@ -302,6 +303,7 @@ def verify(
         if isinstance(error, OSError) and error.errno != errno.ENOMEM:
             raise
         raise FileFormatError(f"{path}: asks for more memory than there is: {error}") from None
+    # Each claimed number beside the computed one
     claim = entry.claim
     slack = limits.tolerance * max(1.0, abs(reference.optimal)) + reference.error_bound
     apart = slack + evaluation.error_bound + (min(claim.error_bound, slack) if claim.exact else claim.error_bound)

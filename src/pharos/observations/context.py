@@ -1,4 +1,4 @@
-"""An observation with what a pure function of the state cannot see: the previous action, the remaining time."""
+"""An observation with inputs beyond the state: the previous action, the remaining time."""
 
 import numpy as np
 

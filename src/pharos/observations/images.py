@@ -244,7 +244,7 @@ def _shades(layers: Mapping[str, Layer], covering: bool) -> np.ndarray:
 
 
 def _paint(planes: np.ndarray, shades: np.ndarray, covering: bool, out: np.ndarray) -> None:
-    """The twin of the kernel for one state: what `interaction.draw_simple` does after drawing."""
+    """Python twin of the kernel for one state: the part of `interaction.draw_simple` after drawing."""
     size = out.shape[1] // planes.shape[1]
     for layer, plane in enumerate(planes):
         shade = shades[layer, plane].repeat(size, axis=0).repeat(size, axis=1)
@@ -425,7 +425,7 @@ def _sprite_image(name: str, layer: Layer, value: int, scenery: Scenery) -> np.n
 
 
 def _compose(planes, picture, top, left, sprite, place, color, keep, out) -> None:
-    """The twin of the kernel for one state: what `interaction.draw_complex` does after drawing."""
+    """Python twin of the kernel for one state: the part of `interaction.draw_complex` after drawing."""
     out[:] = picture
     for layer, plane in enumerate(planes):
         for row, column in np.argwhere(plane):

@@ -156,7 +156,7 @@ def ntk(
     others: Sequence[Sequence[int]] | np.ndarray | None = None,
     **options: object,
 ) -> np.ndarray:
-    """Return the tangent kernel of an agent's network on what it sees of an environment's states.
+    """Return the tangent kernel of an agent's network on observations of an environment's states.
 
     Args:
         env: an environment, its name, or its state space.
@@ -212,7 +212,7 @@ def check_memory(rows: int, columns: int, what: str) -> None:
 
 
 def network_inputs(observation: Observation, states: np.ndarray) -> np.ndarray:
-    """(N, ...) float32: what the first layer of a network gets of states (N, D), as Stable-Baselines3 prepares it.
+    """(N, ...) float32 input of the first layer of a network for states (N, D), as Stable-Baselines3 prepares it.
 
     Pictures of bytes are (C, H, W) in [0, 1]; numbers of categories become ones among zeros.
 

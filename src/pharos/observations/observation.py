@@ -155,7 +155,7 @@ def names() -> list[str]:
 
 
 def title(name: str, options: Mapping[str, Any], *, whole: bool = False) -> str:
-    """The name of an observation in tables and figures, with the options that change what the agent is told:
+    """The name of an observation in tables and figures, with the options that change what the agent sees:
     "simple_image(motion=True)".
 
     Args:

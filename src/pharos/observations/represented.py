@@ -35,7 +35,7 @@ def representation(
     landmarks: int | None = None,
     **options: object,
 ) -> Representation:
-    """Return what a network makes of the states of a state space, for `pharos.hardness.report` and its measures.
+    """Return the representation of a state space by an observation and a network, for `pharos.hardness.report`.
 
         hardness.report(space.mdp(), representation=observations.representation(space, "vector", "mlp128x2"))
 
@@ -92,7 +92,7 @@ def representation(
 
 
 def _own_network(network: object, shape: tuple[int, ...]) -> tuple[Callable[..., np.ndarray], dict[str, Any]]:
-    """(kernel of inputs x, y; what it is), of a function of the shape or of its name."""
+    """(kernel of inputs x, y; its description), of a function of the shape or of its name."""
     source = sources.find(network) if isinstance(network, str) else sources.source_of(network)
     function = sources.load(source) if isinstance(network, str) and source is not None else network
     name = source.name if source is not None else str(getattr(network, "__name__", network))

@@ -80,6 +80,7 @@ def value_map(
     from matplotlib.patches import Rectangle
 
     assert space.environment is not None
+    # Values as an image over the two variables
     first, size = _extent(space, over, place)
     place = place - first
     mdp = solution.mdp
@@ -90,6 +91,7 @@ def value_map(
     axis.set_facecolor("#c9ccd1")
     image = axis.imshow(values, cmap="cividis")
     drawn.colorbar(image, ax=axis, shrink=0.8, label="value").outline.set_visible(False)
+    # The actions of the policy in each cell
     lengths, letters = _lengths(solution), _letters(space.environment.actions)
     draws_actions = over == CELLS or max(size) <= MOST_LETTERS
     low, high = _range_of(values)
@@ -109,6 +111,7 @@ def value_map(
         else:
             text = "".join(letters[int(action)] for action in np.flatnonzero(lengths[s] > 0.02))
             axis.text(column, row, text, ha="center", va="center", color=color, fontsize=7)
+    # Frames around start states
     for row, column in place[np.isin(shown, mdp.start_states)]:
         axis.add_patch(
             Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="#D55E00", linewidth=1.6)
@@ -190,6 +193,7 @@ def _cells(
     for name in fix:
         if name not in others:
             raise UnknownName(f"component of {environment} to fix", name, others)
+    # States whose other variables have the fixed values
     start = dict(zip(names, space.states()[0].tolist(), strict=True))
     if rest == "start":
         fix = {name: start[name] for name in others} | dict(fix)
@@ -201,6 +205,7 @@ def _cells(
         raise ParameterError(
             f"{environment}: no state has {', '.join(f'{name}={value}' for name, value in fix.items())}"
         )
+    # Variables that still vary in the slice
     free = [name for name in others if name not in fix and np.ptp(states[shown, names.index(name)])]
     if free:
         slices = " ".join(f"--fix {name}={start[name]}" for name in free[:4])

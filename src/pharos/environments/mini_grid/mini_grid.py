@@ -51,6 +51,7 @@ def level_of(layout: GridLayout) -> Level:
     starts: list[tuple[int, int, int]] = []
     doors: list[str] = []
     things: list[tuple[int, int, int, int, str]] = []
+    # Cells, player, doors and things, by their two letters
     for row, texts in enumerate(rows):
         for column, text in enumerate(texts):
             if text in CELLS:
@@ -67,6 +68,7 @@ def level_of(layout: GridLayout) -> Level:
                     f"MiniGrid: level has {text!r} at row {row}, column {column}; expected .. ## GG ~~ >> vv << ^^, or "
                     f"one of {' '.join(DOOR_LETTERS + THING_LETTERS)} and one of {' '.join(COLORS)}"
                 )
+    # One player, a goal or target, and no way out of the grid
     if len(starts) != 1:
         raise ParameterError(f"MiniGrid: level has {len(starts)} players; expected one of {' '.join(PLAYER)}")
     door, thing = _target(layout.target, doors, [text for *_, text in things])
