@@ -67,7 +67,7 @@ def test_one_seed_gives_one_game_in_every_engine(name, chance, spaces):
     interpreted._step_one = InterpretedStepping(env).step_one
     interpreted._outcome_one = InterpretedStepping(env).outcome_one
     many, table, twin = (make_vec(env, 1, space=each, **options) for each in (None, space, None))
-    twin._walk._step_many = InterpretedStepping(env).step_many
+    twin._stepper._step_many = InterpretedStepping(env).step_many
     actions = np.random.default_rng(1).integers(env.num_actions, size=300).tolist()
     games = [played(each, actions) for each in (single, interpreted)]
     games += [played_by_one_of_many(each, actions) for each in (many, table, twin)]

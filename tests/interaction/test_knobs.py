@@ -121,7 +121,7 @@ def by_table(knobs, space):
 
 def by_interpreted_rules(knobs, space):
     env = VectorEnv(RING, 3000, time_limit=HORIZON, **knobs)
-    env._walk._step_many = InterpretedStepping(RING).step_many
+    env._stepper._step_many = InterpretedStepping(RING).step_many
     return in_vectors(env)
 
 

@@ -70,7 +70,7 @@ def test_rules_table_and_interpreted_twin_walk_the_same_way(space, mode, chance)
     compiled = make_vec(space.environment, 5, **options)
     table = make_vec(space.environment, 5, space=space, **options)
     twin = make_vec(space.environment, 5, **options)
-    twin._walk._step_many = InterpretedStepping(twin.environment).step_many
+    twin._stepper._step_many = InterpretedStepping(twin.environment).step_many
     walks = (compiled, table, twin)
     first = [walk.reset()[0] for walk in walks]
     np.testing.assert_array_equal(first[0], first[1])

@@ -193,7 +193,7 @@ def test_every_engine_plays_the_same_lazy_game(name, lake, grid):
     options = {"autoreset_mode": AutoresetMode.NEXT_STEP, "time_limit": 30, "seed": 5, "observation": "vector", **ALL}
     compiled, twin = (make_vec(env, 4, **options) for _ in range(2))
     table = make_vec(env, 4, space=space, **options)
-    twin._walk._step_many = InterpretedStepping(env).step_many
+    twin._stepper._step_many = InterpretedStepping(env).step_many
     walks, stayed = (compiled, table, twin), 0
     observed = [walk.reset()[0] for walk in walks]
     rng = np.random.default_rng(1)

@@ -71,7 +71,7 @@ def test_single_and_vector_environments_show_the_last_frames(name):
             done, now = terminated | truncated, env.states
             for i in range(3):
                 if mode == "SAME_STEP" and done[i]:
-                    last = env._walk.states(env._walk.final[[i]])[0]
+                    last = env._stepper.states(env._stepper.final[[i]])[0]
                     expected = stack_of(BREAKOUT, name, [*episodes[i], tuple(last)], IMAGES[name])
                     np.testing.assert_array_equal(info["final_obs"][i], expected)
                     over[i] = True

@@ -250,7 +250,7 @@ class Exploration:
         return self.mdp.chance.weights(choices, self._before(choices, previous))
 
     def _outcomes(self, state: int, executed: np.ndarray) -> list[list[Any]]:
-        """(state, previous, probability, reward) of possible outcomes, likeliest first; executed: (A,) probabilities."""
+        """(state, previous, probability, reward) of possible outcomes, likeliest first; executed: (A,) chances."""
         merged: dict[tuple[int | None, int | None, float], float] = {}
         for action in np.flatnonzero(executed).tolist():
             for after, probability, reward in self._of_executing(state, action):

@@ -278,14 +278,14 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         self._reward_channel = RewardChannel(interaction.chance, n) if simulator.modifies_rewards else None
         self._num_drawn = n if simulator.has_outcomes else 0  # outcomes that are drawn in a step
         space = simulator.state_space
-        self._walk: Stepper = (
+        self._stepper: Stepper = (
             RulesStepper(simulator, n, self._mode) if space is None else TableStepper(simulator, space, n, self._mode)
         )
 
     @property
     def states(self) -> np.ndarray:
         """(N, D) int64, the current states."""
-        return self._walk.states(self._walk.current).copy()
+        return self._stepper.states(self._stepper.current).copy()
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """The picture for people of each environment, (H, W, 3) uint8, where render_mode is "rgb_array"; else None."""
@@ -309,7 +309,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         """
         options = options or {}
         mask = self._checked_mask(options.get("reset_mask"))
-        self._walk.restart(mask, self._seeded(seed), options.get("state"))
+        self._stepper.restart(mask, self._seeded(seed), options.get("state"))
         self._previous[mask] = self.simulator.first_previous
         self._elapsed[mask] = 0
         self._ended[mask] = False
@@ -332,11 +332,11 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         n = self.num_envs
         rewards, executed, probabilities = np.empty(n), np.empty(n, np.int64), np.empty(self._num_drawn)
         terminated, truncated = np.empty(n, np.bool_), np.empty(n, np.bool_)
-        walk = self._walk
-        walk.step(
+        stepper = self._stepper
+        stepper.step(
             EnvironmentBatch(
-                self._rng, actions, walk.current, self._previous, self._elapsed, self._ended,
-                rewards, terminated, truncated, executed, walk.final, walk.vectors(), probabilities,
+                self._rng, actions, stepper.current, self._previous, self._elapsed, self._ended,
+                rewards, terminated, truncated, executed, stepper.final, stepper.vectors(), probabilities,
             )
         )  # fmt: skip
         info = self._info(executed, probabilities)
@@ -352,16 +352,16 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     def _observations(self, moves: np.ndarray, begins: np.ndarray) -> Seen:
         """Observations of the current states; `moves`, `begins` (N,) bool: after a step, at the start of an episode."""
         if self._frame_stack is None:
-            return self._walk.observations(self._previous, self._elapsed)
-        states = self._walk.states(self._walk.current)
+            return self._stepper.observations(self._previous, self._elapsed)
+        states = self._stepper.states(self._stepper.current)
         self._frame_stack.push(states, moves, begins)
         return self._frame_stack.current(states, self._previous, self._elapsed)
 
     def _info(self, executed: np.ndarray, probabilities: np.ndarray) -> dict[str, Any]:
         everywhere = np.ones(self.num_envs, np.bool_)
-        name = self._walk.name
+        name = self._stepper.name
         info = {
-            name: self._walk.current.copy(),
+            name: self._stepper.current.copy(),
             f"_{name}": everywhere,
             "executed_action": executed,
             "_executed_action": everywhere,
@@ -375,16 +375,16 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     def _add_final(self, info: dict[str, Any], done: np.ndarray) -> None:
         """Add terminal observations and infos, as Gymnasium's own vector environments do."""
         rows, executed = np.flatnonzero(done), info["executed_action"]
-        context, places = (executed[rows], self._walk.final_elapsed[rows]), self._walk.final[rows]
+        context, places = (executed[rows], self._stepper.final_elapsed[rows]), self._stepper.final[rows]
         if self._frame_stack is None:
-            last = self._walk.seen(places, *context)
+            last = self._stepper.seen(places, *context)
         else:
-            last = self._frame_stack.terminal(rows, self._walk.states(places), *context)
+            last = self._frame_stack.terminal(rows, self._stepper.states(places), *context)
         final = np.full(self.num_envs, None, object)
         for row, observation in zip(rows, _rows_of(last, len(rows)), strict=True):
             final[row] = observation
-        name = self._walk.name
-        state = np.zeros_like(self._walk.final)
+        name = self._stepper.name
+        state = np.zeros_like(self._stepper.final)
         state[rows] = places
         info["final_obs"], info["_final_obs"] = final, done
         info["final_info"] = {

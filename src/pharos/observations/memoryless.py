@@ -122,13 +122,13 @@ class _PolicySearch:
         if table is not None and not mdp.is_random:
             rewards = mdp.rewards[rows, executed]
             return TabularMDP.from_arrays(table[rows, executed], rewards, terminal=mdp.terminal, **setting)
-        matrix, rewards = self.chosen
+        matrix, rewards = self.transitions
         pairs = (rows * mdp.num_actions + executed).ravel()
         return TabularMDP.from_matrices(matrix[pairs], rewards[rows, executed], **setting)
 
     @cached_property
-    def chosen(self) -> tuple[Any, np.ndarray]:
-        """Transitions by chosen action, random actions included: (S A, S) probabilities, (S, A) rewards."""
+    def transitions(self) -> tuple[Any, np.ndarray]:
+        """Transitions and rewards by chosen action, random actions included: (S A, S) probabilities, (S, A) rewards."""
         mdp, choices = self.mdp, np.eye(self.mdp.num_actions)
         matrix, rewards = mdp.dynamics.matrix()[:, : mdp.num_states], mdp.rewards
         if not mdp.is_random:

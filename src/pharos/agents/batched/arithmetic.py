@@ -177,9 +177,9 @@ class TensorArithmetic(CompiledArithmetic):
         free, bound = advantages * ratio, advantages * ratio.clamp(1.0 - clip, 1.0 + clip)
         error = values[..., 0] - returns
         total = -torch.minimum(free, bound) - of_entropy * entropy + of_value * error * error
-        for mirror, part in ((loss, total), (divergence, ratio - 1.0 - gained)):
-            mirror.tensor.copy_(part.mean(1))
-            mirror.fetch()
+        for buffer, part in ((loss, total), (divergence, ratio - 1.0 - gained)):
+            buffer.tensor.copy_(part.mean(1))
+            buffer.fetch()
         of_log_p = torch.where(free <= bound, -free / number, torch.zeros_like(free))[..., None]
         one_hot = torch.zeros_like(p).scatter_(2, actions[..., None], 1.0)
         torch.mul(p, log_p + entropy[..., None], out=dscores).mul_(of_entropy[..., None] / number)

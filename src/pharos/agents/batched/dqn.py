@@ -111,7 +111,7 @@ class DQNLane(Lane[QNetworks]):
         self._explores = np.zeros(width, np.bool_)
         self._no_scores = np.zeros((width, self.copies, self.num_actions), np.float32)
         self._remembers = device == "cpu" and all(remembers_targets(run) for run in self.runs)
-        self._known: torch.Tensor | None = None  # (W, S, A) values of the target networks, where they are remembered
+        self._target_table: torch.Tensor | None = None  # (W, S, A) values of target networks, if kept
         self._target_calls = np.maximum(self.own["target_update_interval"].astype(np.int64) // self.copies, 1)
 
     def network_for(self, shape: tuple[int, ...]) -> QNetworks:
@@ -156,7 +156,7 @@ class DQNLane(Lane[QNetworks]):
         """Move the target networks of some runs towards the online ones, all the way where tau is 1."""
         rows = torch.from_numpy(runs).to(self.device)
         tau = torch.from_numpy(self.own["tau"][runs].astype(np.float32)[:, None]).to(self.device)
-        self._known = None
+        self._target_table = None
         self.target[rows] = self.target[rows].mul_(1.0 - tau) + self.parameters[rows] * tau
 
     def update(self) -> None:
@@ -192,9 +192,9 @@ class DQNLane(Lane[QNetworks]):
         """(W, B, A) values of states (W, B) by the target networks."""
         if not self._remembers:
             return self.network.scores(self.target_values, self.observed(states)).clone()
-        if self._known is None:
-            self._known = self._all_target_scores(states.array.shape[1])
-        return self._known[self._rows, states.tensor]
+        if self._target_table is None:
+            self._target_table = self._all_target_scores(states.array.shape[1])
+        return self._target_table[self._rows, states.tensor]
 
     def _all_target_scores(self, size: int) -> torch.Tensor:
         """(W, S, A) of all states, `size` of each run at a time; runs with fewer states repeat their last one."""
@@ -210,7 +210,7 @@ class DQNLane(Lane[QNetworks]):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Restore a state that `arrays` returned."""
         super().restore(arrays)
-        self._known = None
+        self._target_table = None
 
     def own_arrays(self) -> dict[str, np.ndarray]:
         """See `Lane`."""

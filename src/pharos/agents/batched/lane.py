@@ -242,7 +242,7 @@ class Lane(Generic[Net]):
         self.loss = PinnedBuffer((width,), torch.float64, device)
         self.values: Values = self.views(self.parameters)
         self.gradient_views = self.network.parameters.views(self.gradients)
-        self._asked = PinnedBuffer((width, self.copies, *self.depth), torch.int64, device)
+        self._queries = PinnedBuffer((width, self.copies, *self.depth), torch.int64, device)
         self._scores = PinnedBuffer((width, self.copies, self.num_actions), torch.float32, device)
         self._answer = CudaGraph(self.answer, device)
         self.steps = self.calls = self.collected = 0
@@ -304,14 +304,14 @@ class Lane(Generic[Net]):
 
     def answer(self) -> None:
         """Write the scores of the requested states; a GPU records this."""
-        self._asked.send()
-        self._scores.tensor.copy_(self.evaluate(self.observed(self._asked)))
+        self._queries.send()
+        self._scores.tensor.copy_(self.evaluate(self.observed(self._queries)))
         self._scores.fetch()
 
     def scores_of(self, states: np.ndarray) -> np.ndarray:
         """(W, E, A) scores of states (W, E, *depth), in a buffer that the next call reuses."""
         wait(self.device)
-        self._asked.array[:] = states
+        self._queries.array[:] = states
         self._answer()
         wait(self.device)
         return self._scores.array

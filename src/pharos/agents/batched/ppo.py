@@ -44,9 +44,9 @@ class PPOLane(Lane[ActorCritics]):
         self._valued = PinnedBuffer((width, self.copies, 1), torch.float32, device)
         self.divergence = PinnedBuffer((width,), torch.float64, device)
         self.weights = tuple(PinnedBuffer((width,), torch.float64, device) for _ in WEIGHTS)
-        for mirror, name in zip(self.weights, WEIGHTS, strict=True):
-            mirror.array[:] = self.own[name]
-            mirror.send()
+        for buffer, name in zip(self.weights, WEIGHTS, strict=True):
+            buffer.array[:] = self.own[name]
+            buffer.send()
         self._minibatch_updates: dict[int, MinibatchUpdate] = {}
 
     def network_for(self, shape: tuple[int, ...]) -> ActorCritics:
@@ -139,8 +139,8 @@ class PPOLane(Lane[ActorCritics]):
             self._minibatch_updates[size] = MinibatchUpdate(self, size)
         update = self._minibatch_updates[size]
         wait(self.device)
-        for mirror, part in zip(update.minibatch, minibatch, strict=True):
-            mirror.array[:] = part
+        for buffer, part in zip(update.minibatch, minibatch, strict=True):
+            buffer.array[:] = part
         if self.shared["normalize_advantage"] and size > 1:
             kernels.normalize(update.minibatch[3].array)
         update.forward()
