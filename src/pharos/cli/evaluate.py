@@ -146,7 +146,7 @@ class Given:
     """
 
     policy: Any
-    observer: dict[str, Any] = field(default_factory=dict)
+    observer_options: dict[str, Any] = field(default_factory=dict)
     task: "Task | None" = None
 
 
@@ -195,7 +195,7 @@ def evaluate(
             worth = _worth_over_histories(goal, mdp, decisions, chance)
         else:
             worth = _worth(solution_of(mdp, policy, decisions, tolerance))
-    is_network = decisions is not None and "observation" in decisions.observer
+    is_network = decisions is not None and "observation" in decisions.observer_options
     rounding = ", for the probabilities that its network computes in 32 bits" if is_network else ""
     best, uniform, worst = (values[name].value for name in POLICIES)
     every = [*values.values(), worth]
@@ -256,12 +256,12 @@ def _estimated(worth: Worth) -> str:
 
 def _sees_frames(goal: Target, decisions: Given) -> bool:
     """Whether the policy sees several frames, so that its values belong to histories of states."""
-    observer = decisions.observer
-    if "observation" not in observer:
+    setting = decisions.observer_options
+    if "observation" not in setting:
         return False
     from pharos.observations import observe
 
-    name, options = observer["observation"], observer["observation_options"]
+    name, options = setting["observation"], setting["observation_options"]
     return "frames" in options and observe(goal.found_environment(), name, **options).frames > 1
 
 
@@ -270,7 +270,7 @@ def _worth_over_histories(goal: Target, mdp: "TabularMDP", decisions: Given, cha
     from pharos.training import Task, evaluate_agent
 
     began = time.perf_counter()
-    task = Task(goal.found_environment(), chance, **decisions.observer, gamma=mdp.gamma, horizon=mdp.horizon)
+    task = Task(goal.found_environment(), chance, **decisions.observer_options, gamma=mdp.gamma, horizon=mdp.horizon)
     evaluation = evaluate_agent(decisions.policy, task)
     return Worth(evaluation.value, evaluation.error_bound, time.perf_counter() - began, evaluation.episodes)
 
@@ -281,7 +281,7 @@ def solution_of(mdp: "TabularMDP", policy: str, decisions: Given | None, toleran
     from pharos.solvers import uniform_value, value_iteration, worst_value
 
     if decisions is not None:
-        return evaluate_policy(mdp, decisions.policy, tolerance, **decisions.observer)
+        return evaluate_policy(mdp, decisions.policy, tolerance, **decisions.observer_options)
     return {"optimal": value_iteration, "uniform": uniform_value, "worst": worst_value}[policy](mdp, tolerance)
 
 

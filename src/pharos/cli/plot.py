@@ -153,13 +153,12 @@ def policies(
 
     loaded = {folder.name: load_agent(folder, trust=trust) for folder in runs}
     tasks = [task for task, _ in loaded.values()]
-    observers = [
-        task for task, agent in loaded.values() if not isinstance(agent, np.ndarray)
-    ]  # tables see the state itself
-    task = (observers or tasks)[0]
+    # Tables see the state itself
+    observed_tasks = [task for task, agent in loaded.values() if not isinstance(agent, np.ndarray)]
+    task = (observed_tasks or tasks)[0]
     if len({(each.env.name, str(each.env.parameters)) for each in tasks}) > 1:
         raise ParameterError("the runs are of several environments; draw each in a picture of its own")
-    if len({str(each.observation) for each in observers}) > 1:
+    if len({str(each.observation) for each in observed_tasks}) > 1:
         raise ParameterError("the runs have several observations; draw each in a picture of its own")
     agents: dict[str, Any] = {name: agent for name, (_, agent) in loaded.items()}
     best = value_iteration(task.mdp.with_horizon(None).with_gamma(gamma))
@@ -251,8 +250,7 @@ def _learnt(policy: str | None, trust: bool) -> "Learnt | None":
     from pharos.explorer import Learnt
 
     named = read_policy(policy, trust=trust)
-    agent, observer = named.policy, named.observer
-    return Learnt(agent, Path(policy).name, **observer)
+    return Learnt(named.policy, Path(policy).name, **named.observer_options)
 
 
 def _exploration(goal: Target, building: Building, **options: Any) -> "Exploration":

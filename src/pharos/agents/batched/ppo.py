@@ -128,7 +128,7 @@ class PPOLane(Lane[ActorCritics]):
         return self._valued.array[..., 0].copy()
 
     def learn_minibatch(self, minibatch: tuple[np.ndarray, ...], is_active: np.ndarray) -> np.ndarray:
-        """One gradient step of the active runs whose policy stays within `target_kl`; returns these runs, (W,) bool.
+        """One gradient step of the active runs whose policy has not moved too far (`target_kl`); (W,) bool: these runs.
 
         Args:
             minibatch: (states, actions, logarithms of probabilities, advantages, returns), (W, B) each, states
