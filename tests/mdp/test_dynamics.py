@@ -101,7 +101,7 @@ def backed_up(dynamics, equation, x):
 def moved(dynamics, play, now, width):
     """The mass one step later, as the formula has it."""
     mass = np.where(play.live[:, None], now, 0.0)
-    return dynamics.pushed(play.chance.executed(mass, chosen_mass(play.policy, mass)), width)
+    return dynamics.push_forward(play.chance.executed(mass, chosen_mass(play.policy, mass)), width)
 
 
 def as_matrices(mdp):
@@ -133,8 +133,8 @@ def test_every_representation_gives_the_same_answers(mdp, seed):
         same([each.expected(x, states) for each in all_of_them])
     same([each.largest(values) for each in all_of_them])
     same([each.smallest(values, states) for each in all_of_them])
-    same([each.pushed(mass) for each in all_of_them])
-    same([each.pushed(mass, num_actions) for each in all_of_them])
+    same([each.push_forward(mass) for each in all_of_them])
+    same([each.push_forward(mass, num_actions) for each in all_of_them])
     same([each.arrivals(states) for each in all_of_them])
     same([each.matrix().toarray() for each in all_of_them])
     same([each.leads_to(0) for each in all_of_them])
@@ -145,7 +145,7 @@ def test_every_representation_gives_the_same_answers(mdp, seed):
     for steps in (None, 0, 1, 3):
         same([each.reachable(mdp.starts, steps) for each in all_of_them])
     adjoint = (mass * mdp.dynamics.expected(np.append(values[:-1], 0.0))).sum()
-    assert (mdp.dynamics.pushed(mass)[:, 0] * values[:-1]).sum() == pytest.approx(adjoint)
+    assert (mdp.dynamics.push_forward(mass)[:, 0] * values[:-1]).sum() == pytest.approx(adjoint)
 
 
 @pytest.mark.long
@@ -169,7 +169,7 @@ def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
     ):
         now = rng.random((mdp.num_states, width))
         fast, slow = np.empty((mdp.num_states, mdp.width)), moved(Listed.of(mdp), play, now, mdp.width)
-        assert mdp.dynamics.move(play, now, fast) == pytest.approx(slow[live].sum())
+        assert mdp.dynamics.step_distribution(play, now, fast) == pytest.approx(slow[live].sum())
         np.testing.assert_allclose(fast, slow, atol=1e-12)
     play = PolicyStep(live, policy.later, mdp.chance)
     fast, slow = (np.zeros((mdp.num_states, mdp.width)) for _ in range(2))

@@ -344,7 +344,7 @@ def test_dynamics_answer_the_same(mdp, seed):
     for ask in (
         lambda d: d.expected(x),
         lambda d: d.expected(x[:, 0], some),
-        lambda d: d.pushed(mass, actions),
+        lambda d: d.push_forward(mass, actions),
         lambda d: d.largest(x[:, 0]),
         lambda d: d.successors_of(some),
         lambda d: d.arrivals(some),

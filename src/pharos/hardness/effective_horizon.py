@@ -566,7 +566,7 @@ class _Nodes:
             allowed = actions(nodes)
             if allowed is None:
                 return None
-            following = self.choices.following(nodes, allowed)
+            following = self.choices.successors(nodes, allowed)
             nodes = np.unique(following[~is_reached[following]])
             is_reached[nodes] = True
         return np.flatnonzero(is_reached)

@@ -151,7 +151,7 @@ class HittingTimes:
         matrix = choices.matrix
         self.choices = choices
         self.support = (matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), choices.num_actions)
-        self.arrays = (*without_common(matrix, choices.num_actions), choices.alike)
+        self.arrays = (*without_common(matrix, choices.num_actions), choices.is_restart)
         first, previous = choices.reversed
         self.back = (first.astype(np.int64), previous.astype(np.int64))
         self.members = np.argsort(choices.underlying, kind="stable")
@@ -431,7 +431,7 @@ class Factors:
 
 def factors_of(choices: ExpandedMDP, policy: np.ndarray, inner: np.ndarray) -> Factors | None:
     """The factors of 1 - P of a policy on the `inner` nodes; None where it is not proper. Rows are made to sum to 1."""
-    first, unknown = _numbered_once(choices.alike[inner])
+    first, unknown = _numbered_once(choices.is_restart[inner])
     place = np.full(len(policy), first.size)  # what leads elsewhere is left out of the equations
     place[inner] = unknown
     solved = inner[first]

@@ -100,7 +100,7 @@ class FiniteHorizonValues:
     def following(self, met: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """(N,) bool: nodes that some of these actions (N, A) lead to from the nodes that are met."""
         result, nodes = np.zeros(self.num_nodes, np.bool_), np.flatnonzero(met)
-        result[self.choices.following(nodes, actions[nodes])] = True
+        result[self.choices.successors(nodes, actions[nodes])] = True
         return result
 
     def at_start(self, values: np.ndarray) -> float:

@@ -193,7 +193,7 @@ def discounted_arrivals(
     executed = walk.executed(started, visits)
     result = np.append(started + visits.sum(axis=1), 0.0)
     over = np.flatnonzero(~walk.live)
-    arrived = mdp.gamma * mdp.dynamics.pushed(executed)[:, 0]
+    arrived = mdp.gamma * mdp.dynamics.push_forward(executed)[:, 0]
     np.add.at(arrived, mdp.start_states, mdp.start_probabilities)
     result[over] = arrived[over]
     if mdp.has_ends:
@@ -219,7 +219,7 @@ def support_with_ends(mdp: TabularMDP, policy: TablePolicy | None = None) -> np.
     is_visited[~walk.live] = 0.0
     live = (is_visited > 0).any(axis=1) | (started > 0)
     executed = walk.executed((started > 0).astype(np.float64), is_visited) > 0
-    arrived = mdp.dynamics.pushed(executed.astype(np.float64))[:, 0] > 0
+    arrived = mdp.dynamics.push_forward(executed.astype(np.float64))[:, 0] > 0
     arrived[mdp.starts] = True
     is_end = np.append(np.zeros(mdp.num_states), 1.0)
     ends = mdp.has_ends and bool((mdp.dynamics.expected(is_end)[executed] > 0).any())
@@ -277,7 +277,7 @@ class Propagation:
         waiting *= gamma if self.mdp.is_sticky else 1.0
         visits, before = np.zeros_like(waiting), math.inf
         while True:
-            left = self.mdp.dynamics.settle(self.later, gamma, _LEAST, waiting, visits) / (1 - gamma)
+            left = self.mdp.dynamics.accumulate_visits(self.later, gamma, _LEAST, waiting, visits) / (1 - gamma)
             if left <= tolerance or left >= before:
                 return started, visits, left
             before = left
@@ -310,7 +310,7 @@ class Propagation:
         kernels.record(self.live, play.policy, weights, mass, scale, total, largest)
 
     def _push(self, now: np.ndarray, first: bool, after: np.ndarray) -> float:
-        return self.mdp.dynamics.move(self.first if first else self.later, now, after)
+        return self.mdp.dynamics.step_distribution(self.first if first else self.later, now, after)
 
 
 # Standard occupancy ---------------------------------------------------------------------------------------------------
@@ -415,7 +415,7 @@ def exploration_time(mdp: TabularMDP, *, horizon: int | None = None) -> Explorat
         executed[is_large] = 0.0
         if not executed.any():
             break
-        mass = mdp.dynamics.pushed(executed, mdp.width)
+        mass = mdp.dynamics.push_forward(executed, mdp.width)
         chance = mdp.chance
     met = min(met, 1.0)
     if met <= 0.0:

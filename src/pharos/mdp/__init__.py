@@ -1,4 +1,4 @@
-"""Tabular MDPs: dynamics, rewards, the chance that can be added, what is chosen, and states merged.
+"""Tabular MDPs: dynamics, rewards, added chance, selections of actions, and merged states.
 
 A file is loaded when something in it is first used: to step an environment needs `Chance` and no table.
 """

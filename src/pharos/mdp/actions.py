@@ -1,12 +1,12 @@
-"""Which action is chosen, and which one is executed.
+"""Selection of the action that is chosen, and chance that decides which one is executed.
 
-Chosen (`Selection`): the best action, the worst one, or what a policy says. The one thing in which the Bellman
-equations of optimal values, worst values and values of a policy differ.
+Chosen (`Selection`): the best action, the worst one, or that of a policy. The Bellman equations of optimal values,
+worst values and values of a policy differ in nothing else.
 
 Executed (`Chance`): sticky, random and lazy actions are added to a world, an MDP in, an MDP out, and nothing is copied:
-an MDP carries three weights, and `Chance` says what they do to values (`choice`), to distributions (`executed`), to the
-weights of each action (`weights`) and to single steps (`draw`). Whether the executed action has an effect: its dynamics
-carry one probability more, see table.py.
+an MDP carries three weights, and `Chance` applies them to values (`choice`), to distributions (`executed`), to the
+weights of each action (`weights`) and to single steps (`draw`). Lazy actions, which may have no effect, are one more
+probability of the dynamics, see table.py.
 """
 
 import math
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 
 
 States = slice | np.ndarray
-"""Which states: a range, or their numbers (N,)."""
+"""Some states: a range, or their numbers (N,)."""
 
 
 class Selection(Protocol):
-    """What is chosen, given the values of executing each action.
+    """Choice of an action, given the values of executing each one.
 
     Attributes:
         kind: of a solution: "optimal", "worst" or "policy".
         mass: the largest sum of the probabilities of choosing, at least 1.
-        operations: rounding operations, at most, of a value of what is chosen.
+        operations: rounding operations, at most, of the value of the choice.
     """
 
     @property
@@ -49,13 +49,13 @@ class Selection(Protocol):
     def operations(self, num_actions: int) -> int: ...
 
     def value(self, q: np.ndarray, states: States = slice(None)) -> np.ndarray:
-        """(N, 1, ...), or (N, A, ...) where it depends on the previous action: from q (N, A, ...) of some states."""
+        """(N, 1, ...) value of the choice, from q (N, A, ...) of some states; (N, A, ...) by the previous action."""
 
     def first_value(self, q: np.ndarray, states: States = slice(None)) -> np.ndarray:
-        """(N, 1, ...): without a previous action."""
+        """(N, 1, ...) value of the choice on the first step, without a previous action."""
 
     def policy(self, q: np.ndarray) -> "PolicyTable":
-        """What is chosen as a policy: the first of the best or worst actions, or the policy itself."""
+        """The choice as a policy: the first of the best or worst actions, or the policy itself."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ WORST = Extreme(-1.0, "worst")
 
 
 class PolicyTable:
-    """What a policy chooses.
+    """Policy over states, as a table of actions or of probabilities.
 
     Attributes:
         num_actions: A.
@@ -105,14 +105,14 @@ class PolicyTable:
 
     @staticmethod
     def of(mdp: "TabularMDP", policy: object = None) -> "PolicyTable":
-        """From what users write.
+        """Make the table of a policy in any form that users write.
 
         Args:
             policy: (S,) integers, an action for each state; or (S, A) probabilities. Under sticky actions also (S, A +
                 1) integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or
                 a function from an array of state indices to any of these; None: uniform.
-        Rows are divided by their sums in float64, as those of a float32 softmax sum to 1 within 1e-7 only, and what is
-        lacking or too much would add up over the steps of an episode; `operations` counts the rounding of that.
+        Rows are divided by their sums in float64: those of a float32 softmax sum to 1 within 1e-7 only, and the
+        difference would add up over the steps of an episode; `operations` counts the rounding of the division.
         Raises:
             ParameterError: the shape is wrong, or rows are not probabilities that sum to 1 within 1e-6.
         """
@@ -130,24 +130,24 @@ class PolicyTable:
 
     @property
     def table(self) -> np.ndarray:
-        """As users write it: (S,) actions, or (S, A) or (S, A + 1, A) probabilities."""
+        """The policy as users write it: (S,) actions, or (S, A) or (S, A + 1, A) probabilities."""
         if self.actions is not None:
             return self.actions
         return self.probabilities if self.looks_back else self.probabilities[:, 0]
 
     @property
     def looks_back(self) -> bool:
-        """Whether what is chosen depends on the previously executed action."""
+        """Whether the choice depends on the previously executed action."""
         return self.actions is None and self.probabilities.shape[1] > 1
 
     @cached_property
     def later(self) -> np.ndarray:
-        """(S, B, A) after the first step: B is A, or 1 where the previous action does not matter."""
+        """(S, B, A) probabilities after the first step: B is A, or 1 where the previous action does not matter."""
         return np.ascontiguousarray(self.probabilities[:, :-1] if self.looks_back else self.probabilities)
 
     @cached_property
     def first(self) -> np.ndarray:
-        """(S, 1, A) on the first step."""
+        """(S, 1, A) probabilities on the first step."""
         return np.ascontiguousarray(self.probabilities[:, -1:])
 
     @cached_property
@@ -167,13 +167,13 @@ class PolicyTable:
         return np.einsum("sba,sa...->sb...", self.first[states], q)
 
     def of_states(self, states: slice) -> "PolicyTable":
-        """What it chooses in some states alone."""
+        """The policy of some states alone."""
         if self.actions is not None:
             return PolicyTable(self.num_actions, actions=np.ascontiguousarray(self.actions[states]))
         return PolicyTable(self.num_actions, np.ascontiguousarray(self.probabilities[states]))
 
-    def chosen(self, mass: np.ndarray) -> np.ndarray:
-        """(S, A): how mass (S, W) after the first step chooses actions; the adjoint of `value`."""
+    def choice_mass(self, mass: np.ndarray) -> np.ndarray:
+        """(S, A) mass that chooses each action after the first step, of mass (S, W); the adjoint of `value`."""
         return chosen_mass(self.later, mass)
 
     def policy(self, q: np.ndarray) -> "PolicyTable":
@@ -186,7 +186,7 @@ def mass_of(largest: float, num_actions: int) -> float:
 
 
 def chosen_mass(policy: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    """(S, A): how mass (S, W) chooses actions by policy (S, B, A), B = W or 1."""
+    """(S, A) mass that chooses each action, of the mass of states (S, W), by a policy (S, B, A), B = W or 1."""
     if policy.shape[1] == 1:
         return policy[:, 0] * mass.sum(axis=1, keepdims=True)
     return np.einsum("sba,sb->sa", policy, mass)
@@ -230,7 +230,7 @@ def _normalized(mdp: "TabularMDP", table: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Chance:
-    """Which action is executed: the chosen one, the previously executed one, or any one; the weights sum to 1.
+    """Weights of executing the chosen action, the previously executed one, or a uniform one; they sum to 1.
 
     On the first step there is no previous action: the chosen one is executed with probability `first_chosen`, else a
     uniform one. (Only where random actions come before sticky ones does this differ from `chosen + previous`.)
@@ -307,7 +307,7 @@ class Chance:
     # What it does -----------------------------------------------------------------------------------------------------
 
     def choice(self, q: np.ndarray, value: np.ndarray) -> np.ndarray:
-        """(N, W, ...): the value of what is executed, given the value of what is chosen; W previous actions.
+        """(N, W, ...): the value of the executed action, given the value of the chosen one; W previous actions.
 
             V(s, b) = chosen value(s, b) + previous q(s, b) + uniform mean_x q(s, x)
 
@@ -340,40 +340,43 @@ class Chance:
         later = self.chosen * q + self.previous * repeated + self.uniform * mean
         return np.where(is_first, self.first_chosen * q + self.first_uniform * mean, later)
 
-    def executed(self, mass: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """(N, A): how the mass of states executes the actions; the adjoint of `choice`.
+    def executed(self, mass: np.ndarray, choice: np.ndarray) -> np.ndarray:
+        """(N, A): the mass that executes each action; the adjoint of `choice`.
 
         Args:
             mass: (N, W), of states, by the previously executed action where that matters.
-            chosen: (N, A), the mass that chooses each action.
+            choice: (N, A), the mass that chooses each action.
         """
-        result = self.chosen * chosen
+        result = self.chosen * choice
         if self.uniform:
-            result = result + self.uniform * mass.sum(axis=1, keepdims=True) / chosen.shape[1]
+            result = result + self.uniform * mass.sum(axis=1, keepdims=True) / choice.shape[1]
         return result + self.previous * mass if self.previous else result
 
-    def weights(self, chosen: np.ndarray, previous: np.ndarray | None = None) -> np.ndarray:
+    def weights(self, policy: np.ndarray, previous: np.ndarray | None = None) -> np.ndarray:
         """(N, A): the probability that each action is executed.
 
         Args:
-            chosen: (N, A), the probabilities of choosing each action.
+            policy: (N, A), the probabilities of choosing each action.
             previous: (N,) previously executed actions, A where there is none; it matters under sticky actions alone.
         """
-        num_actions = chosen.shape[1]
-        later = self.chosen * chosen + self.uniform / num_actions
+        num_actions = policy.shape[1]
+        later = self.chosen * policy + self.uniform / num_actions
         if previous is None or not self.is_sticky:
             return later
         later = later + self.previous * (np.asarray(previous)[:, None] == np.arange(num_actions))
         is_first = (np.asarray(previous) == num_actions)[:, None]
-        return np.where(is_first, self.first_chosen * chosen + self.first_uniform / num_actions, later)
+        return np.where(is_first, self.first_chosen * policy + self.first_uniform / num_actions, later)
 
-    def draw(self, chosen: np.ndarray, previous: np.ndarray, num_actions: int, rng: np.random.Generator) -> np.ndarray:
-        """(N,): executed actions at random. previous (N,), A where there is none. Draws 2 N numbers of `rng`."""
-        u, is_first = rng.random(len(chosen)), previous == num_actions
+    def draw(self, actions: np.ndarray, previous: np.ndarray, num_actions: int, rng: np.random.Generator) -> np.ndarray:
+        """(N,): executed actions at random, of chosen `actions` (N,) and previous ones (N,), A where there is none.
+
+        Draws 2 N numbers of `rng`.
+        """
+        u, is_first = rng.random(len(actions)), previous == num_actions
         uniform = np.where(is_first, u >= self.first_chosen, u >= self.chosen + self.previous)
         sticks = ~is_first & ~uniform & (u >= self.chosen)
-        anything = rng.integers(num_actions, size=len(chosen))
-        return np.where(sticks, previous, np.where(uniform, anything, chosen))
+        uniform_actions = rng.integers(num_actions, size=len(actions))
+        return np.where(sticks, previous, np.where(uniform, uniform_actions, actions))
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
@@ -382,8 +385,9 @@ class Chance:
 
 @dataclass(frozen=True)
 class ChanceSetting:
-    """What is added to an environment: chance of acting, which changes the MDP, and how rewards are paid, which does
-    not: values and regret are those of the rewards as they are earned.
+    """Chance added to an environment: of acting, which changes the MDP, and noise and delay of rewards, which do not.
+
+    Values and regret are those of the rewards as they are earned.
 
     Attributes:
         sticky: probability that the previous action is executed again.
@@ -437,7 +441,7 @@ class ChanceSetting:
 
     @property
     def changes_mdp(self) -> bool:
-        """Whether there is chance of acting."""
+        """Whether there is chance of acting, which changes the MDP."""
         return bool(self.sticky or self.random or self.lazy)
 
     def of(self, mdp: "TabularMDP") -> "TabularMDP":
@@ -511,7 +515,7 @@ def lazy_actions(mdp: "TabularMDP", p: float, *, staying: "npt.ArrayLike | None"
         staying: (S, A) what staying pays. None: what the rules pay for going from s to s by a, where the MDP is of a
             state space; else r(s, a), as the rewards of a table belong to state and action alone.
     Returns:
-        An MDP without ages: a state can be met twice.
+        An MDP without ages: a state can be visited twice.
     Raises:
         ParameterError: p is not in [0, 1), or `staying` has another shape.
     Cost: an array of rewards. One more term in each expectation.

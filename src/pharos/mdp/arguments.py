@@ -1,7 +1,7 @@
-"""Arguments, checked: each error names the argument, what was found, and the first entry that is wrong.
+"""Checks of arguments: each error names the argument, the value found, and the first entry that is wrong.
 
-`require_mdp` says what to write where a function gets something that an MDP can be made of; the others check the parts
-that a TabularMDP is made of.
+`require_mdp` suggests what to write where a function gets something that an MDP can be made of; the others check the
+parts of a TabularMDP.
 """
 
 import functools
@@ -19,7 +19,7 @@ R = TypeVar("R")
 
 
 def require_mdp(function: Callable[P, R]) -> Callable[P, R]:
-    """The function, which raises ParameterError, with what to write, unless its first argument is a TabularMDP."""
+    """The function with a check: ParameterError, with a remedy, unless its first argument is a TabularMDP."""
 
     @functools.wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -54,7 +54,7 @@ def _remedy(value: object) -> str:
 
 
 def as_array(value: object, name: str, dtype: npt.DTypeLike | None = None) -> np.ndarray:
-    """An array of what a user gave under a name; ParameterError where it is none, such as lists of several lengths."""
+    """The argument `name` as an array; ParameterError where it is none, such as lists of several lengths."""
     try:
         return np.asarray(value, dtype)
     except (ValueError, TypeError) as error:
@@ -62,7 +62,7 @@ def as_array(value: object, name: str, dtype: npt.DTypeLike | None = None) -> np
 
 
 def checked_next_states(next_states: object) -> np.ndarray:
-    """(S, A) int32 or int64: where each action leads, -1 for the end.
+    """(S, A) int32 or int64: the next state of each action, -1 for the end.
 
     Raises:
         ParameterError: it is not a table of states; the first wrong entry is named.

@@ -61,8 +61,8 @@ def minimize(mdp: TabularMDP, observations: npt.ArrayLike | None = None) -> Mini
         BRIDGE's consolidation (Laidlaw, Russell and Dragan 2023).
     """
     rewards = mdp.reward_table
-    paid = rewards.table if len(rewards.palette) else rewards.table + 0.0  # -0.0 and 0.0 are one reward
-    classes = _numbered(paid, np.asarray(mdp.terminal).astype(np.int64))
+    entries = rewards.table if len(rewards.palette) else rewards.table + 0.0  # -0.0 and 0.0 are one reward
+    classes = _numbered(entries, np.asarray(mdp.terminal).astype(np.int64))
     if observations is not None:
         observed = np.asarray(observations)
         if observed.ndim == 0 or len(observed) != mdp.num_states:
@@ -104,7 +104,7 @@ def _refined(table: Indices, classes: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _refined_general(mdp: TabularMDP, classes: np.ndarray) -> tuple[np.ndarray, int]:
-    """The same for transition probabilities."""
+    """(coarsest stable partition, rounds) of transition probabilities."""
     from pharos.kernels import partition
 
     states, matrix = mdp.num_states, mdp.dynamics.matrix()

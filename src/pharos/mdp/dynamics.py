@@ -1,12 +1,11 @@
-"""What executing an action does, whatever the transitions are stored as.
+"""Transition dynamics of executed actions, independent of how transitions are stored.
 
-`Dynamics` asks and answers in the terms of mathematics: expectations, their adjoint, what can follow. It knows no
-chance of choosing, no policy and no terminal states; a `BellmanEquation` brings them along where a whole backup is
-wanted.
+`Dynamics` has the operations of mathematics: expectations, their adjoint, possible successors. It knows no chance of
+choosing, no policy and no terminal states; a `BellmanEquation` supplies them for a whole backup.
 
 A way of storing transitions is one class: `Table` (table.py), `OutcomeTable` (also there). It needs the methods
 that are abstract here, four attributes, and arrays that kernels/outcomes.py can read: all loops are compiled, each
-written once for all of them. docs/decisions/0008-one-operator.md says why, and where the next class goes.
+written once for all of them. See docs/decisions/0008-one-operator.md for the reasons, and the place of a new class.
 
 States are numbered 0 .. S - 1; S stands for the end of an episode, which has no value and no successors.
 
@@ -36,7 +35,7 @@ Blocks = Callable[[], Iterator[tuple[int, np.ndarray]]]
 
 
 class BellmanEquation(NamedTuple):
-    """The equation x = T x of values, but for the dynamics.
+    """The Bellman equation x = T x of values, without the dynamics.
 
         (T x)(s, b) = chance of choice in q(s, .),   q(s, a) = r(s, a) + gamma E x(next, a)
 
@@ -55,15 +54,15 @@ class BellmanEquation(NamedTuple):
 
 
 class PolicyStep(NamedTuple):
-    """How mass moves: live (S,) bool, the states that play goes on in; policy and chance of choosing, one step's."""
+    """One step of play: policy and chance that move the mass of live states, those in which play goes on."""
 
-    live: np.ndarray
+    live: np.ndarray  # (S,) bool
     policy: np.ndarray  # (S, B, A)
     chance: Chance
 
 
 class Outcomes(NamedTuple):
-    """What N executions may lead to.
+    """Possible outcomes of N executions: pairs of a state and an executed action.
 
     Attributes:
         which: (K,) index of the execution, ascending.
@@ -106,7 +105,7 @@ class StronglyConnected(NamedTuple):
 
 
 class Dynamics(ABC):
-    """What executing an action does, for S states and A actions.
+    """Transition dynamics of executed actions, for S states and A actions.
 
     Attributes:
         operations: the rounding operations, at most, of one expectation.
@@ -126,7 +125,7 @@ class Dynamics(ABC):
     laziness: float = 0.0
     workers: int | None = None
 
-    # What each representation says of itself --------------------------------------------------------------------------
+    # Of each representation ------------------------------------------------------------------------------------------
 
     @abstractmethod
     def expected(self, x: np.ndarray, states: States = slice(None)) -> np.ndarray:
@@ -144,7 +143,7 @@ class Dynamics(ABC):
 
     @property
     def for_sweeps(self) -> object:
-        """The same for the loops in which solvers spend their time: what the compiler knows more of."""
+        """The argument `transitions` of sweeps, in types that let the compiler make them faster."""
         return self.for_kernels
 
     @abstractmethod
@@ -157,7 +156,7 @@ class Dynamics(ABC):
 
     @abstractmethod
     def restricted_to(self, states: np.ndarray) -> "Dynamics":
-        """These states alone, ascending, with new numbers. What leads out of them is not right any more."""
+        """The dynamics of these states alone, ascending and renumbered; transitions that leave them are replaced."""
 
     @abstractmethod
     def merged(self, classes: np.ndarray, representatives: np.ndarray) -> "Dynamics":
@@ -165,11 +164,11 @@ class Dynamics(ABC):
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
-        """What it is made of, by name, as files keep it."""
+        """The arrays of this representation by name, as files keep them."""
 
     @abstractmethod
     def part(self, start: int, stop: int) -> "tuple[Dynamics, np.ndarray]":
-        """The states [start, stop) alone, and the states outside that they may lead to; numbers as `Part` says."""
+        """The dynamics of the states [start, stop), numbered as in `Part`, and the outside states they may lead to."""
 
     def deterministic_table(self) -> Indices | None:
         """(S, A) next states, -1 for the end, where each execution has one outcome; else None."""
@@ -180,10 +179,10 @@ class Dynamics(ABC):
         """Whether an action that has an effect may have several outcomes."""
         return not self.is_deterministic
 
-    # What follows from it ---------------------------------------------------------------------------------------------
+    # Derived operations -----------------------------------------------------------------------------------------------
 
     def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray, runs: np.ndarray | None = None) -> None:
-        """out = T x; x and out are not the same. Between the states and the end there may be others, of a part.
+        """Set out to T x, out not x itself. Between the rows of the states and the end there may be those of a halo.
 
         runs: the states of some runs (R, 2) alone, see `runs_of`; None: all.
         """
@@ -211,7 +210,7 @@ class Dynamics(ABC):
         """Replace each entry of x by its backup, from entries that are old or already new; once each.
 
         Args:
-            threads: that may share the entries; which of two is first is theirs then, so that x is not the same to the
+            threads: that may share the entries; their order is then left to chance, so that x is not the same to the
                 last bit in every run.
             part: the states [start, stop) alone.
         Returns the largest change.
@@ -219,48 +218,50 @@ class Dynamics(ABC):
         return swept(self.for_sweeps, self.num_actions, equation, x, None, threads, part)
 
     def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: TopologicalOrder) -> None:
-        """Replace each entry of x by its backup, from the last state of an order to the first: the fixed point."""
+        """Set x to the fixed point: replace each entry by its backup, from the last state of an order to the first."""
         swept(self.for_sweeps, self.num_actions, equation, x, order.states)
 
-    def move(self, play: PolicyStep, now: np.ndarray, after: np.ndarray) -> float:
-        """after (S, W) = the mass now (S, W') one step later, without what has ended.
+    def step_distribution(self, step: PolicyStep, now: np.ndarray, after: np.ndarray) -> float:
+        """Set after (S, W) to the mass now (S, W') one step later, without the mass of ended episodes.
 
         Returns the sum over live states.
         """
-        return occupancy.push(self.for_kernels, play.live, play.policy, play.chance.triple, now, after)
+        return occupancy.push(self.for_kernels, step.live, step.policy, step.chance.triple, now, after)
 
-    def pushed(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
-        """(S, W): where the mass (S, A) of executed actions goes, without what ends; W = A by executed action, or 1.
+    def push_forward(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
+        """(S, W): the mass (S, A) of executed actions one step later, without what ends; W = A by that action, or 1.
 
-        The adjoint of `expected`: sum(mass * expected(x)) = sum(pushed(mass) * x) where x is 0 at the end.
+        The adjoint of `expected`: sum(mass * expected(x)) = sum(push_forward(mass) * x) where x is 0 at the end.
         """
         after = np.zeros((self.num_states, width))
         outcomes.pushed(self.for_kernels, np.ascontiguousarray(mass, np.float64), after)
         return after
 
-    def settle(self, play: PolicyStep, gamma: float, least: float, waiting: np.ndarray, visits: np.ndarray) -> float:
-        """Count the waiting mass (S, W) as visits (S, W) and move it on, discounted. Returns what waits afterwards.
+    def accumulate_visits(
+        self, step: PolicyStep, gamma: float, least: float, waiting: np.ndarray, visits: np.ndarray
+    ) -> float:
+        """Add the waiting mass (S, W) to visits (S, W) and move it on, discounted; return the mass that waits then.
 
         Masses below `least` may stay.
         """
-        weights = play.chance.triple
-        return occupancy.settle(self.for_kernels, play.live, play.policy, weights, gamma, least, waiting, visits)
+        weights = step.chance.triple
+        return occupancy.settle(self.for_kernels, step.live, step.policy, weights, gamma, least, waiting, visits)
 
-    def support(self, play: PolicyStep, reached: np.ndarray) -> None:
-        """Set reached (S, W), 1 where mass may be and else 0, to 1 wherever it may come to."""
-        occupancy.support(self.for_kernels, play.live, play.policy, play.chance.triple, reached)
+    def support(self, step: PolicyStep, reachable: np.ndarray) -> None:
+        """Grow reachable (S, W), 1 where there is mass and else 0, to all that the mass may reach in some steps."""
+        occupancy.support(self.for_kernels, step.live, step.policy, step.chance.triple, reachable)
 
     def entries_of(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`entries` of each action in each of some states; the first is i A + a."""
         return self.entries(*self._all_actions(states))
 
     def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
-        """What executing actions (N,) in states (N,) may lead to: ascending by next state, each of them once."""
+        """The outcomes of executing actions (N,) in states (N,), ascending by next state, each of which comes once."""
         from scipy import sparse
 
-        which, following, probabilities = self.entries(states, actions)
-        small = np.int32 if max(len(following), self.num_states + 1) < 2**31 else np.int64
-        columns = np.where(following < 0, self.num_states, following).astype(small)
+        which, next_states, probabilities = self.entries(states, actions)
+        small = np.int32 if max(len(next_states), self.num_states + 1) < 2**31 else np.int64
+        columns = np.where(next_states < 0, self.num_states, next_states).astype(small)
         indptr = np.append(0, np.cumsum(np.bincount(which, minlength=len(states)))).astype(small)
         matrix = sparse.csr_matrix((probabilities, columns, indptr), shape=(len(states), self.num_states + 1))
         matrix.sum_duplicates()
@@ -269,15 +270,15 @@ class Dynamics(ABC):
 
     def successors_of(self, states: np.ndarray) -> np.ndarray:
         """The states that some action may lead to from some of these, ascending; S stands for the end."""
-        following = self.entries_of(states)[1]
-        return np.unique(np.where(following < 0, self.num_states, following))
+        next_states = self.entries_of(states)[1]
+        return np.unique(np.where(next_states < 0, self.num_states, next_states))
 
     def largest(self, x: np.ndarray, states: States = slice(None)) -> np.ndarray:
-        """(N, A): the largest of x (S + 1,) over what executing an action may lead to."""
+        """(N, A): the largest of x (S + 1,) over the possible next states of each action."""
         return self._extreme(x, states, 1.0)
 
     def smallest(self, x: np.ndarray, states: States = slice(None)) -> np.ndarray:
-        """(N, A): the smallest of x (S + 1,) over what executing an action may lead to."""
+        """(N, A): the smallest of x (S + 1,) over the possible next states of each action."""
         return self._extreme(x, states, -1.0)
 
     def _extreme(self, x: np.ndarray, states: States, sign: float) -> np.ndarray:
@@ -293,17 +294,17 @@ class Dynamics(ABC):
         return self.expected(indicator) > 0
 
     def reachable(self, starts: np.ndarray, steps: int | None = None) -> np.ndarray:
-        """(S,) bool: the states that can be met within `steps` steps (None: any number) from the start states."""
+        """(S,) bool: the states that can be reached within `steps` steps (None: any number) from the start states."""
         is_reached = np.zeros(self.num_states, np.bool_)
         frontier = np.unique(starts)
         is_reached[frontier] = True
         small = np.int32 if self.num_states < 2**31 else np.int64
-        now, following = (np.empty(self.num_states, small) for _ in range(2))
+        now, after = (np.empty(self.num_states, small) for _ in range(2))
         count, level = len(frontier), 0
         now[:count] = frontier
         while count and (steps is None or level < steps):
-            count = graph.onwards(self.for_kernels, now, count, following, is_reached)
-            now, following = following, now
+            count = graph.onwards(self.for_kernels, now, count, after, is_reached)
+            now, after = after, now
             level += 1
         return is_reached
 
@@ -318,7 +319,7 @@ class Dynamics(ABC):
 
         Args:
             least: small components with cycles are put together until a group has as many states.
-        Cost: one look at each transition, and 33 bytes a state.
+        Cost: one read of each transition, and 33 bytes a state.
         """
         from pharos.kernels import bellman  # which few need
 
@@ -344,8 +345,8 @@ class Dynamics(ABC):
         """Sweep x group by group of `components`, from the last to the first, until each is settled.
 
         Args:
-            target: a sweep of a group changes it by at most as much in the end, or by `settled` times its values.
-            most: backups, after which each group that is left is swept once.
+            target: a group is settled once a sweep changes it by at most this, or by `settled` times the values.
+            most: number of backups, after which each remaining group is swept once.
         """
         choice, before = _choice(equation.select), float(max(x.max(), -x.min()))
         if choice is not None and not equation.chance.is_sticky:
@@ -400,7 +401,7 @@ class Dynamics(ABC):
         return sparse.csr_matrix((entries.probabilities, entries.states, indptr), shape=shape)
 
     def _all_actions(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Each state with each action."""
+        """(states, actions) of all pairs of some states and an action."""
         return np.repeat(states, self.num_actions), np.tile(np.arange(self.num_actions), len(states))
 
 
@@ -453,7 +454,7 @@ def swept(
 
 
 def _choice(select: Selection) -> "float | np.ndarray | None":
-    """The argument `choice` of kernels; None for policies that draw actions, or look back."""
+    """The argument `choice` of kernels; None for policies that are random, or depend on the previous action."""
     if isinstance(select, Extreme):
         return select.sign
     assert isinstance(select, PolicyTable)
@@ -503,7 +504,7 @@ def split(blocks: Blocks, shape: tuple[int, ...], start: int, stop: int) -> tupl
 
 
 def runs_of(is_in: np.ndarray, gap: int = 1) -> np.ndarray:
-    """(R, 2) int64: where the stretches of rows begin and end that are in, (n,) bool; ascending.
+    """(R, 2) int64: first row and end of each stretch of rows of which is_in (n,) bool holds; ascending.
 
     gap: stretches with fewer rows than that between them are one.
     """
@@ -514,13 +515,13 @@ def runs_of(is_in: np.ndarray, gap: int = 1) -> np.ndarray:
 
 
 def runs_between(runs: np.ndarray, num_rows: int) -> np.ndarray:
-    """(R, 2): the stretches of the other rows."""
+    """(R, 2): the runs of the rows that are in none of `runs`."""
     edges = np.concatenate([[0], runs.reshape(-1), [num_rows]]).reshape(-1, 2)
     return edges[edges[:, 1] > edges[:, 0]]
 
 
 def count_of(runs: np.ndarray) -> int:
-    """How many rows there are in runs (R, 2)."""
+    """Number of rows in runs (R, 2)."""
     return int((runs[:, 1] - runs[:, 0]).sum())
 
 
@@ -530,7 +531,7 @@ def rows_of(runs: np.ndarray) -> np.ndarray:
 
 
 def shares_of(runs: np.ndarray, shares: int) -> list[np.ndarray]:
-    """The runs (R, 2) in as many parts of as many rows each, up to one; in order, without empty ones."""
+    """The runs (R, 2) cut into `shares` parts of equal numbers of rows, up to one; in order, without empty parts."""
     before = np.concatenate([[0], np.cumsum(runs[:, 1] - runs[:, 0])])
     cuts = [int(before[-1]) * i // shares for i in range(shares + 1)]
     parts = []

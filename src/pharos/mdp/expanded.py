@@ -1,4 +1,4 @@
-"""An MDP with chance, written out: nodes, choices and where they may lead.
+"""An MDP with chance, written out: nodes, choices and their outcomes.
 
 Nodes. Without sticky actions the states, and the implicit end. Under sticky actions the pairs (state, previously
 executed action) that can be reached, and the start states without a previous action; a target is a state, reached with
@@ -25,8 +25,8 @@ class ExpandedMDP:
         previous: (N,) the previously executed action, A for none; -1 where it does not matter.
         starts: [(node, probability)] of the first step.
         num_actions: A.
-        alike: (N,) bool, nodes that all lead to the same nodes with the same probabilities, whatever is chosen: those
-            in which episodes end, where a restart leads to one of several start states.
+        is_restart: (N,) bool, nodes in which episodes end, where a restart leads to one of several start states: all of
+            them lead to the same nodes with the same probabilities, by every choice.
     """
 
     matrix: "scipy.sparse.csr_matrix"
@@ -35,7 +35,7 @@ class ExpandedMDP:
     starts: list[tuple[int, float]]
     num_actions: int
     num_targets: int
-    alike: np.ndarray
+    is_restart: np.ndarray
 
     @cached_property
     def table(self) -> np.ndarray | None:
@@ -45,7 +45,7 @@ class ExpandedMDP:
         return matrix.indices.reshape(-1, self.num_actions).astype(np.int64) if is_single else None
 
     def expected(self, values: np.ndarray) -> np.ndarray:
-        """(N, A): the mean of values (N,) over what a choice leads to."""
+        """(N, A): the mean of values (N,) over the outcomes of each choice."""
         if self.table is not None:
             return values[self.table]
         return np.asarray(self.matrix @ values).reshape(-1, self.num_actions)
@@ -56,18 +56,18 @@ class ExpandedMDP:
             return values[self.table]
         return np.maximum.reduceat(values[self.matrix.indices], self.matrix.indptr[:-1]).reshape(-1, self.num_actions)
 
-    def following(self, nodes: np.ndarray, choices: np.ndarray) -> np.ndarray:
+    def successors(self, nodes: np.ndarray, choices: np.ndarray) -> np.ndarray:
         """The nodes that some of the choices (n, A) bool in nodes (n,) may lead to, some of them several times."""
-        which, chosen = np.nonzero(choices)
+        which, actions = np.nonzero(choices)
         if self.table is not None:
-            return self.table[nodes[which], chosen]
-        return np.asarray(self.matrix[nodes[which] * self.num_actions + chosen].indices)
+            return self.table[nodes[which], actions]
+        return np.asarray(self.matrix[nodes[which] * self.num_actions + actions].indices)
 
     def rewards(self, mdp: TabularMDP) -> np.ndarray:
         """(N, A): the expected reward of each choice, in the MDP that is written out."""
-        paid = np.vstack([mdp.rewards, np.zeros((1, mdp.num_actions))])
-        paid[:-1][np.asarray(mdp.terminal)] = 0.0
-        executed = paid[np.minimum(self.underlying, mdp.num_states)]
+        rewards = np.vstack([mdp.rewards, np.zeros((1, mdp.num_actions))])
+        rewards[:-1][np.asarray(mdp.terminal)] = 0.0
+        executed = rewards[np.minimum(self.underlying, mdp.num_states)]
         return mdp.chance.chosen_values(executed, self.previous, mean_of_actions(executed)[:, None])
 
     @cached_property
@@ -80,7 +80,7 @@ class ExpandedMDP:
 
     @cached_property
     def _recurrent_class(self) -> np.ndarray:
-        """(N,) its recurrent class, nodes that lead to each other and to no others, from 0 on; -1: none."""
+        """(N,) the recurrent class of each node, from 0 on, of nodes that lead to each other alone; -1: none."""
         first, previous = self.reversed
         size = len(self.underlying)
         graph = scipy.sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size))
@@ -93,9 +93,9 @@ class ExpandedMDP:
 
     @cached_property
     def is_connected(self) -> bool:
-        """Whether every target that is met at all can be reached from every node: each recurrent class has all.
+        """Whether every target that has a node can be reached from every node: each recurrent class has all targets.
 
-        So from every node every target is surely reached, by whoever chooses at random.
+        So from every node the uniform policy surely reaches every target.
         """
         inside = np.flatnonzero(self._recurrent_class >= 0)
         pairs = np.unique(self._recurrent_class[inside] * np.int64(self.num_targets) + self.underlying[inside])
@@ -103,10 +103,10 @@ class ExpandedMDP:
 
     @cached_property
     def crude_upper(self) -> float:
-        """Proven, and far too large: a shortest path of at most H edges succeeds with probability q^H or more.
+        """Proven, far too large upper bound on the expected time of any target: H / q^H.
 
-        So the expected time is at most H / q^H. H is that by way of one node, which all others lead to; infinite where
-        there is none.
+        A shortest path of at most H edges, each of probability q or more, succeeds with probability q^H or more. H is
+        the length of paths by way of one node, to which all others lead; infinite where there is none.
         """
         if not self.is_connected or self._recurrent_class.max() > 0:
             return math.inf
@@ -133,6 +133,7 @@ class ExpandedMDP:
         width = mdp.policy_width  # node s (A + 1) + b, b = A: no previous action
         terminal = np.asarray(mdp.terminal)
         executed, ends = outcomes_of(mdp, terminal)  # (S A, S + ends): outcome of executing an action in a live state
+        # Nodes.
         size = num_states + ends
         nodes = size * width
         live = np.zeros(size, np.bool_)
@@ -143,6 +144,7 @@ class ExpandedMDP:
             for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True)
             if p > 0
         ]
+        # Probabilities of executing each action, for each node and choice.
         node = np.flatnonzero(live[owner])
         choice, chooser = np.tile(np.eye(num_actions), (node.size, 1)), np.repeat(node, num_actions)
         weights = executed_actions(mdp, choice, owner[chooser], previous[chooser])
@@ -151,15 +153,16 @@ class ExpandedMDP:
         weights = scipy.sparse.csr_matrix(
             (weights.data, weights.indices, np.append(0, counts.cumsum())), shape=(counts.size, weights.shape[1])
         )
+        # Transitions of live nodes, and those of terminal states and of the end.
         matrix = weights @ nodes_of_outcomes(executed, num_actions, width)
         matrix = scipy.sparse.csr_matrix(matrix + _restarts(owner, live, starts, num_actions, nodes, restart))
         matrix.sum_duplicates()
-        alike = ~live[owner] if restart and len(starts) > 1 else np.zeros(nodes, np.bool_)
-        choices = ExpandedMDP(matrix, owner, previous, starts, num_actions, size, alike)
-        return choices.reachable() if width > 1 else choices
+        is_restart = ~live[owner] if restart and len(starts) > 1 else np.zeros(nodes, np.bool_)
+        expanded = ExpandedMDP(matrix, owner, previous, starts, num_actions, size, is_restart)
+        return expanded.reachable() if width > 1 else expanded
 
     def reachable(self) -> "ExpandedMDP":
-        """The nodes that can be reached from the start, by whatever is chosen."""
+        """The expanded MDP on the nodes that some choices reach from the start."""
         first, previous = self.reversed
         size = len(self.underlying)
         graph = scipy.sparse.csr_matrix(
@@ -181,7 +184,7 @@ class ExpandedMDP:
             starts,
             self.num_actions,
             self.num_targets,
-            self.alike[nodes],
+            self.is_restart[nodes],
         )
 
 
@@ -194,16 +197,16 @@ def mean_of_actions(values: np.ndarray) -> np.ndarray:
 
 
 def executed_actions(
-    mdp: TabularMDP, chosen: np.ndarray, owner: np.ndarray, previous: np.ndarray
+    mdp: TabularMDP, policy: np.ndarray, owner: np.ndarray, previous: np.ndarray
 ) -> "scipy.sparse.csr_matrix":
     """(N, S A) CSR: the probability that each action is executed in the state of a node.
 
     Args:
-        chosen: (N, A) probabilities of choosing each action. owner: (N,) states. previous: (N,) as of `Chance.weights`.
+        policy: (N, A) probabilities of choosing each action. owner: (N,) states. previous: (N,) as of `Chance.weights`.
     """
-    nodes, num_actions = chosen.shape
+    nodes, num_actions = policy.shape
     columns = owner[:, None] * num_actions + np.arange(num_actions)
-    entries = mdp.chance.weights(chosen, previous).ravel(), columns.ravel(), np.arange(nodes + 1) * num_actions
+    entries = mdp.chance.weights(policy, previous).ravel(), columns.ravel(), np.arange(nodes + 1) * num_actions
     matrix = scipy.sparse.csr_matrix(entries, shape=(nodes, mdp.num_states * num_actions))
     matrix.eliminate_zeros()
     return matrix
@@ -232,7 +235,7 @@ def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> "tuple[scipy.sparse.cs
 def _restarts(
     owner: np.ndarray, live: np.ndarray, starts: list[tuple[int, float]], num_actions: int, nodes: int, restart: bool
 ) -> "scipy.sparse.csr_matrix":
-    """(N A, N): what terminal states and the end lead to."""
+    """(N A, N): transitions of terminal states and of the end."""
     ended = np.flatnonzero(~live[owner])
     if restart:
         rows = np.repeat((ended[:, None] * num_actions + np.arange(num_actions)).ravel(), len(starts))

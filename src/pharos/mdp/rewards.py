@@ -4,7 +4,7 @@ Games pay few different rewards: up to 256 distinct values are kept as one byte 
 float64, an eighth of the memory of (S, A) float64 and an eighth of what a sweep has to stream; more are kept as
 float64.
 
-Those of stored transitions are computed in parallel after the build, and replaced without building again.
+Rewards of stored transitions are computed in parallel after the build, and replaced without building again.
 """
 
 import inspect
@@ -48,7 +48,7 @@ class Rewards:
 
     @staticmethod
     def from_array(rewards: np.ndarray) -> "Rewards":
-        """From (S, A) numbers; ParameterError where one is NaN or infinite."""
+        """Make rewards of (S, A) numbers; ParameterError where one is NaN or infinite."""
         rewards = np.asarray(rewards, np.float64)
         collector = RewardsCollector((rewards.shape[0], rewards.shape[1]))
         for start in range(0, len(rewards), _BLOCK):
@@ -80,7 +80,7 @@ class Rewards:
         return Rewards(np.asarray(self.table[states]), self.palette)
 
     def mixed(self, other: "Rewards", p: float) -> "Rewards":
-        """(1 - p) these + p others, of as many states and actions; where both are equal, that."""
+        """(1 - p) times these rewards plus p times others of the same shape; exact where both are equal."""
         collector = RewardsCollector(self.shape)
         for start in range(0, len(self.table), _BLOCK):
             block = slice(start, start + _BLOCK)
@@ -100,10 +100,10 @@ class Rewards:
 
 
 class RangedRewards(Rewards):
-    """Rewards of a state space of which only some ranges may be asked for: they are computed when they are.
+    """Rewards of a state space that are computed when they are read, of a range of states or of all.
 
     Attributes:
-        whole: all of them, once somebody has asked for them; else None.
+        whole: the rewards of all states, once they were computed; else None.
     """
 
     def __init__(self, shape: tuple[int, int], compute: Callable[[int, int], Rewards]):
@@ -130,7 +130,7 @@ class RangedRewards(Rewards):
 
 @dataclass
 class RewardsCollector:
-    """Takes rewards block by block and ends with a palette where there are few distinct ones."""
+    """Collector of rewards, block by block; they end with a palette where few are distinct."""
 
     shape: tuple[int, int]
     _codes: np.ndarray | None = None
@@ -138,7 +138,7 @@ class RewardsCollector:
     _palette: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def add(self, start: int, block: np.ndarray) -> None:
-        """Rewards of the states from `start` on."""
+        """Add the rewards of the states from `start` on."""
         if self._values is None:
             if self._codes is None:
                 self._codes = large_zeros(self.shape, np.uint8)
@@ -157,7 +157,7 @@ class RewardsCollector:
         self._values[start : start + len(block)] = block
 
     def _is_known(self, start: int, block: np.ndarray) -> bool:
-        """Enter a block whose rewards are all among the first few of the palette; whether they are."""
+        """Enter a block whose rewards are all among the first few of the palette; return whether they are."""
         assert self._codes is not None
         codes, left = np.zeros(block.shape, np.uint8), block.size
         for code, reward in enumerate(self._palette[:_FEW]):
@@ -180,7 +180,7 @@ class RewardsCollector:
 
 
 def rewards_of_shape(rewards: npt.ArrayLike, shape: tuple[int, ...]) -> Rewards:
-    """Rewards (S, A) of this shape; ParameterError where they have another, or one is not finite."""
+    """Rewards of an array; ParameterError where its shape is not `shape`, or an entry is not finite."""
     array = as_array(rewards, "rewards", np.float64)
     if array.shape != shape:
         raise ParameterError(f"rewards have shape {array.shape}; expected {shape}, one for each state and action")
@@ -188,7 +188,7 @@ def rewards_of_shape(rewards: npt.ArrayLike, shape: tuple[int, ...]) -> Rewards:
 
 
 def expected_over_outcomes(rewards: npt.ArrayLike, probabilities: np.ndarray) -> np.ndarray:
-    """(S, A) expected rewards: those given, or the mean of those of the outcomes, (S, A, K).
+    """(S, A) expected rewards: as given, or the mean over outcomes of rewards (S, A, K).
 
     Raises:
         ParameterError: they have neither shape, or one of a possible outcome is not finite.
@@ -248,7 +248,7 @@ def rewards_of_space(
 
 
 def ranged_rewards(space: "StateSpace") -> "Rewards":
-    """The rewards by the rules, of which each range is computed when it is asked for."""
+    """The rewards by the rules, of which each range of states is computed when it is read."""
     env = space.environment
     assert env is not None
 
@@ -259,7 +259,7 @@ def ranged_rewards(space: "StateSpace") -> "Rewards":
 
 
 def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "Rewards":
-    """What the rules pay for going from a state to itself, whether an action leads there or not; 0 in terminal states.
+    """(S, A) rewards by the rules for going from a state to itself, possible or not; 0 in terminal states.
 
     Args:
         reward: a function reward(self, state, action, next_state) in place of the environment's.
@@ -295,7 +295,7 @@ def _collected(
     first: int = 0,
     last: int | None = None,
 ) -> "Rewards":
-    """Blocks (first state, rewards) of the states [first, last) as one; RuleError where one is not finite."""
+    """Rewards of the states [first, last), from blocks (first state, rewards); RuleError where one is not finite."""
     from pharos.rules import refused_reward
 
     stop = space.num_states if last is None else last
@@ -309,7 +309,7 @@ def _collected(
 
 
 def rewards_of_outcomes(space: "StateSpace") -> np.ndarray:
-    """What each possible outcome of a state space with chance pays when it is drawn: (N,) float64, in their order.
+    """(N,) float64, the reward of each possible outcome of a state space with chance, in the order of the outcomes.
 
     Raises:
         RuleError: the reward function raised an exception.
@@ -323,24 +323,24 @@ def rewards_of_outcomes(space: "StateSpace") -> np.ndarray:
         stop = min(start + _ROWS, space.num_states)
         which, successors, _ = space.dynamics.entries_of(np.arange(start, stop))
         number = np.arange(len(which)) - np.searchsorted(which, which)  # of each outcome within its row
-        paid = np.zeros(len(which))
+        rewards = np.zeros(len(which))
         for k in range(int(number.max(initial=-1)) + 1):  # as if the k-th were the only one
             now = number == k
             outcomes = which[now], successors[now], np.ones(int(now.sum()))
             ranks = np.full(len(outcomes[0]), k)
             means = rules.expected_block(space.packed_states, outcomes, space.terminal, start, stop, ranks)
-            paid[now] = means.reshape(-1)[which[now]]
-        blocks.append(paid)
+            rewards[now] = means.reshape(-1)[which[now]]
+        blocks.append(rewards)
     return np.concatenate(blocks)
 
 
 class PaidOutcomes(NamedTuple):
-    """What executing an action may lead to and pay, in all states.
+    """Possible next states and rewards of executed actions, in all states.
 
     Attributes:
         which: (N,) row s A + a of the state and the executed action, ascending.
         states: (N,) next states, S for the end.
-        rewards: (N,) what this outcome pays.
+        rewards: (N,) reward of the outcome.
         probabilities: (N,) float64 > 0.
     """
 
@@ -351,7 +351,7 @@ class PaidOutcomes(NamedTuple):
 
 
 def paid_outcomes(mdp: "TabularMDP") -> PaidOutcomes:
-    """The possible outcomes of all states and executed actions of an MDP, each with what it pays when it is drawn.
+    """The possible outcomes of all states and executed actions of an MDP, each with its own reward.
 
     A reward is the outcome's own where the MDP is of an environment whose rewards it has, else the expected one of
     state and action. Cost: some 50 bytes an outcome; for MDPs that fit.
@@ -370,7 +370,7 @@ def paid_outcomes(mdp: "TabularMDP") -> PaidOutcomes:
     np.maximum.at(largest, own.which, np.abs(own.rewards))
     is_own = np.abs(mean - expected) <= 1e-9 * largest  # else rewards were replaced
     parts = [
-        [column[chosen[table.which]] for column in table] for table, chosen in ((own, is_own), (outcomes, ~is_own))
+        [column[is_taken[table.which]] for column in table] for table, is_taken in ((own, is_own), (outcomes, ~is_own))
     ]
     joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
     order = np.argsort(joined[0], kind="stable")
@@ -378,7 +378,7 @@ def paid_outcomes(mdp: "TabularMDP") -> PaidOutcomes:
 
 
 def _outcomes_of_environment(mdp: "TabularMDP") -> PaidOutcomes | None:
-    """By the rules, where the MDP has chance and is of an environment."""
+    """Outcomes with rewards by the rules, where the MDP has chance and is of an environment; else None."""
     from pharos.state_space import load
 
     if mdp.folder is None or mdp.dynamics.is_deterministic:
@@ -391,8 +391,8 @@ def _outcomes_of_environment(mdp: "TabularMDP") -> PaidOutcomes | None:
         which, successors, probabilities = space.dynamics.entries_of(np.arange(space.num_states))
         columns = [which, successors, rewards_of_outcomes(space), (1.0 - stays) * probabilities]
     else:  # lazy actions alone
-        paid = rewards_of_space(space).array.ravel()
-        columns = [rows, np.ravel(space.successors), paid, np.full(len(rows), 1.0 - stays)]
+        rewards = rewards_of_space(space).array.ravel()
+        columns = [rows, np.ravel(space.successors), rewards, np.full(len(rows), 1.0 - stays)]
     if stays:
         staying = rows, rows // space.num_actions, rewards_of_staying(space).array.ravel(), np.full(len(rows), stays)
         columns = [np.concatenate(pair) for pair in zip(columns, staying, strict=True)]
@@ -402,7 +402,7 @@ def _outcomes_of_environment(mdp: "TabularMDP") -> PaidOutcomes | None:
 
 
 def _joined(outcomes: PaidOutcomes) -> PaidOutcomes:
-    """Those of a row that lead to the same state and pay the same as one, in the place of the first."""
+    """The outcomes with those of a row that have the same next state and reward joined, in the place of the first."""
     which, states, rewards, probabilities = outcomes
     order = np.lexsort((rewards, states, which))
     key = np.stack([which, states, rewards])[:, order]

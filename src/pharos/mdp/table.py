@@ -1,8 +1,8 @@
 """Tables of transitions.
 
-`Table`: one next state for each state and action, games and whatever is deterministic. `Lazy`: a table in which now and
-then nothing happens; nothing is copied, neither successors nor probabilities. `OutcomeTable`: several outcomes for each
-state and action, games whose rules have chance.
+`Table`: one next state for each state and action, of deterministic games. `Lazy`: another table in which actions have
+no effect with some probability; neither successors nor probabilities are copied. `OutcomeTable`: several outcomes for
+each state and action, of games whose rules have chance.
 
 Arrays of outcomes as users write them are checked, and held compactly. A sparse matrix of transitions becomes such a
 table too (`Matrices`).
@@ -84,8 +84,8 @@ class Table(Dynamics):
         return np.arange(len(states)), self.next_states[states, actions], np.ones(len(states))
 
     def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
-        which, following, probabilities = self.entries(states, actions)
-        return Outcomes(which, np.where(following < 0, self.num_states, following.astype(np.int64)), probabilities)
+        which, next_states, probabilities = self.entries(states, actions)
+        return Outcomes(which, np.where(next_states < 0, self.num_states, next_states.astype(np.int64)), probabilities)
 
     def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return self.next_states[states, actions]
@@ -96,7 +96,7 @@ class Table(Dynamics):
         return Table(local), halo
 
     def restricted_to(self, states: np.ndarray) -> "Table":
-        """These states alone; what leads out of them leads back to where it came from."""
+        """The table of these states alone; transitions that leave them lead back to where they came from."""
         number = np.full(self.num_states, -1, np.int64)
         number[states] = np.arange(len(states))
         table = np.asarray(self.next_states[states])
@@ -123,7 +123,7 @@ class Lazy(Dynamics):
     Under sticky actions the action that had no effect counts as executed.
 
     Attributes:
-        tables: the dynamics without laziness; of lazy ones theirs, as p adds up.
+        tables: the dynamics without laziness; where they are lazy already, their own tables, and p is that of both.
         laziness: p, in (0, 1).
     """
 
@@ -164,26 +164,26 @@ class Lazy(Dynamics):
             own[:, None] if x.ndim == 1 else own
         )
 
-    def pushed(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
+    def push_forward(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
         own = mass if width > 1 else mass.sum(axis=1, keepdims=True)
-        return (1.0 - self.laziness) * self.tables.pushed(mass, width) + self.laziness * own
+        return (1.0 - self.laziness) * self.tables.push_forward(mass, width) + self.laziness * own
 
     def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
         from scipy import sparse
 
-        which, following, probabilities = self.tables.outcomes(states, actions)
+        which, next_states, probabilities = self.tables.outcomes(states, actions)
         count = len(states)
         entries = (
             np.concatenate([(1.0 - self.laziness) * probabilities, np.full(count, self.laziness)]),
-            (np.concatenate([which, np.arange(count)]), np.concatenate([following, np.asarray(states)])),
+            (np.concatenate([which, np.arange(count)]), np.concatenate([next_states, np.asarray(states)])),
         )
         matrix = sparse.csr_matrix(entries, (count, self.num_states + 1))  # adds up what leads to the same state
         which = np.repeat(np.arange(count), np.diff(matrix.indptr))
         return Outcomes(which, matrix.indices.astype(np.int64), matrix.data)
 
     def entries(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        which, following, probabilities = self.outcomes(states, actions)
-        return which, np.where(following == self.num_states, -1, following), probabilities
+        which, next_states, probabilities = self.outcomes(states, actions)
+        return which, np.where(next_states == self.num_states, -1, next_states), probabilities
 
     def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         stays = rng.random(len(states)) < self.laziness
@@ -213,7 +213,7 @@ FEW, MANY = 1 << 8, 1 << 16
 
 
 def checked_outcomes(successors: npt.ArrayLike, probabilities: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Both as arrays (S, A, K), the probabilities as float64.
+    """(successors, probabilities) as arrays (S, A, K), the probabilities as float64.
 
     Raises:
         ParameterError: a shape or type is wrong, an index is outside, or a row holds no probabilities; the first such
@@ -256,7 +256,7 @@ def checked_outcomes(successors: npt.ArrayLike, probabilities: npt.ArrayLike) ->
 def compact_outcomes(
     successors: np.ndarray, probabilities: np.ndarray, *, most_padding: float = MOST_PADDING, most_vectors: int = MANY
 ) -> dict[str, Any]:
-    """What an `OutcomeTable` is made of, from (S, A, K) arrays: possible ones alone, in their order."""
+    """Arguments of an `OutcomeTable`, from (S, A, K) arrays: the possible outcomes alone, in their order."""
     num_states, num_actions, _ = successors.shape
     possible = probabilities > 0
     counts = possible.sum(axis=2)
@@ -314,7 +314,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
 
     @staticmethod
     def from_arrays(successors: npt.ArrayLike, probabilities: npt.ArrayLike) -> "OutcomeTable":
-        """From (S, A, K) successors, -1 for the end, and probabilities; what is impossible is left out.
+        """Make a table of (S, A, K) successors, -1 for the end, and probabilities, without impossible outcomes.
 
         Up to 65,536 distinct vectors of probabilities become a palette. Rows are kept one after another where more than
         30 % of (S, A, K) would be padding.
@@ -347,7 +347,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
         except WrongOutcomes as error:
             raise ParameterError(f"{error.name}: {error}") from None
 
-    # What it says of itself -------------------------------------------------------------------------------------------
+    # Properties -------------------------------------------------------------------------------------------------------
 
     @property
     def operations(self) -> int:  # type: ignore[override]
@@ -405,7 +405,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
     def arrays(self) -> dict[str, np.ndarray]:
         return {name: np.asarray(array) for name, array in self.by_name.items()}
 
-    # What executing does ----------------------------------------------------------------------------------------------
+    # Transitions ------------------------------------------------------------------------------------------------------
 
     def expected(self, x: np.ndarray, states: States = slice(None)) -> np.ndarray:
         rows = np.arange(self.num_states)[states]
@@ -422,8 +422,8 @@ class OutcomeTable(OutcomeRows, Dynamics):
         size = int((self.begins(rows + 1) - self.begins(rows)).sum())
         columns = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size)
         count = kernels.entries(self.for_kernels, states, actions, *columns)
-        which, following, probabilities = (column[:count] for column in columns)
-        return which, following, probabilities
+        which, next_states, probabilities = (column[:count] for column in columns)
+        return which, next_states, probabilities
 
     def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         if self.is_deterministic:
@@ -439,7 +439,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
         return self._of_states(slice(start, stop), slice(first, last), local), halo
 
     def restricted_to(self, states: np.ndarray) -> "OutcomeTable":
-        """These states alone; what leads out of them leads back to where it came from."""
+        """The table of these states alone; transitions that leave them lead back to where they came from."""
         number = np.full(self.num_states + 1, -2, np.int64)
         number[states], number[-1] = np.arange(len(states)), -1
         return self._renumbered(states, number)
@@ -448,7 +448,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
         return self._renumbered(representatives, np.append(classes, -1))
 
     def ends_and_stays(self) -> tuple[np.ndarray, np.ndarray]:
-        """(S,) bool each: whether all that a state leads to is the end; and whether it is the end or the state."""
+        """(S,) bool each: whether a state leads to nothing but the end; and to nothing but the end or itself."""
         successors, states = np.asarray(self.flat), np.arange(self.num_states + 1)
         first = self.begins(states * self.num_actions)
         ends = successors == -1
@@ -460,9 +460,9 @@ class OutcomeTable(OutcomeRows, Dynamics):
     def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
         """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for where it came from."""
         which, places = self.places(self._rows(np.asarray(states)))
-        following = number[self.flat[places]]
-        following = np.where(following == -2, which // self.num_actions, following)
-        return self._of_states(states, places, as_indices(following, len(states)))
+        next_states = number[self.flat[places]]
+        next_states = np.where(next_states == -2, which // self.num_actions, next_states)
+        return self._of_states(states, places, as_indices(next_states, len(states)))
 
     def _of_states(self, states: States, places: States, successors: Indices) -> "OutcomeTable":
         """The rows of some states, with other successors (N,); places (N,) of their entries, all and in order."""
@@ -483,11 +483,11 @@ class OutcomeTable(OutcomeRows, Dynamics):
 
 
 class Matrices(OutcomeTable):
-    """A table of outcomes, row after row, that was given as a sparse matrix, and is kept in files as one.
+    """A table of outcomes, row after row, that was given as a sparse matrix, and is stored in files as one.
 
     Attributes:
-        transitions: (S A, S) CSR float64, row s A + a; what a row lacks to 1 is the probability that the episode ends,
-            but for 4 (n + 2) units of 2^-53 where rows have n entries: as much as their own rounding may lack.
+        transitions: (S A, S) CSR float64, row s A + a; 1 minus the sum of a row is the probability that the episode
+            ends, where it exceeds 4 (n + 2) units of 2^-53 for rows of n entries: less may be rounding.
     """
 
     def __init__(self, transitions: "csr_matrix", num_actions: int):
@@ -553,7 +553,7 @@ def transitions_of(P: object) -> tuple["csr_matrix", int]:
 def expected_rewards(P: object, R: npt.ArrayLike, num_states: int, num_actions: int) -> np.ndarray:
     """(S, A) expected rewards, from (S, A); from (S,), alike for every action; or from (S, A, S) with a dense P.
 
-    What is none of these comes back as it is.
+    Other shapes are returned unchanged.
     """
     rewards = as_array(R, "R", np.float64)
     if rewards.shape == (num_states, num_actions, num_states) and isinstance(P, np.ndarray | list | tuple):

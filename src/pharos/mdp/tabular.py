@@ -1,6 +1,6 @@
 """TabularMDP: next states, rewards, discount, start distribution, and chance that stays implicit.
 
-What of an MDP can be met from its start: pairs of a state and the action executed before, and the part of it.
+Also the states of an MDP that can be reached from its start, and the pairs of a state and the action before.
 """
 
 from collections.abc import Callable
@@ -50,7 +50,7 @@ class TabularMDP:
     `lazy_actions` add chance.
 
     Attributes:
-        dynamics: what executing an action does; solvers and measures ask it, whatever it is stored as.
+        dynamics: transitions of executed actions, the same interface for every way of storing them.
         reward_table: the rewards, compactly; `rewards` is the same as (S, A) float64.
         terminal: (S,) bool, the terminal states: they lead to themselves with reward 0 (or are whole rows of -1, reward
             0).
@@ -59,7 +59,7 @@ class TabularMDP:
         start_states, start_probabilities: the start distribution.
         chance: weights of the chosen, the previously executed and a uniform action.
         folder: of the state space, where there is one.
-        environment: whose states these are, where that is known.
+        environment: the one that the states are of, where it is known.
         age: (S,) integers that each transition out of a state that is not terminal makes larger; None where they are
             not known. Solvers take the states in this order then, once.
     """
@@ -167,7 +167,7 @@ class TabularMDP:
         horizon: int | None = None,
         terminal: npt.ArrayLike | None = None,
     ) -> "TabularMDP":
-        """As `from_outcomes`, on a table of outcomes that is there, with expected rewards (S, A)."""
+        """An MDP on an existing table of outcomes, with expected rewards (S, A); see `from_outcomes`."""
         num_states = dynamics.num_states
         reward_table = rewards_of_shape(rewards, (num_states, dynamics.num_actions))
         silent = (reward_table.array == 0).all(axis=1)
@@ -240,9 +240,9 @@ class TabularMDP:
 
     @property
     def next_states(self) -> Indices | None:
-        """(S, A) int32, int64 or `PackedIndices`, where each action leads; -1: the episode ends.
+        """(S, A) int32, int64 or `PackedIndices`, the next state of each action; -1: the episode ends.
 
-        None where that is not how they are stored.
+        None where transitions are not stored so.
         """
         return getattr(self.dynamics, "next_states", None)
 
@@ -250,9 +250,9 @@ class TabularMDP:
     def transitions(self) -> "csr_matrix | None":
         """(S A, S) sparse probabilities with rows s A + a.
 
-        What a row lacks to 1 is the probability that the episode ends.
+        1 minus the sum of a row is the probability that the episode ends.
 
-        None where that is not how they are stored.
+        None where transitions are not stored so.
         """
         return getattr(self.dynamics, "transitions", None)
 
@@ -297,11 +297,11 @@ class TabularMDP:
 
     @property
     def nodes(self) -> str:
-        """The name of what values and choices belong to."""
+        """Name, in words, of the nodes that values and choices belong to."""
         return "pairs (state, previously executed action)" if self.is_sticky else "states"
 
     def without_width(self, x: np.ndarray) -> np.ndarray:
-        """Values (..., W) as users get them: under sticky actions as they are, else without the last axis."""
+        """Values (..., W) in the shape for users: without the last axis, unless actions are sticky."""
         return x if self.is_sticky else x[..., 0]
 
     @property
@@ -314,7 +314,7 @@ class TabularMDP:
         """Whether some transition ends the episode without a next state."""
         return self.dynamics.has_ends
 
-    # What can be met --------------------------------------------------------------------------------------------------
+    # Reachable states -------------------------------------------------------------------------------------------------
 
     @property
     def starts(self) -> np.ndarray:
@@ -326,28 +326,30 @@ class TabularMDP:
         return self.dynamics.reachable(self.starts, steps)
 
     def pairs_within(self, steps: int | None = None) -> np.ndarray:
-        """(S, A) bool: the pairs (state, previously executed action) that can be met within `steps` steps from a start.
+        """(S, A) bool: pairs (state, previously executed action) that can be reached within `steps` steps of a start.
 
-        Which actions can be executed after which, chance says: where every action is a repetition, those of the first
-        step go on. Start states without a previous action are not among them.
+        Chance decides which actions can be executed after which: where every action is a repetition, that of the first
+        step is executed always. Start states without a previous action are not among them.
         """
-        reached = now = np.zeros((self.num_states, self.num_actions), np.bool_)
+        is_reached = now = np.zeros((self.num_states, self.num_actions), np.bool_)
         if self.chance.executes_any:
-            return reached if steps == 0 else self._arrivals(self.states_within(None if steps is None else steps - 1))
+            return (
+                is_reached if steps == 0 else self._arrivals(self.states_within(None if steps is None else steps - 1))
+            )
         lone, level = np.zeros(self.num_states, np.bool_), 0
         lone[self.starts] = True
         while (lone.any() or now.any()) and (steps is None or level < steps):
-            now = self.nodes_after(now, lone) & ~reached
-            reached, lone, level = reached | now, np.zeros_like(lone), level + 1
-        return reached
+            now = self.nodes_after(now, lone) & ~is_reached
+            is_reached, lone, level = is_reached | now, np.zeros_like(lone), level + 1
+        return is_reached
 
     def nodes_within(self, steps: int | None = None) -> np.ndarray:
-        """(S, W) bool: what values belong to and can be met within `steps` steps from a start: `pairs_within` under
+        """(S, W) bool: the nodes of values that can be reached within `steps` steps from a start: `pairs_within` under
         sticky actions, else `states_within`. Start states without a previous action are not among them."""
         return self.pairs_within(steps) if self.is_sticky else self.states_within(steps)[:, None]
 
     def nodes_after(self, nodes: np.ndarray, lone: np.ndarray) -> np.ndarray:
-        """(S, W) bool: the nodes that can be met one step after these (S, W), or after starts (S,) with no action."""
+        """(S, W) bool: the nodes one step after nodes (S, W), or after start states `lone` (S,) with no action."""
         if nodes.shape[1] < self.num_actions or self.chance.executes_any:
             after = self._arrivals(nodes.any(axis=1) | lone)
             return after if nodes.shape[1] == self.num_actions else np.asarray(after.any(axis=1, keepdims=True))
@@ -357,13 +359,13 @@ class TabularMDP:
         after[outcomes.states, actions[outcomes.which]] = True
         return after[:-1]
 
-    def _arrivals(self, is_met: np.ndarray) -> np.ndarray:
+    def _arrivals(self, is_visited: np.ndarray) -> np.ndarray:
         """(S, A) bool: the pairs (state, executed action) one step after some states (S,) bool."""
-        return self.dynamics.arrivals(np.flatnonzero(is_met & ~np.asarray(self.terminal)))
+        return self.dynamics.arrivals(np.flatnonzero(is_visited & ~np.asarray(self.terminal)))
 
     @property
     def lone_starts(self) -> np.ndarray:
-        """(S,) bool: start states that are no state and previous action, but nodes of their own."""
+        """(S,) bool: under sticky actions the start states, nodes of their own without a previous action."""
         lone = np.zeros(self.num_states, np.bool_)
         lone[self.starts] = self.is_sticky
         return lone
@@ -381,9 +383,9 @@ class TabularMDP:
     def with_rewards(self, rewards: npt.ArrayLike) -> "TabularMDP":
         """The same MDP with other rewards, (S, A); those of terminal states must be 0."""
         table = rewards_of_shape(rewards, self.reward_table.shape)
-        paid = self.terminal[:, None] & (table.array != 0)
-        if paid.any():
-            s, a = map(int, np.argwhere(paid)[0])
+        wrong = self.terminal[:, None] & (table.array != 0)
+        if wrong.any():
+            s, a = map(int, np.argwhere(wrong)[0])
             raise ParameterError(f"rewards[{s}, {a}] is {table.array[s, a]}, but state {s} is terminal; expected 0")
         return replace(self, reward_table=table, staying=None)
 
@@ -434,15 +436,14 @@ class TabularMDP:
         return TopologicalOrder(states, int(np.count_nonzero(age[1:] != age[:-1])))
 
     def within(self, steps: int) -> "TabularMDP":
-        """The same MDP with only those states that can be met within `steps` steps from a start; they keep their order.
+        """The same MDP with only those states that can be reached within `steps` steps from a start, in their order.
 
         Both agree on every episode of at most `steps` steps from the start: values there, returns, effective horizon.
-        Of states that take all the steps to reach, only that they exist is right: what leads out of the set does not
-        any more.
+        Transitions of states that take all the steps to reach may be wrong: those that leave the set are replaced.
 
         Returns:
-            This MDP where all of its states are met; else one without a folder, as its states have other numbers.
-        Cost: one look at each transition of the states that are met, and a copy of them.
+            This MDP where all of its states are reached; else one without a folder, as its states have other numbers.
+        Cost: one read of each transition of the reached states, and a copy of them.
         """
         is_reached = self.states_within(steps)
         is_reached[self.start_states] = True
@@ -490,8 +491,7 @@ def _some(rewards: Callable[[], Rewards], states: np.ndarray) -> Rewards:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part of an MDP: a contiguous range of its states, [start, stop), and the states outside of it that it needs the
-    values of.
+    """A part of an MDP: a contiguous range of its states, [start, stop), and the outside states whose values it needs.
 
     Numbers of breadth-first search are local, so a range leads to few states outside of it, its *halo*: with 16 ranges
     9 % of a range's rows on a Breakout of 2.4 million states, 0.03 % on a Freeway. Ranges are what several processes
@@ -544,5 +544,5 @@ class Part:
         return np.zeros((len(self) + len(self.halo) + 1, self.width))
 
     def selection(self, select: Selection) -> Selection:
-        """What is chosen in these states, of what is chosen in those of the whole MDP."""
+        """The selection of actions in the states of this part, of a selection in the whole MDP."""
         return select.of_states(slice(self.start, self.stop)) if isinstance(select, PolicyTable) else select

@@ -194,5 +194,5 @@ class _PolicySearch:
                 break
             executed = np.zeros((mdp.num_states, mdp.num_actions))
             executed[rows, policy] = mass
-            mass = mdp.gamma * mdp.dynamics.pushed(executed)[:, 0]
+            mass = mdp.gamma * mdp.dynamics.push_forward(executed)[:, 0]
         return visits

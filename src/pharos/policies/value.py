@@ -532,7 +532,7 @@ def table_values(mdp: TabularMDP, policies: Sequence[np.ndarray]) -> list[Evalua
             part = answers.reached_states() // states
             counts = np.bincount(answers.rows // (answers.width * states), minlength=number).tolist()
             copies, joined = answers.reached_mdp()
-        values = solvers.evaluate_apart(copies, joined, part, mdp.start_probabilities)
+        values = solvers.evaluate_parts(copies, joined, part, mdp.start_probabilities)
         evaluations += [Evaluation(value, True, bound, n) for (value, bound), n in zip(values, counts, strict=True)]
     return evaluations
 

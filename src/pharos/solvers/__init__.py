@@ -3,7 +3,7 @@
 from pharos.solvers.solution import ReferenceValues, Solution, cumulative_expected_regret, regret, regret_scale
 from pharos.solvers.values import (
     TablePolicy,
-    evaluate_apart,
+    evaluate_parts,
     evaluate_policy,
     uniform_policy,
     uniform_value,

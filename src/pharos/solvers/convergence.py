@@ -1,4 +1,4 @@
-"""When sweeps have converged, or will not; how many are left, and what they cost."""
+"""Convergence of sweeps: tests for it and for its failure, and estimates of the sweeps left and of their cost."""
 
 import math
 from collections.abc import Callable
@@ -25,7 +25,7 @@ _ENDLESS, _LOOK = 10_000, 64
 def shrinking(change: float, before: float, sweeps: int, gamma: float) -> float:
     """The factor, at most gamma, by which a sweep shrinks the largest change.
 
-    The last half of the sweeps tells: changes often shrink by much more than gamma in each.
+    It is that of the last half of the sweeps: changes often shrink by much more than gamma in each.
 
     Args:
         change: by the last of `sweeps` sweeps. before: by the one after half of them.
@@ -39,11 +39,11 @@ def sweeps_left(change: float, factor: float, tolerance: float, gamma: float) ->
 
 
 class Convergence:
-    """Sweeps, or rounds of them, until their proven bound meets the tolerance.
+    """Record of sweeps, or of rounds of them, on the way to a proven bound that meets the tolerance.
 
     Attributes:
-        sweeps: so far. bound: after the last one. least: the smallest so far, but for gains of less than a tenth.
-        in_vain: sweeps since then.
+        sweeps: number so far. bound: after the last one. least: the smallest bound so far, but for gains of less than a
+            tenth. in_vain: sweeps since then.
     """
 
     def __init__(
@@ -74,9 +74,9 @@ class Convergence:
         return bound <= self.tolerance
 
     def is_endless(self) -> bool:
-        """Whether 10,000 sweeps more would not do: near gamma = 1 on cycles, or where rounding moves values about.
+        """Whether 10,000 further sweeps would not suffice: near gamma = 1 on cycles, or where rounding moves values.
 
-        To be asked after every sweep.
+        To be called after every sweep.
         """
         self._bounds.append(self.bound)
         count = len(self._bounds)
@@ -99,7 +99,7 @@ def operations(mdp: TabularMDP, sweeps: float) -> float:
 
 
 def imprecise(mdp: TabularMDP, bound: float, tolerance: float, is_single: bool = False) -> PrecisionError:
-    """The error where floats of 64 bits, or of 32 where values are stored in these, do not reach the tolerance."""
+    """PrecisionError that 64-bit floats, or 32-bit ones where values are stored so, do not reach the tolerance."""
     bits, end, advice = (32, "3.4e38", "use float64, ") if is_single else (64, "1.8e308", "")
     if not math.isfinite(bound):
         return PrecisionError(

@@ -19,13 +19,13 @@ Values of 32 bits. Backups are computed in 64 bits, and what is stored is the ne
 backup it is off by at most s = 2^-24 |v| + 2^-150. That is one more rounding of a new entry, so e becomes e + s; and d,
 which sweeps tell of the backups before they are stored, becomes d + s: D <= (rho (d + s) + e + s) / (1 - rho).
 
-Values component by component: where states cannot come back, those behind them are solved first.
+Values component by component: where play cannot come back to a state, the states that it leads to are solved first.
 
 A strongly connected component needs the values of those that it leads to, and no others. Sweeps over all states
 go on over those that are long settled, and a component settles only after those behind it; one after another, from the
 last to the first, each is swept until it is settled, and states without a cycle once.
 
-What it gives is a better place to go on sweeping from, as that of policy_iteration.py: the bound of `fixed_point` comes
+Its result is a better x to go on sweeping from, like that of policy_iteration.py: the bound of `fixed_point` comes
 from the next sweep over all states, and nothing has to be proven of components.
 Source: Dai, Mausam, Weld and Goldsmith (2011), "Topological value iteration algorithms".
 """
@@ -69,7 +69,7 @@ class FixedPoint(NamedTuple):
 
 
 class Backup(Generic[M]):
-    """The backup T of an MDP and of what is chosen in its states.
+    """The Bellman backup T of an MDP under a selection of actions: the best, the worst, or those of a policy.
 
     Attributes:
         dtype: that values are stored in; backups are computed in 64 bits.
@@ -86,12 +86,12 @@ class Backup(Generic[M]):
         self.factor = self.factor_of(select.mass)
         # q: a product and a sum, each of two half units; with chance of choosing the mean over actions, too, and a
         # product and a sum for each of three weights, and their rounding
-        chosen = 4 if chance.is_none else mdp.num_actions + 12
-        self.operations = chosen + select.operations(mdp.num_actions) + mdp.dynamics.operations
+        per_state = 4 if chance.is_none else mdp.num_actions + 12
+        self.operations = per_state + select.operations(mdp.num_actions) + mdp.dynamics.operations
         self.largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
 
     def factor_of(self, mass: float) -> float:
-        """Of the contraction, where probabilities of choosing sum to at most `mass`."""
+        """Contraction factor, where the probabilities of choosing sum to at most `mass`."""
         chance, dynamics = self.mdp.chance, self.mdp.dynamics
         executed = chance.chosen * mass + chance.previous + chance.uniform
         is_exact = mass == 1.0 and dynamics.mass == 1.0 and chance.is_none
@@ -99,7 +99,7 @@ class Backup(Generic[M]):
 
     @property
     def patience(self) -> float:
-        """Sweeps that would gain a factor of 2.7, but for rounding, and some."""
+        """Number of sweeps that, without rounding, shrink the error by a factor of e = 2.7 or more."""
         return SETTLING + math.ceil(1 / (1 - self.factor))
 
     def zeros(self) -> np.ndarray:
@@ -114,7 +114,7 @@ class Backup(Generic[M]):
         return out
 
     def sweep(self, x: np.ndarray, part: tuple[int, int] | None = None) -> float:
-        """x = T x in place, from the last state to the first where that is possible; the largest change.
+        """Set x to T x in place, from the last state to the first where possible; return the largest change.
 
         part: the range of states [start, stop) alone, where transitions are in arrays.
         """
@@ -129,7 +129,7 @@ class Backup(Generic[M]):
         return float(self.rounding_of(self.largest_reward, largest)) + self.stored(largest)
 
     def rounding_of(self, rewards: Numbers, largest: Numbers) -> Numbers:
-        """The same for rewards up to `rewards`, in 64 bits."""
+        """A bound on the rounding error of a backup in 64 bits of rewards up to `rewards`, entries up to `largest`."""
         return self.operations * (_UNIT * (rewards + largest) + 2.0**-1074)
 
     def stored(self, largest: float) -> float:
@@ -137,12 +137,12 @@ class Backup(Generic[M]):
         return _UNIT32 * (1 + 4 * _UNIT32) * largest + 2 * _LEAST32 if self.is_single else 0.0
 
     def size(self, largest: float) -> float:
-        """How large backups may be of which the largest was stored as `largest`."""
+        """A bound on backups before they are stored, the largest of which was stored as `largest`."""
         return largest * (1 + 4 * _UNIT32) + 4 * _LEAST32 if self.is_single else largest
 
     def changed(self, change: float, largest: float) -> float:
-        """By how much stored entries have changed, at most, that were at most `largest`; `change` is what a sweep says:
-        of backups before they were stored, computed in 32 bits by some dynamics.
+        """A bound on the change of stored entries of at most `largest`; `change` is that of a sweep, which compares
+        backups before they are stored, and which some dynamics compute in 32 bits.
         """
         if not self.is_single:
             return change
@@ -201,8 +201,8 @@ def fixed_point(
 
 
 def _in_single(backup: Backup[TabularMDP], convergence: Convergence, x: np.ndarray) -> FixedPoint:
-    """The same for values of 32 bits, by sweeps alone; by those of 64 bits, which are stored then, where these would
-    not end: near gamma = 1 rounding to 32 bits adds up over 1 / (1 - gamma) sweeps."""
+    """Fixed point in values of 32 bits, by sweeps alone; where these would not end, in 64 bits, rounded to 32 bits at
+    last: near gamma = 1 rounding to 32 bits adds up over 1 / (1 - gamma) sweeps."""
     tolerance = convergence.tolerance
     while True:
         shift = backup.sweep(x)
@@ -246,7 +246,7 @@ def backward_induction(
 def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np.ndarray, reward: np.ndarray) -> float:
     """The error of values x on the functional graph of a deterministic policy.
 
-    gamma < 1: |x - x*| <= |T x - x| / (1 - gamma), with the rounding of T x. gamma = 1: what does not end goes round in
+    gamma < 1: |x - x*| <= |T x - x| / (1 - gamma), with the rounding of T x. gamma = 1: paths that do not end lead into
     cycles of value 0, and rounding errors add up along at most S steps.
     """
     rounding = Backup(mdp, select).rounding(largest_of(x))
@@ -274,7 +274,7 @@ def largest_of(x: np.ndarray) -> float:
 def _in_one_pass(
     backup: Backup[TabularMDP], tolerance: float, progress: Callable[[int, float], None] | None, x: np.ndarray | None
 ) -> FixedPoint:
-    """Where no state can be visited again: each is backed up once, after all that it leads to.
+    """Fixed point where no state can be visited again: each is backed up once, after all states that it leads to.
 
     Rounding adds up along the way: that of a state n steps before the end is at most e (1 + rho + ... + rho^n).
     """
@@ -298,10 +298,10 @@ def _in_one_pass(
 
 
 def bound_of_steps(mdp: TabularMDP, horizon: int, bound: float, largest: float) -> float:
-    """The error bound of the values of a horizon, with what rounding adds to it.
+    """The error bound of the values of a horizon, enlarged by the rounding of its own computation.
 
     Args:
-        bound: that was added up, step by step. largest: of the values.
+        bound: sum of the errors of all steps. largest: of the values.
 
     Raises:
         PrecisionError: values are too large for 64-bit floats.
@@ -322,7 +322,7 @@ FIRST_ATTEMPT, LEFT = 32, 100
 WORTH = 5e8
 # States under sticky actions that are swept in one call, at least.
 LEAST = 512
-# Sweeps over all states that an attempt may cost, at most: near gamma = 1 those that are left are without number.
+# Sweeps over all states that an attempt may cost, at most: near gamma = 1 the number of sweeps left has no limit.
 MOST = 4096
 # Bytes of a state that an attempt takes, at most.
 BYTES = 48
@@ -331,7 +331,7 @@ SHARE = 0.25
 
 
 class ComponentSolver:
-    """Decides once whether components pay, by counting operations, and improves values."""
+    """Solver of strongly connected components: decides once, by counting operations, whether that pays."""
 
     def __init__(self, mdp: TabularMDP, select: Selection):
         self.mdp, self.select = mdp, select
@@ -351,10 +351,10 @@ class ComponentSolver:
         return self._left > LEFT and operations(self.mdp, self._left) > WORTH and self._fits
 
     def improve(self, x: np.ndarray, tolerance: float) -> bool:
-        """Settle the components of x (S + 1, W) one after another; whether that was tried.
+        """Settle the components of x (S + 1, W) one after another; return whether that was tried.
 
-        An attempt may cost half of the sweeps that seem to be left, and `MOST`; then each component that is left is
-        swept once.
+        An attempt may cost half of the sweeps that seem to be left, and at most `MOST`; after that every remaining
+        component is swept once.
         """
         mdp, self._is_tried = self.mdp, True
         components = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST if mdp.is_sticky else 1)

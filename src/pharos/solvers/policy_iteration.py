@@ -1,7 +1,7 @@
 """Policy iteration: values of the greedy policy by linear algebra, where sweeps would take too long.
 
-What it gives is only a better place to go on sweeping from: the bound of `fixed_point` comes from the next sweep alone.
-Three ways, by what the operator is: a deterministic policy without chance has a functional graph, one pass over it
+Its result is only a better x to go on sweeping from: the bound of `fixed_point` comes from the next sweep alone.
+Three ways, depending on the operator: a deterministic policy without chance has a functional graph, one pass over it
 gives its values; small systems are solved directly; large ones inexactly, by a Krylov method whose operator is a sweep
 of the policy, so that nothing is stored but some vectors. Source: Howard (1960); Puterman (1994), section 6.4; inexact:
 Gargiani et al. (2024), "Inexact policy iteration methods for large-scale Markov decision processes".
@@ -9,8 +9,9 @@ Gargiani et al. (2024), "Inexact policy iteration methods for large-scale Markov
 Sparse linear systems (1 - gamma P) x = r of a policy, within limits of time and memory: two families of MDPs are slow
 by sweeps near gamma = 1, and each is quick by one of two methods. Where states lead to near ones (rings, grids,
 corridors, games of many screens), elimination in the order of Cuthill and McKee fills little in; how much is counted
-beforehand. Where any state soon leads anywhere, BiCGSTAB converges within some tens of steps. What has neither is not
-solved here. Source: Cuthill and McKee (1969); Liu (1990), elimination trees; van der Vorst (1992), BiCGSTAB.
+beforehand. Where any state soon leads anywhere, BiCGSTAB converges within some tens of steps. MDPs with neither
+property are not solved here. Source: Cuthill and McKee (1969); Liu (1990), elimination trees; van der Vorst (1992),
+BiCGSTAB.
 """
 
 import math
@@ -55,7 +56,7 @@ def _eliminated(system: "csr_matrix", right: np.ndarray) -> np.ndarray:
 
 
 def _large(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """By elimination where it fills little in, else by BiCGSTAB."""
+    """The x of system x = right, by elimination where it fills little in, else by BiCGSTAB from a guess."""
     from scipy.sparse import csgraph, linalg
 
     order = csgraph.reverse_cuthill_mckee(system)
@@ -72,7 +73,7 @@ def _large(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray
 
 
 def _iterated(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """By BiCGSTAB from x, again for what is left, as far as rounding allows; NaN where it does not converge."""
+    """The x of system x = right, by BiCGSTAB, repeated on the residual as far as rounding allows; NaN if divergent."""
     residual = right - system @ x
     for call in range(CALLS):
         step, left, _ = bicgstab(lambda y: system @ y, residual, SHRINKAGE, MOST_STEPS)
@@ -109,11 +110,13 @@ def bicgstab(
     with np.errstate(all="ignore"):  # a breakdown is NaN, and does not converge
         while norm > enough and step < steps:
             step += 1
-            # Preconditioned: where episodes do not end, constant vectors shrink to 1 - gamma, which slows all methods.
+            # Search direction, preconditioned: where episodes do not end, constant vectors shrink to 1 - gamma, which
+            # slows all methods.
             linear_algebra.shift(direction, np.float64(total) / size / constant, towards)
             moved[:] = times(towards)
             alpha = np.float64(rho) / linear_algebra.products(right, moved)[0]
             total = linear_algebra.advance(residual, -alpha, moved)
+            # Stabilisation: the step along the residual that makes the new residual smallest.
             linear_algebra.shift(residual, np.float64(total) / size / constant, onwards)
             stabilised = times(onwards)
             across, own = linear_algebra.products(residual, stabilised)
@@ -121,6 +124,7 @@ def bicgstab(
             linear_algebra.advance(x, alpha, towards)
             linear_algebra.advance(x, omega, onwards)
             linear_algebra.advance(residual, -omega, stabilised)
+            # Next direction.
             before = rho
             rho, norm = linear_algebra.products(right, residual)
             total = linear_algebra.turn(direction, (rho / np.float64(before)) * (alpha / omega), omega, moved, residual)
@@ -163,7 +167,7 @@ SPARSE = 50_000.0
 
 
 class PolicyIteration:
-    """Decides when it pays, by counting operations, and improves values."""
+    """Policy iteration between sweeps: decides when an attempt pays, by counting operations, and improves values."""
 
     def __init__(self, mdp: TabularMDP, select: Selection):
         self.mdp, self.select = mdp, select
@@ -212,7 +216,7 @@ class PolicyIteration:
 
     def improve(self, x: np.ndarray, tolerance: float) -> None:
         """Replace x (S + 1, W) by values of a policy that is greedy in its own values, or nearly so."""
-        with np.errstate(all="ignore"):  # what is not finite is in vain, and forgotten
+        with np.errstate(all="ignore"):  # an attempt that is not finite has failed, and is undone
             if self.is_chain or self.is_direct:
                 return self._improve_exactly(x)
             before = x.copy()
@@ -235,7 +239,7 @@ class PolicyIteration:
                 return
             change, largest = self.mdp.dynamics.sweep(self.equation, x), np.abs(x).max()
             before_this, policy = policy, self._greedy(x)
-            # what still changes may be the policy alone, between actions that are equal up to rounding
+            # the policy may still change between actions that are equal up to rounding
             is_settled = change <= SETTLED * largest
             if is_settled or policy is before_this or np.array_equal(policy.table, before_this.table):
                 self.is_exact = True
@@ -244,15 +248,15 @@ class PolicyIteration:
             self._refine(x, policy)
 
     def _evaluate(self, x: np.ndarray, policy: PolicyTable) -> None:
-        """The values of a policy, in place of x (S + 1, W)."""
+        """Replace x (S + 1, W) by the values of a policy."""
         if self.is_chain and policy.actions is not None:
             x[:-1, 0] = chain_values(self.mdp.gamma, *chain(self.mdp, policy.actions))[0]
         else:
             x[:-1] = linear_values(self.mdp, policy, x[:-1])
 
     def _refine(self, x: np.ndarray, policy: PolicyTable) -> None:
-        """Solve once more, for what rounding has left: along a cycle of n steps it adds up, and counts 1 / (1 - gamma)
-        times."""
+        """Solve once more for the residual that rounding has left, which adds up along a cycle of n steps and counts
+        1 / (1 - gamma) times."""
         assert policy.actions is not None
         successor, reward = chain(self.mdp, policy.actions)
         left = reward + self.mdp.gamma * x[successor, 0] - x[:-1, 0]
@@ -261,7 +265,7 @@ class PolicyIteration:
             x[:-1, 0] += step
 
     def _improve_inexactly(self, x: np.ndarray, target: float) -> bool:
-        """Go on until a sweep changes x by at most the target, or rounding ends it; whether it beats sweeps alone.
+        """Improve x until a sweep changes it by at most the target, or by rounding alone; whether that beats sweeps.
 
         An attempt may cost a third of the sweeps that seem to be left, and more as long as it is ahead of them.
         """
@@ -284,7 +288,7 @@ class PolicyIteration:
         return change < self._change
 
     def _evaluate_roughly(self, x: np.ndarray, policy: PolicyTable) -> float:
-        """Move x (S + 1, W) towards the values of a policy; the cost, in sweeps.
+        """Move x (S + 1, W) towards the values of a policy; return the cost, in sweeps.
 
         One sweep in place is x -> G x + g with the fixed point that is sought; (1 - G) d = G x + g - x is solved for
         the step d, to a tenth. G y is a sweep from y without rewards.
@@ -308,7 +312,7 @@ class PolicyIteration:
         return applications + 2.0
 
     def _greedy(self, x: np.ndarray) -> PolicyTable:
-        """The policy of the best (or worst) actions by x; a given policy as it is."""
+        """The policy of the best (or worst) actions by x; where a policy is given, that one."""
         if isinstance(self.select, PolicyTable):
             return self.select
         mdp, actions = self.mdp, np.empty(self.mdp.num_states, np.int64)
@@ -320,7 +324,7 @@ class PolicyIteration:
 
 
 def without_rewards(rewards: Rewards) -> Rewards:
-    """Rewards of 0, kept in the same way."""
+    """Rewards of 0, stored like `rewards`."""
     return Rewards(np.zeros_like(rewards.table), np.zeros_like(rewards.palette))
 
 
@@ -329,12 +333,12 @@ def chain(mdp: TabularMDP, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     table, rewards = mdp.dynamics.deterministic_table(), mdp.reward_table
     assert table is not None
     rows = np.arange(mdp.num_states)
-    paid = rewards.table[rows, actions]
-    return table[rows, actions].astype(np.int64), rewards.palette[paid] if len(rewards.palette) else paid
+    entries = rewards.table[rows, actions]
+    return table[rows, actions].astype(np.int64), rewards.palette[entries] if len(rewards.palette) else entries
 
 
 def chain_values(gamma: float, successor: np.ndarray, reward: np.ndarray) -> tuple[np.ndarray, int]:
-    """((S,) values on a functional graph, in O(S); a state on a cycle of infinite value, where gamma is 1, or -1)."""
+    """((S,) values on a functional graph, in O(S); where gamma is 1 a state on a cycle of infinite value, else -1)."""
     v = np.empty(len(successor))
     return v, int(bellman.chain_values(successor, reward, gamma, v, np.empty(len(successor), np.int64)))
 
@@ -345,9 +349,9 @@ def linear_values(mdp: TabularMDP, policy: PolicyTable, guess: np.ndarray) -> np
 
     states, actions, width = mdp.num_states, mdp.num_actions, mdp.width
     nodes = states * width
-    chosen = np.broadcast_to(policy.later, (states, width, actions)).reshape(nodes, actions)
-    weights = executed_actions(mdp, chosen, np.repeat(np.arange(states), width), np.tile(np.arange(width), states))
+    pi = np.broadcast_to(policy.later, (states, width, actions)).reshape(nodes, actions)
+    weights = executed_actions(mdp, pi, np.repeat(np.arange(states), width), np.tile(np.arange(width), states))
     moves = nodes_of_outcomes(mdp.dynamics.matrix()[:, :states], actions, width)
     system = sparse.identity(nodes, format="csr") - mdp.gamma * (weights @ moves)
-    paid = weights @ mdp.rewards.ravel()
-    return solution_of_system(system, paid, guess.reshape(nodes)).reshape(states, width)
+    rewards = weights @ mdp.rewards.ravel()
+    return solution_of_system(system, rewards, guess.reshape(nodes)).reshape(states, width)

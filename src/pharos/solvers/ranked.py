@@ -16,10 +16,10 @@ is sent once these are done, and the rest in the end, which changes no value. Ot
 on that Breakout in 2, 4 and 16 ranks the states that read no halo before the others take 89, 212 and 278, the states
 that others read before the rest 240, 231 and 284, and a halo that is one sweep older 49, 96 and 208.
 
-All ranks run the same loop and see the same numbers, so they need nobody who tells them when to stop.
+All ranks run the same loop and see the same numbers, so they stop after the same sweep without a coordinator.
 
-`SolverCheckpoint` has the values so far, in a file, so that who is killed while solving goes on from there.
-`shared_solution` is what several processes share: who takes part, and the Solution that comes of it.
+`SolverCheckpoint` keeps the values so far in a file, so that a solve that was killed goes on from there.
+`shared_solution` runs the solve on all ranks and makes its Solution.
 """
 
 import contextlib
@@ -53,20 +53,20 @@ _DIGEST = 32  # characters of a digest; two follow, of the header and of the val
 
 
 class SolverCheckpoint:
-    """Where ranks keep their values; the first one reads and writes.
+    """File of the values of all ranks, so far; the first rank reads and writes it.
 
-    A file holds what one question has come to: its name is a digest of the MDP, of what is chosen and of the rest. It
-    does not depend on the number of ranks, and is removed once the question is answered.
+    A file holds the values of one question: its name is a digest of the MDP, of the selection of actions and of
+    `question`. It does not depend on the number of ranks, and is removed once the question is answered.
 
     Attributes:
-        numbers: what `keep` was given beside the values.
+        numbers: those that `keep` was given beside the values.
     """
 
-    def __init__(self, folder: Path | None, what: str, seconds: float = SECONDS):
+    def __init__(self, folder: Path | None, question: str, seconds: float = SECONDS):
         """
-        folder: None to keep nothing. what: the question, but for the MDP and what is chosen.
+        folder: None to keep nothing. question: the setting of the solve, but for the MDP and the selection of actions.
         """
-        self._folder, self._what, self._seconds = folder, what, seconds
+        self._folder, self._question, self._seconds = folder, question, seconds
         self._next = time.monotonic() + seconds
         self._path: Path | None = None
         self.numbers = (0.0, 0.0)
@@ -75,7 +75,7 @@ class SolverCheckpoint:
         """Set the values to those of the file, where there is one. Returns the sweeps that they took."""
         if self._folder is None:
             return 0
-        name = storage.digest_of_json([self._what, backup.mdp.num_states, backup.mdp.width, backup.fingerprint()])
+        name = storage.digest_of_json([self._question, backup.mdp.num_states, backup.mdp.width, backup.fingerprint()])
         self._path = self._folder / f"{name}.values"
         header, whole = np.zeros(_HEADER), None
         if backup.rank.rank == 0:
@@ -104,7 +104,7 @@ class SolverCheckpoint:
                     file.write(header + (storage.digest_of_bytes(header) + storage.digest_of_bytes(values)).encode())
                     file.write(values)
             except OSError as error:
-                self._folder = None  # which is as if nothing were due; the last file stays
+                self._folder = None  # from now on nothing is due; the last file stays
                 warnings.warn(
                     f"{self._path}: {error.strerror or error}; values are not kept any more, solving goes on",
                     stacklevel=2,
@@ -113,7 +113,7 @@ class SolverCheckpoint:
         self._next = now + max(self._seconds, _SHARE * (now - began))
 
     def finish(self, backup: "RankedBackup") -> None:
-        """The question is answered."""
+        """Remove the file, as the question is answered."""
         if backup.rank.rank == 0 and self._path is not None:
             with contextlib.suppress(OSError):
                 self._path.unlink(missing_ok=True)
@@ -149,12 +149,12 @@ _MIX = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # of splitm
 
 
 class RankedBackup:
-    """One rank's part of the backup T of an MDP, and of what is chosen in its states.
+    """One rank's part of the Bellman backup T of an MDP under a selection of actions.
 
     Attributes:
         part: the states of this rank. backup: T on them; its factor and its rounding are those of the whole MDP.
         x: (n + H + 1, W) values, see mdp/tabular.py. previous: those before the last sweep of a horizon.
-        first: (R, 2) runs of its states that sweeps of a horizon begin with: those that others read, and between them.
+        first: (R, 2) runs of its states that sweeps of a horizon begin with: those that others read, short gaps filled.
     """
 
     def __init__(self, mdp: TabularMDP, select: Selection, rank: Rank):
@@ -179,9 +179,9 @@ class RankedBackup:
         return self.part.zeros()
 
     def sweep(self) -> float:
-        """Replace the values of this rank's states by their backups, in place; the largest change.
+        """Replace the values of this rank's states by their backups, in place; return the largest change.
 
-        Messages are on their way then, until `share`.
+        Messages stay under way until `share`.
         """
         halo, x, change = self._halo, self.x, 0.0
         halo.receive(x, in_two=True)
@@ -194,7 +194,7 @@ class RankedBackup:
         return change
 
     def plain_sweep(self) -> None:
-        """Replace them not in place, and keep those before as `previous`."""
+        """Replace the values of this rank's states by backups of the old values, which are kept as `previous`."""
         halo, x, new = self._halo, self.x, self.previous
         dynamics, equation = self.part.dynamics, self.backup.equation
         halo.receive(new)
@@ -215,7 +215,7 @@ class RankedBackup:
     # Values of all ranks, at the first ------------------------------------------------------------------------------
 
     def gathered(self, x: np.ndarray) -> np.ndarray | None:
-        """(S + 1, W) at the first rank: the values that each has of its states; None at the others."""
+        """(S + 1, W) values of the states of all ranks, at the first rank; None at the others."""
         is_first = self.rank.rank == 0
         whole = np.zeros((self.mdp.num_states + 1 if is_first else 0, x.shape[1]))
         own = x[: len(self.part)]
@@ -226,14 +226,14 @@ class RankedBackup:
         return whole if is_first else None
 
     def scatter(self, whole: np.ndarray | None) -> None:
-        """Start from values (S + 1, W) that the first rank has."""
+        """Set the values of all ranks, halos included, to those of the first rank, (S + 1, W)."""
         self.rank.scatter_rows(whole, self.cuts, self.x)
         self._halo.receive(self.x)
         self._halo.send(self.x)
         self._halo.finish(self.x[len(self.part) : -1])
 
     def fingerprint(self) -> str:
-        """A digest of what is solved, whatever the number of ranks: of one backup of values drawn by state number."""
+        """Digest of the equation, whatever the number of ranks: of one backup of values drawn by state number."""
         part, equation = self.part, self.backup.equation
         x = self.part.zeros()
         numbers = np.concatenate([np.arange(part.start, part.stop), part.halo])
@@ -254,7 +254,7 @@ class RankedBackup:
 
 
 def _larger(one: float, other: float) -> float:
-    """NaN where one is."""
+    """The larger of two numbers; NaN where one is NaN."""
     return float(np.maximum(one, other))
 
 
@@ -306,7 +306,7 @@ def ranked_induction(
     checkpoint: SolverCheckpoint,
     progress: Callable[[int, float], None] | None,
 ) -> tuple[float, np.ndarray]:
-    """The values with `horizon` steps to go. Returns (bound, values with one step less)."""
+    """Compute the values with `horizon` steps to go, in `backup.x`; return (bound, values with one step less)."""
     step = checkpoint.start(backup)
     bound, largest = checkpoint.numbers if step else (0.0, 0.0)
     before = backup.x.copy()
@@ -337,7 +337,7 @@ def shared_solution(
     progress: Callable[[int, float], None] | None = None,
     checkpoint_seconds: float = SECONDS,
 ) -> Solution:
-    """The values of what is chosen, by several processes. Under MPI the first gets them, and the others None.
+    """Solution of an MDP under a selection of actions, by several processes; under MPI the others get None.
 
     Args:
         processes: 1; or "mpi": those that `mpiexec` has started, all of which make the call.
@@ -351,21 +351,21 @@ def shared_solution(
         raise ParameterError(f"checkpoint {folder}: is a file; expected a folder")
 
     def program(rank: Rank) -> tuple[float, int, np.ndarray, np.ndarray] | None:
-        what = f"{mdp.gamma!r} {mdp.chance} horizon {horizon}"
-        file = SolverCheckpoint(folder, what, checkpoint_seconds)
+        question = f"{mdp.gamma!r} {mdp.chance} horizon {horizon}"
+        file = SolverCheckpoint(folder, question, checkpoint_seconds)
         backup = RankedBackup(mdp, select, rank)
         if horizon is None:
             bound, sweeps = ranked_fixed_point(backup, tolerance, file, progress)
-            following = x = backup.gathered(backup.x)
+            next_x = x = backup.gathered(backup.x)
         else:
             sweeps = horizon
             bound, before = ranked_induction(backup, horizon, file, progress)
-            x, following = backup.gathered(backup.x), backup.gathered(before)
+            x, next_x = backup.gathered(backup.x), backup.gathered(before)
         file.finish(backup)
-        return None if x is None or following is None else (bound, sweeps, x, following)
+        return None if x is None or next_x is None else (bound, sweeps, x, next_x)
 
     answer = run_spmd(processes, program)
     if answer is None:
         return cast(Any, None)
-    bound, sweeps, x, following = answer
-    return Solution(mdp, bound, sweeps, watch.seconds, horizon, select, x, following)
+    bound, sweeps, x, next_x = answer
+    return Solution(mdp, bound, sweeps, watch.seconds, horizon, select, x, next_x)

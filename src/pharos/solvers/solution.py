@@ -1,4 +1,4 @@
-"""Solution: values, policy, and the error bound that holds for them; and regret, what is lost against it.
+"""Solution: values, policy, and their error bound; and regret, what a policy loses against the optimal one.
 
 Regret: what is lost by not having played the optimal policy from the first episode on.
 
@@ -39,9 +39,9 @@ class Solution:
     Attributes:
         mdp: what was solved.
         error_bound: every entry of `v` and `q` is within this of the true value (proven; in units of return).
-        sweeps, seconds: what it took; compiling is not among the seconds.
-        horizon: of the values: those of the first step, with all steps to go; or None.
-        select: what is chosen: the best action, the worst one, or what a policy says.
+        sweeps, seconds: cost of the solve; compiling is not among the seconds.
+        horizon: number of steps to go of the values; or None.
+        select: which action is chosen: the best one, the worst one, or that of a policy.
         x: (S + 1, W) float64, or float32 where it was asked for: values of (state, previously executed action), W = A
             under sticky actions, else 1; row S, the end, is 0.
         next_x: the values of next states: x, or with a horizon those with one step less to go.
@@ -85,8 +85,8 @@ class Solution:
 
     def q_of(self, states: np.ndarray | slice) -> np.ndarray:
         """(N, A), the values of executing each action in some states (indices or a slice)."""
-        following = self.mdp.dynamics.expected(self.next_x, states).astype(np.float64, copy=False)
-        return self.mdp.reward_table.rows(states) + self.mdp.gamma * following
+        next_values = self.mdp.dynamics.expected(self.next_x, states).astype(np.float64, copy=False)
+        return self.mdp.reward_table.rows(states) + self.mdp.gamma * next_values
 
     @cached_property
     def policy(self) -> np.ndarray:
@@ -102,7 +102,7 @@ class Solution:
 
     @property
     def given_policy(self) -> np.ndarray | None:
-        """Of a policy: (S,) actions, (S, A) or (S, A + 1, A) probabilities; None of optimal and worst values."""
+        """The policy that was evaluated: (S,) actions, (S, A) or (S, A + 1, A) probabilities; else None."""
         return getattr(self.select, "table", None)
 
     def optimal_actions(self, tie_tolerance: float = 1e-6) -> np.ndarray:
@@ -123,7 +123,7 @@ class Solution:
         return float(probabilities @ self.mdp.chance.first.choice(q, self.select.first_value(q, starts))[:, 0])
 
     def conventions(self) -> dict[str, Any]:
-        """What the values mean, JSON-able."""
+        """Discount, horizon, kind and error bound of the values, JSON-able."""
         return {"gamma": self.gamma, "horizon": self.horizon, "kind": self.kind, "error_bound": self.error_bound}
 
     def __repr__(self) -> str:
@@ -188,7 +188,7 @@ class ReferenceValues:
 
     @staticmethod
     def of(task: "HasReference") -> "ReferenceValues":
-        """Those of a task; the space is built and solved where it is not yet."""
+        """Reference values of a task; its space is built and solved where it is not yet."""
         return task.reference
 
     def spread(self, reference: str = "uniform") -> float:

@@ -63,7 +63,7 @@ _SECONDS = 600.0
 
 
 class SolvingOptions(TypedDict, total=False):
-    """Options of `value_iteration`, which it describes."""
+    """Options of `value_iteration`, described there."""
 
     horizon: int | None
     keep_all: bool
@@ -81,7 +81,7 @@ class TableAgent(Protocol):
     """An agent with a policy over the states."""
 
     def policy_table(self) -> np.ndarray:
-        """As `evaluate_policy` takes it."""
+        """(S,) actions, or probabilities, as `evaluate_policy` takes them."""
 
 
 TablePolicy: TypeAlias = ArrayLike | Callable[[np.ndarray], ArrayLike] | TableAgent
@@ -181,7 +181,7 @@ def solution_of(  # noqa: PLR0913
     dtype: DTypeLike = "float64",
     blocks: int = 1,
 ) -> Solution:
-    """The values of what is chosen: a fixed point, or those of backward induction where there is a horizon."""
+    """Solution under a selection of actions: a fixed point, or by backward induction where there is a horizon."""
     check_tolerance(tolerance)
     horizon, dtype = checked_horizon(mdp, horizon), checked_dtype(dtype)
     is_shared = is_distributed(processes, checkpoint)
@@ -209,18 +209,18 @@ def solution_of(  # noqa: PLR0913
             else:
                 result = fixed_point(mdp, select, tolerance, report, x, usable_workers(threads), dtype)
         result = result if mapped is None else result._replace(x=mapped)
-        following = result.x
+        next_x = result.x
     elif values is not None:
         raise ParameterError(f"values={str(values)!r}: a file keeps values without a horizon; found {horizon} steps")
     else:
-        result, following, steps = backward_induction(mdp, select, horizon, keep_all)
+        result, next_x, steps = backward_induction(mdp, select, horizon, keep_all)
     if steps is not None:
         steps = mdp.without_width(steps[:, :-1])
-    return Solution(mdp, result.bound, result.sweeps, watch.seconds, horizon, select, result.x, following, steps)
+    return Solution(mdp, result.bound, result.sweeps, watch.seconds, horizon, select, result.x, next_x, steps)
 
 
 def _kept_values(path: str | os.PathLike, shape: tuple[int, int], dtype: DTypeLike = np.float64) -> np.ndarray:
-    """(S + 1, W) mapped from a file of NumPy (.npy): what is there, or zeros in a new one.
+    """(S + 1, W) values mapped from a file of NumPy (.npy): those that it holds, or zeros in a new file.
 
     A bound holds from any values on (see fixed_point.py), so a file left in the middle of a sweep is a good start.
     Values that are not finite count as 0, and so does the last row, which is the end.
@@ -242,7 +242,7 @@ def _kept_values(path: str | os.PathLike, shape: tuple[int, int], dtype: DTypeLi
 def _in_memory(
     mapped: np.ndarray | None, progress: Callable[[int, float], None] | None
 ) -> Iterator[tuple[np.ndarray | None, Callable[[int, float], None] | None]]:
-    """(values to sweep, the function that is told of sweeps).
+    """(values to sweep, progress callback of the sweeps).
 
     Large values that memory has room for are swept there, as pages of a file that change are written again and again,
     and copied to their file every ten minutes, where that costs little, and in the end, whatever ends it.
@@ -268,7 +268,7 @@ def _in_memory(
 
 
 def is_distributed(processes: int | str, checkpoint: str | os.PathLike | None) -> bool:
-    """Whether anything else is asked for than one process that keeps nothing (`True` is no number of processes)."""
+    """Whether several processes or a checkpoint are requested (`True` is no number of processes)."""
     return processes != 1 or processes is True or checkpoint is not None
 
 
@@ -279,7 +279,7 @@ def check_tolerance(tolerance: float) -> None:
 
 
 def checked_dtype(dtype: DTypeLike) -> np.dtype:
-    """float64 or float32."""
+    """The dtype, float64 or float32; ParameterError for others."""
     try:
         kind = np.dtype(dtype)
     except TypeError:
@@ -353,7 +353,7 @@ def blocked_fixed_point(
 def _swept(
     backup: Backup[TabularMDP], x: np.ndarray, part: tuple[int, int], largest: float, tolerance: float
 ) -> tuple[float, float, int]:
-    """Sweep a range some times; (by how much its values have changed in all, and in the last sweep, sweeps)."""
+    """Sweep a range some times; return (change of its values in all, change in the last sweep, sweeps)."""
     total = first = change = 0.0
     count = 0
     while count < _REPEATS:
@@ -367,7 +367,7 @@ def _swept(
 
 
 def _bound(backup: Backup[TabularMDP], moved: np.ndarray, largest: float) -> float:
-    """The largest residual of a range whose inputs have changed so much, over 1 - rho."""
+    """Residual of a range whose inputs have changed by at most `moved`, divided by 1 - rho."""
     change = float(moved.max())
     return backup.bound(change, backup.rounding(backup.size(largest + change)))
 
@@ -418,13 +418,13 @@ def evaluate_policy(
     return solution_of(mdp, select, tolerance, horizon=horizon, processes=processes, checkpoint=checkpoint)
 
 
-def evaluate_apart(
+def evaluate_parts(
     mdp: TabularMDP, policy: np.ndarray, part: np.ndarray, start_probabilities: np.ndarray
 ) -> list[tuple[float, float]]:
     """(value at the start, its error bound) of each part of an MDP with a horizon, to the bits that it has alone.
 
     Args:
-        mdp: of parts that never meet, such as copies of one MDP.
+        mdp: disjoint parts without transitions between them, such as copies of one MDP.
         policy: as `evaluate_policy` takes actions, or probabilities.
         part: (S,) the part of each state, 0 to P - 1; each has states, and as many starts.
         start_probabilities: (N,) of the starts of each part.
@@ -436,7 +436,7 @@ def evaluate_apart(
     begins = np.searchsorted(part[order], np.arange(part.max() + 1))
 
     def largest(entries: np.ndarray) -> np.ndarray:
-        """(P,) of the entries (S, ...) of its states."""
+        """(P,) maximum of the entries (S, ...) over the states of each part."""
         of_states: np.ndarray = entries.reshape(len(part), -1).max(axis=1)
         return np.maximum.reduceat(of_states[order], begins)
 
