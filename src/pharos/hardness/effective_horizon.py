@@ -336,7 +336,7 @@ class LargeHorizon:
         n, most = self._begin(), np.zeros(3)
         now, following = self.nodes
         for t in range(self.steps):
-            n = self.kernels.walk(
+            n = self.kernels.step_along(
                 *(self.next_states, self.rewards, self.ahead[t + 1], self.optimal[t], self.spread[t], log, near),
                 *(now, n, following, self.is_visited, most),
             )

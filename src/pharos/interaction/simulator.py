@@ -309,7 +309,7 @@ class FrameStack:
         if self.observation.irrelevant:
             rng = self._rng[rows]
             coins = np.empty((len(states), self.observation.irrelevant), np.float32)
-            stepping.throw(rng, coins)
+            stepping.flip_coins(rng, coins)
             self._rng[rows] = rng
         return self.context(states, previous, elapsed, seen=stack, coins=coins)
 
@@ -358,5 +358,5 @@ class RewardChannel:
         """
         self.earned = earned
         amounts = earned.copy()
-        stepping.pay(self._rng, self.noise, self._pending, self._steps, is_step, ended, amounts)
+        stepping.modify_rewards(self._rng, self.noise, self._pending, self._steps, is_step, ended, amounts)
         return amounts

@@ -1,12 +1,12 @@
 """W runs at once: their random numbers, episodes on the tables of their MDPs, and minibatches of DQN and PPO.
 
 Random numbers are counted: Philox4x32-10 (Salmon, Moraes, Dror and Shaw, SC 2011), four words of 32 bits a call. The
-same counter and key give the same words, whoever asks, in whatever order. A key names a run; a counter names a draw:
+same counter and key give the same words, in whatever order they are drawn. A key names a run; a counter names a draw:
 (draw, copy, step, stream).
 
 Each run has E copies of its environment. Every draw is named by its counter: the run is the key, and a step of a copy
-has one block of four words: a random action; what is executed; which outcome; where the next episode starts. Where
-actions may have no effect or pay is noisy there is another block: whether there is an effect; two for the noise.
+has one block of four words: a random action; the executed action; the outcome; the start of the next episode. Where
+actions may have no effect or rewards are noisy there is another block: whether there is an effect; two for the noise.
 Whether a run explores in a step is a block of its own, as one draw holds for all copies of a run.
 
 DQN: minibatches of a replay memory, losses with their gradients, Adam with clipping. Sources: Mnih et al. (2015); van
@@ -23,7 +23,7 @@ from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at
 from pharos.kernels.outcomes import drawn_outcome, outcome, size_of
-from pharos.kernels.stepping import executed_by_number, normal_by_numbers, paid_late, start_by_number
+from pharos.kernels.stepping import delayed_reward, executed_by_number, normal_by_numbers, start_by_number
 
 # Random numbers -------------------------------------------------------------------------------------------------------
 
@@ -86,13 +86,13 @@ def exploring(keys, step, epsilon, is_warming, out):
 
 
 @njit(cache=True, nogil=True)
-def anneal(first, last, share, passed, out):
-    """out (W,) = what goes from first to last, (W,), over a share (W,) of the training, of which `passed` is over."""
+def anneal(first, last, share, elapsed, out):
+    """out (W,) = linear schedules from first to last (W,) over a share (W,) of the training, at `elapsed`."""
     for i in range(len(out)):
-        if passed > share[i]:
+        if elapsed > share[i]:
             out[i] = last[i]
         else:
-            out[i] = first[i] + passed * (last[i] - first[i]) / share[i] if share[i] > 0.0 else first[i]
+            out[i] = first[i] + elapsed * (last[i] - first[i]) / share[i] if share[i] > 0.0 else first[i]
 
 
 @njit(cache=True, nogil=True)
@@ -130,21 +130,22 @@ def look_up_frames(table, begins, histories, piece, out):
 
 
 @njit(cache=True, nogil=True)
-def write_drawn(raw, places, members, out):
-    """out (W, pitch): the entries `places` (size,) of observations, B of each of the runs `members`, one run after
-    another in raw (len(members) B, M).
+def write_drawn(raw, places, runs, out):
+    """out (W, pitch): the entries `places` (size,) of observations, B of each of `runs`, one after another.
+
+    raw (len(runs) B, M): the observations of one run after another.
     """
-    size, number = len(places), len(raw) // len(members)
-    for k in range(len(members)):
+    size, number = len(places), len(raw) // len(runs)
+    for k in range(len(runs)):
         for b in range(number):
-            row, target = raw[k * number + b], out[members[k], b * size : (b + 1) * size]
+            row, target = raw[k * number + b], out[runs[k], b * size : (b + 1) * size]
             for j in range(size):
                 target[j] = row[places[j]]
 
 
 @njit(cache=True, nogil=True)
 def choose(keys, step, explores, q, actions):
-    """actions (W, E): random ones where a run explores, else the first of the best of q (W, E, A)."""
+    """Epsilon-greedy actions (W, E): random ones where a run explores, else the first of the best of q (W, E, A)."""
     for i in range(actions.shape[0]):
         for e in range(actions.shape[1]):
             if explores[i]:
@@ -157,103 +158,111 @@ def choose(keys, step, explores, q, actions):
                 actions[i, e] = best
 
 
-def paid(rewards, s, a, k):
-    """The reward of outcome k of (s, a): of the outcome itself, or expected where only that is known."""
+def outcome_reward(rewards, s, a, k):
+    """The reward of outcome k of (s, a), or the expected reward of (s, a) where only that is known."""
 
 
-@overload(paid)
-def _paid(rewards, s, a, k):
+@overload(outcome_reward)
+def _outcome_reward(rewards, s, a, k):
     if len(rewards) == 2:  # (table, palette) of expected rewards
         return lambda rewards, s, a, k: reward_at(rewards[0], rewards[1], s, a)
     return lambda rewards, s, a, k: outcome(rewards, s, a, k)[0]
 
 
 @njit(cache=True, nogil=True)
-def start(keys, members, starts, cumulative, state):
-    """state (W, E) of the first episodes of the runs `members`."""
-    for i in members:
+def start(keys, runs, starts, cumulative, state):
+    """Write the start states of the first episodes of `runs` to state (W, E)."""
+    for i in runs:
         for e in range(state.shape[1]):
             state[i, e] = starts[start_by_number(cumulative, unit(philox(1, e, 0, STEP, keys[i])[3]))]
 
 
 @njit(cache=True, nogil=True)
 def advance(
-    transitions, rewards, staying, terminal, starts, cumulative, members, setting, knobs, actions, episodes, pending,
+    transitions, rewards, staying, terminal, starts, cumulative, runs, setting, knobs, actions, episodes, pending,
     transition, counts,
 ):  # fmt: skip
-    """One step of every copy of the runs `members`, which share an MDP; what has ended starts anew.
+    """One step of every copy of `runs`, which share an MDP; episodes that have ended start anew.
 
-    transitions: see kernels/outcomes.py; rewards: see `paid`; staying (S, A): what an action without effect pays,
-    (0, 0) where all have one; terminal (S,); starts, cumulative: start states and their cumulated probabilities.
+    transitions: see kernels/outcomes.py; rewards: see `outcome_reward`; staying (S, A): the reward of an action without
+    effect, (0, 0) where all have one; terminal (S,); starts, cumulative: start states and their cumulated
+    probabilities.
     setting: (keys (W,) uint64, step, chances (W, 4), limits (W,), gammas (W,)), as in `stepping.Setting`.
-    knobs (W, 3): the probability that an action has no effect, the deviation of the noise of pay, its delay in steps.
-    pending (W, E, D): what was earned and is due; see `paid_late`.
+    knobs (W, 3): the probability that an action has no effect, the deviation of the noise of rewards, their delay in
+    steps.
+    pending (W, E, D): rewards earned and not paid yet; see `delayed_reward`.
     episodes: (state, previous, elapsed (W, E) int64, return, discount (W, E) float64) of the running episodes, and
     (number, sum of returns (W,)) of the finished ones, which this step adds to where `counts` is true.
     transition: (next state (W, E) int64, reward (W, E) float64, flags (W, E) uint8) of this step, written here; the
-    reward is what is paid, returns are of what is earned. A transition that ends an episode without a next state has
+    reward is the paid one, returns are of earned rewards. A transition that ends an episode without a next state has
     the state itself there.
     """
     keys, step, chances, limits, gammas = setting
     state, previous, elapsed, running, discount, finished, returns = episodes
-    following, reward, flags = transition
+    next_states, reward, flags = transition
     num_actions = size_of(transitions)[1]
-    for i in members:
+    for i in runs:
         chance = (chances[i, 0], chances[i, 1], chances[i, 2], chances[i, 3])
         for e in range(state.shape[1]):
-            w = philox(0, e, step, STEP, keys[i])
+            # executed action, by the chances of the run
+            words_of_step = philox(0, e, step, STEP, keys[i])
             s, action = state[i, e], actions[i, e]
             if chance[0] < 1.0 or chance[3] < 1.0:
-                action = executed_by_number(action, previous[i, e], chance, num_actions, unit(w[1]))
+                action = executed_by_number(action, previous[i, e], chance, num_actions, unit(words_of_step[1]))
             lazy, noise, delay = knobs[i, 0], knobs[i, 1], np.int64(knobs[i, 2])
-            more = philox(2, e, step, STEP, keys[i]) if lazy > 0.0 or noise > 0.0 else w
-            if lazy > 0.0 and unit(more[0]) < lazy:
+            effect_words = philox(2, e, step, STEP, keys[i]) if lazy > 0.0 or noise > 0.0 else words_of_step
+            # next state and earned reward: no effect, or an outcome
+            if lazy > 0.0 and unit(effect_words[0]) < lazy:
                 t, earned = s, np.float64(staying[s, action])
             else:
-                k = drawn_outcome(transitions, s, action, unit(w[2]))[0]
+                k = drawn_outcome(transitions, s, action, unit(words_of_step[2]))[0]
                 t = np.int64(outcome(transitions, s, action, k)[0])
-                earned = np.float64(paid(rewards, s, action, k))
+                earned = np.float64(outcome_reward(rewards, s, action, k))
+            # the transition, with the paid reward
             ended = t < 0 or terminal[t]
             elapsed[i, e] += 1
             timeout = not ended and elapsed[i, e] >= limits[i]
-            following[i, e] = s if t < 0 else t
+            next_states[i, e] = s if t < 0 else t
             flags[i, e] = (DONE if ended or timeout else 0) | (TIMEOUT if timeout else 0)
             reward[i, e] = earned
             if delay > 0:
-                reward[i, e] = paid_late(pending[i, e, :delay], elapsed[i, e] - 1, earned, ended or timeout)
+                reward[i, e] = delayed_reward(pending[i, e, :delay], elapsed[i, e] - 1, earned, ended or timeout)
             if noise > 0.0:
-                reward[i, e] += noise * normal_by_numbers(unit(more[1]), unit(more[2]))
+                reward[i, e] += noise * normal_by_numbers(unit(effect_words[1]), unit(effect_words[2]))
+            # the running episode; at its end count it and start another
             running[i, e] += discount[i, e] * earned
             discount[i, e] *= gammas[i]
-            state[i, e], previous[i, e] = following[i, e], action
+            state[i, e], previous[i, e] = next_states[i, e], action
             if ended or timeout:
                 if counts:
                     finished[i] += 1
                     returns[i] += running[i, e]
                 running[i, e], discount[i, e] = 0.0, 1.0
-                state[i, e] = starts[start_by_number(cumulative, unit(w[3]))]
+                state[i, e] = starts[start_by_number(cumulative, unit(words_of_step[3]))]
                 previous[i, e], elapsed[i, e] = -1, 0
 
 
 @njit(cache=True, nogil=True)
 def act(keys, step, scores, actions, log_probabilities):
-    """Draw actions (W, E) from the softmax of scores (W, E, A), and the logarithms of their probabilities, float32."""
+    """Draw actions (W, E) from the softmax of scores (W, E, A); log_probabilities: their logarithms, float32."""
     num_actions = scores.shape[2]
     for i in range(actions.shape[0]):
         for e in range(actions.shape[1]):
+            # mass of the softmax, up to a factor; subtracting the best score avoids overflow
             best = scores[i, e].max()
             total = 0.0
             for a in range(num_actions):
                 total += np.exp(np.float64(scores[i, e, a] - best))
+            # the first action whose cumulative mass exceeds a uniform share of it
             u = unit(philox(0, e, step, STEP, keys[i])[0]) * total
-            passed, chosen = 0.0, num_actions - 1
+            cumulative, action = 0.0, num_actions - 1
             for a in range(num_actions):
-                passed += np.exp(np.float64(scores[i, e, a] - best))
-                if u < passed:
-                    chosen = a
+                cumulative += np.exp(np.float64(scores[i, e, a] - best))
+                if u < cumulative:
+                    action = a
                     break
-            actions[i, e] = chosen
-            log_probabilities[i, e] = np.float64(scores[i, e, chosen] - best) - np.log(total)
+            actions[i, e] = action
+            log_probabilities[i, e] = np.float64(scores[i, e, action] - best) - np.log(total)
 
 
 @njit(cache=True, nogil=True)
@@ -263,11 +272,11 @@ def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
     place: the row that is written next; filled: the number of rows that are; gammas (W,).
     memory: (state, next state (W, R, E), action (W, R, E), reward (W, R, E) float32, flags (W, R, E)).
     batch: (state, next state (W, B), action (W, B), reward (W, B) float32, discount (W, B) float32), written here:
-    discount is what the value of the next state is multiplied by: gamma^n, 0 where the episode ended there. A return
-    stops at the end of an episode, at a time limit, and at the newest transition.
+    discount is the factor of the value of the next state: gamma^n, 0 where the episode ended there. A return stops at
+    the end of an episode, at a time limit, and at the newest transition.
     """
-    state, following, action, reward, flags = memory
-    states, nexts, actions, rewards, discounts = batch
+    state, next_state, action, reward, flags = memory
+    states, next_states, actions, rewards, discounts = batch
     size, copies = state.shape[1], state.shape[2]
     last = (place - 1) % size
     for i in range(states.shape[0]):
@@ -275,18 +284,18 @@ def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
             w = philox(b, draw, step, SAMPLE, keys[i])
             row, e = below(w[0], filled), below(w[1], copies)
             at, rewards[i, b], discounts[i, b] = _steps_from(i, row, e, last, gammas[i], num_steps, reward, flags)
-            states[i, b], actions[i, b], nexts[i, b] = state[i, row, e], action[i, row, e], following[i, at, e]
+            states[i, b], actions[i, b], next_states[i, b] = state[i, row, e], action[i, row, e], next_state[i, at, e]
 
 
 @njit(cache=True, nogil=True)
 def sample_histories(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
-    """`sample` of the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
+    """`sample` from the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
 
     They are read from the rows before; the first state of an episode stands for those before it. Rows that were never
     written have the flag DONE.
     """
-    state, following, action, reward, flags = memory
-    states, nexts, actions, rewards, discounts = batch
+    state, next_state, action, reward, flags = memory
+    states, next_states, actions, rewards, discounts = batch
     size, copies, frames = state.shape[1], state.shape[2], states.shape[2]
     first, last = (place - filled) % size, (place - 1) % size
     for i in range(states.shape[0]):
@@ -295,16 +304,17 @@ def sample_histories(keys, step, draw, place, filled, gammas, num_steps, memory,
             row, e = (first + below(w[0], filled)) % size, below(w[1], copies)
             at, rewards[i, b], discounts[i, b] = _steps_from(i, row, e, last, gammas[i], num_steps, reward, flags)
             actions[i, b] = action[i, row, e]
+            # the next history is that of the last row, moved on by its next state
             _last_states(i, row, e, state, flags, states[i, b])
-            _last_states(i, at, e, state, flags, nexts[i, b])
+            _last_states(i, at, e, state, flags, next_states[i, b])
             for f in range(1, frames):
-                nexts[i, b, f - 1] = nexts[i, b, f]
-            nexts[i, b, frames - 1] = following[i, at, e]
+                next_states[i, b, f - 1] = next_states[i, b, f]
+            next_states[i, b, frames - 1] = next_state[i, at, e]
 
 
 @njit(cache=True, nogil=True)
 def _steps_from(i, row, e, last, gamma, num_steps, reward, flags):
-    """(the row where they end, return, discount of what follows) of at most `num_steps` steps from a row."""
+    """(last row, return, discount of the value after it) of at most `num_steps` steps from a row."""
     size = reward.shape[1]
     total, factor, at = 0.0, 1.0, row
     for n in range(num_steps):
@@ -319,7 +329,7 @@ def _steps_from(i, row, e, last, gamma, num_steps, reward, flags):
 
 @njit(cache=True, nogil=True)
 def _last_states(i, row, e, state, flags, out):
-    """out (k,) = the state of a row and those of the k - 1 before it, the oldest first."""
+    """out (k,) = the state of a row and those of the k - 1 rows before it, the oldest first, within its episode."""
     size = state.shape[1]
     for f in range(len(out) - 1, -1, -1):
         out[f] = state[i, row, e]
@@ -340,6 +350,7 @@ def huber(q, q_next, q_choice, actions, rewards, discounts, dq, loss):
     for i in range(q.shape[0]):
         total = 0.0
         for b in range(num_rows):
+            # temporal difference to the target of the next state
             best = 0
             for a in range(num_actions):
                 dq[i, b, a] = 0.0
@@ -347,6 +358,7 @@ def huber(q, q_next, q_choice, actions, rewards, discounts, dq, loss):
                     best = a
             target = rewards[i, b] + discounts[i, b] * q_next[i, b, best]
             difference = q[i, b, actions[i, b]] - target
+            # smooth L1 loss, and its gradient at the action of the transition
             size = abs(difference)
             total += 0.5 * size * size if size < 1.0 else size - 0.5
             dq[i, b, actions[i, b]] = share * min(max(difference, float32(-1.0)), float32(1.0))
@@ -355,6 +367,7 @@ def huber(q, q_next, q_choice, actions, rewards, discounts, dq, loss):
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _squares(x):
+    """Sum of squares of x (P,) float32."""
     total = float32(0.0)
     for j in range(len(x)):
         total += x[j] * x[j]
@@ -363,6 +376,7 @@ def _squares(x):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _adam(parameters, gradient, mean, square, scale, step, eps):
+    """One step of Adam for one run, in place; `scale` clips the gradient, `step` and `eps` include bias corrections."""
     first, second, keep = float32(0.1), float32(0.001), float32(0.999)
     for j in range(len(parameters)):
         g = scale * gradient[j]
@@ -374,7 +388,7 @@ def _adam(parameters, gradient, mean, square, scale, step, eps):
 
 @njit(cache=True, nogil=True)
 def adam(parameters, gradients, means, squares, counts, is_active, rates, max_norms, eps):
-    """A step of Adam (betas 0.9 and 0.999) for the runs that are active, by gradients clipped to a norm.
+    """One step of Adam (betas 0.9 and 0.999) for the active runs, by gradients clipped to a norm.
 
     parameters, gradients, means, squares: (W, P) float32; counts (W,): steps so far; rates, max_norms (W,).
     """
@@ -383,7 +397,7 @@ def adam(parameters, gradients, means, squares, counts, is_active, rates, max_no
             counts[i] += 1
             norm = np.sqrt(np.float64(_squares(gradients[i])))
             scale = float32(min(1.0, max_norms[i] / (norm + 1e-6)))
-            root = np.sqrt(1.0 - 0.999 ** counts[i])  # what divides the root of the squares multiplies the rest
+            root = np.sqrt(1.0 - 0.999 ** counts[i])  # bias correction of the squares, moved to step and eps
             step = float32(rates[i] / (1.0 - 0.9 ** counts[i]) * root)
             _adam(parameters[i], gradients[i], means[i], squares[i], scale, step, float32(eps * root))
 
@@ -422,17 +436,18 @@ def advantages(rewards, values, begins, last_values, ends, gammas, lambdas, out)
         gamma, both = float32(gammas[i]), float32(gammas[i] * lambdas[i])
         for e in range(copies):
             advantage = float32(0.0)
-            goes_on, following = float32(0.0 if ends[i, e] else 1.0), last_values[i, e]
+            goes_on, next_value = float32(0.0 if ends[i, e] else 1.0), last_values[i, e]
+            # backwards: temporal difference of each step, plus the discounted advantage after it
             for t in range(num_steps - 1, -1, -1):
-                delta = rewards[i, t, e] + gamma * following * goes_on - values[i, t, e]
+                delta = rewards[i, t, e] + gamma * next_value * goes_on - values[i, t, e]
                 advantage = delta + both * goes_on * advantage
                 out[i, t, e] = advantage
-                goes_on, following = float32(1.0) - begins[i, t, e], values[i, t, e]
+                goes_on, next_value = float32(1.0) - begins[i, t, e], values[i, t, e]
 
 
 @njit(cache=True, nogil=True)
 def shuffle(keys, step, draw, order):
-    """order (W, M) = a permutation of 0 .. M-1 for each run (Fisher and Yates)."""
+    """order (W, M) = a random permutation of 0 .. M-1 for each run (Fisher and Yates)."""
     number = order.shape[1]
     for i in range(order.shape[0]):
         for j in range(number):
@@ -460,7 +475,7 @@ def gather(order, first, sources, targets):
 
 @njit(cache=True, nogil=True)
 def normalize(advantages):
-    """Each run's (W, B) less its mean, by its standard deviation + 1e-8; B >= 2."""
+    """Normalise advantages (W, B) in place: less the mean of each run, by its standard deviation + 1e-8; B >= 2."""
     number = advantages.shape[1]
     for i in range(advantages.shape[0]):
         mean, squares = 0.0, 0.0
@@ -478,7 +493,7 @@ def normalize(advantages):
 def clipped_loss(scores, values, minibatch, clip_ranges, entropy_weights, value_weights, dscores, dvalues, loss, kl):
     """The loss of PPO (W,), its gradients, and the approximate divergence from the old policy (W,).
 
-    scores (W, B, A), values (W, B, 1) float32; dscores and dvalues alike.
+    scores (W, B, A), values (W, B, 1) float32; dscores and dvalues (gradients) of the same shapes.
     minibatch: (actions, old logarithms of probabilities, advantages, returns), (W, B) each.
     """
     actions, old, advantage, returns = minibatch
@@ -488,6 +503,7 @@ def clipped_loss(scores, values, minibatch, clip_ranges, entropy_weights, value_
         total, divergence = 0.0, 0.0
         low, high = 1.0 - clip_ranges[i], 1.0 + clip_ranges[i]
         for b in range(number):
+            # log-softmax of the scores, and its entropy
             best, mass = scores[i, b].max(), 0.0
             for a in range(num_actions):
                 log_p[a] = scores[i, b, a] - best
@@ -496,6 +512,7 @@ def clipped_loss(scores, values, minibatch, clip_ranges, entropy_weights, value_
             for a in range(num_actions):
                 log_p[a] -= mass
                 entropy -= np.exp(log_p[a]) * log_p[a]
+            # ratio to the old policy, clipped objective, error of the value
             gained = log_p[actions[i, b]] - old[i, b]
             ratio = np.exp(gained)
             divergence += (ratio - 1.0) - gained
@@ -503,6 +520,7 @@ def clipped_loss(scores, values, minibatch, clip_ranges, entropy_weights, value_
             bound = advantage[i, b] * min(max(ratio, low), high)
             error = values[i, b, 0] - returns[i, b]
             total += -min(free, bound) - entropy_weights[i] * entropy + value_weights[i] * error * error
+            # gradients by value and scores; the clipped objective has none by the ratio
             of_log_p = -free / number if free <= bound else 0.0
             dvalues[i, b, 0] = value_weights[i] * 2.0 * error / number
             for a in range(num_actions):

@@ -25,7 +25,7 @@ from pharos.kernels.outcomes import expectation, fetch_values, outcome, outcomes
 
 
 def state_at(order, i):
-    """The state at place i."""
+    """The state at place i of an order; i itself where the order is None."""
 
 
 @overload(state_at)
@@ -56,7 +56,7 @@ def is_increasing(transitions, live, age):
 @interpreted_first()
 @njit(cache=True, nogil=True)
 def topological_order(transitions, live):
-    """The order; where there is a cycle, it lacks the states of the cycle and all that they lead to.
+    """States in topological order, without those of a cycle and all that they lead to.
 
     Cost: two passes over the transitions; 16 bytes a state.
     """
@@ -70,11 +70,13 @@ def topological_order(transitions, live):
                     if t >= 0:
                         waiting[t] += 1
     order = np.empty(num_states, np.int64)
+    # states that no other one leads to come first
     tail = 0
     for s in range(num_states):
         if waiting[s] == 0:
             order[tail] = s
             tail += 1
+    # a state follows when all edges into it are done
     head = 0
     while head < tail:
         s = order[head]
@@ -95,7 +97,7 @@ def topological_order(transitions, live):
 @interpreted_first()
 @njit(cache=True, nogil=True)
 def longest_path(transitions, live, order):
-    """Edges of the longest path of states in such an order. Cost: one pass over the transitions; 4 bytes a state."""
+    """Edges of the longest path, given a topological order. Cost: one pass over the transitions; 4 bytes a state."""
     num_states, num_actions = size_of(transitions)
     length = np.zeros(num_states, np.int32)
     longest = 0
@@ -138,7 +140,7 @@ def _reward_at(table, palette, s, a):
 
 
 def _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s):
-    """(1 - uniform) q(s, what is chosen) + uniform mean_a q(s, a)."""
+    """(1 - uniform) q(s, choice) + uniform mean_a q(s, a): the backup of v at s."""
 
 
 @overload(_backup, jit_options={"forceinline": True})
@@ -162,8 +164,8 @@ def _backup_of(transitions, table, palette, gamma, uniform, choice, v, actions, 
         return of_extreme
 
     def of_policy(transitions, table, palette, gamma, uniform, choice, v, actions, s):
-        chosen = np.int64(choice[s])
-        q = reward_at(table, palette, s, chosen) + gamma * expectation(transitions, v, s, chosen)
+        action = np.int64(choice[s])
+        q = reward_at(table, palette, s, action) + gamma * expectation(transitions, v, s, action)
         if uniform > 0.0:
             total = 0.0
             for a in range(len(actions)):
@@ -177,7 +179,7 @@ def _backup_of(transitions, table, palette, gamma, uniform, choice, v, actions, 
 @interpreted_first()
 @njit(cache=True, nogil=True)
 def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, actions, order, start, stop):
-    """v[s] = (1 - uniform) q(s, what is chosen) + uniform mean_a q(s, a), in place, for places [start, stop)."""
+    """v[s] = (1 - uniform) q(s, choice) + uniform mean_a q(s, a), in place, for places [start, stop) of the order."""
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
         if i >= start + AHEAD:
@@ -192,8 +194,7 @@ def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, action
 @interpreted_first()
 @njit(cache=True, nogil=True)
 def optimal_backup(transitions, table, palette, gamma, uniform, choice, v, out, actions, runs):
-    """out[s] = the backup of v for s of some runs (R, 2), not in place: what threads and ranks share, and horizons
-    need."""
+    """out[s] = the backup of v for s of some runs (R, 2), not in place: for threads, ranks and horizons."""
     for i in range(len(runs)):
         stop = runs[i, 1]
         for s in range(runs[i, 0], stop):
@@ -204,20 +205,20 @@ def optimal_backup(transitions, table, palette, gamma, uniform, choice, v, out, 
 
 @njit(forceinline=True)
 def _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s):
-    """q[a] = r(s, a) + gamma v(next, a). Returns (that of what is chosen, their sum)."""
+    """q[a] = r(s, a) + gamma v(next, a). Returns (q of the choice, sum of q)."""
     total = 0.0
     for a in range(len(actions)):
         q[a] = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
         total += q[a]
-    return _chosen(choice, q, actions, s), total
+    return _choice_value(choice, q, actions, s), total
 
 
-def _chosen(choice, q, actions, s):
-    """The entry of q (A,) that is chosen."""
+def _choice_value(choice, q, actions, s):
+    """The entry of q (A,) that `choice` takes: the best, the worst, or that of the policy's action."""
 
 
-@overload(_chosen, jit_options={"forceinline": True})
-def _chosen_of(choice, q, actions, s):
+@overload(_choice_value, jit_options={"forceinline": True})
+def _choice_value_of(choice, q, actions, s):
     if not isinstance(choice, types.Float):
         return lambda choice, q, actions, s: q[choice[s]]
 
@@ -233,20 +234,20 @@ def _chosen_of(choice, q, actions, s):
 @interpreted_first()
 @njit(cache=True, nogil=True)
 def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions, q, order, start, stop):
-    """v[s, b] = chosen q(s, what is chosen) + previous q(s, b) + uniform mean_a q(s, a), in place.
+    """v[s, b] = chosen q(s, choice) + previous q(s, b) + uniform mean_a q(s, a), in place.
 
-    v (S + 1, A); q (A,) scratch; for places [start, stop).
+    v (S + 1, A); q (A,) scratch; for places [start, stop) of the order.
     """
-    chosen, previous, uniform = weights
+    chosen_weight, previous_weight, uniform_weight = weights
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
         if i >= start + AHEAD:
             fetch_values(transitions, v, actions, state_at(order, i - AHEAD))
         s = state_at(order, i)
         best, total = _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s)
-        shared = chosen * best + uniform * total / len(actions)
+        shared = chosen_weight * best + uniform_weight * total / len(actions)
         for b in range(len(actions)):
-            value = shared + previous * q[b]
+            value = shared + previous_weight * q[b]
             change = max(change, abs(value - v[uint64(s), b]))
             v[uint64(s), b] = value
     return change
@@ -255,8 +256,8 @@ def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions
 @interpreted_first()
 @njit(cache=True, nogil=True)
 def sticky_backup(transitions, table, palette, gamma, weights, choice, v, out, actions, runs):
-    """out[s, b] = the backup of v for s of some runs (R, 2), not in place."""
-    chosen, previous, uniform = weights
+    """out[s, b] = the backup of v for s of some runs (R, 2), not in place; terms as in `sticky_sweep`."""
+    chosen_weight, previous_weight, uniform_weight = weights
     q = np.empty(len(actions))
     for i in range(len(runs)):
         stop = runs[i, 1]
@@ -264,24 +265,24 @@ def sticky_backup(transitions, table, palette, gamma, weights, choice, v, out, a
             if s + AHEAD < stop:
                 fetch_values(transitions, v, actions, s + AHEAD)
             best, total = _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s)
-            shared = chosen * best + uniform * total / len(actions)
+            shared = chosen_weight * best + uniform_weight * total / len(actions)
             for b in range(len(actions)):
-                out[uint64(s), b] = shared + previous * q[b]
+                out[uint64(s), b] = shared + previous_weight * q[b]
 
 
 @interpreted_first()
 @njit(cache=True, nogil=True)
-def policy_sweep(transitions, table, palette, gamma, chosen, uniform, policy, v, order, start, stop):
+def policy_sweep(transitions, table, palette, gamma, chosen_weight, uniform_weight, policy, v, order, start, stop):
     """v[s] = sum_a (chosen policy[s, a] + uniform / A) q(s, a), in place; policy (S, A): probabilities of choosing."""
     _, num_actions = size_of(transitions)
-    each = uniform / num_actions
+    uniform_share = uniform_weight / num_actions
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
         s = state_at(order, i)
         value = 0.0
         for a in range(num_actions):
             q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
-            value += (chosen * policy[s, a] + each) * q
+            value += (chosen_weight * policy[s, a] + uniform_share) * q
         change = max(change, abs(value - v[s]))
         v[s] = value
     return change
@@ -295,21 +296,22 @@ def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, 
     v (S + 1, A). policy (S, B, A): B is A, or 1 where the previous action does not matter. q (A,) scratch.
     """
     _, num_actions = size_of(transitions)
-    chosen, previous, uniform = weights
-    each = uniform / num_actions
+    chosen_weight, previous_weight, uniform_weight = weights
+    uniform_share = uniform_weight / num_actions
     looks_back = policy.shape[1] > 1
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
         s = state_at(order, i)
         for a in range(num_actions):
             q[a] = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
+        # the mean under the policy, once where it does not depend on the previous action b
         shared = 0.0
         for b in range(num_actions):
             if b == 0 or looks_back:
                 shared = 0.0
                 for a in range(num_actions):
-                    shared += (chosen * policy[s, b, a] + each) * q[a]
-            value = shared + previous * q[b]
+                    shared += (chosen_weight * policy[s, b, a] + uniform_share) * q[a]
+            value = shared + previous_weight * q[b]
             change = max(change, abs(value - v[s, b]))
             v[s, b] = value
     return change
@@ -328,6 +330,7 @@ def chain_values(successor, reward, gamma, v, order):
     for start in range(num_states):
         if mark[start] != 0:
             continue
+        # walk to the end, to a state already done, or back into this walk
         length = 0
         s = start
         while s >= 0 and mark[s] == 0:
@@ -356,6 +359,7 @@ def chain_values(successor, reward, gamma, v, order):
                 v[t] = reward[t] + gamma * v[successor[t]]
                 mark[t] = -1
             last = first
+        # the walk before the cycle, or all of it, backwards
         for i in range(last - 1, -1, -1):
             t = order[i]
             v[t] = reward[t] + (gamma * v[successor[t]] if successor[t] >= 0 else 0.0)
@@ -383,22 +387,24 @@ def number_components(transitions, live, component, path, waiting):
     tail = 0
     for start in range(num_states):
         depth = -1
-        following = start
+        next_state = start
         while component[start] == 0 or depth >= 0:
-            if component[following] == 0:
+            # a new state: put it on the path, with the next number
+            if component[next_state] == 0:
                 depth += 1
-                path[depth], action[depth], branch[depth], is_root[depth] = following, 0, 0, True
-                component[following] = number
+                path[depth], action[depth], branch[depth], is_root[depth] = next_state, 0, 0, True
+                component[next_state] = number
                 number += 1
             s = np.int64(path[depth])
-            following = s
+            next_state = s
+            # look on at its transitions; a smaller number than its own shows a way back to an earlier state
             if live[s]:
                 a, k = np.int64(action[depth]), np.int64(branch[depth])
-                while a < num_actions and following == s:
+                while a < num_actions and next_state == s:
                     while k < len(outcomes_of(transitions, s, a)):
                         t, _ = outcome(transitions, s, a, k)
                         if t >= 0 and component[t] == 0:
-                            following = np.int64(t)  # and look at this transition again, when it is finished
+                            next_state = np.int64(t)  # and look at this transition again, when it is finished
                             break
                         if t >= 0 and component[t] < component[s]:
                             component[s] = component[t]
@@ -407,8 +413,9 @@ def number_components(transitions, live, component, path, waiting):
                     else:
                         a, k = a + 1, np.int64(0)
                 action[depth], branch[depth] = a, k
-            if following != s:
+            if next_state != s:
                 continue
+            # all transitions done: a root closes its component, other states wait for their root
             if is_root[depth]:
                 number -= 1
                 while tail > 0 and component[waiting[tail - 1]] >= component[s]:
@@ -421,6 +428,7 @@ def number_components(transitions, live, component, path, waiting):
                 waiting[tail] = s
                 tail += 1
             depth -= 1
+    # numbers go down from S: shift them to begin at 0
     for s in range(num_states):
         component[s] -= last + 1
     return num_states - last
@@ -430,12 +438,13 @@ def number_components(transitions, live, component, path, waiting):
 def component_order(transitions, live, component, first, is_cyclic, order):
     """order (S,) = the states by component, ascending in each; those of component c from first[c] to first[c + 1].
 
-    is_cyclic[c] = whether a state of c can be visited again. first (C + 1,) of zeros.
+    is_cyclic[c] = whether a state of c can be visited again. first (C + 1,): zero before.
     """
     num_states, num_actions = size_of(transitions)
     count = len(is_cyclic)
     for s in range(num_states):
         first[component[s]] += 1
+    # counting sort: sizes, then where each component begins; several states form a cycle
     total = 0
     for c in range(count + 1):
         size = first[c]
@@ -451,6 +460,7 @@ def component_order(transitions, live, component, first, is_cyclic, order):
                 for k in outcomes_of(transitions, s, a):
                     t, _ = outcome(transitions, s, a, k)
                     is_cyclic[c] |= t == s
+    # `first` points to the ends now: shift it back
     for c in range(count, 0, -1):
         first[c] = first[c - 1]
     first[0] = 0
@@ -458,9 +468,10 @@ def component_order(transitions, live, component, first, is_cyclic, order):
 
 @njit(cache=True, nogil=True)
 def joined(first, is_cyclic, least):
-    """(starts (G + 1,) in the order, whether each group has a cycle): neighbouring components put together.
+    """(starts (G + 1,) in the order, whether each group has a cycle): neighbouring components joined into groups.
 
-    Those without a cycle as many as there are; those with one, and whatever comes next, until they have `least` states.
+    Components without a cycle are joined as long as they follow each other; one with a cycle is joined by those that
+    come next until the group has `least` states.
     """
     starts = np.empty(len(first), np.int64)
     has_cycle = np.empty(len(is_cyclic), np.bool_)
@@ -477,7 +488,7 @@ def joined(first, is_cyclic, least):
 
 
 @njit(cache=True, nogil=True)
-def settle(
+def sweep_groups(
     transitions,
     table,
     palette,
@@ -490,22 +501,22 @@ def settle(
     starts,
     has_cycle,
     target,
-    settled,
-    most,
-    before,
+    rounding,
+    max_backups,
+    largest_before,
 ):
     """Sweep group by group, from the last to the first, each until it changes by at most `target`, or by its rounding.
 
-    starts, has_cycle: as `joined` makes them; settled: a change that is no more than rounding, relative to the values.
-    most: backups, after which each group that is left is swept once. before: the largest absolute value so
-    far. See kernels/bellman.py for the rest.
+    starts, has_cycle: as from `joined`; rounding: a change that is no more than rounding, relative to the values.
+    max_backups: after so many each group that is left is swept once. largest_before: the largest absolute value so far.
+    The other arguments are those of all backups.
     """
     for group in range(len(has_cycle) - 1, -1, -1):
-        change, largest = np.inf, before
-        while change > max(target, settled * largest):
+        change, largest = np.inf, largest_before
+        while change > max(target, rounding * largest):
             start, stop = starts[group], starts[group + 1]
             change = optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, actions, order, start, stop)
             largest += change  # at least as large as the values
-            most -= stop - start
-            if most < 0 or not has_cycle[group]:
+            max_backups -= stop - start
+            if max_backups < 0 or not has_cycle[group]:
                 break

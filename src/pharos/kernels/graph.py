@@ -1,20 +1,20 @@
-"""Breadth-first searches on the graph of a deterministic MDP, forward on its table and backward on a reversed copy.
+"""Breadth-first searches, eccentricities, periods and symmetries of the graph of a deterministic MDP.
 
 Nodes are the S states and, where some transition is -1, one more: node S, the implicit end of an episode. `ends` (S,)
 bool marks states whose row is not followed (terminal states). With `start` >= 0 every such state and node S lead to
 `start` in one step, without that edge being stored; with `start` = -1 they lead nowhere.
 
-Distances are in steps, -1 where there is no path. `queue` is scratch of one entry a node; after a search it holds the
-nodes found, in the order of their distance.
+Searches go forward on the table of next states and backward on a reversed copy. Distances are in steps, -1 where there
+is no path. `queue` is scratch of one entry a node; after a search it holds the nodes found, in the order of their
+distance.
 
-Distances of a graph by sweeps over its table in order: no queue, no reversed copy, the same arguments.
+Distance sweeps need neither queue nor reversed copy: they pass over the table in order. distance (N,) holds 0 at the
+source and `far`, the largest number of its type, elsewhere, and upper bounds from then on; they are the distances once
+a sweep changes nothing, as none can be lowered along an edge then. Breadth-first search numbers a state before those
+that it leads to, so that most paths are followed in one sweep.
 
-distance (N,) holds 0 at the source and `far`, the largest number of its type, elsewhere, and upper bounds from then on;
-they are the distances once a sweep changes nothing, as none can be lowered along an edge then. Breadth-first search
-numbers a state before those that it leads to, so that most ways are followed in one sweep.
-
-A graph may contain a clock: every edge leads from one layer of nodes to the next, and round again. Symmetries of a
-deterministic table are maps of the states onto each other under which every action does the same.
+A graph with a clock is periodic: every edge leads from one of P layers of nodes to the next, and round again.
+Symmetries of a deterministic table are maps of the states onto each other under which every action does the same.
 """
 
 import numpy as np
@@ -27,10 +27,10 @@ from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 @interpreted_first()
 @njit(cache=True, nogil=True)
 def search(table, reverse, start, source, distance, queue):
-    """distance[v] = steps from `source` to v, by the table (next_states, ends); or, where that is None, from v to
-    `source`, by reverse: (first, previous) of `reversed_graph`, and the nodes that lead to `start`.
+    """distance[v] = steps from `source` to v by the table, or from v to `source` by the reversed graph.
 
-    Returns (nodes found, largest distance, sum of distances).
+    table: (next_states, ends), or None; reverse, where table is None: (first, previous) of `reversed_graph`, and the
+    nodes that lead to `start`. Returns (nodes found, largest distance, sum of distances).
     """
     if reverse is not None:
         first, previous, restarting = reverse
@@ -47,6 +47,7 @@ def search(table, reverse, start, source, distance, queue):
         head += 1
         total += distance[u]
         d = distance[u] + 1
+        # backward: stored predecessors of u, and at `start` the states that restart there
         if reverse is not None:
             for i in range(first[u], first[u + 1]):
                 v = previous[i]
@@ -61,6 +62,7 @@ def search(table, reverse, start, source, distance, queue):
                         distance[v] = d
                         queue[tail] = v
                         tail += 1
+        # forward: an end leads to `start` alone, other states to their successors
         if table is not None:
             if u == num_states or ends[u]:
                 if start >= 0 and distance[start] < 0:
@@ -84,8 +86,8 @@ def search(table, reverse, start, source, distance, queue):
 def fill_predecessors(next_states, ends, first, previous):
     """previous[first[v] : first[v + 1]] = distinct predecessors of v other than v, by rows that are followed.
 
-    `first` comes shifted by one place and leaves in place. Where `previous` is None, it is zero before, and becomes how
-    many there are, again one place ahead.
+    `first` is shifted by one place before: first[v + 1] is where v begins; the call moves it to where v ends. Where
+    `previous` is None, the call counts only: first (zero before) becomes the number of predecessors, one place ahead.
     """
     num_states, num_actions = next_states.shape
     for u in range(num_states):
@@ -145,7 +147,7 @@ def bound_eccentricities(from_pivot, to_pivot, out_pivot, in_pivot, out_lower, o
 @interpreted_first()
 @njit(cache=True, nogil=True)
 def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
-    """Whose eccentricity may exceed `best`, and where to search next.
+    """Summary of the nodes whose eccentricity may exceed `best`: how many are open, and where to search next.
 
     Returns (open out, open in, node of the largest upper bound out, the same in, open node in the middle): the middle
     is the least sum of lower bounds; ties of upper bounds go to the larger lower bound.
@@ -154,6 +156,7 @@ def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
     far_out, far_in, middle = -1, -1, -1
     for v in range(len(out_lower)):
         is_open = False
+        # out(v) may exceed `best`: keep the node of the largest bound
         if out_upper[v] > best:
             num_out += 1
             is_open = True
@@ -163,6 +166,7 @@ def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
                 or (out_upper[v] == out_upper[far_out] and out_lower[v] > out_lower[far_out])
             ):
                 far_out = v
+        # the same for in(v)
         if in_upper[v] > best:
             num_in += 1
             is_open = True
@@ -172,6 +176,7 @@ def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
                 or (in_upper[v] == in_upper[far_in] and in_lower[v] > in_lower[far_in])
             ):
                 far_in = v
+        # a node near to all others, by its lower bounds, tightens the bounds of many
         if is_open and (middle < 0 or out_lower[v] + in_lower[v] < out_lower[middle] + in_lower[middle]):
             middle = v
     return num_out, num_in, far_out, far_in, middle
@@ -179,8 +184,11 @@ def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
 
 @interpreted_first("n")
 @njit(cache=True, nogil=True)
-def onwards(transitions, nodes, n, following, is_visited):
-    """States that nodes[:n] lead to and that were not seen before; returns how many. is_visited (S,) bool."""
+def onwards(transitions, nodes, n, next_nodes, is_visited):
+    """States that nodes[:n] lead to and that were not visited before; returns how many.
+
+    next_nodes (S,): the first entries get them; is_visited (S,) bool.
+    """
     count = 0
     for i in range(n):
         for a in range(size_of(transitions)[1]):
@@ -188,7 +196,7 @@ def onwards(transitions, nodes, n, following, is_visited):
                 t, _ = outcome(transitions, nodes[i], a, j)
                 if t >= 0 and not is_visited[t]:
                     is_visited[t] = True
-                    following[count] = t
+                    next_nodes[count] = t
                     count += 1
     return count
 
@@ -246,7 +254,7 @@ def lower_forward(next_states, ends, start, distance, far, first, stop):
 
 @njit(cache=True, nogil=True)
 def summary(distance, far):
-    """(Nodes found, largest distance among them, their sum)."""
+    """(nodes found, largest distance among them, sum of their distances)."""
     reach, largest, total = 0, 0, 0
     for v in range(len(distance)):
         d = distance[v]
@@ -269,6 +277,7 @@ def period(next_states, ends, start, level, has_end):
     """
     num_states, num_actions = next_states.shape
     divisor = np.int64(0)
+    # the edge from node S, the end, to `start`
     if start >= 0 and has_end:
         divisor = np.int64(level[num_states]) + 1 - level[start]
     for u in range(num_states):
@@ -288,12 +297,12 @@ def period(next_states, ends, start, level, has_end):
 
 @njit(cache=True, nogil=True)
 def last_gap(next_states, ends, start, order, layer_first, position, current, coming, max_reads):
-    """Largest k such that some node does not yet reach its whole layer in exactly k steps; -1 where layers are single
-    nodes.
+    """Largest k such that some node does not yet reach its whole layer in exactly k steps.
 
     Every edge leads from layer j to layer j + 1 modulo P. order (N,): the nodes by layer, layer_first (P + 1,),
     position (N,): place of a node in its layer. current, coming: (widest layer, words) uint64 scratch.
-    Returns (gap, table entries read); the gap is -2 where it is at least P, -3 where `max_reads` were not enough.
+    Returns (gap, table entries read); the gap is -1 where layers are single nodes, -2 where it is at least P, -3 where
+    `max_reads` were not enough.
 
     f(j) = first k for which every node of layer j reaches layer j + k whole; f(j) <= f(j + 1) + 1. So going down from a
     layer whose f is known, layers that cannot pass the best gap so far are skipped.
@@ -306,6 +315,7 @@ def last_gap(next_states, ends, start, order, layer_first, position, current, co
         bound += 1
         if bound - 1 <= gap:
             continue
+        # bit i of current[p]: node i of the origin reaches node p of the layer at hand; at first itself alone
         width = layer_first[origin + 1] - layer_first[origin]
         words = (width + 63) // 64
         last_word = ~np.uint64(0) if width % 64 == 0 else (np.uint64(1) << np.uint64(width % 64)) - np.uint64(1)
@@ -319,9 +329,10 @@ def last_gap(next_states, ends, start, order, layer_first, position, current, co
                 return -2, reads
             if reads > max_reads:
                 return -3, reads
-            following = layer + 1 if layer + 1 < num_layers else 0
-            coming_width = layer_first[following + 1] - layer_first[following]
-            coming[:coming_width, :words] = 0
+            # pass the bits on along the edges to the next layer
+            next_layer = layer + 1 if layer + 1 < num_layers else 0
+            next_width = layer_first[next_layer + 1] - layer_first[next_layer]
+            coming[:next_width, :words] = 0
             for i in range(layer_first[layer], layer_first[layer + 1]):
                 u = order[i]
                 p = position[u]
@@ -336,8 +347,9 @@ def last_gap(next_states, ends, start, order, layer_first, position, current, co
                     for w in range(words):
                         coming[q, w] |= current[p, w]
             reads += words * num_actions * (layer_first[layer + 1] - layer_first[layer])
+            # f is known when every node of the layer is reached by all nodes of the origin
             full = True
-            for q in range(coming_width):
+            for q in range(next_width):
                 for w in range(words):
                     if coming[q, w] != (last_word if w == words - 1 else ~np.uint64(0)):
                         full = False
@@ -345,7 +357,7 @@ def last_gap(next_states, ends, start, order, layer_first, position, current, co
                 if not full:
                     break
             current, coming = coming, current
-            layer = following
+            layer = next_layer
             k += 1
         bound = k
         gap = max(gap, k - 1)
@@ -356,7 +368,7 @@ def last_gap(next_states, ends, start, order, layer_first, position, current, co
 def search_in_step(
     next_states, ends, order, layer_first, position, targets, layer, offset, away, home, best, scratch, visits, largest
 ):
-    """Searches backward from many targets at once, a bit each, that stand in the same layer at the same time.
+    """Search backward from many targets at once, a bit each, so that all searches stand in the same layer at each tick.
 
     Every edge leads from layer j to layer j + 1 modulo P; states that end lead nowhere. So a tick reads one layer,
     where searches that keep step by their levels read as many as they have targets in different layers. From a node v
@@ -371,6 +383,7 @@ def search_in_step(
     num_actions = next_states.shape[1]
     num_layers, words, num_targets = len(layer_first) - 1, visits.shape[1], len(targets)
     farthest = np.int64(home.max())
+    # the tick after which no search can beat the other way
     last = np.int64(0)
     for i in range(num_targets):
         last = max(last, offset[i] + away[i] + farthest)
@@ -378,6 +391,7 @@ def search_in_step(
     for tick in range(last + 1):
         low, width = layer_first[layer], layer_first[layer + 1] - layer_first[layer]
         current, coming = scratch[tick % 2], scratch[1 - tick % 2]
+        # targets that the nodes of this layer reach by an edge into the layer of the last tick
         for p in range(width):
             u = order[low + p]
             for w in range(words):
@@ -388,9 +402,11 @@ def search_in_step(
                     for w in range(words):
                         coming[p, w] |= current[q, w]
         reads += num_actions * width
+        # targets of this layer that join now
         while joined < num_targets and offset[joined] == tick:
             coming[position[targets[joined]], joined // 64] |= np.uint64(1) << np.uint64(joined % 64)
             joined += 1
+        # nodes that reach a target for the first time: their distance is the time since it joined
         for p in range(width):
             for w in range(words):
                 new = coming[p, w] & ~visits[low + p, w]
@@ -401,6 +417,7 @@ def search_in_step(
                             steps = min(np.int64(tick - offset[i]), np.int64(home[order[low + p]] + away[i]))
                             largest[i] = max(largest[i], steps)
         layer = layer - 1 if layer else num_layers - 1
+    # nodes that the searches did not reach have the other way alone: the farthest of them counts
     unseen = np.zeros((farthest + 1, words), np.uint64)
     for place in range(len(order)):
         for w in range(words):
@@ -416,6 +433,7 @@ def search_in_step(
 
 @njit(cache=True, nogil=True)
 def _gcd(a, b):
+    """Greatest common divisor, but for its sign."""
     while b:
         a, b = b, a % b
     return a
@@ -441,12 +459,14 @@ def symmetry(next_states, ends, start, s, t, image, preimage, queue):
         u = queue[head]
         head += 1
         x = image[u] - 1
+        # u and its image x must both end the episode, or neither
         if ends[u] != ends[x]:
             return False, tail
         if ends[u]:
             restarts = start >= 0
             continue
         for a in range(num_actions):
+            # their successors determine the map further, or contradict it
             v, y = next_states[u, a], next_states[x, a]
             if v < 0 or y < 0:
                 if v != y:
@@ -463,7 +483,7 @@ def symmetry(next_states, ends, start, s, t, image, preimage, queue):
 @interpreted_first("steps")
 @njit(cache=True, nogil=True)
 def forget(image, preimage, queue, steps):
-    """Zero again, where `symmetry` wrote."""
+    """Set image and preimage back to zero where `symmetry` wrote."""
     for i in range(steps):
         preimage[image[queue[i]] - 1] = 0
         image[queue[i]] = 0
@@ -471,10 +491,13 @@ def forget(image, preimage, queue, steps):
 
 @njit(cache=True, nogil=True)
 def join(orbit, image):
-    """Make one orbit of the orbits of u and its image, for every u; orbit (S,): a smaller state of the same orbit, or
-    itself. Returns how many orbits there are."""
+    """Unite the orbits of u and its image, for every u, by union-find; returns how many orbits there are.
+
+    orbit (S,): a smaller state of the same orbit, or itself.
+    """
     for u in range(len(orbit)):
         a, b = u, image[u] - 1
+        # roots of both orbits, halving the paths to them; the smaller root stands for both
         while orbit[a] != a:
             orbit[a] = orbit[orbit[a]]
             a = orbit[a]

@@ -1,25 +1,25 @@
-"""The table of states already found: index of a state, or -1, in the first free slot from the one that its hash names.
+"""Hash tables of states, with open addressing: find the index of a state, and number states that are new.
+
+A state's hash names a slot; its entry is in the first slot from there that is free or holds this very state. The same
+table in three forms, a section each:
 
 In memory, the keys are not in the table: slot -> index -> states[index], so it costs 4 bytes a slot, whatever the width
-of a state.
+of a state. -1 marks a free slot.
 
-Kernels of a search by several processes: each owns the states whose hash falls to it, whoever finds them.
+In a search by several processes each state has an owner, the process that its hash names, whoever finds it. An owner
+has keys (capacity, W) uint64, states in the order in which it received them, and numbers (capacity,) int64: the number
+of a state, or -1 - place while it waits for one, where place is the first of the places in the block that lead to it.
+table (slots,) leads from the hash of a state to its entry, a row of keys and numbers.
 
-An owner has keys (capacity, W) uint64, states in the order in which it heard of them, and numbers (capacity,) int64:
-the number of a state, or -1 - place while it waits for one, where place is the first of the places in the block that
-lead to it. table (slots,) leads from the hash of a state to its entry.
+On disk each entry is a whole state and its index: entries (slots, W + 1) uint64, a mapped file, holds the W words of a
+state, then 1 + its index, 0 in a free slot, or NEW + j while candidate j waits for its number. Memory is read and
+written in order of slots: many candidates are first sorted by the 16 highest bits of their hash, their bucket, which
+are the highest bits of their slot in a table of any size. keys (M, W) uint64: candidates; indices (M,) int64:
+-1 - bucket, or an index where it is known; order (M,) int32: candidates that are looked up, by bucket, each bucket in
+the order of candidates.
 
-On disk each entry is a whole state and its index, in the first free slot from its hash's.
-
-entries (slots, W + 1) uint64, a mapped file: W words of a state, then 1 + its index, 0 in a free slot, or NEW + j while
-it waits for its number. Memory is read and written in order of slots: many candidates are first sorted by the 16
-highest bits of their hash, their bucket, which are the highest bits of their slot in a table of any size.
-
-keys (M, W) uint64: candidates; indices (M,) int64: -1 - bucket, or an index where it is known; order (M,) int32:
-candidates that are looked up, by bucket, each bucket in the order of candidates.
-
-States are packed into words and back a few at a time, where NumPy (rules/layout.py) would take a call for each
-component.
+The last section packs states into words and unpacks them a few at a time, where NumPy (rules/layout.py) would take a
+call for each component.
 """
 
 from typing import Any
@@ -33,11 +33,10 @@ from numba.core import cgutils
 from pharos.kernels.interpreted import in_python, interpreted_first
 
 intrinsic: Any = numba.extending.intrinsic  # whose types would hide those of the functions that it makes
-_BATCH = 32
+_BATCH = 32  # states whose slots are fetched from memory at the same time
 
-# Fields of `progress`, (5,) int64: where a search stands.
-# States expanded; states numbered; states up to the end of the current level; levels finished; 0, or 1 + a component at
-# fault.
+# Fields of `progress`, (5,) int64, of a breadth-first search: states expanded; states numbered; states up to the end of
+# the current level; levels finished; 0, or what is at fault: 1 + a component, D + 2 for a probability or an age.
 FIRST, COUNT, LEVEL_END, DEPTH, FAULT = range(5)
 
 
@@ -68,7 +67,7 @@ def _entry(context, builder, array_type, array, index):
 @in_python(lambda table, slot: int(table[slot]))
 @intrinsic
 def entry_at(typing_context, table, slot):
-    """table[slot], which another thread may be writing; what it wrote before is seen as well (an acquiring load)."""
+    """table[slot], by an acquiring load: all that another thread wrote before it published the entry is visible."""
 
     def codegen(context, builder, sig, args):
         place = _entry(context, builder, sig.args[0], *args)
@@ -81,7 +80,7 @@ def entry_at(typing_context, table, slot):
 @in_python(lambda table, slot, index: table.__setitem__(slot, index))
 @intrinsic
 def publish(typing_context, table, slot, index):
-    """table[slot] = index, after everything written before (a releasing store), for threads that read `entry_at`."""
+    """Set table[slot] = index by a releasing store: threads that read it by `entry_at` see all earlier writes."""
 
     def codegen(context, builder, sig, args):
         place = _entry(context, builder, sig.args[0], *args[:2])
@@ -125,9 +124,11 @@ def fill(table, states, count):
     slots = np.empty(_BATCH, np.int64)
     for first in range(0, count, _BATCH):
         n = min(_BATCH, count - first)
+        # hash a batch and fetch its slots, so that the processor waits for all of them at once
         for i in range(n):
             slots[i] = slot_of(hash_of_row(states, first + i), capacity)
             prefetch(table, slots[i])
+        # put each state into the first free slot from its own
         for i in range(n):
             slot = slots[i]
             while table[slot] >= 0:
@@ -137,7 +138,7 @@ def fill(table, states, count):
 
 @njit(cache=True, nogil=True)
 def fill_range(table, states, count, low, high, left_over):
-    """The same for the states whose slots are in [low, high), so that threads can fill disjoint ranges of one table.
+    """Put the states whose slots are in [low, high) into a table: threads fill disjoint ranges of one table.
 
     Returns the number of states that found no free slot before `high`, and puts their indices into left_over, as many
     as fit.
@@ -148,14 +149,17 @@ def fill_range(table, states, count, low, high, left_over):
     n, over = 0, 0
     for first in range(0, count, _BATCH):
         stop = min(first + _BATCH, count)
+        # collect the states of this range; n only grows where the slot is in it
         for i in range(first, stop):
             slots[n] = slot_of(hash_of_row(states, i), capacity)
             indices[n] = i
             n += low <= slots[n] < high
+        # wait until a batch is full, or the states end
         if n < _BATCH and stop < count:
             continue
         for i in range(n):
             prefetch(table, slots[i])
+        # put each into the first free slot before `high`, else note that it is left over
         for i in range(n):
             slot = slots[i]
             while slot < high and table[slot] >= 0:
@@ -172,7 +176,7 @@ def fill_range(table, states, count, low, high, left_over):
 
 @njit(cache=True, nogil=True)
 def fill_more(table, states, indices):
-    """Put some more states into a table."""
+    """Put states[indices] into a table, none of which is there yet."""
     capacity = table.shape[0]
     for index in indices:
         slot = slot_of(hash_of_row(states, index), capacity)
@@ -190,6 +194,7 @@ def find(table, states, keys, out):
     for j in range(len(keys)):
         slot = slot_of(hash_of_row(keys, j), capacity)
         out[j] = -1
+        # probe until the same state or a free slot
         while table[slot] >= 0:
             index = int64(table[slot])
             equal = True
@@ -204,7 +209,7 @@ def find(table, states, keys, out):
 @interpreted_first("keys")
 @njit(cache=True, nogil=True)
 def slots_of(keys, capacity, out):
-    """out[j] = the slot from which to search for keys[j]."""
+    """out[j] = the slot in a table of `capacity` slots from which to search for keys[j]."""
     for j in range(len(keys)):
         out[j] = slot_of(hash_of_row(keys, j), capacity)
 
@@ -212,28 +217,31 @@ def slots_of(keys, capacity, out):
 @interpreted_first("keys")
 @njit(cache=True, nogil=True)
 def insert_missing(table, states, keys, indices, successors, progress):
-    """Number the successors that threads did not find, in order; the serial half of a wide frontier.
+    """Number the successors that threads did not find, in order: the serial half of expanding a wide frontier.
 
-    indices (rows * A,): index, or -1 - slot from which to search on. Row i belongs to state progress[FIRST] + i;
-    successors (rows, A). `progress` goes on by these rows.
+    keys (rows * A, W): the successors; indices (rows * A,): index, or -1 - slot from which to search on. Row i belongs
+    to state progress[FIRST] + i; successors (rows, A) gets the indices. `progress` goes on by these rows.
     """
     first, count, level_end, depth = progress[FIRST], progress[COUNT], progress[LEVEL_END], progress[DEPTH]
     capacity = table.shape[0]
     words = states.shape[1]
     rows, num_actions = successors.shape
-    ahead = 24
-    for j in range(min(ahead, rows * num_actions)):
+    # slots are fetched so many successors before they are read
+    lookahead = 24
+    for j in range(min(lookahead, rows * num_actions)):
         if indices[j] < 0:
             prefetch(table, -1 - indices[j])
     for i in range(rows):
         for a in range(num_actions):
             j = i * num_actions + a
-            if j + ahead < rows * num_actions and indices[j + ahead] < 0:
-                prefetch(table, -1 - indices[j + ahead])
+            if j + lookahead < rows * num_actions and indices[j + lookahead] < 0:
+                prefetch(table, -1 - indices[j + lookahead])
             index = indices[j]
+            # search on; another successor of this block may have entered the state meanwhile
             slot = -1 - index
             while index < 0:
                 index = int64(table[slot])
+                # a free slot: the state is new and gets the next number
                 if index < 0:
                     index = count
                     for k in range(words):
@@ -241,6 +249,7 @@ def insert_missing(table, states, keys, indices, successors, progress):
                     publish(table, slot, count)
                     count += 1
                     break
+                # an occupied slot: compare all words, and go on to the next slot where they differ
                 equal = True
                 for k in range(words):
                     equal = equal and states[index, k] == keys[j, k]
@@ -248,6 +257,7 @@ def insert_missing(table, states, keys, indices, successors, progress):
                     index = -1
                     slot = slot + 1 if slot + 1 < capacity else 0
             successors[i, a] = index
+        # the last state of a level is expanded: the next level ends with the newest state
         if first + i + 1 == level_end:
             level_end = count
             depth += 1
@@ -265,16 +275,19 @@ _OWNER_BITS = 24  # the lowest of a hash, which the slots of tables below 2^32 o
 def route(keys, indices, size, order, counts):
     """Sort candidates by their owners.
 
-    keys (M, W); indices (M,): negative where a candidate is to be asked for. order (M,) int64 gets these candidates,
-    those of the first owner first and each owner's in their order; counts (size,) int64 gets how many there are.
+    keys (M, W); indices (M,): negative where a candidate must be looked up by its owner. order (M,) int64 gets these
+    candidates, those of the first owner first and each owner's in their order; counts (size,) int64 gets the number of
+    each owner's.
     """
     owners = np.empty(len(keys), np.int64)
     counts[:] = 0
+    # the owner of each candidate, by the lowest bits of its hash
     for j in range(len(keys)):
         if indices[j] < 0:
             low = hash_of_row(keys, j) & uint64((1 << _OWNER_BITS) - 1)
             owners[j] = int64((low * uint64(size)) >> uint64(_OWNER_BITS))
             counts[owners[j]] += 1
+    # counting sort: owner o begins behind all smaller owners
     place = np.zeros(size, np.int64)
     for owner in range(1, size):
         place[owner] = place[owner - 1] + counts[owner - 1]
@@ -286,7 +299,7 @@ def route(keys, indices, size, order, counts):
 
 @njit(cache=True, nogil=True)
 def claim(table, keys, numbers, count, candidates, places, entries):
-    """Find the entry of each candidate that is asked for, and make one for each that is new.
+    """Find the entry of each candidate that this owner is asked for, and make one for each that is new.
 
     candidates (N, W), places (N,): states and where in the block they stand; entries (N,) int64 gets their entries. Of
     the places that lead to a new state the first is kept, whatever the order in which they come. Returns the number of
@@ -299,6 +312,7 @@ def claim(table, keys, numbers, count, candidates, places, entries):
         slot = slot_of(hash_of_row(candidates, j), capacity)
         while True:
             entry = int64(table[slot])
+            # a free slot: the state is new and waits for its number
             if entry < 0:
                 entry = count
                 for k in range(words):
@@ -307,6 +321,7 @@ def claim(table, keys, numbers, count, candidates, places, entries):
                 table[slot] = count
                 count += 1
                 break
+            # an occupied slot: a match without a number yet keeps the smallest place
             equal = True
             for k in range(words):
                 equal = equal and keys[entry, k] == candidates[j, k]
@@ -329,7 +344,7 @@ _NEW = uint64(1 << 63)
 
 @njit(forceinline=True)
 def _slot_for(entries, keys, j):
-    """(slot, its entry): where keys[j] is, or the free slot where it belongs."""
+    """(slot, its entry) of keys[j]: the slot where it is, or the free one where it belongs, whose entry is 0."""
     capacity, words = entries.shape[0], keys.shape[1]
     slot = slot_of(hash_of_row(keys, j), capacity)
     while True:
@@ -346,7 +361,7 @@ def _slot_for(entries, keys, j):
 
 @njit(forceinline=True)
 def _enter(entries, slot, keys, j, entry):
-    """Put keys[j] into a slot, with what is said of it."""
+    """Put keys[j] and its `entry`, the last word, into a slot."""
     words = keys.shape[1]
     for k in range(words):
         entries[slot, k] = keys[j, k]
@@ -355,10 +370,12 @@ def _enter(entries, slot, keys, j, entry):
 
 @njit(cache=True, nogil=True)
 def sort_by_bucket(indices, first, order):
-    """Fill order; returns its length. indices[j] >= 0, a state in this block that leads to itself, gets its index:
-    first + indices[j].
+    """Fill order (M,) with the candidates to look up, sorted by bucket; returns their number.
+
+    indices[j] >= 0, a state in this block that leads to itself, gets its index: first + indices[j].
     """
     size = 0
+    # few candidates are looked up in the order in which they come
     if len(indices) <= _FEW:
         for j in range(len(indices)):
             if indices[j] >= 0:
@@ -367,6 +384,7 @@ def sort_by_bucket(indices, first, order):
                 order[size] = j
                 size += 1
         return size
+    # counting sort by bucket: sizes, then where each bucket begins, then the candidates
     place = np.zeros(BUCKETS + 1, np.int64)
     for j in range(len(indices)):
         if indices[j] >= 0:
@@ -386,8 +404,10 @@ def sort_by_bucket(indices, first, order):
 
 @njit(cache=True, nogil=True)
 def look_up(entries, keys, order, low, high, indices, slots):
-    """indices[j] for candidates order[low:high]: its index; -1 where it is new, slots[j] then being its slot; -2 - i
-    where i is equal.
+    """Look up candidates order[low:high], entering those that are new.
+
+    indices[j] becomes the index of candidate j; -1 where it is new, slots[j] then being its slot; -2 - i where it
+    equals the earlier candidate i, which is new.
     """
     capacity = entries.shape[0]
     for p in range(low, high):
@@ -396,6 +416,7 @@ def look_up(entries, keys, order, low, high, indices, slots):
         j = order[p]
         slot, entry = _slot_for(entries, keys, j)
         slots[j] = -1
+        # a new state's entry names this candidate until states are numbered
         if entry == 0:
             _enter(entries, slot, keys, j, _NEW | uint64(j))
             indices[j] = -1
@@ -408,9 +429,9 @@ def look_up(entries, keys, order, low, high, indices, slots):
 
 @njit(cache=True, nogil=True)
 def number(keys, indices, successors, states, appended, progress):
-    """Number what is new in the order of candidates, into states[count - appended :]; row i of successors (rows, A) is
-    state progress[FIRST] + i.
+    """Number new states in the order of candidates, and write them to states[count - appended :].
 
+    indices (M,): as `look_up` leaves them. Row i of successors (rows, A) belongs to state progress[FIRST] + i;
     `progress` goes on by these rows.
     """
     first, count, level_end, depth = progress[FIRST], progress[COUNT], progress[LEVEL_END], progress[DEPTH]
@@ -418,6 +439,7 @@ def number(keys, indices, successors, states, appended, progress):
     for i in range(rows):
         for a in range(num_actions):
             j = i * num_actions + a
+            # a new state takes the next number; a copy of an earlier candidate takes that one's
             if indices[j] == -1:
                 for k in range(keys.shape[1]):
                     states[count - appended, k] = keys[j, k]
@@ -426,6 +448,7 @@ def number(keys, indices, successors, states, appended, progress):
             elif indices[j] < 0:
                 indices[j] = indices[-2 - indices[j]]  # an earlier candidate
             successors[i, a] = indices[j]
+        # the last state of a level is expanded: the next level ends with the newest state
         if first + i + 1 == level_end:
             level_end = count
             depth += 1
@@ -433,8 +456,8 @@ def number(keys, indices, successors, states, appended, progress):
 
 
 @njit(cache=True, nogil=True)
-def settle(entries, order, low, high, indices, slots):
-    """Give the new entries of candidates order[low:high] their numbers."""
+def assign_numbers(entries, order, low, high, indices, slots):
+    """Replace the provisional entries of new candidates order[low:high] by their numbers."""
     words = entries.shape[1] - 1
     for p in range(low, high):
         j = order[p]
@@ -453,7 +476,7 @@ def place(entries, keys, order, low, high, first):
 
 @njit(cache=True, nogil=True)
 def place_from_memory(entries, table, states, low, high):
-    """Put the states in slots [low, high) of a table in memory (hash_table.py) into an empty table."""
+    """Copy the states in slots [low, high) of a table in memory into an empty table on disk."""
     for i in range(low, high):
         if i + _AHEAD < high and table[i + _AHEAD] >= 0:
             prefetch(states, int64(table[i + _AHEAD]))
@@ -465,7 +488,7 @@ def place_from_memory(entries, table, states, low, high):
 
 @njit(cache=True, nogil=True)
 def place_again(entries, old, low, high):
-    """Put the entries in slots [low, high) of an old table into a larger one."""
+    """Copy the entries in slots [low, high) of an old table into a larger one."""
     words = old.shape[1] - 1
     keys = old[:, :words]
     for i in range(low, high):

@@ -1,14 +1,15 @@
-"""Least expected hitting times on explicit choices, and bounds of them by the ways between neighbouring states.
+"""Kernels for least expected hitting times: sweeps, certified residuals, and bounds by short ways between neighbours.
 
 Nodes have A actions each, row n A + a of a sparse matrix (first, node, weight). hardness/hitting_times.py says
-what is computed and why the bounds hold. `goal` (N,) bool marks the nodes of the target, `alike` (N,) bool nodes that
-all have the same rows, such as those in which episodes end: what holds for the first of them is not worked out again
-for the others.
+what is computed and why the bounds hold. `goal` (N,) bool marks the nodes of the target, `shares_rows` (N,) bool nodes
+that all have the same rows, such as those in which episodes end: what holds for the first of them is not worked out
+again for the others.
 
-Bounds of expected times between neighbouring states, for all pairs at once, and to each target from a hub, through the
-nodes around the target, are those of hardness/stochastic_diameter.py. Outcomes: state x has those numbered first[x] to
-first[x + 1]: outcome i happens with probability prob[i] when action[i] is executed (-1: any action), and leads to
-node[i]. Outcome i stands for the aim to go from x to node[i] by choosing action[i].
+Ways back bound the expected times between neighbouring states, for all pairs at once; from them follow bounds from a
+hub to each target, and closer ones through the nodes around the target: hardness/stochastic_diameter.py proves all.
+Outcomes: state x has those numbered first[x] to first[x + 1]: outcome i happens with probability prob[i] when action[i]
+is executed (-1: any action), and leads to node[i]. Outcome i stands for the aim to go from x to node[i] by choosing
+action[i].
 """
 
 import heapq
@@ -22,9 +23,12 @@ UNIT = 2.0**-53
 
 @njit(cache=True, nogil=True)
 def backward_order(first, previous, goal, order, distance):
-    """Nodes by their distance to the goal on the reversed graph: distance (N,), -1 where there is no path; returns how
-    many."""
+    """Order nodes by their distance to the goal, by a search on the reversed graph; returns how many reach it.
+
+    order (N,): these nodes, the goal first; distance (N,): in steps, -1 where there is no path.
+    """
     distance[:] = -1
+    # level 0: the nodes of the goal
     tail = 0
     for n in range(len(goal)):
         if goal[n]:
@@ -45,28 +49,30 @@ def backward_order(first, previous, goal, order, distance):
 
 
 @njit(cache=True, nogil=True)
-def sweep_in_place(rows, common, alike, goal, order, count, j, mode):
-    """j(n) = 1 + min_a sum p j, in place in the order given; j is 0 at the goal. And mode(n) = sum p mode under the
-    actions that are best for j, unless mode is None.
+def sweep_in_place(rows, common, shares_rows, goal, order, count, j, mode):
+    """One sweep of j(n) = 1 + min_a sum p j, in place in the order given; j is 0 at the goal.
 
-    What all actions of a node have in common is in its row of `common`, the rest in `rows` of each action.
+    Where mode is not None, also mode(n) = sum p mode under the action that is best for j. What all actions of a node
+    have in common is in its row of `common`, the rest in `rows` of each action.
     Returns (largest change of j, sum f f, sum f g, sum g g): f, what j has gained, g, what mode has lost in the sweep.
     """
     first, node, weight = rows
     always, always_node, always_weight = common
     num_actions = (len(first) - 1) // len(goal)
-    change, of_alike, mode_of_alike = 0.0, -1.0, 0.0
+    change, shared_value, shared_mode = 0.0, -1.0, 0.0
     ff, fg, gg = 0.0, 0.0, 0.0
     for i in range(count):
         n = order[i]
         if goal[n]:
             continue
-        if alike[n] and of_alike >= 0:
-            change = max(change, abs(of_alike - j[n]))
-            j[n] = of_alike
+        # the same rows as an earlier node: the same values
+        if shares_rows[n] and shared_value >= 0:
+            change = max(change, abs(shared_value - j[n]))
+            j[n] = shared_value
             if mode is not None:
-                mode[n] = mode_of_alike
+                mode[n] = shared_mode
             continue
+        # the best action, by the part of the sum that differs between actions
         best, choice = np.inf, n * num_actions
         for row in range(n * num_actions, (n + 1) * num_actions):
             total = 0.0
@@ -75,93 +81,99 @@ def sweep_in_place(rows, common, alike, goal, order, count, j, mode):
             if total < best:
                 best, choice = total, row
         best += 1.0
-        left = 0.0
+        # mode under this action, and the common part of both sums
+        new_mode = 0.0
         if mode is not None:
             for k in range(first[choice], first[choice + 1]):
-                left += weight[k] * mode[node[k]]
+                new_mode += weight[k] * mode[node[k]]
         for k in range(always[n], always[n + 1]):
             best += always_weight[k] * j[always_node[k]]
             if mode is not None:
-                left += always_weight[k] * mode[always_node[k]]
+                new_mode += always_weight[k] * mode[always_node[k]]
+        # store both, and add up how far they moved
         f = best - j[n]
         change = max(change, abs(f))
         j[n] = best
-        if alike[n]:
-            of_alike = best
+        if shares_rows[n]:
+            shared_value = best
         if mode is not None:
-            g = mode[n] - left
+            g = mode[n] - new_mode
             ff += f * f
             fg += f * g
             gg += g * g
-            mode[n] = left
-            if alike[n]:
-                mode_of_alike = left
+            mode[n] = new_mode
+            if shares_rows[n]:
+                shared_mode = new_mode
     return change, ff, fg, gg
 
 
 @njit(cache=True, nogil=True)
-def residuals(rows, common, alike, goal, order, count, high, low, policy, residual, error):
-    """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; policy[n] = the action that
-    attains T j. j = high; or j = high + low, two floats a node, so that j may be 1e16 times its differences.
+def residuals(rows, common, shares_rows, goal, order, count, high, low, policy, residual, error):
+    """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; T is one Bellman step.
+
+    j = high; or j = high + low, two floats a node, so that j may be 1e16 times its differences. policy[n] = the action
+    that attains T j. residual, error (N,): T j - j, and by how much it may be off; None where low is.
 
     T j(n) - j(n) = 1 + min_a sum_m p(m | n, a) (j(m) - j(n)): written with differences, no rounding error grows with j
     itself. Both bounds count all rounding: `operations` says how many units in the last place one sum may be off. The
     error of a difference of two pairs is a unit of the difference and eight units of a unit of the numbers.
-    residual, error (N,): T j - j, and by how much it may be off; None where low is.
     """
     first, node, weight = rows
     always, always_node, always_weight = common
     num_actions = (len(first) - 1) // len(goal)
-    above, below, largest, first_alike = 0.0, 0.0, 0.0, -1
+    above, below, largest, twin = 0.0, 0.0, 0.0, -1
     for i in range(count):
         n = order[i]
         if goal[n]:
             continue
-        if alike[n]:
-            if first_alike >= 0 and high[n] == high[first_alike] and (low is None or low[n] == low[first_alike]):
-                policy[n] = policy[first_alike]
+        # the same rows and value as an earlier node: the same result
+        if shares_rows[n]:
+            if twin >= 0 and high[n] == high[twin] and (low is None or low[n] == low[twin]):
+                policy[n] = policy[twin]
                 if low is not None:
-                    residual[n], error[n] = residual[first_alike], error[first_alike]
+                    residual[n], error[n] = residual[twin], error[twin]
                 continue
-            first_alike = n
-        here, under = high[n], 0.0 if low is None else low[n]
+            twin = n
+        value, correction = high[n], 0.0 if low is None else low[n]
+        # the part of the sum that all actions have in common; size and scale bound its rounding
         shared, size, scale = 0.0, 1.0, 0.0
         for k in range(always[n], always[n + 1]):
-            step = always_weight[k] * _difference(high, low, always_node[k], here, under)
+            step = always_weight[k] * _difference(high, low, always_node[k], value, correction)
             shared += step
             size += abs(step)
             if low is not None:
-                scale += always_weight[k] * (abs(high[always_node[k]]) + abs(here))
+                scale += always_weight[k] * (abs(high[always_node[k]]) + abs(value))
         shared += 1.0
+        # each action's sum, and the interval that rounding leaves for the minimum
         best, least, most, choice = np.inf, np.inf, np.inf, 0
         for a in range(num_actions):
             row = n * num_actions + a
-            total, own, reach = 0.0, size, scale
+            total, magnitude, extent = 0.0, size, scale
             for k in range(first[row], first[row + 1]):
-                step = weight[k] * _difference(high, low, node[k], here, under)
+                step = weight[k] * _difference(high, low, node[k], value, correction)
                 total += step
-                own += abs(step)
+                magnitude += abs(step)
                 if low is not None:
-                    reach += weight[k] * (abs(high[node[k]]) + abs(here))
-            off = operations(num_actions, first[row + 1] - first[row] + always[n + 1] - always[n]) * UNIT * own
+                    extent += weight[k] * (abs(high[node[k]]) + abs(value))
+            slack = operations(num_actions, first[row + 1] - first[row] + always[n + 1] - always[n]) * UNIT * magnitude
             if low is not None:
-                off += 8 * UNIT * UNIT * reach
+                slack += 8 * UNIT * UNIT * extent
             total += shared
-            least, most = min(least, total - off), min(most, total + off)
+            least, most = min(least, total - slack), min(most, total + slack)
             if total < best:
                 best, choice = total, a
                 if low is not None:
-                    residual[n], error[n] = best, off
+                    residual[n], error[n] = best, slack
         policy[n] = choice
         above = max(above, most)
         below = max(below, -least)
-        largest = max(largest, here)
+        largest = max(largest, value)
     return above, below, largest
 
 
 @njit(cache=True, nogil=True)
 def operations(num_actions, terms):
-    """Units in the last place by which a sum of so many products may be off, relative to the sum of their sizes.
+    """Units in the last place by which a sum of `terms` products may be off, relative to the sum of their sizes.
 
     One for each product, difference and addition; num_actions + 8 for a probability, itself a sum over the actions that
     chance may execute; 9 for what `common` left out.
@@ -170,23 +182,29 @@ def operations(num_actions, terms):
 
 
 @njit(cache=True, nogil=True)
-def _difference(high, low, m, here, under):
-    """(high[m] + low[m]) - (here + under), to a unit of the difference; without low and under where low is None."""
-    total = high[m] - here
+def _difference(high, low, m, value, correction):
+    """(high[m] + low[m]) - (value + correction), to a unit of the difference; high[m] - value where low is None.
+
+    The rounding error of high[m] - value is computed exactly, and added to the difference of the small parts.
+    """
+    total = high[m] - value
     if low is None:
         return total
     part = total - high[m]
-    rest = (high[m] - (total - part)) - (here + part)
-    return total + (rest + (low[m] - under))
+    rounding = (high[m] - (total - part)) - (value + part)
+    return total + (rounding + (low[m] - correction))
 
 
 @njit(cache=True, nogil=True)
 def almost_surely(first, node, num_actions, goal, sure, attractor):
-    """sure[n]: some policy leads from n to the goal with probability 1. A greatest fixed point over least ones (de
-    Alfaro 1999)."""
+    """sure[n] = whether some policy leads from n to the goal with probability 1.
+
+    A greatest fixed point over least ones. attractor (N,) bool is scratch. Source: de Alfaro (1999).
+    """
     size = len(goal)
     sure[:] = True
     while True:
+        # least fixed point: nodes with an action that may enter the attractor and never leaves `sure`
         attractor[:] = goal
         grew = True
         while grew:
@@ -205,6 +223,7 @@ def almost_surely(first, node, num_actions, goal, sure, attractor):
                         attractor[n] = True
                         grew = True
                         break
+        # nodes outside the attractor are not sure; those that need them may now fail, too
         same = True
         for n in range(size):
             if sure[n] != attractor[n]:
@@ -216,15 +235,15 @@ def almost_surely(first, node, num_actions, goal, sure, attractor):
 
 @njit(cache=True, nogil=True)
 def proper_policy(first, node, weight, num_actions, goal, order, count, sure, policy):
-    """policy[n] of order[:count]: an action that may lead nearer to the goal and never out of these nodes; so it surely
-    arrives.
+    """policy[n] for n in order[:count]: an action that may lead nearer to the goal and never out of these nodes.
 
-    order: nodes by distance to the goal; all of them surely reach it. The most probable way nearer is taken. sure (N,)
-        is scratch.
+    So the goal is reached surely. order: nodes by distance to the goal; all of them surely reach it. The action most
+    likely to lead nearer is taken. sure (N,) is scratch.
     """
     sure[:] = False
     for i in range(count):
         sure[order[i]] = True
+    # grow the set of nodes that have an action, from the goal on
     nearer = goal.copy()
     grew = True
     while grew:
@@ -233,6 +252,7 @@ def proper_policy(first, node, weight, num_actions, goal, order, count, sure, po
             n = order[i]
             if nearer[n]:
                 continue
+            # among the actions that stay in these nodes, the one most likely to enter the set
             best = 0.0
             for a in range(num_actions):
                 row = n * num_actions + a
@@ -249,11 +269,10 @@ def proper_policy(first, node, weight, num_actions, goal, order, count, sure, po
                 grew = True
 
 
-# There is no way back nearby.
-# Travel ---------------------------------------------------------------------------------------------------------------
+# Ways back ------------------------------------------------------------------------------------------------------------
 
 
-NONE = 255
+NONE = 255  # steps of a way back where there is none nearby
 # More than the rounding error of a sum of probabilities.
 ROUNDING = 1e-12
 # The distance from 1 to the next float.
@@ -261,19 +280,22 @@ EPSILON = 2.0**-52
 
 
 @njit(cache=True, nogil=True)
-def _execution(executed, chosen, previous, weights):
-    """Probability that `executed` is executed; previous = -1: on the first step, or where it does not matter."""
+def _execution(executed, choice, previous, weights):
+    """Probability that the action `executed` is executed where `choice` is chosen.
+
+    executed = -1: whatever is executed. previous = -1: on the first step, or where it does not matter.
+    """
     if executed < 0:
         return 1.0
     now, before, uniform, first_now, first_uniform = weights
     if previous < 0:
-        return first_uniform + (first_now if executed == chosen else 0.0)
-    return uniform + (now if executed == chosen else 0.0) + (before if executed == previous else 0.0)
+        return first_uniform + (first_now if executed == choice else 0.0)
+    return uniform + (now if executed == choice else 0.0) + (before if executed == previous else 0.0)
 
 
 @njit(cache=True, nogil=True)
 def outcomes_into(node, num_nodes):
-    """(first, outcome): which outcomes lead to each node, by a counting sort."""
+    """(first, outcome): outcomes that lead to node n are outcome[first[n]:first[n + 1]]; a counting sort."""
     first = np.zeros(num_nodes + 2, np.int64)
     for i in range(len(node)):
         first[node[i] + 2] += 1
@@ -288,8 +310,11 @@ def outcomes_into(node, num_nodes):
 
 @njit(cache=True, nogil=True)
 def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
-    """Nodes by their distance to y: queue[:result]; levels[n] = distance + 1, via[n] = the outcome aimed at first, the
-    most probable one of those that lead to the same node. Ends with `ball` nodes."""
+    """Search backward from y, along outcomes: the nodes by their distance to y, at most `ball`, are queue[:result].
+
+    levels[n] = distance + 1; via[n] = the outcome aimed at first on the way from n: the most probable one of those that
+    lead to the same node.
+    """
     _, _, node, prob = outcomes
     into_first, into_outcome = into
     levels[y] = 1
@@ -312,16 +337,17 @@ def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
 
 @njit(cache=True, nogil=True)
 def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball, levels, queue, via):
-    """For outcomes i that lead to nodes low..high: steps[square[i] + j] of a shortest way from outcome j of its state
-    to node[i], where way is None; else the outcomes along those ways that steps has, one after another: way[start[i]]
-    on.
+    """Shortest ways back to node[i], for outcomes i into nodes low..high, from the other outcomes of its state.
 
-    NONE where the `ball` nodes nearest to node[i] do not include it. levels (N,) uint8 is zero before and after.
+    Where `way` is None: steps[square[i] + j] = length of the way from outcome j of the state to node[i]; NONE where the
+    `ball` nodes nearest to node[i] do not include it. Else way[start[i]] on = the outcomes along the ways whose length
+    is not NONE, one way after another. levels (N,) uint8 is zero before and after.
     """
     first, _, node, _ = outcomes
     into_first, into_outcome = into
     for y in range(low, high):
         size = _search_back(y, outcomes, owner, into, ball, levels, queue, via)
+        # each outcome i into y, and each other outcome j of the same state
         for k in range(into_first[y], into_first[y + 1]):
             i = into_outcome[k]
             x = owner[i]
@@ -337,16 +363,17 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
                         way[at] = via[n]
                         at += 1
                         n = node[via[n]]
+        # reset the nodes that the search visited
         for k in range(size):
             levels[queue[k]] = 0
 
 
 @njit(cache=True, nogil=True)
 def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, length):
-    """Forget the longest ways back, until the expected steps on the way back are at most `limit`; length[i]: of the
-    ways that are kept.
+    """Drop the longest ways back until the expected steps on the way back are at most `limit`, for every outcome.
 
-    Returns the largest expected steps.
+    steps: NONE where dropped; length[i] becomes the sum of the lengths of the ways that are left. Returns the largest
+    expected number of steps.
     """
     first, action, node, prob = outcomes
     largest = 0.0
@@ -354,6 +381,7 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
         low, high = first[owner[i]], first[owner[i] + 1]
         length[i] = 0
         while square[i] >= 0:
+            # expected steps on ways back, the largest over the previously executed action
             worst = 0.0
             for previous in range(-1, num_previous):
                 total = 0.0
@@ -365,6 +393,7 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
             if worst <= limit:
                 largest = max(largest, worst)
                 break
+            # too many: drop all ways of the greatest length, and try again
             farthest = 0
             for j in range(low, high):
                 if steps[square[i] + j - low] != NONE:
@@ -381,12 +410,14 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
 
 @njit(cache=True, nogil=True)
 def attempt(
-    begin, end, outcomes, owner, weights, num_previous, square, steps, start, way, own, times, value, new, once
+    begin, end, outcomes, owner, weights, num_previous, square, steps, start, way, constant, times, value, new, once
 ):
-    """new[i] = own + sum over what happens instead: along the way back, the sum of values; else times[there].
+    """new[i] = constant + the expected cost of the outcomes that happen where outcome i is aimed at.
 
-    The largest over the previously executed action. Returns the largest increase. `once`: also for outcomes without any
-    way back, which depend on no values: they are worked out in one pass and stay as they are.
+    Another outcome costs the sum of `value` along its way back to node[i], where there is one, else `times` of the node
+    that it leads to. The largest expectation over the previously executed action counts. Returns the largest increase.
+    `once`: also for outcomes without any way back, which depend on no values: they are worked out in one pass and stay
+    as they are.
     """
     first, action, node, prob = outcomes
     increase, mean = 0.0, 0.0
@@ -399,14 +430,15 @@ def attempt(
                 mean = 0.0
                 for j in range(low, high):
                     mean += prob[j] * times[node[j]]
-            new[i] = own + max(mean - prob[i] * times[node[i]], 0.0) + (high - low + 2) * EPSILON * mean
+            new[i] = constant + max(mean - prob[i] * times[node[i]], 0.0) + (high - low + 2) * EPSILON * mean
             increase = max(increase, new[i] - value[i])
             continue
         if node[i] == owner[i]:  # an outcome that stays is on no shortest way, so that no sum takes its entry
             continue
+        # expected cost, by the outcomes j that may happen: a way back, or giving up
         worst = 0.0
         for previous in range(-1, num_previous):
-            total = own
+            total = constant
             at = start[i]
             for j in range(low, high):
                 chance = prob[j] * _execution(action[j], action[i], previous, weights)
@@ -426,18 +458,17 @@ def attempt(
 
 @njit(cache=True, nogil=True)
 def times_from(hub, first, node, cost, leak):
-    """(N,) least t with t(hub) = 0, t(y) = (t(x) + cost[i]) / (1 - leak[i]) over outcomes i from x to y, by Dijkstra's
-    algorithm.
+    """(N,) least t with t(hub) = 0, t(y) = (t(x) + cost[i]) / (1 - leak[i]) over outcomes i from x to y (Dijkstra).
 
-    Where almost all attempts are given up, 1 - leak is no more than the rounding of a sum of probabilities, which is
-    taken off.
+    leak[i]: probability that the attempt at outcome i is given up. Where that is almost 1, 1 - leak is no more than the
+    rounding of a sum of probabilities, which is taken off.
     """
     bound = np.full(len(first) - 1, np.inf)
     done = np.zeros(len(bound), np.bool_)
     bound[hub] = 0.0
     heap = [(0.0, hub)]
     while len(heap) > 0:
-        so_far, x = heapq.heappop(heap)
+        time, x = heapq.heappop(heap)
         if done[x]:
             continue
         done[x] = True
@@ -445,17 +476,17 @@ def times_from(hub, first, node, cost, leak):
             y = node[i]
             remainder = 1 - leak[i] - ROUNDING
             if not done[y] and remainder > 0:
-                there = (so_far + cost[i]) / remainder
-                if there < bound[y]:
-                    bound[y] = there
-                    heapq.heappush(heap, (there, y))
+                candidate = (time + cost[i]) / remainder
+                if candidate < bound[y]:
+                    bound[y] = candidate
+                    heapq.heappush(heap, (candidate, y))
     return bound
 
 
-# Predecessors beyond which a node is not gone back from: those of a start state are all states in which episodes end.
 # Vicinities -----------------------------------------------------------------------------------------------------------
 
 
+# Predecessors beyond which a node is not gone back from: those of a start state are all states in which episodes end.
 CROWD = 64
 # Turns that a lost step costs among the nodes on the way to a target, and turns that are kept: ways that lose more
 # steps at once are not gone.
@@ -469,24 +500,28 @@ UPDATES = 1 + 1e-9
 
 
 @njit(cache=True, nogil=True)
-def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, room):
+def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scratch):
     """new[z] for z in targets[begin:end]: the least of bound[z] and (bound[x] + c(x)) / (1 - l(x)) over x around z.
+
+    c(x): expected steps from x until z is reached or the nodes around z are left, and then to the hub; l(x):
+    probability that they are left. hardness/stochastic_diameter.py proves the bound.
 
     graph: (outcomes, owner, into, steps from the hub to each node (N,)); chance: (weights, previous actions, actions).
     times (N,): expected steps from each node to the hub, at most; bound (N,): from the hub to each node, at most.
-    room: (place (N,) int32, zero before and after; queue, an entry for each node around z; pushed and turns, those of
-    `_around`; cost and leak, one for each previously executed action as well, the last for none). x is reached with any
-    of those, so c(x) is the largest.
+    scratch: (place (N,) int32, zero before and after; queue, an entry for each node around z; pushed and turns, those
+    of `_around`; cost and leak, one for each previously executed action as well, the last for none). x is reached with
+    any of those, so c(x) is the largest.
     """
     outcomes, owner, into, steps = graph
     weights, num_previous, num_actions = chance
-    place, queue, pushed, turns, cost, leak = room
+    place, queue, pushed, turns, cost, leak = scratch
     first, action, node, prob = outcomes
     none = cost.shape[1] - 1
     now, before, uniform, first_now, first_uniform = weights
     by_cost, by_leak = np.zeros(num_actions), np.zeros(num_actions)
     for k in range(begin, end):
         z = targets[k]
+        # the nodes around z; at first each of them gives up at once: c = times, l = 1, and 0 at z
         size, count = _around(z, owner, into, steps, place, (queue, pushed, turns))
         guess = min(bound[z], 1e300)
         for i in range(size):
@@ -497,6 +532,7 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, room)
             for i in range(1, size):
                 x = queue[i]
                 by_cost[:], by_leak[:] = 0.0, 0.0
+                # expected c and l of the next node: of outcomes of any action, by action, and of all actions
                 always_cost, always_leak, all_cost, all_leak = 1.0, 0.0, 0.0, 0.0
                 for j in range(first[x], first[x + 1]):
                     p, a = place[node[j]], action[j]
@@ -511,10 +547,12 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, room)
                         by_leak[a] += left
                         all_cost += c
                         all_leak += left
+                # the action with the least total time, if giving up costs the present bound of z
                 best = 0
                 for a in range(1, num_actions):
                     if by_cost[a] + by_leak[a] * guess < by_cost[best] + by_leak[best] * guess:
                         best = a
+                # new c and l after each previous action b; none (-1) stands last; kept where the total falls
                 for b in range(-1, num_previous):
                     weight, others = (first_now, first_uniform) if b < 0 else (now, uniform)
                     c = always_cost + others * all_cost + weight * by_cost[best]
@@ -529,6 +567,7 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, room)
                         gained = max(gained, gain)
             if gained <= GAIN * guess:
                 break
+        # the best node x to come from, with the rounding of all sums on top
         least = bound[z]
         for i in range(1, size):
             remainder = 1 - leak[i].max() * UPDATES - ROUNDING
@@ -540,20 +579,22 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, room)
 
 
 @njit(cache=True, nogil=True)
-def _around(z, owner, into, steps, place, room):
-    """Nodes on the way to z, those on short ways from the hub first: queue[:result], as many as it has room for;
-    place[n]: where n stands, and one more.
+def _around(z, owner, into, steps, place, scratch):
+    """Collect nodes on the way to z, those on short ways from the hub first; returns (size, count of `pushed`).
 
-    A node of which z is k steps away, and that lies on a way from the hub to z that is s steps longer than the shortest
-    one, comes k + DETOUR s-th: its steps to z count, and those lost. `pushed` are (node, the next of its turn).
+    queue[:size]: the nodes, as many as the queue holds; place[n]: where n stands, and one more; -1 while it waits. A
+    node of which z is k steps away, and that lies on a way from the hub to z that is s steps longer than the shortest
+    one, comes k + DETOUR s-th: its steps to z count, and those lost. A queue of buckets: `turns` has the first node of
+    each of the next TURNS turns, `pushed` are (node, the next of its turn).
     """
-    queue, pushed, turns = room
+    queue, pushed, turns = scratch
     into_first, into_outcome = into
     turns[:] = -1
     pushed[0, 0], pushed[0, 1], turns[0] = z, -1, 0
     place[z] = -1
     size, count, turn, idle = 0, 1, 0, 0
     while idle <= TURNS and size < len(queue):
+        # the next node of this turn; the search ends after TURNS turns without any
         at = turns[turn % TURNS]
         if at < 0:
             turn += 1
@@ -565,6 +606,7 @@ def _around(z, owner, into, steps, place, room):
         queue[size] = n
         size += 1
         place[n] = size
+        # push its predecessors, later by DETOUR turns for each step that they lose
         if into_first[n + 1] - into_first[n] > CROWD:
             continue
         for k in range(into_first[n], into_first[n + 1]):

@@ -1,4 +1,4 @@
-"""Passes over all states at one step, for the effective horizons of deterministic MDPs, and tails of means, for GORP.
+"""Backward passes for the effective horizons of deterministic MDPs, and tail bounds of means, for GORP.
 
 next_states (S, A), -1 where the episode ends; rewards (S, A) float64. An episode that has ended is worth 0.
 
@@ -15,13 +15,14 @@ from numba import njit, prange
 
 @njit(cache=True, nogil=True, parallel=True)
 def values(next_states, rewards, tie, best, worst, explored, best_now, worst_now, explored_now, optimal, variance):
-    """One step backwards: the values of optimal, worst and uniform play, and what the simple bound needs of them.
+    """One step backwards: the values of optimal, worst and uniform play, and two inputs of the simple bound.
 
     best, worst, explored (S,): of the step after; *_now (S,): of this step. optimal (S,) unsigned: bit a where Q*(s, a)
     is within `tie` of the best. variance (S,): max over a of (Q^e - Q^w) (Q* - Q^w).
     """
     num_actions = next_states.shape[1]
     for s in prange(len(next_states)):
+        # backups of all three, and the variance
         high, low, total = -math.inf, math.inf, 0.0
         spread = 0.0
         for a in range(num_actions):
@@ -34,6 +35,7 @@ def values(next_states, rewards, tie, best, worst, explored, best_now, worst_now
             product = (e - w) * (b - w)
             if a == 0 or product > spread:
                 spread = product
+        # actions that are optimal up to ties
         mask = np.uint64(0)
         for a in range(num_actions):
             t = next_states[s, a]
@@ -69,34 +71,34 @@ def largest(next_states, after, now):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def greedy_return(next_states, rewards, after, followed, now):
-    """now (S,) = min over the actions greedy in r + after(next state) of r + followed(next state)."""
+def greedy_return(next_states, rewards, after, policy_value, now):
+    """now (S,) = min over the actions greedy in r + after(next state) of r + policy_value(next state)."""
     for s in prange(len(next_states)):
         high, low = -math.inf, math.inf
         for a in range(next_states.shape[1]):
             t, r = next_states[s, a], rewards[s, a]
             q = r + (after[t] if t >= 0 else 0.0)
             if q >= high:
-                value = r + (followed[t] if t >= 0 else 0.0)
+                value = r + (policy_value[t] if t >= 0 else 0.0)
                 low = min(low, value) if q == high else value
                 high = q
         now[s] = low
 
 
 @njit(cache=True, nogil=True)
-def walk(next_states, rewards, after, optimal, variance, log, near, nodes, n, following, is_visited, most):
-    """Go one step on from nodes[:n] along greedy actions (`near` False), or along those better than all that are not
-    optimal.
+def step_along(next_states, rewards, after, optimal, variance, log, near, nodes, n, next_nodes, is_visited, hardest):
+    """Go one step on from nodes[:n] along greedy actions (`near` False), or all that are better than any not optimal.
 
-    after (S,): Q(s, a) = r(s, a) + after(next state). is_visited (S,) bool, all False before and after. most (3,): 16
-    variance log / gap^2 of the node that has the largest, the first among equals, and its gap and variance.
-    Returns how many states `following` holds; -1 where an action that is not optimal may be taken.
+    after (S,): Q(s, a) = r(s, a) + after(next state). is_visited (S,) bool, all False before and after. hardest
+    (3,): 16 variance log / gap^2 of the node that has the largest, the first among equals, and its gap and variance.
+    Returns how many states `next_nodes` holds; -1 where an action that is not optimal may be taken.
     """
     num_actions = next_states.shape[1]
     count, at, fails = 0, -1, False
-    most[:] = 0.0
+    hardest[:] = 0.0
     for i in range(n):
         s = nodes[i]
+        # the best action, and the best of those that are not optimal
         top, second = -math.inf, -math.inf
         for a in range(num_actions):
             t = next_states[s, a]
@@ -107,11 +109,13 @@ def walk(next_states, rewards, after, optimal, variance, log, near, nodes, n, fo
         if second == top:
             fails = True
             break
+        # the samples that this gap needs; keep the node that needs most
         gap = top - second
         needed = 0.0 if second == -math.inf else 16 * variance[s] / gap**2 * log
-        if at < 0 or needed > most[0] or (needed == most[0] and s < at):
-            most[0], most[1], most[2] = needed, gap, variance[s]
+        if at < 0 or needed > hardest[0] or (needed == hardest[0] and s < at):
+            hardest[0], hardest[1], hardest[2] = needed, gap, variance[s]
             at = s
+        # next states by the actions that are taken
         for a in range(num_actions):
             t = next_states[s, a]
             if t < 0 or is_visited[t]:
@@ -119,10 +123,11 @@ def walk(next_states, rewards, after, optimal, variance, log, near, nodes, n, fo
             q = rewards[s, a] + after[t]
             if q > second if near else q == top:
                 is_visited[t] = True
-                following[count] = t
+                next_nodes[count] = t
                 count += 1
+    # reset the marks
     for j in range(count):
-        is_visited[following[j]] = False
+        is_visited[next_nodes[j]] = False
     return -1 if fails else count
 
 
@@ -134,7 +139,7 @@ PARTS = 100
 
 @njit(cache=True, nogil=True)
 def _below(distance, m, width, variance):
-    """Bernstein: P(mean <= expectation - distance) is at most this."""
+    """Upper bound on P(mean <= expectation - distance) (Bernstein's inequality)."""
     if distance <= 0:
         return 1.0
     if distance == math.inf or variance + width * distance == 0:
@@ -144,7 +149,7 @@ def _below(distance, m, width, variance):
 
 @njit(cache=True, nogil=True)
 def _quantile(probability, m, width, variance):
-    """The distance beyond which Bernstein leaves no more than this probability."""
+    """The distance beyond which Bernstein's inequality leaves no more than this probability."""
     if width == 0 or variance == 0:
         return 0.0
     if probability <= 0:
@@ -155,8 +160,10 @@ def _quantile(probability, m, width, variance):
 
 @njit(cache=True, nogil=True)
 def bernstein(means, widths, m, lower, upper):
-    """Samples in intervals of length `widths` (N, n), whose variance is at most (best - mean) (mean - worst) = `upper`
-    on entry."""
+    """Tail bounds for means of samples in intervals of length `widths` (N, n); writes lower and upper (N, n).
+
+    The variance of a sample is at most (best - mean) (mean - worst), which is in `upper` before.
+    """
     n = means.shape[1]
     variances = np.empty(n)
     for row in range(len(means)):
@@ -165,6 +172,7 @@ def bernstein(means, widths, m, lower, upper):
         upper[row] = 0.0
         for a in range(n):
             for part in range(PARTS):
+                # the part of mean a, and the chance of each other mean to be below it
                 high = means[row, a] + _quantile(1 - (part + 1) / PARTS, m, widths[row, a], variances[a])
                 low = means[row, a] - _quantile(part / PARTS, m, widths[row, a], variances[a])
                 least = most = 1 / PARTS

@@ -1,8 +1,8 @@
-"""Kernels in Python for little work, which is done long before a kernel is compiled, with the same results.
+"""Kernels run by Python for little work, which is done long before a kernel is compiled, with the same results.
 
 `interpreted_first` makes a kernel count the entries that its calls read. As long as they are few, and the kernel is not
-compiled, Python runs its text, and that of what it calls: the same operations on the same numbers, so the same bits.
-(NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64; few entries do not come that far.)
+compiled, Python runs its text, and that of the functions it calls: the same operations on the same numbers, so the same
+bits. (NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64; few entries do not come that far.)
 """
 
 import os
@@ -19,7 +19,7 @@ from numba.core.registry import CPUDispatcher
 from pharos.system import compiling
 
 LOADING = 4
-"""By how much fewer entries are worth loading a kernel that is compiled on disk (benchmarks/startup.py)."""
+"""Fewer entries, by this factor, are worth loading a kernel that is compiled on disk (benchmarks/startup.py)."""
 
 Intrinsic = TypeVar("Intrinsic", bound=Callable)
 
@@ -28,7 +28,7 @@ _intrinsics: dict[Callable, Callable] = {}  # an intrinsic -> the same in Python
 
 
 def overload(function: Callable, **options: object) -> Callable:
-    """`numba.extending.overload`, also for Python."""
+    """Decorator of the body of an overload: `numba.extending.overload`, also for interpreted kernels."""
 
     def decorate(choose: Callable) -> Callable:
         _overloads[function] = choose
@@ -38,7 +38,7 @@ def overload(function: Callable, **options: object) -> Callable:
 
 
 def in_python(meaning: Callable) -> Callable:
-    """Decorator of an intrinsic: the same in Python."""
+    """Decorator of an intrinsic: `meaning` is the same function in Python."""
 
     def decorate(intrinsic: Intrinsic) -> Intrinsic:
         _intrinsics[intrinsic] = meaning
@@ -48,8 +48,10 @@ def in_python(meaning: Callable) -> Callable:
 
 
 def interpreted_first(*counted: str) -> Callable:
-    """Decorator of a kernel: interpreted until its calls have counted `compiling.SMALL` entries, or so many fewer as
-    loading takes less than compiling.
+    """Decorator of a kernel: its calls are interpreted as long as they are small together, then compiled.
+
+    They are small until they have counted `compiling.SMALL` entries, or 1 / LOADING of that where the compiled kernel
+    is on disk, as loading takes so much less than compiling.
 
     Args:
         counted: arguments whose entries count, a whole number as so many; none: all arrays. The work of a call must not
@@ -86,13 +88,14 @@ def _is_kept(kernel: CPUDispatcher) -> bool:
 
 
 def _as_python(result: object) -> object:
-    """A compiled kernel returns numbers of Python."""
+    """The result with numbers of Python, as a compiled kernel returns them."""
     if isinstance(result, tuple):
         return tuple(map(_as_python, result))
     return result.item() if isinstance(result, np.generic) else result
 
 
 def _entries(argument: object) -> int:
+    """Number of entries of an argument: of an array, of the arrays of a tuple; a whole number counts as itself."""
     if isinstance(argument, tuple):
         return sum(getattr(each, "size", 0) for each in argument)
     return int(argument) if isinstance(argument, int | np.integer) else getattr(argument, "size", 0)
@@ -100,14 +103,14 @@ def _entries(argument: object) -> int:
 
 @cache
 def interpreted(called: Callable) -> Callable:
-    """A kernel, or what kernels call, in Python."""
+    """The Python function of a kernel, an overload or an intrinsic."""
     if called in _intrinsics:
         return _intrinsics[called]
-    return _chosen(_overloads[called]) if called in _overloads else _in_python(called.py_func)
+    return _dispatched(_overloads[called]) if called in _overloads else _in_python(called.py_func)
 
 
 def _in_python(function: FunctionType) -> Callable:
-    """The function, and what it calls, in Python."""
+    """The function with all kernels, overloads and intrinsics that it calls replaced by Python functions."""
     names = {name: function.__globals__.get(name) for name in function.__code__.co_names}
     called = {
         name: interpreted(value)
@@ -118,20 +121,21 @@ def _in_python(function: FunctionType) -> Callable:
     return FunctionType(*text, function.__closure__)
 
 
-def _chosen(choose: Callable) -> Callable:
-    """The body that an overload has for the arguments of each call."""
+def _dispatched(body_for: Callable) -> Callable:
+    """A function that runs the body which an overload has for the types of its arguments."""
     bodies: dict[tuple, Callable] = {}
 
     def call(*arguments: object) -> object:
         types = _types(arguments)
         if types not in bodies:
-            bodies[types] = _in_python(choose(*map(numba.typeof, arguments)))
+            bodies[types] = _in_python(body_for(*map(numba.typeof, arguments)))
         return bodies[types](*arguments)
 
     return call
 
 
 def _types(argument: object) -> tuple:
+    """The type, data type and number of dimensions of an argument, or of each entry of a tuple."""
     if isinstance(argument, tuple):
         return tuple(map(_types, argument))
     return type(argument), getattr(argument, "dtype", None), getattr(argument, "ndim", 0)

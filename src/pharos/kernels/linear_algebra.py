@@ -1,7 +1,7 @@
 """Loops of linear algebra: steps of Krylov methods, the fill of an elimination, products with kernels.
 
-Krylov methods go over vectors (n,) float64, each with the sums that the next step needs. What elimination of a sparse
-matrix will cost, before it is done. Source: Liu (1990), elimination trees.
+Krylov methods: fused operations on vectors (n,) float64, each with the sums that the next step needs. Elimination: the
+number of entries that the factor of a sparse matrix will have. Source: Liu (1990), elimination trees.
 
 Products with a kernel F F' + diagonal go in passes over the rows of F (C, M): each row is read once a product. Those
 with a symmetric matrix read its lower half alone: they are as fast as memory is.
@@ -13,12 +13,12 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def products(a, b):
-    """(a . b, b . b)."""
-    across, own = 0.0, 0.0
+    """(a . b, b . b), in one pass."""
+    ab, bb = 0.0, 0.0
     for i in range(len(b)):
-        across += a[i] * b[i]
-        own += b[i] * b[i]
-    return across, own
+        ab += a[i] * b[i]
+        bb += b[i] * b[i]
+    return ab, bb
 
 
 @njit(cache=True, nogil=True)
@@ -29,7 +29,7 @@ def shift(y, constant, out):
 
 
 @njit(cache=True, nogil=True)
-def take_from(y, out):
+def subtract_from(y, out):
     """out = y - out."""
     for i in range(len(y)):
         out[i] = y[i] - out[i]
@@ -37,7 +37,7 @@ def take_from(y, out):
 
 @njit(cache=True, nogil=True)
 def advance(x, factor, y):
-    """x += factor y; the sum of x."""
+    """x += factor y, in place; returns the sum of x."""
     total = 0.0
     for i in range(len(x)):
         x[i] += factor * y[i]
@@ -47,7 +47,7 @@ def advance(x, factor, y):
 
 @njit(cache=True, nogil=True)
 def turn(direction, beta, omega, moved, residual):
-    """direction = residual + beta (direction - omega moved); its sum."""
+    """direction = residual + beta (direction - omega moved), in place; returns its sum."""
     total = 0.0
     for i in range(len(direction)):
         direction[i] = residual[i] + beta * (direction[i] - omega * moved[i])
@@ -100,6 +100,7 @@ def project(features, z, out):
     """out (A, M) float64 = (F' z)', z (C, A) float32."""
     part = np.zeros(out.shape, np.float32)
     out[:] = 0.0
+    # float32 sums of ROWS rows, added up as float64
     for first in range(0, len(features), ROWS):
         part[:] = 0.0
         for s in range(first, min(first + ROWS, len(features))):
@@ -123,11 +124,13 @@ def step(features, diagonal, weights, rate, projected, now, past, out):
         part[:] = 0.0
         for s in range(first, min(first + ROWS, len(features))):
             for a in range(now.shape[1]):
+                # entry (s, a) of K (weights now), and the new term
                 total = np.float32(0.0)
                 for m in range(features.shape[1]):
                     total += features[s, m] * projected[a, m]
                 total += diagonal[s, 0] * weights[s, a] * now[s, a]
                 past[s, a] = np.float32(2.0) * now[s, a] - np.float32(4.0) * rate * total - past[s, a]
+                # its share of the next projection
                 value = weights[s, a] * past[s, a]
                 for m in range(features.shape[1]):
                     part[a, m] += features[s, m] * value
@@ -142,6 +145,7 @@ def product(matrix, z, out):
     """out (A, C) = z matrix, of a symmetric matrix (C, C) float32 and z (A, C), with float64 sums; the upper half of
     the matrix is not read. z, out: float64. Two rows of the matrix go over z at once."""
     out[:] = 0.0
+    # rows s and s + 1, left of the diagonal: each entry counts for its row and, mirrored, for its column
     for s in range(0, len(matrix) - 1, 2):
         for a in range(len(z)):
             first, second = z[a, s], z[a, s + 1]
@@ -151,9 +155,10 @@ def product(matrix, z, out):
                 upper += x * z[a, m]
                 lower += y * z[a, m]
                 out[a, m] += x * first + y * second
-            beside = matrix[s + 1, s]
-            out[a, s] += upper + matrix[s, s] * first + beside * second
-            out[a, s + 1] += lower + beside * first + matrix[s + 1, s + 1] * second
+            coupling = matrix[s + 1, s]
+            out[a, s] += upper + matrix[s, s] * first + coupling * second
+            out[a, s + 1] += lower + coupling * first + matrix[s + 1, s + 1] * second
+    # the last row of an odd number
     if len(matrix) % 2:
         s = len(matrix) - 1
         for a in range(len(z)):

@@ -12,7 +12,9 @@ from pharos.kernels.graph import is_new_edge
 
 @njit(cache=True, nogil=True)
 def search_from_many(table, reverse, start, sources, origins, front, coming, queue, other, largest):
-    """Searches from up to 64 W sources, along the edges or against them; table, reverse: as `graph.search` has them.
+    """Search from up to 64 W sources at once, along the edges or against them.
+
+    table, reverse: as `graph.search` has them.
 
     origins, front, coming: (N, W) uint64, zero before; front and coming are zero again afterwards, origins[v] has the
     bits of the sources that reach v. queue, other: (N,) scratch. largest (len(sources),): their eccentricities among
@@ -24,6 +26,7 @@ def search_from_many(table, reverse, start, sources, origins, front, coming, que
         next_states, ends = table
         num_states, num_actions = next_states.shape
     width = origins.shape[1]
+    # level 0: each source has reached itself
     for i in range(len(sources)):
         bit = np.uint64(1) << np.uint64(i % 64)
         origins[sources[i], i // 64] |= bit
@@ -35,6 +38,7 @@ def search_from_many(table, reverse, start, sources, origins, front, coming, que
     while count:
         level += 1
         size = 0
+        # pass the new bits of each node of this level on to its neighbours
         for i in range(count):
             u = queue[i]
             if reverse is not None:
@@ -64,7 +68,7 @@ def search_from_many(table, reverse, start, sources, origins, front, coming, que
 
 @njit(cache=True, nogil=True)
 def _push(u, v, origins, front, coming, other, size):
-    """Pass the bits of u that v lacks on to v; v joins the `size` nodes of the next level once. Returns its size."""
+    """Pass the bits of u that v lacks on to v; v joins the next level, of `size` nodes, once. Returns its size."""
     waiting, adds = np.uint64(0), np.uint64(0)
     for w in range(origins.shape[1]):
         waiting |= coming[v, w]
@@ -79,11 +83,15 @@ def _push(u, v, origins, front, coming, other, size):
 
 @njit(cache=True, nogil=True)
 def _settle(queue, count, other, size, origins, front, coming, level, largest, width):
-    """Make the next level the current one; note it as the eccentricity of every source that found something."""
+    """Make the next level the current one; record it as the eccentricity of every source that reached something.
+
+    Returns the pairs (source, node) reached on the next level.
+    """
     for i in range(count):
         for w in range(width):
             front[queue[i], w] = 0
     pairs = 0
+    # 64 sources at a time: move their new bits, count them, and see which sources go on
     for w in range(width):
         any_new = np.uint64(0)
         for i in range(size):
@@ -102,6 +110,7 @@ def _settle(queue, count, other, size, origins, front, coming, level, largest, w
 
 @njit(cache=True, nogil=True)
 def _ones(x):
+    """Number of bits of a word x that are 1."""
     x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
     x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
     x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
@@ -118,14 +127,15 @@ WORDS = 8  # of 64 sources: a cache line
 def dense_search_backward(next_states, ends, start, sources, origins, front, coming, active, arriving, largest):
     """largest[i] = the largest distance to sources[i] of a node that leads there; at most 512 sources, a bit for each.
 
-    Every node asks, level by level, what its successors have reached: one cache line read for each edge on a level
-    where the successor has news, none written but its own. A node that leads to all sources asks no more.
+    Every node reads, level by level, what its successors have reached: one cache line for each edge on a level where
+    the successor has new bits; none is written but its own. A node that leads to all sources reads no more.
     origins, front, coming: (N, 8) uint64, active, arriving: (N,) bool; zero before.
     Returns the number of lines read from successors.
-    Source: Then et al. (2014), bit-parallel search; Beamer, Asanovic and Patterson (2012), asking in place of telling.
+    Source: Then et al. (2014), bit-parallel search; Beamer, Asanovic and Patterson (2012), bottom-up steps.
     """
     num_states, num_actions = next_states.shape
     all_sources, news = np.zeros(WORDS, np.uint64), np.zeros(WORDS, np.uint64)
+    # level 0: each source has reached itself
     for i in range(len(sources)):
         bit = np.uint64(1) << np.uint64(i % 64)
         origins[sources[i], i // 64] |= bit
@@ -140,25 +150,28 @@ def dense_search_backward(next_states, ends, start, sources, origins, front, com
         news[:] = 0
         for v in range(len(origins)):
             arriving[v] = False
+            # skip a node that already leads to all sources
             missing = np.uint64(0)
             for w in range(WORDS):
                 missing |= all_sources[w] & ~origins[v, w]
             if not missing:
                 continue
+            # join the bits of all successors that were new on the last level
             is_end = v == num_states or ends[v]
-            heard = False
+            has_bits = False
             for a in range(1 if is_end else num_actions):
                 u = _successor(next_states, start, v, a, is_end)
                 if u >= 0 and active[u]:
                     reads += 1
-                    if heard:
+                    if has_bits:
                         for w in range(WORDS):
                             coming[v, w] |= front[u, w]
                     else:
                         for w in range(WORDS):
                             coming[v, w] = front[u, w]
-                        heard = True
-            if heard:
+                        has_bits = True
+            # keep those that are new to v; they go on at the next level
+            if has_bits:
                 added = np.uint64(0)
                 for w in range(WORDS):
                     new = coming[v, w] & ~origins[v, w]
@@ -168,6 +181,7 @@ def dense_search_backward(next_states, ends, start, sources, origins, front, com
                     added |= new
                 if added:
                     arriving[v] = goes_on = True
+        # a source that reached a new node has one at this distance
         for i in range(len(sources)):
             if news[i // 64] >> np.uint64(i % 64) & np.uint64(1):
                 largest[i] = level
@@ -179,7 +193,7 @@ def dense_search_backward(next_states, ends, start, sources, origins, front, com
 @njit(cache=True, nogil=True)
 def spread_out(next_states, ends, order, blocked, limit):
     """The first nodes of `order`, at most `limit`, none of them a successor of one before; blocked (N,) bool, zero."""
-    chosen = np.empty(limit, order.dtype)
+    selection = np.empty(limit, order.dtype)
     count = 0
     for i in range(len(order)):
         v = order[i]
@@ -187,14 +201,14 @@ def spread_out(next_states, ends, order, blocked, limit):
             break
         if blocked[v]:
             continue
-        chosen[count] = v
+        selection[count] = v
         count += 1
         if v < len(next_states) and not ends[v]:
             for a in range(next_states.shape[1]):
                 u = next_states[v, a]
                 if u >= 0 and u != v:
                     blocked[u] = True
-    return chosen[:count]
+    return selection[:count]
 
 
 @njit(cache=True, nogil=True)
@@ -234,7 +248,7 @@ def lower_along_edges(next_states, ends, start, in_upper, out_upper):
 
 @njit(cache=True, nogil=True)
 def _successor(next_states, start, v, a, is_end):
-    """The node that v leads to by a; -1 where that is an end which leads nowhere."""
+    """The node that v leads to by a: `start`, or -1, where v is an end; node S where a ends the episode."""
     if is_end:
         return start
     u = np.int64(next_states[v, a])

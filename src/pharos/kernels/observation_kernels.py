@@ -1,4 +1,4 @@
-"""Observations that need no rules, by the components of a block of states, and tangent kernels of observations.
+"""Observations by the components of a block of states alone, without rules, and tangent kernels of observations.
 
 Neural tangent kernels of one block of pairs (x, y) of observations, I times J of them: q: covariance of the
 pre-activations of a layer; theta: its tangent kernel; variance_x (I,), variance_y (J,): q of x with itself. Of a ReLU,
@@ -30,7 +30,7 @@ def mark_components(states, low, offset, out):
 
 @njit(cache=True, nogil=True, inline="always")
 def _mixed(word):
-    """The finalizer of SplitMix64 (Steele, Lea and Flood, 2014)."""
+    """Mix the bits of a word by the finalizer of SplitMix64 (Steele, Lea and Flood, 2014)."""
     word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return word ^ (word >> np.uint64(31))
@@ -40,26 +40,29 @@ def _mixed(word):
 def scramble(states, low, lengths, keys, out):
     """out (N, B), zeros: the components of each state in binary, permuted by a Feistel network of len(keys) rounds."""
     one, step = np.uint64(1), np.uint64(0x9E3779B97F4A7C15)
-    bits, half = out.shape[1], out.shape[1] // 2
+    num_bits, half = out.shape[1], out.shape[1] // 2
     for n in range(states.shape[0]):
+        # the components in binary, the lowest bit of each first
         place = 0
         for i in range(states.shape[1]):
             for b in range(lengths[i]):
                 out[n, place] = ((states[n, i] - low[i]) >> b) & 1
                 place += 1
         for r in range(len(keys)):
-            first, last = (0, half) if r % 2 == 0 else (half, bits)
+            # a hash of one half and the key of the round
+            first, last = (0, half) if r % 2 == 0 else (half, num_bits)
             word = keys[r]
             for place in range(first, last):
                 word = _mixed(word + step + np.uint64(out[n, place]))
-            begin, end = (half, bits) if r % 2 == 0 else (0, half)
-            drawn = word
+            # flips bits of the other half: a new word for every 64 of them
+            begin, end = (half, num_bits) if r % 2 == 0 else (0, half)
+            mask = word
             for place in range(begin, end):
                 if (place - begin) % 64 == 0:
                     word += step
-                    drawn = _mixed(word)
-                out[n, place] ^= np.int8(drawn & one)
-                drawn >>= one
+                    mask = _mixed(word)
+                out[n, place] ^= np.int8(mask & one)
+                mask >>= one
 
 
 # Tangent kernels ------------------------------------------------------------------------------------------------------
@@ -80,7 +83,10 @@ def _relu(q, scale):
 
 @njit(cache=True, nogil=True, inline="always")
 def _series(q, scale, a, b):
-    """The same of an odd function with Hermite coefficients a, b (M,) of degree 1, 3, 5, ... at both deviations."""
+    """(E[f(u) f(v)], E[f'(u) f'(v)]) of an odd function, by its Hermite coefficients a, b (M,) of degree 1, 3, 5, ...
+
+    a, b: at the deviations of u and v; q: their covariance; scale: product of the deviations.
+    """
     correlation = min(max(q / scale, -1.0), 1.0) if scale > 0.0 else 0.0
     power, value, slope = 1.0, 0.0, 0.0
     for m in range(len(a)):
@@ -104,6 +110,7 @@ def dense(q, theta, variances_x, variances_y, kinds, coefficients_x, coefficient
         for j in range(out.shape[1]):
             covariance, tangent = q[i, j], theta[i, j]
             for layer in range(layers):
+                # covariances of the layer's outputs and of their derivatives, then the next layer's kernel
                 scale = math.sqrt(variances_x[layer, i] * variances_y[layer, j])
                 if kinds[layer] == 0:
                     value, slope = _relu(covariance, scale)
@@ -119,9 +126,10 @@ def dense(q, theta, variances_x, variances_y, kinds, coefficients_x, coefficient
 def patches(gram, codes_x, codes_y, variance_x, variance_y, weight, bias, value, slope):
     """One position of a first convolution with ReLUs: value (I, J) = E[f f], slope (I, J) = E[f' f'] (gram + 1).
 
-    gram (U, V): inner products of the different patches; codes_x (I,), codes_y (J,): which of them x and y have there.
+    gram (U, V): inner products of the different patches; codes_x (I,), codes_y (J,): the patch that x and y have there.
     variance_x (U,), variance_y (V,): of the different patches. weight, bias: variances of an entry.
     """
+    # each pair of different patches once
     values, slopes = np.empty(gram.shape, np.float32), np.empty(gram.shape, np.float32)
     for u in range(gram.shape[0]):
         for v in range(gram.shape[1]):
@@ -129,6 +137,7 @@ def patches(gram, codes_x, codes_y, variance_x, variance_y, weight, bias, value,
             mean, derivative = _relu(weight * gram[u, v] + bias, scale)
             values[u, v] = mean
             slopes[u, v] = derivative * (gram[u, v] + 1.0)
+    # then by the patches of x and y
     for i in range(len(codes_x)):
         for j in range(len(codes_y)):
             value[i, j] = values[codes_x[i], codes_y[j]]

@@ -1,6 +1,6 @@
-"""Distributions of states, pushed one step forward.
+"""Distributions of states under a policy, moved one step forward.
 
-transitions: see kernels/outcomes.py; live (S,) bool: states that play goes on in; now, after (S, W) float64:
+transitions: see kernels/outcomes.py; live (S,) bool: states in which episodes go on; now, after (S, W) float64:
 the distribution over states, W = 1, or over pairs (state, previously executed action), W = A; that of the first step
 has W = 1. policy (S, B, A) probabilities, B = 1 or, for policies that look at the previous action, A; weights: (chosen,
 previous, uniform).
@@ -15,7 +15,7 @@ from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 
 @njit(forceinline=True)
 def _mass(now, s):
-    """Probability of being in s."""
+    """Probability of being in s, whatever the previous action."""
     mass = 0.0
     for b in range(now.shape[1]):
         mass += now[s, b]
@@ -28,8 +28,8 @@ def _execute(policy, weights, now, s, mass, executed):
 
     For all actions at once: a call for each of them costs ten times the arithmetic.
     """
-    chosen, previous, uniform = weights
-    even = uniform * mass / len(executed)
+    chosen_weight, previous_weight, uniform_weight = weights
+    uniform_share = uniform_weight * mass / len(executed)
     for a in range(len(executed)):
         if policy.shape[1] == 1:
             p = mass * policy[s, 0, a]
@@ -37,19 +37,16 @@ def _execute(policy, weights, now, s, mass, executed):
             p = 0.0
             for b in range(now.shape[1]):
                 p += now[s, b] * policy[s, b, a]
-        p = chosen * p + even
-        if previous > 0.0:
-            p += previous * now[s, a]
+        p = chosen_weight * p + uniform_share
+        if previous_weight > 0.0:
+            p += previous_weight * now[s, a]
         executed[a] = p
 
 
 @interpreted_first()
 @njit(cache=True, nogil=True)
 def push(transitions, live, policy, weights, now, after):
-    """after = the distribution one step later, without what has ended.
-
-    Returns what goes on: the sum over live states.
-    """
+    """after = the distribution one step later, without mass that has ended; returns the mass of live states."""
     num_states, num_actions = size_of(transitions)
     after[:] = 0.0
     by_action = after.shape[1] > 1
@@ -60,12 +57,14 @@ def push(transitions, live, policy, weights, now, after):
         mass = _mass(now, s)
         if mass == 0.0:
             continue
+        # split the mass of s by executed actions, then by their outcomes
         _execute(policy, weights, now, s, mass, executed)
         for a in range(num_actions):
             for i in outcomes_of(transitions, s, a):
                 t, p = outcome(transitions, s, a, i)
                 if t >= 0:
                     after[t, a if by_action else 0] += p * executed[a]
+    # the mass that goes on
     total = 0.0
     for s in range(num_states):
         if live[s]:
@@ -76,11 +75,11 @@ def push(transitions, live, policy, weights, now, after):
 
 @interpreted_first()
 @njit(cache=True, nogil=True)
-def settle(transitions, live, policy, weights, gamma, least, waiting, visits):
-    """Count what waits in a state as a visit, and let it go on; from the first state to the last, in place.
+def count_visits(transitions, live, policy, weights, gamma, least, waiting, visits):
+    """Count the mass that waits in each state as a visit, and move it on; from the first state to the last, in place.
 
-    waiting (S, W): discounted mass that has come and has not gone on. visits (S,): sum over t of gamma^t P(s_t = s), as
-    far as it has gone on. Masses below `least` stay. Returns what waits in the end.
+    waiting (S, W): discounted mass that has come and has not moved on. visits (S, W): sum over t of gamma^t P(s_t = s),
+    of the mass that has moved on. Masses below `least` stay. Returns the mass that waits in the end.
     """
     num_states, num_actions = size_of(transitions)
     by_action = waiting.shape[1] > 1
@@ -91,6 +90,7 @@ def settle(transitions, live, policy, weights, gamma, least, waiting, visits):
             mass += waiting[s, b]
         if mass < least or not live[s]:
             continue
+        # the mass of s becomes visits, and waits, discounted, in the next states
         _execute(policy, weights, waiting, s, mass, leaving)
         for b in range(waiting.shape[1]):
             visits[s, b] += waiting[s, b]
@@ -108,17 +108,18 @@ def settle(transitions, live, policy, weights, gamma, least, waiting, visits):
 
 
 @njit(cache=True, nogil=True)
-def support(transitions, live, policy, weights, met):
-    """Add to met (S, W), 1 where play may be and else 0, whatever may come after."""
+def support(transitions, live, policy, weights, reachable):
+    """Add to `reachable` (S, W), 1 or 0, all pairs that episodes from its pairs may come to under the policy."""
     num_actions = size_of(transitions)[1]
-    width = met.shape[1]
+    width = reachable.shape[1]
     by_action = width > 1
-    alone = np.zeros_like(met)  # a row is 1 at one place while its node is looked at
-    todo = np.flatnonzero(met.reshape(-1) > 0.0)
-    stack = np.empty(met.size, np.int64)
-    stack[: len(todo)] = todo
-    top = len(todo)
+    alone = np.zeros_like(reachable)  # a row is 1 at one place while its node is looked at
+    nodes = np.flatnonzero(reachable.reshape(-1) > 0.0)
+    stack = np.empty(reachable.size, np.int64)
+    stack[: len(nodes)] = nodes
+    top = len(nodes)
     executed = np.empty(num_actions)
+    # depth-first search: successors by all actions that may be executed in the pair (s, b)
     while top > 0:
         top -= 1
         s, b = divmod(stack[top], width)
@@ -132,8 +133,8 @@ def support(transitions, live, policy, weights, met):
             c = a if by_action else 0
             for i in outcomes_of(transitions, s, a):
                 t, _ = outcome(transitions, s, a, i)
-                if t >= 0 and live[t] and met[t, c] == 0.0:
-                    met[t, c] = 1.0
+                if t >= 0 and live[t] and reachable[t, c] == 0.0:
+                    reachable[t, c] = 1.0
                     stack[top] = t * width + c
                     top += 1
         alone[s, b] = 0.0

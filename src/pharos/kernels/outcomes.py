@@ -1,8 +1,8 @@
-"""Outcomes of executing an action, for loops that do not ask how they are stored.
+"""Outcomes of executing an action, for loops that need not know how they are stored.
 
 `PackedIndices` are read like arrays of int64, entry by entry. So a loop over `next_states[s, a]` is written once, and
-Numba compiles it for each width of the indices; what it makes of int32 and int64 stays what it is. They cannot be
-written to here, nor returned.
+Numba compiles it for each width of the indices; its code for int32 and int64 is the same as without them. They cannot
+be written to here, nor returned.
 
 Kernels take `transitions`, one of three things:
 
@@ -16,12 +16,12 @@ Kernels take `transitions`, one of three things:
   is the last outcome of each row.
 
 `outcomes_of` and `outcome` give them one by one, `expectation` adds up values. Loops over tables cost nothing more:
-their indices are unsigned, as signed ones would be asked at each read whether they count from the end.
+their indices are unsigned, as signed ones would be checked at each read for counting from the end.
 
 State spaces store the possible outcomes, row after row, and their probabilities as codes of a palette. Row s A + a is
-that of action a in state s. Probabilities are seen as their bits, uint64: 0 is an impossible outcome. The palette
+that of action a in state s. Probabilities are compared as their bits, uint64: 0 is an impossible outcome. The palette
 (capacity, K) uint64 has the distinct rows of probabilities, the possible ones in their order, then zeros, numbered in
-the order in which they are met; a table of slots finds them by their hash. K is the most outcomes of a row.
+the order in which they appear; a table of slots finds them by their hash. K is the most outcomes of a row.
 """
 
 import operator
@@ -47,7 +47,7 @@ from pharos.system.arrays import PACKED, PackedIndices
 
 
 class PackedIndicesType(types.Type):
-    """Numba's type of them, by the number of dimensions."""
+    """Numba's type of `PackedIndices`, by the number of dimensions."""
 
     def __init__(self, ndim):
         self.entries = types.Array(from_dtype(PACKED), ndim, "C", readonly=True)
@@ -104,20 +104,19 @@ def _type_of(indices):
 PackedIndices._numba_type_ = property(_type_of)  # type: ignore[attr-defined]
 
 
-# The largest K that the compiler is told.
 # Transitions ----------------------------------------------------------------------------------------------------------
 
 
-UNROLLED = 4
+UNROLLED = 4  # the largest K for which loops over outcomes are unrolled
 
 
 def each_of(num_outcomes):
-    """The last of `transitions`, for sweeps: a tuple of K zeros where K is small."""
+    """The last entry of `transitions`, for sweeps: a tuple of K zeros where K is small, else K."""
     return (0,) * num_outcomes if num_outcomes <= UNROLLED else num_outcomes
 
 
 def _is_lazy(transitions):
-    """Whether the type is that of a pair."""
+    """Whether the type is that of a pair (transitions, probability of staying)."""
     return isinstance(transitions, types.BaseTuple) and len(transitions) == 2
 
 
@@ -127,7 +126,7 @@ def is_table(transitions):
 
 
 def size_of(transitions):
-    """(S, A)."""
+    """(S, A): number of states and actions."""
 
 
 @overload(size_of)
@@ -162,7 +161,7 @@ def _outcomes_of(transitions, s, a):
 
 
 def outcome(transitions, s, a, k):
-    """(next state, -1 for the end; probability) of the outcome with number k."""
+    """(next state, -1 for the end; probability) of outcome k of (s, a)."""
 
 
 @overload(outcome)
@@ -195,7 +194,7 @@ def _outcome(transitions, s, a, k):
 
 
 def _place(transitions, row, k):
-    """(place of a successor, whether the row has fewer than k + 1, so that it is the last one's)."""
+    """(place of successor k of a row, whether k is padding, so that it repeats the last one)."""
 
 
 @overload(_place)
@@ -241,7 +240,7 @@ def _expectation(transitions, v, s, a):
 
 
 def _value(v, s, a):
-    """v of a state, after an action where v tells them apart."""
+    """v[s], or v[s, a] where v depends on the executed action."""
 
 
 @overload(_value, jit_options={"forceinline": True})
@@ -250,7 +249,7 @@ def _value_of(v, s, a):
 
 
 def fetch_values(transitions, v, actions, s):
-    """Ask the processor for what `expectation` will read of v for state s, of a table; actions: see bellman.py."""
+    """Ask the processor to fetch the entries of v that `expectation` reads for state s; actions: see bellman.py."""
 
 
 @overload(fetch_values)
@@ -284,24 +283,25 @@ def expected(transitions, x, states, out):
 
 
 @njit(cache=True, nogil=True)
-def entries(transitions, states, actions, which, following, likely):
-    """The possible outcomes of (states[i], actions[i]), in order: which[j] = i, following[j], likely[j] their
-    probabilities; returns how many there are.
+def entries(transitions, states, actions, index, next_states, probabilities):
+    """The possible outcomes of (states[i], actions[i]), in order; returns how many there are.
+
+    index[j] = i, next_states[j], probabilities[j]: of outcome j.
     """
     n = 0
     for i in range(len(states)):
         for k in outcomes_of(transitions, states[i], actions[i]):
             t, p = outcome(transitions, states[i], actions[i], k)
             if p > 0.0:
-                which[n], following[n], likely[n] = i, t, p
+                index[n], next_states[n], probabilities[n] = i, t, p
                 n += 1
     return n
 
 
 @interpreted_first()
 @njit(cache=True, nogil=True)
-def pushed(transitions, mass, out):
-    """out (S, W) += where the mass (S, A) of executed actions goes, without what ends."""
+def push_forward(transitions, mass, out):
+    """out (S, W) += the mass (S, A) of executed actions, moved to their next states; mass that ends is left out."""
     by_action = out.shape[1] > 1
     for s in range(mass.shape[0]):
         for a in range(mass.shape[1]):
@@ -326,8 +326,8 @@ def largest(transitions, x, states, sign, out):
 
 @interpreted_first("states")
 @njit(cache=True, nogil=True)
-def arrive(transitions, states, out):
-    """out[t, a] = True where executing a in some of these states may lead to t."""
+def mark_arrivals(transitions, states, out):
+    """out[t, a] = True where executing a in one of `states` may lead to t."""
     for s in states:
         for a in range(out.shape[1]):
             for k in outcomes_of(transitions, s, a):
@@ -337,8 +337,9 @@ def arrive(transitions, states, out):
 
 
 def drawn_outcome(transitions, s, a, u):
-    """(number, probability) of the outcome of (s, a) that u in [0, 1) falls on: the first with which the probabilities
-    so far are more than u, else the last possible one.
+    """(number, probability) of the outcome of (s, a) drawn by u in [0, 1).
+
+    That is the first outcome with which the probabilities so far are more than u, else the last possible one.
     """
 
 
@@ -361,7 +362,7 @@ def _drawn_outcome(transitions, s, a, u):
 
 @njit(cache=True, nogil=True)
 def drawn(transitions, s, a, u):
-    """The next state, -1 for the end, of (s, a) that u in [0, 1) falls on; probabilities need not sum to 1."""
+    """The next state of (s, a), -1 for the end, drawn by u in [0, 1); probabilities need not sum to 1."""
     total = 0.0
     for k in outcomes_of(transitions, s, a):
         total += outcome(transitions, s, a, k)[1]
@@ -370,7 +371,7 @@ def drawn(transitions, s, a, u):
 
 @njit(cache=True, nogil=True)
 def draw(transitions, states, actions, u, out):
-    """out[i] = what `drawn` says of (states[i], actions[i]) and u[i]."""
+    """out[i] = the next state of (states[i], actions[i]) drawn by u[i], as by `drawn`."""
     for i in range(len(states)):
         out[i] = drawn(transitions, states[i], actions[i], u[i])
 
@@ -396,57 +397,58 @@ _SEED = uint64(0x9E3779B97F4A7C15)
 
 
 @njit(cache=True, nogil=True)
-def possible(successors, bits, num_actions, out, likely, counts):
-    """Take the possible outcomes of some states: N successors to out, their bits to likely, how many each row has to
-    counts.
+def possible(successors, bits, num_actions, out, out_bits, counts):
+    """Write the possible outcomes of some states one after another; returns how many there are, N.
 
-    successors (rows, A K), bits (rows, A K); out, likely (at least N,), counts (rows * A,). Returns N.
+    successors (rows, A K), bits (rows, A K): of all outcomes; out, out_bits (at least N,): of the possible ones; counts
+    (rows * A,): possible outcomes of each row.
     """
     rows, branches = successors.shape
-    most = branches // num_actions
+    num_outcomes = branches // num_actions
     n = 0
     for i in range(rows):
         for a in range(num_actions):
             before = n
-            for b in range(a * most, (a + 1) * most):
+            for b in range(a * num_outcomes, (a + 1) * num_outcomes):
                 if bits[i, b] != 0:
-                    out[n], likely[n] = successors[i, b], bits[i, b]
+                    out[n], out_bits[n] = successors[i, b], bits[i, b]
                     n += 1
             counts[i * num_actions + a] = n - before
     return n
 
 
 @njit(cache=True, nogil=True)
-def encode(likely, counts, first_row, first, palette, size, table, codes):
-    """codes[r] = the number of row r's probabilities in the palette, for the rows from `first_row` on; new ones are
-    entered.
+def encode(bits, counts, first_row, first, palette, size, table, codes):
+    """codes[r] = the palette's code of row r's probabilities, for the rows from `first_row` on; new ones are entered.
 
-    likely (N,): the row's are those from `first` on. Returns (row, first, size) of the first row that finds the palette
-    full; row is len(counts) where there is none.
+    bits (N,): of the probabilities; those of row `first_row` begin at `first`. Returns (row, first, size) of the first
+    row that finds the palette full; row is len(counts) where there is none.
     """
-    capacity, most = palette.shape
+    capacity, num_outcomes = palette.shape
     slots = table.shape[0]
     code = int64(-1)
     row = first_row
     while row < len(counts):
         n = counts[row]
-        if code < 0 or not _is(palette, code, likely, first, n):
+        # often the same probabilities as in the last row; else probe by their hash
+        if code < 0 or not _is(palette, code, bits, first, n):
             h = _SEED
             for k in range(n):
-                h = mixed(h ^ likely[first + k])
+                h = mixed(h ^ bits[first + k])
             slot = slot_of(h, slots)
             while True:
                 code = int64(table[slot])
-                if code < 0 or _is(palette, code, likely, first, n):
+                if code < 0 or _is(palette, code, bits, first, n):
                     break
                 slot = slot + 1 if slot + 1 < slots else 0
             if code < 0:
+                # probabilities that the palette lacks: enter them, padded by zeros
                 if size == capacity:
                     return row, first, size
                 code = size
                 for k in range(n):
-                    palette[code, k] = likely[first + k]
-                for k in range(n, most):
+                    palette[code, k] = bits[first + k]
+                for k in range(n, num_outcomes):
                     palette[code, k] = 0
                 table[slot] = code
                 size += 1
@@ -472,26 +474,26 @@ def enter(palette, size, table):
 
 
 @njit(forceinline=True)
-def _is(palette, code, likely, first, n):
-    """Whether the vector of this number is that of a row of n outcomes."""
+def _is(palette, code, bits, first, n):
+    """Whether the entry of the palette with this code has the probabilities bits[first : first + n]."""
     if n < palette.shape[1] and palette[code, n] != 0:
         return False
     for k in range(n):
-        if palette[code, k] != likely[first + k]:
+        if palette[code, k] != bits[first + k]:
             return False
     return True
 
 
 @njit(cache=True, nogil=True)
 def padded(values, counts, fill_with_first, out):
-    """out[r] (K,) = the values of row r, then the first of them, or zeros.
+    """out[r] (K,) = the values of row r, then its first value again, or zeros.
 
-    values (N,), counts (rows,), out (rows, K).
+    values (N,): row after row; counts (rows,); out (rows, K).
     """
     first = 0
     for row in range(len(counts)):
         n = counts[row]
-        rest = values[first] if fill_with_first else values[first] * 0
+        padding = values[first] if fill_with_first else values[first] * 0
         for k in range(out.shape[1]):
-            out[row, k] = values[first + k] if k < n else rest
+            out[row, k] = values[first + k] if k < n else padding
         first += n

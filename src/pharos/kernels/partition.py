@@ -1,14 +1,15 @@
-"""Partitions of states: equal rows get equal numbers; classes split by where their members lead.
+"""Partitions of states: equal rows get equal numbers; classes split by the classes that their members lead to.
 
 Exact: hashes only say where to look, and rows are compared entry by entry. `slots` is a hash table of at least twice as
 many entries as rows, -1 where empty, that is empty again after each call.
 
 Under transition probabilities classes split by the probabilities of reaching classes, into the coarsest stable
 partition. Rows are those of a sparse matrix, row s A + a of state s and action a; columns from S on are no state. Two
-rows are alike if they reach every class with the same probability, rounded to 2^-40, so that the order of additions
+rows are equal if they reach every class with the same probability, rounded to 2^-40, so that the order of additions
 does not matter. Members of a class lie side by side in `elements`. Of the groups into which it falls the largest keeps
-its number, and only states that lead to a class with a new number are asked again: a state is renumbered at most
-log2(S) times. Source: Hopcroft (1971); Valmari and Franceschinis (2010), "Simple O(m log n) time Markov chain lumping".
+its number, and only states that lead to a class with a new number are looked at again, the candidates of the next
+round: a state is renumbered at most log2(S) times. Source: Hopcroft (1971); Valmari and Franceschinis (2010), "Simple
+O(m log n) time Markov chain lumping".
 """
 
 import numpy as np
@@ -26,11 +27,13 @@ def number_rows(rows, before, slots, numbers):
     mask = len(slots) - 1
     count = 0
     for i in range(len(rows)):
+        # hash of the pair (before[i], rows[i])
         h = mixed(uint64(before[i]))
         for j in range(rows.shape[1]):
             h = (h ^ uint64(rows[i, j])) * uint64(0x100000001B3)
         h = mixed(h)
         slot = np.int64(h) & mask
+        # probe for an equal pair, compared byte by byte; a free slot gives a new number
         while True:
             other = slots[slot]
             if other < 0:
@@ -69,7 +72,7 @@ def slots_for(rows):
 
 
 @njit(cache=True, nogil=True)
-def states_to_ask(next_states, changed, candidates):
+def affected_states(next_states, changed, candidates):
     """candidates[:n] = the states with a next state that changed its class; returns n."""
     n = 0
     for s in range(len(next_states)):
@@ -84,20 +87,22 @@ def states_to_ask(next_states, changed, candidates):
 
 @njit(cache=True, nogil=True)
 def split(next_states, classes, sizes, count, candidates, n, slots, used, new, changed):
-    """Split classes by the classes that the asked states lead to; returns the number of classes.
+    """Split classes by the classes that the candidates lead to; returns the number of classes.
 
-    Members that are not asked lead where their class led before, and keep its number; so does the first group where all
-    are asked. classes (S,), sizes (S,) members of each class; candidates (S,), of which n are asked; used, new (S,)
-    scratch; changed (S,) bool: whose class changed.
+    Members that are no candidates lead where their class led before, and keep its number; so does the first group where
+    all members are candidates. classes (S,), sizes (S,) members of each class; candidates (S,), of which the first n
+    count; used, new (S,) scratch; changed (S,) bool: whose class changed.
     """
     mask = len(slots) - 1
     num_actions = next_states.shape[1]
     changed[:] = False
-    members = np.zeros(count, np.int32)
+    # candidates of each class
+    num_candidates = np.zeros(count, np.int32)
     for i in range(n):
-        members[classes[candidates[i]]] += 1
+        num_candidates[classes[candidates[i]]] += 1
     for i in range(n):
         s = candidates[i]
+        # signature of s: its class and the classes of its successors; its hash names a slot
         h = mixed(uint64(classes[s]))
         for a in range(num_actions):
             t = next_states[s, a]
@@ -105,17 +110,19 @@ def split(next_states, classes, sizes, count, candidates, n, slots, used, new, c
         slot = np.int64(h) & mask
         while True:
             place = slots[slot]
+            # a new signature: its group keeps the number of the class, or gets a new one
             if place < 0:
                 slots[slot] = i
                 used[i] = slot
                 c = classes[s]
-                if members[c] == sizes[c]:  # all are asked, and this is the first group
-                    members[c] = -1
+                if num_candidates[c] == sizes[c]:  # no other member, and this is the first group
+                    num_candidates[c] = -1
                     new[i] = c
                 else:
                     new[i] = count
                     count += 1
                 break
+            # a signature in this slot: s joins its group if all classes agree
             other = candidates[place]
             same = classes[other] == classes[s]
             for a in range(num_actions):
@@ -128,6 +135,7 @@ def split(next_states, classes, sizes, count, candidates, n, slots, used, new, c
                 new[i] = new[place]
                 break
             slot = (slot + 1) & mask
+    # empty the slots, and renumber the states of new groups
     for i in range(n):
         slots[used[i]] = -1
         s = candidates[i]
@@ -148,14 +156,19 @@ UNITS = 2.0**40
 
 @njit(cache=True, nogil=True)
 def predecessors(first, column, num_actions, edges, states):
-    """states[edges[t]:edges[t + 1]] = the states that some action may lead to t; edges (S + 1,), states (outcomes,)."""
+    """states[edges[t]:edges[t + 1]] = the states that some action may lead to t.
+
+    edges (S + 1,), states (outcomes,). A counting sort; a state appears once for each outcome that leads to t.
+    """
     size = len(edges) - 1
     edges[:] = 0
+    # how many outcomes lead to each state, and where its predecessors begin
     for k in range(len(column)):
         if column[k] < size:
             edges[column[k] + 1] += 1
     for t in range(size):
         edges[t + 1] += edges[t]
+    # fill; edges[t] moves to where t ends, and is moved back by one place
     for s in range(size):
         for k in range(first[s * num_actions], first[(s + 1) * num_actions]):
             t = column[k]
@@ -168,7 +181,7 @@ def predecessors(first, column, num_actions, edges, states):
 
 
 @njit(cache=True, nogil=True)
-def _reached(matrix, row, classes, mass, keys):
+def _class_probabilities(matrix, row, classes, mass, keys):
     """mass[c] = the probability of reaching class c, for the c in keys[:result]; mass is 0 before."""
     first, column, weight = matrix
     n = 0
@@ -184,25 +197,25 @@ def _reached(matrix, row, classes, mass, keys):
 
 @njit(cache=True, nogil=True)
 def _hash(matrix, num_actions, s, classes, mass, keys):
-    """The same for states whose rows are alike, in whatever order they name classes."""
+    """A hash of the rows of s: equal for states with equal rows, in whatever order they name classes."""
     result = uint64(num_actions)
     for row in range(s * num_actions, (s + 1) * num_actions):
         total = uint64(0)
-        for i in range(_reached(matrix, row, classes, mass, keys)):
-            whole = np.int64(np.rint(mass[keys[i]] * UNITS))
-            if whole > 0:
-                total += mixed(mixed(uint64(keys[i])) ^ uint64(whole))
+        for i in range(_class_probabilities(matrix, row, classes, mass, keys)):
+            units = np.int64(np.rint(mass[keys[i]] * UNITS))
+            if units > 0:
+                total += mixed(mixed(uint64(keys[i])) ^ uint64(units))
             mass[keys[i]] = 0.0
         result = mixed(result ^ total)
     return result
 
 
 @njit(cache=True, nogil=True)
-def _alike(matrix, num_actions, s, other, classes, mass, keys, mass_of_other, keys_of_other):
-    """Whether all rows of two states are alike."""
+def _have_equal_rows(matrix, num_actions, s, other, classes, mass, keys, mass_of_other, keys_of_other):
+    """Whether states s and `other` reach every class with the same probability under each action."""
     for a in range(num_actions):
-        n = _reached(matrix, s * num_actions + a, classes, mass, keys)
-        m = _reached(matrix, other * num_actions + a, classes, mass_of_other, keys_of_other)
+        n = _class_probabilities(matrix, s * num_actions + a, classes, mass, keys)
+        m = _class_probabilities(matrix, other * num_actions + a, classes, mass_of_other, keys_of_other)
         same = True
         for i in range(n):
             same = same and np.rint(mass[keys[i]] * UNITS) == np.rint(mass_of_other[keys[i]] * UNITS)
@@ -218,29 +231,30 @@ def _alike(matrix, num_actions, s, other, classes, mass, keys, mass_of_other, ke
 
 @njit(cache=True, nogil=True)
 def refine(matrix, num_actions, into, classes, layout, slots):
-    """Split classes (S,), numbered from 0 without gaps, until nothing splits; returns the rounds, the last in vain.
+    """Split classes (S,), numbered from 0 without gaps, until nothing splits; returns the number of rounds.
 
-    into: `predecessors`. layout: elements, place, begin, sizes, (S,) each, and slots, a power of 2 of at least 2 S that
-    are all -1: scratch.
+    The last round splits nothing. into: `predecessors`. layout: elements, place, begin, sizes, (S,) each, and slots, a
+    power of 2 of at least 2 S that are all -1: scratch.
     """
     size, kind = len(classes), classes.dtype
-    count = _laid_out(classes, layout)
-    candidates, touched, asked_of = np.arange(size).astype(kind), np.empty(size, kind), np.zeros(size, kind)
+    count = _lay_out(classes, layout)
+    candidates, touched, num_candidates = np.arange(size).astype(kind), np.empty(size, kind), np.zeros(size, kind)
     renumbered, number = np.empty(size, kind), np.empty(size, kind)
     rows = (np.zeros(size), np.empty(size, kind), np.zeros(size), np.empty(size, kind))
     groups = (np.empty(size, kind), np.empty(size, kind), np.empty(size, np.uint64), slots, np.empty(size, kind))
     group_sizes = np.empty(size, kind)
-    is_asked = np.zeros(size, np.bool_)
+    is_candidate = np.zeros(size, np.bool_)
     n, rounds = size, 0
     while True:
         rounds += 1
-        num_touched = _to_the_front(candidates, n, classes, layout, asked_of, touched)
+        # group the candidates of each class by their rows, and split classes of several groups
+        num_touched = _move_to_front(candidates, n, classes, layout, num_candidates, touched)
         changed = 0
         for i in range(num_touched):
             c = touched[i]
-            k, asked_of[c] = asked_of[c], 0
+            k, num_candidates[c] = num_candidates[c], 0
             if layout[3][c] > 1:
-                num_groups = _grouped(matrix, num_actions, c, k, classes, layout, groups, group_sizes, rows)
+                num_groups = _group_members(matrix, num_actions, c, k, classes, layout, groups, group_sizes, rows)
                 if num_groups > 1:
                     count, changed = _split(
                         c, k, num_groups, count, layout, groups, group_sizes, renumbered, number, changed
@@ -249,40 +263,44 @@ def refine(matrix, num_actions, into, classes, layout, slots):
             return rounds
         n = 0
         edges, states = into
-        for i in range(changed):  # all signatures of a round are in terms of the classes before it
+        # renumber, and collect the predecessors of renumbered states for the next round
+        for i in range(changed):  # last: all rows of a round are in terms of the classes before it
             s = renumbered[i]
             classes[s] = number[i]
             for k in range(edges[s], edges[s + 1]):
-                if not is_asked[states[k]]:
-                    is_asked[states[k]] = True
+                if not is_candidate[states[k]]:
+                    is_candidate[states[k]] = True
                     candidates[n] = states[k]
                     n += 1
         for i in range(n):
-            is_asked[candidates[i]] = False
+            is_candidate[candidates[i]] = False
 
 
 @njit(cache=True, nogil=True)
-def _to_the_front(candidates, n, classes, layout, asked_of, touched):
-    """Members that are asked come first in their class, asked_of[c] of them; returns how many classes are touched."""
+def _move_to_front(candidates, n, classes, layout, num_candidates, touched):
+    """Move the candidates to the front of their class, num_candidates[c] of them; returns how many classes have some.
+
+    touched (S,): its first entries are these classes.
+    """
     elements, place, begin, _ = layout
     num_touched = 0
     for i in range(n):
         s = candidates[i]
         c = classes[s]
-        if asked_of[c] == 0:
+        if num_candidates[c] == 0:
             touched[num_touched] = c
             num_touched += 1
-        front, here = begin[c] + asked_of[c], place[s]
+        front, current = begin[c] + num_candidates[c], place[s]
         t = elements[front]
-        elements[front], elements[here] = s, t
-        place[s], place[t] = front, here
-        asked_of[c] += 1
+        elements[front], elements[current] = s, t
+        place[s], place[t] = front, current
+        num_candidates[c] += 1
     return num_touched
 
 
 @njit(cache=True, nogil=True)
-def _grouped(matrix, num_actions, c, k, classes, layout, groups, group_sizes, rows):
-    """group[j] of the first k members of class c: members whose rows are alike; returns how many groups.
+def _group_members(matrix, num_actions, c, k, classes, layout, groups, group_sizes, rows):
+    """group[j] of the first k members of class c, the candidates, by equal rows; returns how many groups.
 
     The others lead where they led before: one of them stands for all, and opens group 0.
     """
@@ -290,10 +308,12 @@ def _grouped(matrix, num_actions, c, k, classes, layout, groups, group_sizes, ro
     group, member, hashes, slots, used = groups
     mask = len(slots) - 1
     num_groups = 0
+    # j = -1: the member that stands for all that are no candidates
     for j in range(-1 if k < sizes[c] else 0, k):
         s = elements[begin[c] + (k if j < 0 else j)]
         h = _hash(matrix, num_actions, s, classes, rows[0], rows[1])
         slot = np.int64(h) & mask
+        # probe for a group with the same hash and equal rows; a free slot opens a group
         while True:
             g = slots[slot]
             if g < 0:
@@ -302,12 +322,13 @@ def _grouped(matrix, num_actions, c, k, classes, layout, groups, group_sizes, ro
                 used[g], hashes[g], member[g], group_sizes[g] = slot, h, s, 0
                 num_groups += 1
                 break
-            if hashes[g] == h and _alike(matrix, num_actions, s, member[g], classes, *rows):
+            if hashes[g] == h and _have_equal_rows(matrix, num_actions, s, member[g], classes, *rows):
                 break
             slot = (slot + 1) & mask
         if j >= 0:
             group[j] = g
         group_sizes[g] += 1 if j >= 0 else sizes[c] - k
+    # empty the slots that were used
     for g in range(num_groups):
         slots[used[g]] = -1
     return num_groups
@@ -315,24 +336,26 @@ def _grouped(matrix, num_actions, c, k, classes, layout, groups, group_sizes, ro
 
 @njit(cache=True, nogil=True)
 def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, number, changed):
-    """Lay the groups of class c side by side and number them anew, but for the largest; returns (classes, renumbered
-    states).
+    """Lay the groups of class c side by side and renumber all but the largest; returns (classes, renumbered states).
 
-    Group 0 comes last, beside the members that were not asked.
+    Group 0 comes last, beside the members that are no candidates.
     """
     elements, place, begin, sizes = layout
     group, ends, _, _, states = groups
+    # where each group begins, and which one is the largest
     largest, at = 0, begin[c]
     for g in range(num_groups - 1, -1, -1):
         ends[g] = at
         at += group_sizes[g]
         if group_sizes[g] > group_sizes[largest]:
             largest = g
+    # move the candidates to their groups
     states[:k] = elements[begin[c] : begin[c] + k]
     for j in range(k):
         s = states[j]
         elements[ends[group[j]]], place[s] = s, ends[group[j]]
         ends[group[j]] += 1
+    # new numbers: the largest group keeps c, each other gets the next one
     at = begin[c]
     for g in range(num_groups - 1, -1, -1):
         new = c
@@ -348,9 +371,11 @@ def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, num
 
 
 @njit(cache=True, nogil=True)
-def _laid_out(classes, layout):
-    """Members of each class side by side: elements[begin[c]:begin[c] + sizes[c]], s at place[s]; returns how many
-    classes."""
+def _lay_out(classes, layout):
+    """Lay the members of each class side by side; returns the number of classes.
+
+    elements[begin[c]:begin[c] + sizes[c]]: the members of class c; s is at place[s].
+    """
     elements, place, begin, sizes = layout
     count = 0
     sizes[:] = 0

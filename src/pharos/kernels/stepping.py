@@ -1,9 +1,8 @@
-"""Knobs of interaction, for every loop that steps: executed action, laziness, outcome, start, late and noisy pay.
+"""Interaction with an MDP in every loop that steps: executed action, laziness, outcome, start, late or noisy reward.
 
-Each knob takes its random numbers as arguments, or from a stream rng[i]: of vector environments (here and in
-rules/interaction.py), of Q-learning (below), of the batched engine (batched.py). The table walk of vector environments.
-
-A stream's whole state is one 64-bit word that can be stored and restored.
+Each option of interaction takes its random numbers as arguments, or from a stream rng[i]: of vector environments (here
+and in rules/interaction.py), of Q-learning (below), of the batched engine (batched.py). `walk_table` steps vector
+environments on a table. A stream's whole state is one 64-bit word that can be stored and restored.
 
 Q-learning, compiled: in a table (agents/q_learning.py), and in a kernel from drawn transitions, which is the loop of
 `hardness.sampled_regret`: Q(c, a) of observation c is q[a, c] where the kernel is a matrix K, else F[c] .
@@ -23,7 +22,7 @@ NEXT_STEP, SAME_STEP, DISABLED = range(3)  # when an environment that has ended 
 
 
 class Setting(NamedTuple):
-    """Constants of a walk.
+    """Constants of the interaction of a batch of environments.
 
     Attributes:
         ranges: (2, D) int64, lowest and highest value of each component; (2, 0) on a table.
@@ -79,7 +78,7 @@ class EnvironmentBatch(NamedTuple):
 
 @njit(forceinline=True)
 def uniform_number(rng, i):
-    """A number in [0, 1) of stream i: SplitMix64 (Steele, Lea and Flood 2014) on the counter rng[i]."""
+    """A uniform number in [0, 1) of stream i: SplitMix64 (Steele, Lea and Flood 2014) on the counter rng[i]."""
     rng[i] += uint64(0x9E3779B97F4A7C15)
     z = rng[i]
     z = (z ^ (z >> uint64(30))) * uint64(0xBF58476D1CE4E5B9)
@@ -96,13 +95,13 @@ def next_number(rng):
 
 @njit(forceinline=True)
 def integer_below(rng, i, n):
-    """An integer in [0, n) of stream i."""
+    """A uniform integer in [0, n) of stream i."""
     return min(int(uniform_number(rng, i) * n), n - 1)
 
 
 @njit(forceinline=True)
 def normal_by_numbers(u, v):
-    """A standard normal number of two uniform ones, u > 0 (Box and Muller 1958)."""
+    """A standard normal number from two uniform ones, u > 0 (Box and Muller 1958)."""
     return np.sqrt(-2.0 * np.log(u)) * np.cos(2.0 * np.pi * v)
 
 
@@ -113,38 +112,40 @@ def normal_number(rng, i):
 
 
 @njit(forceinline=True)
-def paid_late(pending, elapsed, earned, is_last):
-    """Pay of a step where rewards come D steps late, and at the end of an episode at once.
+def delayed_reward(pending, elapsed, earned, is_last):
+    """Reward paid at a step where rewards come D steps late, and all at once at the end of an episode.
 
-    pending (D,): what the last steps earned; elapsed: steps of the episode before this one.
+    pending (D,): rewards of the last steps, not paid yet; elapsed: steps of the episode before this one; earned: the
+    reward of this step.
     """
+    # a ring: the reward of D steps ago leaves, that of this step comes in
     place = elapsed % len(pending)
-    late = pending[place]
+    total = pending[place]
     pending[place] = earned
     if is_last:
         for k in range(len(pending)):
-            late += pending[k]
+            total += pending[k]
             pending[k] = 0.0
-    return late
+    return total
 
 
 @njit(cache=True, nogil=True)
-def pay(rng, deviation, pending, elapsed, is_step, ended, out):
-    """Replace what environments (N,) earned by what they are paid, late (pending (N, D)) and with noise of streams rng.
+def modify_rewards(rng, deviation, pending, elapsed, is_step, ended, rewards):
+    """Replace the earned rewards (N,) of environments by the paid ones: late (pending (N, D)), and with noise.
 
     elapsed (N,): steps of their episodes so far; those that are reset and not stepped are paid nothing.
     """
-    for i in range(len(out)):
+    for i in range(len(rewards)):
         if is_step[i]:
             if pending.shape[1] > 0:
-                out[i] = paid_late(pending[i], elapsed[i], out[i], ended[i])
+                rewards[i] = delayed_reward(pending[i], elapsed[i], rewards[i], ended[i])
                 elapsed[i] = 0 if ended[i] else elapsed[i] + 1
             if deviation > 0.0:
-                out[i] += deviation * normal_number(rng, i)
+                rewards[i] += deviation * normal_number(rng, i)
 
 
 @njit(cache=True, nogil=True)
-def throw(rng, out):
+def flip_coins(rng, out):
     """out[i, j] = 0 or 1, a fair coin of stream i for each j."""
     for i in range(len(out)):
         for j in range(out.shape[1]):
@@ -152,50 +153,53 @@ def throw(rng, out):
 
 
 @njit(forceinline=True)
-def executed_by_number(chosen, previous, chance, num_actions, u):
-    """The executed action, by one uniform number u in [0, 1): chosen, then previous, then uniform.
+def executed_by_number(choice, previous, chance, num_actions, u):
+    """The executed action, by one uniform number u in [0, 1): the choice, then the previous action, then a uniform one.
 
-    chance: as in `Setting`; previous: -1 where there is none, and the chosen action has the weight of the first step.
+    chance: as in `Setting`; previous: -1 where there is none, and the choice has the weight of the first step.
     """
     if previous < 0:
         if u < chance[3]:
-            return chosen
+            return choice
         return min(int((u - chance[3]) / (1.0 - chance[3]) * num_actions), num_actions - 1)
     if u < chance[0]:
-        return chosen
+        return choice
     if u < chance[0] + chance[1]:
         return previous
     return min(int((u - chance[0] - chance[1]) / chance[2] * num_actions), num_actions - 1)
 
 
 @njit(forceinline=True)
-def redrawn_action(chosen, previous, chance, num_actions, rng):
-    """The executed action as `executed_by_number`, where a uniform one takes a second number of the stream rng (1,)."""
+def redrawn_action(choice, previous, chance, num_actions, rng):
+    """The executed action, by numbers of the stream rng (1,): a uniform action takes a second one.
+
+    Otherwise as `executed_by_number`.
+    """
     u = uniform_number(rng, 0)
     if previous < 0:
-        return chosen if u < chance[3] else integer_below(rng, 0, num_actions)
+        return choice if u < chance[3] else integer_below(rng, 0, num_actions)
     if u < chance[0]:
-        return chosen
+        return choice
     return previous if u < chance[0] + chance[1] else integer_below(rng, 0, num_actions)
 
 
 @njit(forceinline=True)
-def executed_action(chosen, previous, chance, num_actions, rng, i):
-    """The executed action of stream i; nothing is drawn where the chosen action is always executed."""
+def executed_action(choice, previous, chance, num_actions, rng, i):
+    """The executed action of stream i; nothing is drawn where the choice is always executed."""
     if chance[0] >= 1.0:
-        return chosen
-    return executed_by_number(chosen, previous, chance, num_actions, uniform_number(rng, i))
+        return choice
+    return executed_by_number(choice, previous, chance, num_actions, uniform_number(rng, i))
 
 
 @njit(forceinline=True)
 def has_no_effect(chance, rng, i):
-    """Whether the executed action of stream i changes nothing; nothing is drawn where each has an effect."""
+    """Whether the executed action of stream i changes nothing; nothing is drawn where every action has an effect."""
     return chance[4] > 0.0 and uniform_number(rng, i) < chance[4]
 
 
 @njit(forceinline=True)
 def start_by_number(cumulative, u):
-    """The number of a start state, by one uniform number u in [0, 1)."""
+    """The number of a start state, by one uniform number u in [0, 1) and the cumulated probabilities."""
     k = 0
     while k < len(cumulative) - 1 and u >= cumulative[k]:
         k += 1
@@ -218,7 +222,7 @@ def draw_starts(cumulative, rng, mask, out):
 
 @njit(cache=True, nogil=True)
 def first_outside(actions, num_actions):
-    """The first i whose action is none, or -1."""
+    """The first i whose action is not in [0, num_actions), or -1."""
     for i in range(len(actions)):
         if actions[i] < 0 or actions[i] >= num_actions:
             return i
@@ -245,12 +249,11 @@ def _outcome_on_table(transitions, rewards, s, a, rng, i):
 
 @njit(cache=True, nogil=True)
 def walk_table(transitions, table_rewards, staying, is_terminal, setting, batch, first, last):
-    """One step of environments first .. last - 1 on a tabulated state space; as `step_many`, with indices for
-    states.
+    """One step of environments first .. last - 1 on a tabulated state space: `step_many`, with indices for states.
 
-    transitions: see kernels/outcomes.py; table_rewards: what they pay, (S, A), or with chance as `transitions`, with
-    rewards in the place of the successors; staying: (S, A), what an action without effect pays; (0, 0) where all have
-    one.
+    transitions: see kernels/outcomes.py; table_rewards: their rewards, (S, A), or with chance as `transitions`, with
+    rewards in the place of the successors; staying: (S, A), the reward of an action without effect; (0, 0) where all
+    have one.
     """
     _, _, chance, limit, mode, first_previous, starts, cumulative = setting
     rng, actions, index, previous, elapsed, ended, rewards, terminated, truncated, executed, final = batch[:11]
@@ -260,10 +263,12 @@ def walk_table(transitions, table_rewards, staying, is_terminal, setting, batch,
         rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, -1
         if len(probabilities) > 0:
             probabilities[i] = 1.0
+        # the episode ended on the last step: this one only starts another
         if ended[i]:
             index[i] = starts[drawn_start(cumulative, rng, i)]
             previous[i], elapsed[i], ended[i] = first_previous, 0, False
             continue
+        # executed action, outcome and reward
         action = executed_action(actions[i], previous[i], chance, num_actions, rng, i)
         if has_no_effect(chance, rng, i):
             rewards[i], p = staying[index[i], action], chance[4]
@@ -272,11 +277,13 @@ def walk_table(transitions, table_rewards, staying, is_terminal, setting, batch,
             p *= 1.0 - chance[4]
         if len(probabilities) > 0:
             probabilities[i] = p
+        # bookkeeping of the episode; both ways to end it
         previous[i] = executed[i] = action
         elapsed[i] += 1
         terminated[i] = is_terminal[index[i]]
         truncated[i] = elapsed[i] >= limit
         ended[i] = terminated[i] or truncated[i]
+        # reset in the same step; `final` keeps the last state
         if mode == SAME_STEP and ended[i]:
             final[i] = index[i]
             index[i] = starts[drawn_start(cumulative, rng, i)]
@@ -323,18 +330,19 @@ def q_learning(
     transitions: see kernels/outcomes.py; table, palette: rewards; starts (K,), cumulative (K,): start states and their
     cumulated probabilities;
     chance: (chosen, previous, uniform, first_chosen); limit: steps of an episode; q, visits (R, A): values and number
-    of updates, R = S, or S (A + 1) with rows s (A + 1) + b where the previous action b (A: none) is seen.
+    of updates, R = S, or S (A + 1) with rows s (A + 1) + b where the agent observes the previous action b (A: none).
     schedule: (learning rate, exponent of visits or 0, gamma, first epsilon, last epsilon, steps of exploration,
-        exponential?).
+        exponential?, gamma of returns).
     place: int64 (state or -1, previous action, steps in the episode, steps in all, episodes); sums: float64 (return of
     this episode, its discount, sum of finished returns); word: uint64 (1,).
-    noise: standard deviation of the noise of what is paid; pending: float64 (steps by which it is late,) what is due;
-    noise_word: uint64 (1,). Returns are of what is earned.
+    noise: standard deviation of the noise of paid rewards; pending: float64 (steps by which they are late,), what
+    is due; noise_word: uint64 (1,). Returns are of earned rewards.
     """
     num_states, num_actions = size_of(transitions)
     rate, exponent, gamma, first_epsilon, last_epsilon, exploration, exponential, measure_gamma = schedule
-    sees_previous = len(q) > num_states
+    observes_previous = len(q) > num_states
     for _ in range(steps):
+        # start an episode
         if place[0] < 0:
             place[0] = starts[start_by_number(cumulative, uniform_number(word, 0))]
             place[1] = num_actions
@@ -342,12 +350,14 @@ def q_learning(
             sums[0] = 0.0
             sums[1] = 1.0
         s, b = place[0], place[1]
-        row = s * (num_actions + 1) + b if sees_previous else s
+        row = s * (num_actions + 1) + b if observes_previous else s
+        # epsilon of this step: linear or exponential from first to last
         share = min(1.0, place[3] / exploration) if exploration > 0 else 1.0
         if exponential > 0.0:
             epsilon = first_epsilon * (last_epsilon / first_epsilon) ** share
         else:
             epsilon = first_epsilon + share * (last_epsilon - first_epsilon)
+        # epsilon-greedy action
         if uniform_number(word, 0) < epsilon:
             action = integer_below(word, 0, num_actions)
         else:  # greedy, ties at random
@@ -359,24 +369,29 @@ def q_learning(
                     ties += 1
                     if uniform_number(word, 0) * ties < 1.0:
                         action = a
+        # one step of the MDP
         executed = redrawn_action(action, b if b < num_actions else -1, chance, num_actions, word)
         reward = reward_at(table, palette, s, executed)
         t = _next_state(transitions, s, executed, word)
         ended = t < 0 or terminal[t]
+        # greedy value of the next state, 0 at an end
         value = 0.0
         if not ended:
-            after = t * (num_actions + 1) + executed if sees_previous else t
-            value = q[after, 0]
+            next_row = t * (num_actions + 1) + executed if observes_previous else t
+            value = q[next_row, 0]
             for a in range(1, num_actions):
-                value = max(value, q[after, a])
-        paid = reward
+                value = max(value, q[next_row, a])
+        # the reward that the agent gets, late and noisy
+        paid_reward = reward
         if len(pending) > 0:
-            paid = paid_late(pending, place[2], reward, ended or place[2] + 1 >= limit)
+            paid_reward = delayed_reward(pending, place[2], reward, ended or place[2] + 1 >= limit)
         if noise > 0.0:
-            paid += noise * normal_number(noise_word, 0)
+            paid_reward += noise * normal_number(noise_word, 0)
+        # update Q of the chosen action, which may not be the executed one
         visits[row, action] += 1
         alpha = rate if exponent == 0.0 else max(rate, visits[row, action] ** -exponent)
-        q[row, action] += alpha * (paid + gamma * value - q[row, action])
+        q[row, action] += alpha * (paid_reward + gamma * value - q[row, action])
+        # returns of earned rewards, and the place of the walk
         sums[0] += sums[1] * reward
         sums[1] *= measure_gamma
         place[0] = t
@@ -390,10 +405,10 @@ def q_learning(
 
 
 @njit(forceinline=True)
-def _value(kernel, learnt, c, a):
-    """Q(c, a)."""
+def _value(kernel, learned, c, a):
+    """Q(c, a), of the tabular part and the features."""
     _, features, _ = kernel
-    q, weights = learnt
+    q, weights = learned
     total = q[a, c]
     for i in range(features.shape[1]):
         total += features[c, i] * weights[a, i]
@@ -402,7 +417,7 @@ def _value(kernel, learnt, c, a):
 
 @njit(forceinline=True)
 def _likeness(kernel, c, d):
-    """K(c, d)."""
+    """K(c, d), the kernel of two observations."""
     matrix, features, diagonal = kernel
     if len(matrix) > 0:
         return np.float64(matrix[c, d])
@@ -413,10 +428,10 @@ def _likeness(kernel, c, d):
 
 
 @njit(forceinline=True)
-def _add(kernel, learnt, c, a, step):
-    """Q(., a) += step K(., c)."""
+def _add(kernel, learned, c, a, step):
+    """Q(., a) += step K(., c): a gradient step on Q(c, a)."""
     matrix, features, diagonal = kernel
-    q, weights = learnt
+    q, weights = learned
     if len(matrix) > 0:
         for i in range(q.shape[1]):
             q[a, i] += step * matrix[c, i]
@@ -427,19 +442,19 @@ def _add(kernel, learnt, c, a, step):
 
 
 @njit(cache=True, nogil=True)
-def values(kernel, learnt, out):
-    """out (C, A) = Q."""
+def values(kernel, learned, out):
+    """out (C, A) = Q of all observations and actions."""
     for c in range(out.shape[0]):
         for a in range(out.shape[1]):
-            out[c, a] = _value(kernel, learnt, c, a)
+            out[c, a] = _value(kernel, learned, c, a)
 
 
 @njit(cache=True, nogil=True)
 def learn(
-    outcomes, terminal, group, starts, cumulative, chance, limit, kernel, learnt, target, memory, visits, place, word,
+    outcomes, terminal, group, starts, cumulative, chance, limit, kernel, learned, target, memory, visits, place, word,
     noise, schedule, largest_step, steps,
 ):  # fmt: skip
-    """`steps` steps of an epsilon-greedy walk, with gradient steps on minibatches of what it has met.
+    """`steps` steps of an epsilon-greedy walk, with gradient steps on minibatches of its transitions.
 
     outcomes: (offsets (S A + 1,), states (N,), -1 for the end; rewards (N,); cumulative probabilities of a row (N,)).
     terminal: (S,); group: (S,) the observation of each state; starts, cumulative (K,): of episodes; chance: (chosen,
@@ -448,82 +463,90 @@ def learn(
     target stays as it is. memory: (observations (M,), actions (M,), next observations (M,), -1 for an end, rewards
     (M,)), a ring; visits: (C, A) numbers of choices.
     place: int64 (state or -1, previous action or -1, steps in the episode, steps in all); word, noise_word: uint64 (1,)
-    noise: (standard deviation of what is paid, its random word); schedule: (gamma, first epsilon, last epsilon, steps
-    of exploration, first step of learning, gradient steps in so many steps: two numbers, size of a minibatch).
+    noise: (standard deviation of the noise of rewards, its random word); schedule: (gamma, first epsilon, last epsilon,
+    steps of exploration, first step of learning, gradient steps in so many steps: two numbers, size of a minibatch).
     largest_step: the largest stable step; a minibatch takes that, or the largest that it bears itself.
     """
-    offsets, next_states, pay, likely = outcomes
-    met, acted, after, paid = memory
+    offsets, next_states, outcome_rewards, cumulative_probabilities = outcomes
+    observations, actions, next_observations, rewards = memory
     deviation, noise_word = noise
     gamma, first_epsilon, last_epsilon, exploration, begin, gradient_steps, period, size = schedule
-    num_actions, capacity = visits.shape[1], len(met)
+    num_actions, capacity = visits.shape[1], len(observations)
     batch, errors = np.zeros(size, np.int64), np.zeros(size)
     for _ in range(steps):
+        # start an episode
         if place[0] < 0:
             place[0] = starts[start_by_number(cumulative, uniform_number(word, 0))]
             place[1] = -1
             place[2] = 0
         s, t = place[0], place[3]
         c = group[s]
+        # epsilon-greedy action; before learning begins, a uniform one
         share = min(1.0, t / exploration) if exploration > 0 else 1.0
         epsilon = first_epsilon + share * (last_epsilon - first_epsilon) if t >= begin else 1.0
         action = 0
         if uniform_number(word, 0) < epsilon:
             action = integer_below(word, 0, num_actions)
         else:  # greedy, ties at random
-            best, ties = _value(kernel, learnt, c, 0), 1
+            best, ties = _value(kernel, learned, c, 0), 1
             for a in range(1, num_actions):
-                q = _value(kernel, learnt, c, a)
+                q = _value(kernel, learned, c, a)
                 if q > best:
                     best, ties, action = q, 1, a
                 elif q == best:
                     ties += 1
                     if uniform_number(word, 0) * ties < 1.0:
                         action = a
+        # one step of the MDP: the outcome by its cumulated probability
         executed = redrawn_action(action, place[1], chance, num_actions, word)
         row = s * num_actions + executed
         k, last = offsets[row], offsets[row + 1] - 1
         if k < last:
             u = uniform_number(word, 0)
-            while k < last and u >= likely[k]:
+            while k < last and u >= cumulative_probabilities[k]:
                 k += 1
-        new = next_states[k]
-        ended = new < 0 or terminal[new]
+        next_state = next_states[k]
+        ended = next_state < 0 or terminal[next_state]
+        # store the transition in the ring, with a noisy reward
         slot = t % capacity
-        met[slot], acted[slot], after[slot] = c, action, -1 if ended else group[new]
-        paid[slot] = pay[k]
+        observations[slot], actions[slot], next_observations[slot] = c, action, -1 if ended else group[next_state]
+        rewards[slot] = outcome_rewards[k]
         if deviation > 0.0:
-            paid[slot] += deviation * normal_number(noise_word, 0)
+            rewards[slot] += deviation * normal_number(noise_word, 0)
         visits[c, action] += 1
-        place[0], place[1] = new, executed
+        place[0], place[1] = next_state, executed
         place[2] += 1
         place[3] += 1
         if ended or place[2] >= limit:
             place[0] = -1
         if t < begin:
             continue
-        held = min(t + 1, capacity)
-        due = (t + 1 - begin) * gradient_steps // period - (t - begin) * gradient_steps // period
-        for _ in range(due):
+        # gradient steps that fall due between this step and the next
+        num_stored = min(t + 1, capacity)
+        num_gradient_steps = (t + 1 - begin) * gradient_steps // period - (t - begin) * gradient_steps // period
+        for _ in range(num_gradient_steps):
+            # draw a minibatch; its temporal differences by the target
             for i in range(size):
-                j = integer_below(word, 0, held)
+                j = integer_below(word, 0, num_stored)
                 batch[i] = j
-                y = paid[j]
-                if after[j] >= 0:
-                    best = _value(kernel, target, after[j], 0)
+                y = rewards[j]
+                if next_observations[j] >= 0:
+                    best = _value(kernel, target, next_observations[j], 0)
                     for a in range(1, num_actions):
-                        best = max(best, _value(kernel, target, after[j], a))
+                        best = max(best, _value(kernel, target, next_observations[j], a))
                     y += gamma * best
-                errors[i] = y - _value(kernel, learnt, met[j], acted[j])
+                errors[i] = y - _value(kernel, learned, observations[j], actions[j])
+            # largest stable step of this minibatch, by the row sums of its kernel (Gershgorin)
             bound = 0.0
             for i in range(size):
                 total = 0.0
                 for j in range(size):
-                    if acted[batch[i]] == acted[batch[j]]:
-                        total += abs(_likeness(kernel, met[batch[i]], met[batch[j]]))
+                    if actions[batch[i]] == actions[batch[j]]:
+                        total += abs(_likeness(kernel, observations[batch[i]], observations[batch[j]]))
                 bound = max(bound, total / size)
             if bound <= 0.0:
                 continue
+            # move Q along the kernel of each transition
             step = min(largest_step, 1.0 / bound) / size
             for i in range(size):
-                _add(kernel, learnt, met[batch[i]], acted[batch[i]], step * errors[i])
+                _add(kernel, learned, observations[batch[i]], actions[batch[i]], step * errors[i])

@@ -99,7 +99,7 @@ def _refined(table: Indices, classes: np.ndarray) -> tuple[np.ndarray, int]:
     while n:
         count = partition.split(table, now, sizes, count, waiting, n, slots, used, new, changed)
         rounds += 1
-        n = partition.states_to_ask(table, changed, waiting)
+        n = partition.affected_states(table, changed, waiting)
     return _numbered(now[:, None], np.zeros(states, np.int64)), rounds
 
 

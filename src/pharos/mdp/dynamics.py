@@ -234,7 +234,7 @@ class Dynamics(ABC):
         The adjoint of `expected`: sum(mass * expected(x)) = sum(push_forward(mass) * x) where x is 0 at the end.
         """
         after = np.zeros((self.num_states, width))
-        outcomes.pushed(self.for_kernels, np.ascontiguousarray(mass, np.float64), after)
+        outcomes.push_forward(self.for_kernels, np.ascontiguousarray(mass, np.float64), after)
         return after
 
     def accumulate_visits(
@@ -245,7 +245,7 @@ class Dynamics(ABC):
         Masses below `least` may stay.
         """
         weights = step.chance.triple
-        return occupancy.settle(self.for_kernels, step.live, step.policy, weights, gamma, least, waiting, visits)
+        return occupancy.count_visits(self.for_kernels, step.live, step.policy, weights, gamma, least, waiting, visits)
 
     def support(self, step: PolicyStep, reachable: np.ndarray) -> None:
         """Grow reachable (S, W), 1 where there is mass and else 0, to all that the mass may reach in some steps."""
@@ -311,7 +311,7 @@ class Dynamics(ABC):
     def arrivals(self, states: np.ndarray) -> np.ndarray:
         """(S, A) bool: whether executing action a in some of these states may lead to s."""
         result = np.zeros((self.num_states, self.num_actions), np.bool_)
-        outcomes.arrive(self.for_kernels, np.asarray(states), result)
+        outcomes.mark_arrivals(self.for_kernels, np.asarray(states), result)
         return result
 
     def components(self, live: np.ndarray, least: int) -> StronglyConnected:
@@ -355,7 +355,7 @@ class Dynamics(ABC):
             tables = (self.for_sweeps, equation.rewards.table, equation.rewards.palette, equation.gamma)
             actions, chance = bellman.actions_of(self.num_actions), equation.chance.uniform
             groups = (parts.order, parts.starts, parts.has_cycle)
-            bellman.settle(*tables, chance, choice, x[:, 0], actions, *groups, target, settled, most, before)
+            bellman.sweep_groups(*tables, chance, choice, x[:, 0], actions, *groups, target, settled, most, before)
             return
         for group in range(len(parts.has_cycle) - 1, -1, -1):
             start, stop = int(parts.starts[group]), int(parts.starts[group + 1])

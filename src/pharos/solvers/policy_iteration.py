@@ -304,7 +304,7 @@ class PolicyIteration:
         def times(y: np.ndarray) -> np.ndarray:
             image[:] = y
             mdp.dynamics.sweep(silent, swept)
-            linear_algebra.take_from(y, image)
+            linear_algebra.subtract_from(y, image)
             return image
 
         step, _, applications = bicgstab(times, right, FORCING, STEPS)

@@ -290,7 +290,7 @@ class DiskTable:
 
     def settle(self, size: int, indices: np.ndarray, order: np.ndarray, slots: np.ndarray) -> None:
         """Give what was new its numbers."""
-        self._sweep(size, lambda low, high: kernels.settle(self.entries, order, low, high, indices, slots))
+        self._sweep(size, lambda low, high: kernels.assign_numbers(self.entries, order, low, high, indices, slots))
 
     def _sweep(self, size: int, work: Callable[[int, int], None], also: mmap.mmap | None = None) -> None:
         """Do work(low, high) for parts of range(size), in order of slots, so that a part touches no more than the
