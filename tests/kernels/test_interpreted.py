@@ -75,7 +75,7 @@ def test_interpreted_kernels_give_the_bits_of_compiled_ones(tmp_path):
     code = f"""
 import pickle, sys
 from pathlib import Path
-from pharos.rules.interpreted import InterpretedExploration
+from pharos.rules.interpreted import InterpretedExpansion
 from pharos.system import compiling
 compiling.SMALL = 1 << 24
 import test_interpreted

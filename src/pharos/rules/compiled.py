@@ -1,7 +1,7 @@
-"""The compiled engine: rules run by Numba, inside of the kernels that search, step and draw.
+"""The compiled engine: rules run by Numba, inside the kernels that search, step and draw.
 
-Each class makes its kernels ready when it is made, by calling them with no work to do, and raises Numba's error where
-it cannot.
+Each class compiles its kernels in its constructor, by calling them with no work to do, and raises Numba's error where
+that fails.
 """
 
 from collections.abc import Callable
@@ -55,7 +55,7 @@ def interaction_kernels(
 
 
 class _Compiled:
-    """The parameters and the kernels of one environment."""
+    """Parameters and exploration kernels of one environment."""
 
     def __init__(self, env: Environment, layout: Layout):
         names, self.parameters = numeric_attributes(env)
@@ -65,13 +65,13 @@ class _Compiled:
 
 
 def is_kept(env: Environment, layout: Layout) -> bool:
-    """Whether exploration by the rules of the class was compiled before and kept on disk."""
+    """Whether exploration by the rules of the class was compiled before, and is on disk."""
     cache = getattr(_Compiled(env, layout).kernels.explore, "_cache", None)
     return isinstance(cache, KernelCache) and cache.holds_any()
 
 
 class CompiledExpansion(_Compiled):
-    """See `rules.Exploration`. Threads may share the work: the kernels release Python's lock."""
+    """`rules.Expansion`, compiled. Threads may share the work: the kernels release Python's lock."""
 
     is_compiled = True
 
@@ -108,7 +108,7 @@ class CompiledExpansion(_Compiled):
         self._check(states, stop, progress, failure)
 
     def _check(self, states, stop: int | None, progress, failure: Exception | None) -> None:
-        """RuleError where a rule failed or left the ranges in a state before `stop`; None: in any of them."""
+        """Raise a RuleError where a rule failed or left the ranges in a state before `stop`; None: in any of them."""
         from pharos.kernels.hash_table import COUNT, FAULT, FIRST  # which stepping does without
 
         if failure or progress[FAULT]:
@@ -118,7 +118,7 @@ class CompiledExpansion(_Compiled):
             blame(self.env, self.layout, states[first : min(first + _SUSPECTS, stop)], failure)
 
     def _rows(self, terminal, probabilities) -> Rows:
-        """What the kernels write of each row beside its successors."""
+        """Arrays that kernels write beside the successors: terminal; with chance or an age, probabilities as well."""
         return terminal if self._is_plain else (terminal, probabilities)
 
     def _expand(self, *arrays: object) -> None:
@@ -142,7 +142,7 @@ class CompiledExpansion(_Compiled):
 
 
 class CompiledRewards(_Compiled):
-    """See `rules.Rewards`."""
+    """`rules.TransitionRewards`, compiled."""
 
     def __init__(self, env: Environment, layout: Layout):
         super().__init__(env, layout)
@@ -190,7 +190,7 @@ class CompiledRewards(_Compiled):
 
 
 class CompiledAges(_Compiled):
-    """See `rules.Ages`."""
+    """`rules.Ages`, compiled."""
 
     def __init__(self, env: Environment, layout: Layout):
         super().__init__(env, layout)
@@ -205,7 +205,7 @@ class CompiledAges(_Compiled):
 
 
 def _read_only(array: Indices) -> Indices:
-    """A view that is not to be written to, as arrays of a StateSpace are: the kernel is compiled for these alone."""
+    """A read-only view, as arrays of a StateSpace are: the kernel is compiled for these alone."""
     if isinstance(array, PackedIndices):  # which kernels never write to
         return array
     view = array.view()
@@ -214,7 +214,7 @@ def _read_only(array: Indices) -> Indices:
 
 
 class CompiledStepping:
-    """See `rules.Stepping`: the kernels of interaction.py for one environment."""
+    """`rules.Stepping`, compiled: the kernels of interaction.py for one environment."""
 
     is_compiled = True
 
@@ -236,7 +236,7 @@ class CompiledStepping:
         return CompiledStepping, (self.env,)
 
     def step_and_draw_one(self, *arguments: object) -> Function | None:
-        """The kernel that steps and draws, made ready for these arguments; None where `draw` does not compile."""
+        """The kernel that steps and draws, compiled for these arguments; None where `draw` does not compile."""
         try:
             self._step_and_draw_one(self.parameters, *arguments)
         except Exception:  # Numba raises its own errors, and others from inside of it
@@ -245,7 +245,7 @@ class CompiledStepping:
 
 
 class CompiledDrawing:
-    """See `rules.Drawing`.
+    """A kernel that draws states, with the parameters of one environment; see `rules.Rules.drawing`.
 
     Args:
         kernel: its name in interaction.py. arguments: those of the first call, for no states.
@@ -264,17 +264,17 @@ class CompiledDrawing:
 
 
 class CompiledMotion(CompiledDrawing):
-    """The same with the planes of `draw_motion` behind those of `draw`."""
+    """A kernel that draws states with the planes of `draw_motion` behind those of `draw`."""
 
     motion = True
 
 
 def signature_of(env: Environment) -> tuple:
-    """Instances with equal signatures share one compilation, and the reason why there is none."""
+    """Key of an instance: equal keys share one compilation, and the reason why there is none."""
     _, parameters = numeric_attributes(env)
     return (type(env), env.num_actions, env.outcomes, tuple(map(type_text, parameters)))
 
 
 def _class_of(env: Environment) -> type:
-    """Its class, which type checkers take for a key of `cache` where they do not know its `__hash__`."""
+    """The class of `env`, which type checkers take for a key of `cache` where they do not know its `__hash__`."""
     return type(env)

@@ -1,19 +1,19 @@
 """Rules in Python -> kernels compiled by Numba, once per class of environments, cached on disk across processes.
 
-Numba's own file cache knows a function by its file and does not see changes in what the function calls. So kernels that
-call a user's rules (`exploration.py`, `interaction.py`) are cached under a fingerprint of the rules
-and of the code around them: edited rules get another file, unchanged ones are found compiled. The parameters of an
-instance are arguments, not constants: all instances of a class share one compilation.
+Numba's own file cache knows a function by its file and does not see changes in the functions that it calls. So kernels
+that call a user's rules (`exploration.py`, `interaction.py`) are cached under a fingerprint of the rules and of the
+code around them: edited rules get another file, unchanged ones are found compiled. The parameters of an instance are
+arguments, not constants: all instances of a class share one compilation.
 
 Compiled kernels on disk: one file for each kernel and each signature, in a folder that nobody else can write to.
 
-Reading such a file runs what is in it (it is a pickle, and machine code), so the folder is private to its user. Damage
-is noticed by a checksum: a damaged file is deleted, and the kernel is compiled again.
+Reading such a file runs its content (it is a pickle, and machine code), so the folder is private to its user. Damage is
+noticed by a checksum: a damaged file is deleted, and the kernel is compiled again.
 
-The fingerprint: a text that changes whenever what the rules do may change. It covers a rule's bytecode and constants,
-and everything that the rule reaches by name: functions, constants, arrays, enums, attributes of modules, and methods
-and attributes of `self`. Compiled code and cached state spaces are filed under it, so that edited rules never meet what
-was made from the old ones.
+The fingerprint: a text that changes whenever the behaviour of the rules may change. It covers a rule's bytecode and
+constants, and everything that the rule reaches by name: functions, constants, arrays, enums, attributes of modules, and
+methods and attributes of `self`. Compiled code and cached state spaces are filed under it, so that edited rules never
+meet results of the old ones.
 """
 
 import contextlib
@@ -46,7 +46,7 @@ Function = Callable[..., Any]
 CompiledRules = dict[str, Function]
 """Rules by their names."""
 Constructor = Callable[..., tuple[object, ...]]
-"""The class of what the rules see as `self`, a named tuple."""
+"""The class of `self` in compiled rules, a named tuple."""
 RULES = ("transition", "is_terminal", "reward", "draw")
 _COLOURS = re.compile("\x1b\\[[0-9;]*m")  # Numba writes them where colorama is installed
 _HERE = Path(__file__).parent
@@ -58,20 +58,19 @@ _MACHINERY = (
 
 
 def rules_of_class(cls: type[Environment]) -> tuple[str, ...]:
-    """The names of the rules that a class has: those of every class, and those others that it defines."""
-    own = {
+    """Names of the rules of a class: those of every class, and the optional ones that it defines."""
+    optional = {
         "probability": cls.takes_outcomes(),
         "age": cls.age is not Environment.age,
         "draw_motion": cls.draw_motion is not Environment.draw_motion,
     }
-    return RULES + tuple(rule for rule, is_defined in own.items() if is_defined)
+    return RULES + tuple(rule for rule, is_defined in optional.items() if is_defined)
 
 
 def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[object, ...]]:
-    """Names and values of what compiled rules see as `self`: the numbers, tuples of numbers and arrays that they
-    mention.
+    """(names, values) of the attributes of `self` in compiled rules: numbers, tuples of numbers and arrays.
 
-    Private ones are left out: a named tuple has no fields with an underscore.
+    Those that the rules mention. Private ones are left out: a named tuple has no fields with an underscore.
     """
     attributes = set(dir(type(env))) | set(vars(env))
     names = sorted(attributes & mentioned_names(getattr(type(env), rule) for rule in rules_of_class(type(env))))
@@ -99,7 +98,7 @@ def _plain(value: object) -> object:
 def compiler_of(
     cls: type[Environment], names: tuple[str, ...], outcomes: int, *numbers: int
 ) -> tuple["Compiler", CompiledRules, Constructor]:
-    """What a maker needs: the compiler, the compiled rules by their names, and the class of `self`.
+    """(compiler, compiled rules by their names, class of `self`) for the makers of kernels.
 
     With one outcome, `transition` and `reward` take none, whatever the class; with more of them, both do.
     """
@@ -118,7 +117,7 @@ def compiler_of(
 
 
 def _home(cls: type[Environment], rule: str) -> str:
-    """The name of the class that has the rule: those that inherit it share what is compiled."""
+    """Name, in small letters, of the class that defines the rule: classes that inherit it share its kernels."""
     return next(base.__name__ for base in cls.__mro__ if rule in vars(base)).lower()
 
 
@@ -128,14 +127,14 @@ def _machinery() -> tuple[str, ...]:
 
 
 class Compiler:
-    """Compiles the inner functions of the makers, under a name that is theirs for these rules alone.
+    """Compiler of the inner functions of makers, under a name that is unique to these rules.
 
     The name goes into the symbols of the machine code: code of several classes of environments, compiled in several
     processes, is loaded into one.
 
     Args:
         texts: of the rules that the functions call, each with the name of its class; the name begins with the first of
-            these. key: what else they depend on.
+            these. key: other things they depend on.
     """
 
     def __init__(self, texts: dict[str, tuple[str, str]], key: tuple):
@@ -145,19 +144,19 @@ class Compiler:
         self.name = f"{label}_{hashlib.sha256(repr(everything).encode()).hexdigest()[:20]}"
 
     def calling(self, *rules: str) -> "Compiler":
-        """The compiler of functions that call these rules alone: when another one is edited, they stay compiled."""
+        """Compiler of functions that call these rules alone: when another rule is edited, they stay compiled."""
         return Compiler({rule: self.texts[rule] for rule in rules}, self.key)
 
     def inlined(self, function: Function) -> Function:
-        """A function that becomes part of its callers."""
+        """Compile a function that becomes part of its callers."""
         return numba.njit(forceinline=True)(self._named(function))
 
     def function(self, function: Function) -> Function:
-        """A function that kernels call."""
+        """Compile a function that kernels call."""
         return numba.njit(nogil=True)(self._named(function))
 
     def kernel(self, function: Function) -> Function:
-        """A function that Python calls; the compiled form is kept on disk."""
+        """Compile a function that Python calls; the compiled form is kept on disk."""
         kernel: Any = numba.njit(nogil=True)(self._named(function))
         kernel._cache = cache_of_kernel(f"{self.name}.{function.__name__}")
         return kernel
@@ -168,7 +167,7 @@ class Compiler:
 
 
 def one_outcome(compiler: Compiler, transition: Function) -> Function:
-    """The rule of a class that takes outcomes, where there is but outcome 0, as that of a class that does not."""
+    """The transition of a class that takes outcomes, without the argument: outcome 0 is the only one."""
 
     @compiler.inlined
     def transition_of_one(self, state, action, out):
@@ -178,7 +177,7 @@ def one_outcome(compiler: Compiler, transition: Function) -> Function:
 
 
 def reward_of_one_outcome(compiler: Compiler, reward: Function) -> Function:
-    """The reward of a class that pays by outcome, where there is but outcome 0."""
+    """The reward of a class that pays by outcome, without the argument: outcome 0 is the only one."""
 
     @compiler.inlined
     def reward_of_one(self, state, action, next_state):
@@ -188,7 +187,7 @@ def reward_of_one_outcome(compiler: Compiler, reward: Function) -> Function:
 
 
 def reward_of_any_outcome(compiler: Compiler, reward: Function) -> Function:
-    """The reward of a class that does not pay by outcome, as that of one that does."""
+    """The reward of a class that does not pay by outcome, with the argument, which it ignores."""
 
     @compiler.inlined
     def reward_of_any(self, state, action, next_state, outcome):
@@ -198,7 +197,7 @@ def reward_of_any_outcome(compiler: Compiler, reward: Function) -> Function:
 
 
 class _RuleCompiler:
-    """Compiles a rule and, recursively, the plain functions that it mentions by a global name."""
+    """Compiler of a rule and, recursively, of the plain functions that it mentions by a global name."""
 
     def __init__(self):
         self._done: dict[object, Function] = {}
@@ -206,12 +205,13 @@ class _RuleCompiler:
     def compiled(self, rule: Function) -> Function:
         function = plain_function(rule)
         if not isinstance(function, types.FunctionType):
-            return rule  # Numba will say what it thinks of it
+            return rule  # Numba refuses or calls it
         if function in self._done:
             return self._done[function]
         self._done[function] = function  # a function that calls itself keeps its interpreted self, which Numba refuses
-        reached = {name: function.__globals__.get(name) for name in names_in(function.__code__)}
-        replaced = {**function.__globals__, **self._compiled_among(reached)}
+        # a copy of the function, whose globals and closure hold compiled functions
+        mentioned = {name: function.__globals__.get(name) for name in names_in(function.__code__)}
+        replaced = {**function.__globals__, **self._compiled_among(mentioned)}
         cells = {name: types.CellType(value) for name, value in self._compiled_among(closure_of(function)).items()}
         free = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
         closure = tuple(cells.get(name, cell) for name, cell in free)
@@ -230,7 +230,7 @@ class _RuleCompiler:
 
 @overload(float)
 def _float_of_truth(value):
-    """`float(x == y)`, the most natural reward of 0 or 1, which Numba does not know."""
+    """`float` of a truth, such as `float(x == y)`: the most natural reward of 0 or 1, which Numba does not know."""
     if isinstance(value, numba.types.Boolean):
         return lambda value: 1.0 if value else 0.0
     return None
@@ -245,10 +245,11 @@ def type_text(value: object) -> str:
 
 
 def reason_of(error: BaseException) -> str:
-    """What went wrong and in which line, out of Numba's long message."""
+    """The reason and the line of a failed compilation, from Numba's long message."""
     message = _COLOURS.sub("", str(error)) or type(error).__name__
     lines = [line.strip() for line in message.splitlines() if line.strip()]
     start = next((i for i, line in enumerate(lines) if not line.startswith(("Failed in", "During:"))), 0)
+    # the first line that gives a reason, and the last place outside the makers of kernels
     what = lines[start] if lines else ""
     if what.endswith("for signature:"):  # the useful words stand below
         what += "".join(f" {line.removeprefix('>>>').strip()}" for line in lines[start + 1 : start + 2])
@@ -264,27 +265,27 @@ DIGEST_BYTES = 32
 
 
 class Codegen(Protocol):
-    """What Numba knows of the processor."""
+    """Numba's interface to the processor, as far as the cache needs it."""
 
     def magic_tuple(self) -> object:
-        """What compiled code depends on."""
+        """Features of the processor on which compiled code depends."""
 
 
 class TargetContext(Protocol):
-    """What Numba knows of the process that loads a kernel."""
+    """Numba's interface to the process that loads a kernel, as far as the cache needs it."""
 
     def refresh(self) -> None:
-        """Take over what was registered since."""
+        """Take over functions registered since."""
 
     def codegen(self) -> Codegen:
-        """The processor."""
+        """The interface to the processor."""
 
 
 class KernelCache(NullCache):
-    """What Numba asks for compiled code: `load_overload` and `save_overload` of one kernel.
+    """Cache of the compiled forms of one kernel, a file for each signature: the interface that Numba calls.
 
     Args:
-        path: of the files, without what tells one signature from another.
+        path: of the files, without the ending that tells one signature from another.
     """
 
     def __init__(self, path: Path):
@@ -295,11 +296,11 @@ class KernelCache(NullCache):
         return str(self.path.parent)
 
     def holds_any(self) -> bool:
-        """Whether the kernel was compiled and kept, for whatever signature."""
+        """Whether a compiled form is on disk, for any signature."""
         return any(self.path.parent.glob(f"{self.path.name}.*.nbc"))
 
     def load_overload(self, sig: object, target_context: TargetContext) -> CompileResult | None:
-        """The compiled kernel; None where there is none, or a damaged one, which is deleted."""
+        """The compiled kernel of a signature; None where there is none, or a damaged one, which is deleted."""
         target_context.refresh()
         file = self._file(sig, target_context.codegen())
         try:
@@ -316,7 +317,7 @@ class KernelCache(NullCache):
             return None
 
     def save_overload(self, sig: object, cres: Any) -> None:
-        """Keep a compiled kernel, where there is room: the next process compiles again where there is none."""
+        """Write a compiled kernel to disk; without room for it, the next process compiles again."""
         if cres.lifted or cres.library.has_dynamic_globals:  # it refers to addresses of this process
             return
         data = dumps(cres._reduce())
@@ -330,7 +331,7 @@ class KernelCache(NullCache):
 
 
 def cache_of_kernel(name: str) -> NullCache:
-    """The cache of the kernel with this name; one that keeps nothing where no folder is private."""
+    """The cache of the kernel with this name; one that stores nothing where no folder is private."""
     folder = private_folder(storage.cache_directory())
     return NullCache() if folder is None else KernelCache(folder / name)
 
@@ -371,8 +372,9 @@ def mutable_attributes(env: object, rules: Iterable[str]) -> list[str]:
 
 
 def mentioned_names(functions: Iterable[object], owner: type | None = None) -> set[str]:
-    """Names of attributes and globals in these functions, in those that they call by a global name, and in methods of
-    `owner`.
+    """Names of attributes and globals that these functions mention, directly or by functions that they call.
+
+    Those are functions by a global name or from a closure, and methods of `owner`.
     """
     names: set[str] = set()
     closure: set[object] = set()
@@ -396,7 +398,7 @@ def plain_function(value: object) -> object:
 
 
 def names_in(code: types.CodeType) -> set[str]:
-    """Every name that a code object, or one nested in it, looks up."""
+    """Names that a code object, or one nested in it, looks up."""
     names = set(code.co_names)
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
@@ -416,7 +418,7 @@ def closure_of(function: types.FunctionType) -> dict[str, object]:
 
 
 def function_text(function: object, numbers: dict[object, int]) -> str:
-    """A text for a function and for everything that it reaches by name."""
+    """A text of a function and of everything that it reaches by name; equal texts mean equal behaviour."""
     function = plain_function(function)
     if not isinstance(function, types.FunctionType):
         return repr(function)
@@ -425,14 +427,14 @@ def function_text(function: object, numbers: dict[object, int]) -> str:
     numbers[function] = len(numbers)
     names = names_in(function.__code__)
     parts = [_code_text(function.__code__), repr(function.__defaults__), repr(function.__kwdefaults__)]
-    reached = {name: function.__globals__[name] for name in names if name in function.__globals__}
-    for name, value in sorted({**reached, **closure_of(function)}.items()):
+    mentioned = {name: function.__globals__[name] for name in names if name in function.__globals__}
+    for name, value in sorted({**mentioned, **closure_of(function)}.items()):
         parts.append(f"{name}={value_text(value, names, numbers)}")
     return "\n".join(parts)
 
 
 def value_text(value: object, names: set[str], numbers: dict[object, int]) -> str:
-    """A text for a value; of a module, for those of its attributes that are among `names`."""
+    """A text of a value; of a module or a class, by those of its attributes that are among `names`."""
     value = plain_function(value)
     home = getattr(value, "__module__", None) or ""
     if isinstance(value, types.ModuleType):

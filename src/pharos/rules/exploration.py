@@ -1,14 +1,14 @@
 """Makers of the kernels that enumerate states: they call the rules of one class, on packed states.
 
-Each maker is an ordinary function that returns compiled ones (see `compiler.Compiler`). What the inner functions take
-from it are constants for Numba: the rules; `Parameters`, what the rules see as `self`; W words a state; A actions of at
-most K outcomes, 1 without chance.
+Each maker is an ordinary function that returns compiled ones (see `compiler.Compiler`). The variables that the inner
+functions take from it are constants for Numba: the rules; `Parameters`, the class of `self` in rules; W words a state;
+A actions of at most K outcomes, 1 without chance.
 `layout` is a tuple of one table (D, 4): where component i of a state sits (layout.py).
 
 A state has A K branches, branch a K + k for outcome k of action a. With chance or an age the expansion is another one
 (`expand_branches_function`), and the search the same with A K in place of A: an impossible branch is taken to lead to
 the state itself with probability 0, as the branches of a terminal state do but for its first outcomes; `terminal` is
-then whatever the expansion writes beside the successors.
+then the pair of arrays that the expansion writes beside the successors.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,7 @@ BATCH = 16  # states expanded before their successors are looked up: enough look
 
 
 class ExpansionKernels(NamedTuple):
-    """The compiled kernels; see the makers below."""
+    """Compiled kernels that expand states; see the makers below."""
 
     explore: Function
     expand_and_find: Function
@@ -97,7 +97,7 @@ def words_functions(compiler: Compiler, W: int) -> Words:
 def expand_function(
     compiler: Compiler, rules: CompiledRules, Parameters: Constructor, words: Words, W: int, A: int
 ) -> Function:
-    """Successors of a few states, and where in the table to look for them."""
+    """Function that writes the successors of a few states, and the slots of the table in which to look for them."""
     transition, is_terminal = rules["transition"], rules["is_terminal"]
     load, hash_of, _ = words
     WORDS = (0,) * W
@@ -110,6 +110,7 @@ def expand_function(
         keys (n * A, W), slots (n * A,); terminal[row + i] gets whether state first + i is terminal. The slots are
         prefetched.
         """
+        # the rules see packed states as views: `state` is read, `out` is written
         self = Parameters(*parameters)
         state = read_only_view(WORDS, *layout)
         out = packed_view(WORDS, *layout)
@@ -135,7 +136,7 @@ def expand_function(
 
 
 def prefetch_function(compiler: Compiler, A: int) -> Function:
-    """Fetching the states that look-ups will meet."""
+    """Function that fetches from memory the states with which look-ups will compare."""
 
     @compiler.inlined
     def prefetch_states(table, states, slots, n):
@@ -152,7 +153,7 @@ def prefetch_function(compiler: Compiler, A: int) -> Function:
 def explore_kernel(
     compiler: Compiler, expand: Function, prefetch_states: Function, words: Words, W: int, A: int
 ) -> Function:
-    """The search by one thread."""
+    """Kernel of the search by one thread."""
     same = words.same
 
     @compiler.kernel
@@ -173,19 +174,22 @@ def explore_kernel(
         level_end, depth = progress[LEVEL_END], progress[DEPTH]
         waiting, buffer = 0, 0  # states [first, first + waiting) are expanded, in the other buffer
         while True:
+            # size of the next batch; 0 at the end, and where its successors might not fit
             n = 0
             if count + 2 * BATCH * A <= room:
                 n = max(0, min(BATCH, count - first - waiting, last - first - waiting))
             if n == 0 and waiting == 0:
                 break
+            # expand the next batch into one buffer
             if n > 0:
                 progress[COUNT] = count
-                ahead = first + waiting
+                begin = first + waiting
                 batch, places = keys[buffer], slots[buffer]
-                expand(parameters, layout, states, ahead, n, batch, places, terminal, ahead - base, table, progress)
+                expand(parameters, layout, states, begin, n, batch, places, terminal, begin - base, table, progress)
                 if progress[FAULT]:
                     return
             buffer = 1 - buffer
+            # look up the successors of the batch in the other buffer, and number those that are new
             for i in range(waiting):
                 for a in range(A):
                     j = i * A + a
@@ -204,6 +208,7 @@ def explore_kernel(
                             break
                         slot = slot + 1 if slot + 1 < capacity else 0
                     successors[first + i - base, a] = index
+                # the last state of a level: the next level ends with the newest state
                 if first + i + 1 == level_end:
                     level_end = count
                     depth += 1
@@ -219,7 +224,7 @@ def explore_kernel(
 def expand_and_find_kernel(
     compiler: Compiler, expand: Function, prefetch_states: Function, words: Words, A: int
 ) -> Function:
-    """The part of a wide frontier that threads share."""
+    """Kernel of the part of a wide frontier that threads share: expand states and find known successors."""
     same = words.same
 
     @compiler.kernel
@@ -234,6 +239,7 @@ def expand_and_find_kernel(
         capacity = table.shape[0]
         waiting, buffer = 0, 0
         for batch in range(start, stop + BATCH, BATCH):
+            # expand the next batch into one buffer
             n = max(0, min(BATCH, stop - batch))
             if n > 0:
                 part = keys[(batch - base) * A : (batch - base + n) * A]
@@ -242,6 +248,7 @@ def expand_and_find_kernel(
                 if progress[FAULT]:
                     return
             buffer = 1 - buffer
+            # look up the successors of the batch before it
             before = batch - BATCH
             first = (before - base) * A
             for j in range(waiting * A):
@@ -265,7 +272,7 @@ def expand_and_find_kernel(
 def rewards_of_kernel(
     compiler: Compiler, rules: CompiledRules, Parameters: Constructor, words: Words, W: int, A: int
 ) -> Function:
-    """Rewards of stored transitions."""
+    """Kernel of the rewards of stored transitions, without chance."""
     reward = rules["reward"]
     load = words.load
     WORDS = (0,) * W
@@ -278,15 +285,15 @@ def rewards_of_kernel(
         """
         self = Parameters(*parameters)
         state = read_only_view(WORDS, *layout)
-        following = read_only_view(WORDS, *layout)
+        next_state = read_only_view(WORDS, *layout)
         finite = True
         for s in range(start, stop):
             load(state, states, s)
             for a in range(A):
                 value = 0.0
                 if not terminal[s]:
-                    load(following, states, int64(successors[s, a]))
-                    value = float(reward(self, state, a, following))
+                    load(next_state, states, int64(successors[s, a]))
+                    value = float(reward(self, state, a, next_state))
                 finite = finite and np.isfinite(value)
                 out[s - start, a] = value
         return finite
@@ -298,7 +305,7 @@ def rewards_of_kernel(
 
 
 def _rules_of_branches(compiler: Compiler, rules: CompiledRules, K: int) -> tuple[Function, Function, Function]:
-    """(transition, probability, age) as `expand` calls them, whatever the class defines."""
+    """(transition, probability, age) with the arguments of `expand`, whether the class defines them or not."""
     transition = rules["transition"]
 
     @compiler.inlined
@@ -321,7 +328,7 @@ def _rules_of_branches(compiler: Compiler, rules: CompiledRules, K: int) -> tupl
 def expand_branches_function(
     compiler: Compiler, rules: CompiledRules, Parameters: Constructor, words: Words, W: int, A: int, K: int
 ) -> Function:
-    """Successors of a few states by all branches, how likely they are, and where in the table to look for them."""
+    """Function that writes the successors of a few states by all branches, their probabilities and slots."""
     load, hash_of, _ = words
     transition, probability, age = _rules_of_branches(compiler, rules, K)
     is_terminal = rules["is_terminal"]
@@ -353,14 +360,15 @@ def expand_branches_function(
             for a in range(A):
                 total = 0.0
                 for k in range(K):
+                    # a branch: its probability, and, where that is positive, its successor
                     slots[j] = -1
-                    likely = 1.0 if k == 0 else 0.0
+                    p = 1.0 if k == 0 else 0.0
                     if not ended:
-                        likely = float(probability(self, state, a, k))
-                        total += likely
-                        if not (likely >= 0.0 and likely <= 1.0 + TOLERANCE):
+                        p = float(probability(self, state, a, k))
+                        total += p
+                        if not (p >= 0.0 and p <= 1.0 + TOLERANCE):
                             broken = True
-                        if likely > 0.0:
+                        if p > 0.0:
                             load(out, states, first + i)
                             transition(self, state, a, k, out)
                             if AGED and np.int64(age(self, out)) <= now:
@@ -370,8 +378,9 @@ def expand_branches_function(
                             slots[j] = slot_of(hash_of(keys, j), capacity)
                             prefetch(table, slots[j])
                     if CHANCE:
-                        probabilities[row + i, a * K + k] = likely if likely > 0.0 else 0.0
+                        probabilities[row + i, a * K + k] = p if p > 0.0 else 0.0
                     j += 1
+                # the probabilities of an action must sum to 1
                 if CHANCE and not ended and not abs(total - 1.0) <= TOLERANCE:
                     broken = True
         progress[FAULT] = max(fault(state), fault(out))
@@ -384,7 +393,7 @@ def expand_branches_function(
 def expected_rewards_kernel(
     compiler: Compiler, rules: CompiledRules, Parameters: Constructor, words: Words, W: int, A: int, K: int
 ) -> Function:
-    """Rewards of stored transitions: what executing an action pays on average.
+    """Kernel of the expected rewards of stored transitions, with chance.
 
     K: 1 where rewards do not depend on the outcome, which is not looked for then.
     """
@@ -402,27 +411,29 @@ def expected_rewards_kernel(
         """
         self = Parameters(*parameters)
         state = read_only_view(WORDS, *layout)
-        following = read_only_view(WORDS, *layout)
+        next_state = read_only_view(WORDS, *layout)
         before, first, same = int64(-1), 0.0, True
-        passed, outcome = int64(-1), int64(-1)  # possible outcomes of this action passed by, and the last of them
+        last_rank, outcome = int64(-1), int64(-1)  # the last possible outcome so far: its rank among these, its number
         for j in range(len(which)):
             i, a = which[j] // A, which[j] % A
             if terminal[start + i]:
                 continue
             if which[j] != before:
                 load(state, states, start + i)
-                passed, outcome = int64(-1), int64(-1)
-            load(following, states, int64(successors[j]))
+                last_rank, outcome = int64(-1), int64(-1)
+            # the number of the outcome, from its rank among the possible ones
+            load(next_state, states, int64(successors[j]))
             if K > 1:
-                rank = ranks[j] if len(ranks) > 0 else passed + 1
-                while passed < rank and outcome < K - 1:
+                rank = ranks[j] if len(ranks) > 0 else last_rank + 1
+                while last_rank < rank and outcome < K - 1:
                     outcome += 1
                     if probability(self, state, a, outcome) > 0.0:
-                        passed += 1
-            value = float(reward(self, state, a, following, outcome))
+                        last_rank += 1
+            value = float(reward(self, state, a, next_state, outcome))
             if which[j] != before:
                 before, first, same = which[j], value, True
                 out[i, a] = 0.0
+            # add up; equal rewards are not averaged, so that no rounding changes them
             same = same and value == first
             out[i, a] += probabilities[j] * value
             if j + 1 == len(which) or which[j + 1] != before:
@@ -437,7 +448,7 @@ def no_ages(*arguments: object) -> None:
 
 
 def ages_of_kernel(compiler: Compiler, rules: CompiledRules, Parameters: Constructor, words: Words, W: int) -> Function:
-    """Ages of states."""
+    """Kernel of the ages of states."""
     age = rules["age"]
     load = words.load
     WORDS = (0,) * W

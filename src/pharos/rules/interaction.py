@@ -1,11 +1,11 @@
 """Makers of the kernels of interaction: they call the rules of one class on states that are rows of int64.
 
-As in exploration.py, what the inner functions take from their makers are constants for Numba: the rules; `Parameters`,
-what the rules see as `self`; A actions of at most K outcomes. `ranges` (2, D) int64: lowest and highest value of each
-component.
+As in exploration.py, the variables that the inner functions take from their makers are constants for Numba: the rules;
+`Parameters`, the class of `self` in rules; A actions of at most K outcomes. `ranges` (2, D) int64: lowest and highest
+value of each component.
 
-One environment takes a branch a K + k, outcome k of action a, which `outcome_one` draws before; many draw it
-themselves. Without chance K is 1, so a branch is an action. Branch -1 - a is action a without effect.
+A kernel for one environment takes a branch a K + k, outcome k of action a, which `outcome_one` draws before; a kernel
+for many draws it itself. Without chance K is 1, so a branch is an action. Branch -1 - a is action a without effect.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ Advances = tuple[Function, Function]  # `advance` and `stay`, of `advance_functi
 
 
 class InteractionKernels(NamedTuple):
-    """The compiled kernels; see the makers below."""
+    """Compiled kernels that step and draw; see the makers below."""
 
     step_one: Function
     outcome_one: Function
@@ -62,52 +62,52 @@ def interaction(
 
 
 def advance_functions(compiler: Compiler, rules: CompiledRules, K: int) -> Advances:
-    """One step by the rules, checked; and one by an action without effect."""
+    """(advance, stay): one checked step by the rules, and one step by an action without effect."""
     transition, is_terminal, reward = rules["transition"], rules["is_terminal"], rules["reward"]
 
     @compiler.inlined
-    def go(self, state, branch, following):
-        transition(self, state, branch, following)
+    def move_by_action(self, state, branch, next_state):
+        transition(self, state, branch, next_state)
 
     @compiler.inlined
-    def go_by_outcome(self, state, branch, following):
-        transition(self, state, branch // K, branch % K, following)
+    def move_by_outcome(self, state, branch, next_state):
+        transition(self, state, branch // K, branch % K, next_state)
 
     @compiler.inlined
-    def pay(self, state, action, following, outcome):
-        return float(reward(self, state, action, following))
+    def reward_of_pair(self, state, action, next_state, outcome):
+        return float(reward(self, state, action, next_state))
 
     @compiler.inlined
-    def pay_by_outcome(self, state, action, following, outcome):
-        return float(reward(self, state, action, following, outcome))
+    def reward_of_outcome(self, state, action, next_state, outcome):
+        return float(reward(self, state, action, next_state, outcome))
 
-    move, paid = (go, pay) if K == 1 else (go_by_outcome, pay_by_outcome)
+    move, earned = (move_by_action, reward_of_pair) if K == 1 else (move_by_outcome, reward_of_outcome)
 
     @compiler.inlined
-    def advance(self, ranges, state, branch, following):
+    def advance(self, ranges, state, branch, next_state):
         """Write the successor of `state`; return the reward and 0 (goes on), 1 (terminal) or 2 + i (component i left
         its range).
         """
         for i in range(len(state)):
-            following[i] = state[i]
-        move(self, state, branch, following)
+            next_state[i] = state[i]
+        move(self, state, branch, next_state)
         for i in range(len(state)):
-            if following[i] < ranges[0, i] or following[i] > ranges[1, i]:
+            if next_state[i] < ranges[0, i] or next_state[i] > ranges[1, i]:
                 return 0.0, 2 + i
-        return paid(self, state, branch // K, following, branch % K), int64(is_terminal(self, following))
+        return earned(self, state, branch // K, next_state, branch % K), int64(is_terminal(self, next_state))
 
     @compiler.inlined
-    def stay(self, state, action, following):
+    def stay(self, state, action, next_state):
         """The same of an action without effect: the successor is the state."""
         for i in range(len(state)):
-            following[i] = state[i]
-        return paid(self, state, action, following, -1), int64(0)
+            next_state[i] = state[i]
+        return earned(self, state, action, next_state, -1), int64(0)
 
     return advance, stay
 
 
 def drawn_outcome_function(compiler: Compiler, rules: CompiledRules, K: int) -> Function:
-    """Which outcome a number from 0 to 1 stands for."""
+    """Function that draws an outcome by a number from 0 to 1."""
     if K > 1:
         probability = rules["probability"]
 
@@ -118,19 +118,19 @@ def drawn_outcome_function(compiler: Compiler, rules: CompiledRules, K: int) -> 
     @compiler.inlined
     def drawn_outcome(self, state, action, u):
         """(outcome, its probability): the first one with which the probabilities so far are more than u in [0, 1)."""
-        drawn, likely, passed = 0, 0.0, 0.0
+        number, p, total = 0, 0.0, 0.0
         for outcome in range(K):
             chance = float(probability(self, state, action, outcome))
-            if chance > 0.0 and passed <= u:  # else it is drawn already
-                drawn, likely = outcome, chance
-                passed += chance
-        return drawn, likely
+            if chance > 0.0 and total <= u:  # else an earlier outcome is drawn
+                number, p = outcome, chance
+                total += chance
+        return number, p
 
     return only_outcome if K == 1 else drawn_outcome
 
 
 def outcome_one_kernel(compiler: Compiler, Parameters: Constructor, drawn_outcome: Function) -> Function:
-    """The outcome of one step of one environment."""
+    """Kernel that draws the outcome of one step of one environment."""
 
     @compiler.kernel
     def outcome_one(parameters, state, action, u):
@@ -141,29 +141,29 @@ def outcome_one_kernel(compiler: Compiler, Parameters: Constructor, drawn_outcom
 
 
 def step_one_kernel(compiler: Compiler, Parameters: Constructor, advances: Advances) -> Function:
-    """One step of one environment."""
+    """Kernel of one step of one environment."""
     advance, stay = advances
 
     @compiler.kernel
-    def step_one(parameters, ranges, scale, state, branch, following, vector):
-        """One step: `advance`, and vector[i] = (following[i] - low[i]) * scale[i] where `vector` has room (0 entries:
+    def step_one(parameters, ranges, scale, state, branch, next_state, vector):
+        """One step: `advance`, and vector[i] = (next_state[i] - low[i]) * scale[i] where `vector` has room (0 entries:
         not wanted).
         """
         self = Parameters(*parameters)
         if branch < 0:
-            value, code = stay(self, state, -1 - branch, following)
+            value, code = stay(self, state, -1 - branch, next_state)
         else:
-            value, code = advance(self, ranges, state, branch, following)
+            value, code = advance(self, ranges, state, branch, next_state)
         if len(vector) > 0:
             for i in range(len(state)):
-                vector[i] = (following[i] - ranges[0, i]) * scale[i]
+                vector[i] = (next_state[i] - ranges[0, i]) * scale[i]
         return value, code
 
     return step_one
 
 
 def draw_all_function(compiler: Compiler, rules: CompiledRules, L: int) -> Function:
-    """Where things are, and behind these planes their motion."""
+    """Function that draws a state, and behind its planes the planes of its motion."""
     draw, draw_motion = rules["draw"], rules["draw_motion"]
 
     @compiler.inlined
@@ -176,7 +176,7 @@ def draw_all_function(compiler: Compiler, rules: CompiledRules, L: int) -> Funct
 
 
 def draw_flat_function(compiler: Compiler, rules: CompiledRules) -> Function:
-    """A simple image, a pixel for each cell."""
+    """Function that draws a simple image, a pixel for each cell."""
     draw = rules["draw"]
 
     @compiler.inlined
@@ -200,22 +200,22 @@ def draw_flat_function(compiler: Compiler, rules: CompiledRules) -> Function:
 def step_and_draw_one_kernel(
     compiler: Compiler, Parameters: Constructor, advances: Advances, draw_flat: Function
 ) -> Function:
-    """One step of one environment, and its image."""
+    """Kernel of one step of one environment, and its image."""
     advance, stay = advances
 
     @compiler.kernel
-    def step_and_draw_one(parameters, ranges, state, branch, following, shades, image):
+    def step_and_draw_one(parameters, ranges, state, branch, next_state, shades, image):
         """One step: `advance`, and the simple image of the successor, a pixel for each cell, on planes of their own.
 
         shades (L, 256) uint8 as in `draw_simple`; image (L, rows, columns) uint8, zero.
         """
         self = Parameters(*parameters)
         if branch < 0:
-            value, code = stay(self, state, -1 - branch, following)
+            value, code = stay(self, state, -1 - branch, next_state)
         else:
-            value, code = advance(self, ranges, state, branch, following)
+            value, code = advance(self, ranges, state, branch, next_state)
         if code <= 1:
-            draw_flat(self, following, shades, image)
+            draw_flat(self, next_state, shades, image)
         return value, code
 
     return step_and_draw_one
@@ -224,7 +224,7 @@ def step_and_draw_one_kernel(
 def step_many_kernel(
     compiler: Compiler, Parameters: Constructor, advances: Advances, drawn_outcome: Function, A: int, K: int
 ) -> Function:
-    """One step of many environments."""
+    """Kernel of one step of many environments."""
     advance, stay = advances
 
     @compiler.kernel
@@ -237,31 +237,33 @@ def step_many_kernel(
         """
         ranges, scale, chance, limit, mode, first_previous, starts, cumulative = setting
         rng, actions, states, previous, elapsed, ended, rewards, terminated, truncated, executed, final = batch[:11]
-        vector, likely = batch[11:]
+        vector, probabilities = batch[11:]
         self = Parameters(*parameters)
         length = states.shape[1]
-        following = np.empty(length, np.int64)
+        next_state = np.empty(length, np.int64)
         for i in range(first, last):
             rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, -1
             if K > 1:
-                likely[i] = 1.0
+                probabilities[i] = 1.0
+            # executed action and its outcome, unless the episode is over
             restart = ended[i]
             if not restart:
                 action = executed_action(actions[i], previous[i], chance, A, rng, i)
                 if has_no_effect(chance, rng, i):
-                    value, code = stay(self, states[i], action, following)
+                    value, code = stay(self, states[i], action, next_state)
                     if K > 1:
-                        likely[i] = chance[4]
+                        probabilities[i] = chance[4]
                 else:
                     branch = action
                     if K > 1:  # nothing is drawn where an action has one outcome
                         outcome, p = drawn_outcome(self, states[i], action, uniform_number(rng, i))
-                        likely[i] = p * (1.0 - chance[4])
+                        probabilities[i] = p * (1.0 - chance[4])
                         branch = action * K + outcome
-                    value, code = advance(self, ranges, states[i], branch, following)
+                    value, code = advance(self, ranges, states[i], branch, next_state)
                 if code > 1:
                     executed[i] = action
                     return i * length + code - 2
+                # the episode after this step; in SAME_STEP an end is left at once
                 rewards[i] = value
                 previous[i] = executed[i] = action
                 elapsed[i] += 1
@@ -270,9 +272,10 @@ def step_many_kernel(
                 ended[i] = terminated[i] or truncated[i]
                 restart = mode == SAME_STEP and ended[i]
                 for c in range(length):
-                    states[i, c] = following[c]
+                    states[i, c] = next_state[c]
                     if restart:
-                        final[i, c] = following[c]
+                        final[i, c] = next_state[c]
+            # reset to a start state
             if restart:
                 k = drawn_start(cumulative, rng, i)
                 for c in range(length):
@@ -287,7 +290,7 @@ def step_many_kernel(
 
 
 def is_terminal_one_kernel(compiler: Compiler, rules: CompiledRules, Parameters: Constructor) -> Function:
-    """Whether one state is terminal."""
+    """Kernel of the truth whether one state is terminal."""
     is_terminal = rules["is_terminal"]
 
     @compiler.kernel
@@ -301,7 +304,7 @@ def is_terminal_one_kernel(compiler: Compiler, rules: CompiledRules, Parameters:
 def draw_simple_kernel(
     compiler: Compiler, rules: CompiledRules, Parameters: Constructor, draw_flat: Function
 ) -> Function:
-    """Simple images of many states."""
+    """Kernel of the simple images of many states."""
     draw = rules["draw"]
 
     @compiler.kernel
@@ -315,9 +318,11 @@ def draw_simple_kernel(
         layers, rows, columns = planes.shape
         size = out.shape[2] // rows
         for n in range(first, last):
+            # a pixel for each cell: drawn on the image itself
             if size == 1 and not covering:
                 draw_flat(self, states[n], shades, out[n])
                 continue
+            # otherwise on planes, then enlarged, later layers over earlier ones
             planes[:] = 0
             draw(self, states[n], planes)
             for layer in range(layers):
@@ -334,7 +339,7 @@ def draw_simple_kernel(
 
 
 def draw_complex_kernel(compiler: Compiler, rules: CompiledRules, Parameters: Constructor) -> Function:
-    """Complex images of many states."""
+    """Kernel of the complex images of many states."""
     draw = rules["draw"]
 
     @compiler.kernel
@@ -356,6 +361,7 @@ def draw_complex_kernel(compiler: Compiler, rules: CompiledRules, Parameters: Co
             for layer in range(layers):
                 for row in range(rows):
                     for column in range(columns):
+                        # a sprite, blended with the pixels below it
                         value = planes[layer, row, column]
                         if value == 0 or sprite[layer, row, value] < 0:
                             continue
@@ -374,7 +380,7 @@ def draw_complex_kernel(compiler: Compiler, rules: CompiledRules, Parameters: Co
 
 
 def draw_planes_kernel(compiler: Compiler, rules: CompiledRules, Parameters: Constructor) -> Function:
-    """What `draw` writes, for many states."""
+    """Kernel of the planes that `draw` writes, for many states."""
     draw = rules["draw"]
 
     @compiler.kernel

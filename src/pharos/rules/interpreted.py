@@ -1,6 +1,4 @@
-"""The interpreted engine: rules called in Python, where Numba cannot compile them, and to name the state in which they
-failed.
-"""
+"""The interpreted engine: rules called in Python, where Numba cannot compile them, and to name a failing state."""
 
 import multiprocessing
 import numbers
@@ -22,22 +20,22 @@ from pharos.system.arrays import SUM_TOLERANCE
 
 
 class Branches(NamedTuple):
-    """What N states lead to by B branches each: A actions, or, with chance, outcome k of action a as branch a K + k.
+    """Next states of N states by B branches each: A actions, or, with chance, outcome k of action a as branch a K + k.
 
     Attributes:
-        following: (N B, D) int64, or uint8 where it suffices; terminal states lead to themselves, and so do impossible
-            outcomes.
+        next_states: (N B, D) int64, or uint8 where it suffices; terminal states and impossible outcomes lead to the
+            state itself.
         terminal: (N,) bool.
         probabilities: (N, B) float64; None without chance.
     """
 
-    following: np.ndarray
+    next_states: np.ndarray
     terminal: np.ndarray
     probabilities: np.ndarray | None = None
 
 
 def interpreted_branches(env: Environment, rows: list[list[int]]) -> Branches:
-    """Call the rules in each state; see `Branches`.
+    """The branches of some states, by calling the rules in each.
 
     Args:
         rows: N states, D integers each.
@@ -50,7 +48,7 @@ def interpreted_branches(env: Environment, rows: list[list[int]]) -> Branches:
 
 
 def interpreted_successors(env: Environment, rows: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
-    """Call the rules of a class without chance in each state.
+    """The successors of some states by a class without chance, by calling its rules in each.
 
     Args:
         rows: N states, D integers each.
@@ -67,6 +65,7 @@ def interpreted_successors(env: Environment, rows: list[list[int]]) -> tuple[np.
     transition, is_terminal = _transition(env), env.is_terminal
     terminal = np.zeros(len(rows), np.bool_)
     out: list[list[int]] = []
+    # call the rules; `out` tells at which action one failed
     try:
         for i, row in enumerate(rows):
             state = tuple(row)
@@ -83,23 +82,24 @@ def interpreted_successors(env: Environment, rows: list[list[int]]) -> tuple[np.
             "" if len(out) % len(actions) == 0 else f" by action {env.actions[(len(out) - 1) % len(actions)]!r}"
         )
         raise RuleError(f"{env}: in state {state}{action_name} a rule raises {error!r}") from error
-    following = _array(out)
+    # successors out of range, or all where some are no states: the first bad one is named
+    next_states = _array(out)
     components = env.components
-    if following.shape == (len(out), len(components)):
-        outside = ((following < components.low) | (following > components.high)).any(axis=1)
+    if next_states.shape == (len(out), len(components)):
+        outside = ((next_states < components.low) | (next_states > components.high)).any(axis=1)
         suspects = np.flatnonzero(outside)[:1].tolist()
     else:
         suspects = list(range(len(out)))
     for j in suspects:
         i, action = divmod(j, len(actions))
         check_successor(env, tuple(rows[i]), action, out[j])
-    return following, terminal
+    return next_states, terminal
 
 
 def _small_successors(env: Environment, rows: list[list[int]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """The same for integers from 0 to 255, the usual case: each successor becomes bytes at once, and no list is kept.
+    """`interpreted_successors` for integers from 0 to 255, the usual case: no lists, successors become bytes.
 
-    None where a rule raises, an integer is another or a range is left: rules are pure, so that the caller can ask
+    None where a rule raises, an integer is another or a range is left: rules are pure, so that the caller can call them
     again.
     """
     transition, is_terminal, actions = _transition(env), env.is_terminal, range(env.num_actions)
@@ -122,10 +122,10 @@ def _small_successors(env: Environment, rows: list[list[int]]) -> tuple[np.ndarr
     data = b"".join(out)
     if len(data) != len(out) * len(components) or len(set(map(len, out))) != 1:
         return None
-    following = np.frombuffer(data, np.uint8).reshape(len(out), -1)
-    if (following.min(axis=0) < components.low).any() or (following.max(axis=0) > components.high).any():
+    next_states = np.frombuffer(data, np.uint8).reshape(len(out), -1)
+    if (next_states.min(axis=0) < components.low).any() or (next_states.max(axis=0) > components.high).any():
         return None
-    return following, terminal
+    return next_states, terminal
 
 
 def _transition(env: Environment) -> Callable[..., None]:
@@ -136,6 +136,7 @@ def _transition(env: Environment) -> Callable[..., None]:
 
 
 def _array(out: list[list[int]]) -> np.ndarray:
+    """The successors as an array; an empty one where they are no integers of one length."""
     try:
         return np.array(out, np.int64)
     except (ValueError, TypeError, OverflowError):
@@ -143,7 +144,7 @@ def _array(out: list[list[int]]) -> np.ndarray:
 
 
 def check_successor(env: Environment, state: tuple[int, ...], action: int, out: list[int], which: str = "") -> None:
-    """RuleError where `out` is no state; `which` outcome it is, in words."""
+    """Raise a RuleError where `out` is no state; `which`: the outcome, in words."""
     components = env.components
     where = f"{env}: {which}action {env.actions[action]!r} in state {state}"
     if len(out) != len(components):
@@ -157,13 +158,13 @@ def check_successor(env: Environment, state: tuple[int, ...], action: int, out: 
 
 
 def _outcomes(env: Environment, rows: list[list[int]]) -> Branches:
-    """The same for classes with chance or an age."""
+    """`interpreted_branches` of a class with chance or an age."""
     terminal = np.zeros(len(rows), np.bool_)
     probabilities = np.zeros((len(rows), env.num_actions, env.outcomes))
-    following = np.empty((len(rows), env.num_actions, env.outcomes, len(env.components)), np.int64)
+    next_states = np.empty((len(rows), env.num_actions, env.outcomes, len(env.components)), np.int64)
     for i, row in enumerate(rows):
         state = tuple(row)
-        following[i] = row
+        next_states[i] = row
         try:
             terminal[i] = env.is_terminal(state)
         except Exception as error:
@@ -174,8 +175,8 @@ def _outcomes(env: Environment, rows: list[list[int]]) -> Branches:
         for action in range(env.num_actions):
             probabilities[i, action] = outcome_probabilities(env, state, action)
             for outcome in np.flatnonzero(probabilities[i, action]).tolist():
-                following[i, action, outcome] = _outcome(env, state, action, outcome)
-    flat = following.reshape(-1, len(env.components))
+                next_states[i, action, outcome] = _outcome(env, state, action, outcome)
+    flat = next_states.reshape(-1, len(env.components))
     return Branches(flat, terminal, probabilities.reshape(len(rows), -1) if env.has_chance else None)
 
 
@@ -203,7 +204,7 @@ def outcome_probabilities(env: Environment, state: tuple[int, ...], action: int)
 
 
 def _outcome(env: Environment, state: tuple[int, ...], action: int, outcome: int) -> list[int]:
-    """Where an outcome leads; RuleError where that is no state, or no older one."""
+    """The next state by an outcome; RuleError where that is no state, or not older than `state`."""
     which = f"outcome {outcome} of " if env.takes_outcomes() else ""
     out = list(state)
     try:
@@ -232,7 +233,7 @@ _SHARE = 64  # states that are worth sending to another process
 
 
 class InterpretedExpansion:
-    """See `rules.Exploration`. One thread asks; the rules themselves run in as many processes as there are workers."""
+    """`rules.Expansion`, interpreted: one thread, and as many processes that run rules as there are workers."""
 
     is_compiled = False
 
@@ -271,11 +272,11 @@ class InterpretedExpansion:
         layout = self.layout
         unpacked = np.empty((len(states), len(layout.word)), np.int64)
         unpack_rows(layout.word, layout.shift, layout.mask, layout.low, states, unpacked)
-        following, terminal[:], likely = self._branches(unpacked)
-        if likely is not None:
-            probabilities[:] = likely
+        next_states, terminal[:], p = self._branches(unpacked)
+        if p is not None:
+            probabilities[:] = p
         keys[:] = 0
-        pack_rows(layout.word, layout.shift, layout.low, following, keys)
+        pack_rows(layout.word, layout.shift, layout.low, next_states, keys)
 
     def _branches(self, states: np.ndarray) -> Branches:
         return self._interpreters.branches(states)
@@ -286,7 +287,7 @@ class InterpretedExpansion:
 
 
 class InterpretedRewards:
-    """See `rules.Rewards`."""
+    """`rules.TransitionRewards`, interpreted."""
 
     def __init__(self, env: Environment, layout: Layout):
         self.env, self.layout = env, layout
@@ -297,48 +298,49 @@ class InterpretedRewards:
     def block(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
         out = np.zeros((stop - start, self.env.num_actions))
         rows = list(map(tuple, unpack(self.layout, states[start:stop]).tolist()))
-        going = np.flatnonzero(~np.asarray(terminal[start:stop])).tolist()
+        live = np.flatnonzero(~np.asarray(terminal[start:stop])).tolist()
         with np.errstate(all="ignore"):  # what is not finite is reported
             for a in range(self.env.num_actions):
-                following = list(map(tuple, unpack(self.layout, states[successors[start:stop, a]]).tolist()))
-                for i in going:
-                    out[i, a] = self._reward(rows[i], a, following[i])
+                next_states = list(map(tuple, unpack(self.layout, states[successors[start:stop, a]]).tolist()))
+                for i in live:
+                    out[i, a] = self._reward(rows[i], a, next_states[i])
         return out
 
     def expected_block(self, states, outcomes, terminal, start: int, stop: int, ranks=()) -> np.ndarray:
         num_actions = self.env.num_actions
         out = np.zeros((stop - start) * num_actions)
-        paid: list[list[float]] = [[] for _ in out]
+        rewards: list[list[float]] = [[] for _ in out]
         rows = list(map(tuple, unpack(self.layout, states[start:stop]).tolist()))
-        which, following, probabilities = outcomes
-        after = list(map(tuple, unpack(self.layout, states[following]).tolist()))
+        which, successors, probabilities = outcomes
+        next_states = list(map(tuple, unpack(self.layout, states[successors]).tolist()))
         ended = np.asarray(terminal[start:stop]).tolist()
         with np.errstate(all="ignore"):  # what is not finite is reported
             for j, (pair, probability) in enumerate(zip(which.tolist(), probabilities.tolist(), strict=True)):
                 i, a = divmod(pair, num_actions)
                 if not ended[i]:
-                    rank = int(ranks[j]) if len(ranks) else len(paid[pair])
-                    paid[pair].append(float(self._reward(rows[i], a, after[j], rank)))
-                    out[pair] += probability * paid[pair][-1]
-        for pair, each in enumerate(paid):
-            if each and each.count(each[0]) == len(each):
-                out[pair] = each[0]
+                    rank = int(ranks[j]) if len(ranks) else len(rewards[pair])
+                    rewards[pair].append(float(self._reward(rows[i], a, next_states[j], rank)))
+                    out[pair] += probability * rewards[pair][-1]
+        # equal rewards are not averaged, so that no rounding changes them
+        for pair, values in enumerate(rewards):
+            if values and values.count(values[0]) == len(values):
+                out[pair] = values[0]
         return out.reshape(-1, num_actions)
 
-    def _reward(self, state: tuple[int, ...], action: int, following: tuple[int, ...], rank: int = 0) -> float:
-        """What the possible outcome of this rank pays."""
+    def _reward(self, state: tuple[int, ...], action: int, next_state: tuple[int, ...], rank: int = 0) -> float:
+        """The reward of the possible outcome with this rank among those of (state, action); -1: without effect."""
         env = self.env
         try:
             if rank >= 0 and env.has_chance and env.pays_by_outcome():
                 possible = [k for k in range(env.outcomes) if env.probability(state, action, k) > 0]
                 rank = possible[rank]
-            return env.reward_of(state, action, following, rank)
+            return env.reward_of(state, action, next_state, rank)
         except Exception as error:
             raise refused_reward(self.env, state, action, f"raises {error!r}") from error
 
 
 class InterpretedAges:
-    """See `rules.Ages`."""
+    """`rules.Ages`, interpreted."""
 
     def __init__(self, env: Environment, layout: Layout):
         self.env, self.layout = env, layout
@@ -350,13 +352,14 @@ class InterpretedAges:
 
 
 def refused_reward(env: Environment, state: tuple[int, ...], action: int, why: str) -> RuleError:
-    """The error for a reward that is none."""
+    """The error for a reward that is no finite number, or that raises."""
     return RuleError(f"{env}: reward of action {env.actions[action]!r} in state {state} {why}")
 
 
 def blame(env: Environment, layout: Layout, suspects: np.ndarray, failure: BaseException | None) -> NoReturn:
-    """Compiled rules failed or left the declared ranges in one of some packed states: name the first where they do
-    interpreted.
+    """Raise the error of compiled rules that failed or left the declared ranges in one of some packed states.
+
+    It names the first state where they fail interpreted.
     """
     rows = unpack(layout, suspects).tolist()
     if failure and not rows:  # they were not run yet: it is Numba's, of compiling them
@@ -392,7 +395,7 @@ class Interpreters:
             self._connections.append(ours)
 
     def branches(self, states: np.ndarray) -> Branches:
-        """As `interpreted_branches` of states (N, D) int64, shared between the processes where they are many."""
+        """`interpreted_branches` of states (N, D) int64, shared between the processes where they are many."""
         shares = min(len(self._connections) + 1, len(states) // _SHARE)
         if shares < 2:
             return interpreted_branches(self.env, states.tolist())
@@ -401,12 +404,12 @@ class Interpreters:
             _send(connection, part) for connection, part in zip(self._connections[: shares - 1], parts[1:], strict=True)
         ]
         answers = [interpreted_branches(self.env, parts[0].tolist())]
-        for connection, part, is_asked in zip(self._connections[: shares - 1], parts[1:], requests, strict=True):
-            answer = _received(connection, len(part), self.env) if is_asked else None
+        for connection, part, is_sent in zip(self._connections[: shares - 1], parts[1:], requests, strict=True):
+            answer = _received(connection, len(part), self.env) if is_sent else None
             answers.append(answer or interpreted_branches(self.env, part.tolist()))
-        following, terminal, probabilities = zip(*answers, strict=True)
-        likely = None if probabilities[0] is None else np.concatenate(probabilities)
-        return Branches(np.concatenate(following), np.concatenate(terminal), likely)
+        next_states, terminal, probabilities = zip(*answers, strict=True)
+        all_probabilities = None if probabilities[0] is None else np.concatenate(probabilities)
+        return Branches(np.concatenate(next_states), np.concatenate(terminal), all_probabilities)
 
     def close(self) -> None:
         """Let the processes end."""
@@ -416,6 +419,7 @@ class Interpreters:
 
 
 def _send(connection: Connection, states: np.ndarray) -> bool:
+    """Send states to a process; whether it is alive."""
     try:
         connection.send_bytes(np.ascontiguousarray(states).data)
     except OSError:  # it was killed
@@ -424,8 +428,9 @@ def _send(connection: Connection, states: np.ndarray) -> bool:
 
 
 def _received(connection: Connection, rows: int, env: Environment) -> Branches | None:
-    """What another process found; None where it was killed, or where a rule fails, which this process shall find out
-    itself.
+    """The branches that another process sends; None where it was killed, or where a rule fails.
+
+    This process then calls the rules itself, and raises the error.
     """
     try:
         data = connection.recv_bytes()
@@ -435,18 +440,18 @@ def _received(connection: Connection, rows: int, env: Environment) -> Branches |
         return None
     branches = rows * env.num_actions * env.outcomes
     size = branches * len(env.components)
-    likely = None
+    probabilities = None
     if env.outcomes > 1:
-        likely = np.frombuffer(data, np.float64, branches).reshape(rows, -1)
+        probabilities = np.frombuffer(data, np.float64, branches).reshape(rows, -1)
         data = data[8 * branches :]
     terminal = np.frombuffer(data, np.bool_, rows)
     small = len(data) == rows + size
-    following = np.frombuffer(data, np.uint8 if small else np.int64, size, offset=rows)
-    return Branches(following.reshape(-1, len(env.components)), terminal, likely)
+    next_states = np.frombuffer(data, np.uint8 if small else np.int64, size, offset=rows)
+    return Branches(next_states.reshape(-1, len(env.components)), terminal, probabilities)
 
 
 def _interpret(env: Environment, connection: Connection) -> None:
-    """What one of the processes does until the other end is closed."""
+    """Loop of one of the processes: receive states, send their branches, until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the builder's to handle
     os.closerange(
         3, connection.fileno()
@@ -459,10 +464,10 @@ def _interpret(env: Environment, connection: Connection) -> None:
             return
         try:
             states = np.frombuffer(data, np.int64).reshape(-1, len(env.components))
-            following, terminal, likely = interpreted_branches(env, states.tolist())
-            small = following.size and following.min() >= 0 and following.max() < 256
-            answer = terminal.tobytes() + following.astype(np.uint8 if small else np.int64).tobytes()
-            answer = answer if likely is None else likely.tobytes() + answer
+            next_states, terminal, probabilities = interpreted_branches(env, states.tolist())
+            small = next_states.size and next_states.min() >= 0 and next_states.max() < 256
+            answer = terminal.tobytes() + next_states.astype(np.uint8 if small else np.int64).tobytes()
+            answer = answer if probabilities is None else probabilities.tobytes() + answer
         except Exception:
             answer = b""
         try:

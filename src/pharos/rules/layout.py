@@ -1,4 +1,4 @@
-"""Where each component of a state sits in its 64-bit words; integer vectors <-> packed states.
+"""Layout of states in 64-bit words: the place of each component; integer vectors <-> packed states.
 
 Component i with `size[i]` values takes ceil(log2(size[i])) bits and holds value - low[i]. Components follow one another
 in the order of declaration; one that would straddle two words starts the next word. The rule is part of the file
@@ -28,9 +28,7 @@ class Layout:
 
     @cached_property
     def tables(self) -> tuple[np.ndarray, ...]:
-        """The layout as compiled code takes it: one table (D, 4) int64 of 64 * word + shift, mask << shift, low,
-        size.
-        """
+        """The layout for compiled code: one table (D, 4) int64 of 64 * word + shift, mask << shift, low, size."""
         offset = (self.word << np.uint64(6)) + self.shift
         columns = (offset.astype(np.int64), (self.mask << self.shift).astype(np.int64), self.low, self.size)
         return (np.stack(columns, axis=1),)
@@ -62,7 +60,7 @@ def layout_of(components: Components) -> Layout:
 
 
 def pack(layout: Layout, states: np.ndarray) -> np.ndarray:
-    """(N, D) integers within their ranges -> (N, W) uint64."""
+    """Packed states (N, W) uint64 of integers (N, D) within their ranges."""
     offsets = (np.asarray(states, np.int64) - layout.low).astype(np.uint64)
     packed = np.zeros((len(offsets), layout.num_words), np.uint64)
     for i in range(len(layout.word)):
@@ -71,7 +69,7 @@ def pack(layout: Layout, states: np.ndarray) -> np.ndarray:
 
 
 def unpack(layout: Layout, packed: np.ndarray) -> np.ndarray:
-    """(N, W) uint64 -> (N, D) int64."""
+    """Integers (N, D) int64 of packed states (N, W) uint64."""
     states = np.empty((len(packed), len(layout.word)), np.int64)
     for i in range(len(layout.word)):
         field = (packed[:, int(layout.word[i])] >> layout.shift[i]) & layout.mask[i]

@@ -1,4 +1,4 @@
-"""A packed state that rules read and write as if it were an array of integers.
+"""Packed states that rules read and write as if they were arrays of integers.
 
 A state of D small integers is stored in a few 64-bit words (rules/layout.py says where each component sits).
 Unpacking 29 components, running a rule and packing them again costs three times the rule itself. So compiled rules get
@@ -85,7 +85,7 @@ def packed_view(typing_context, words, fields):
 
 @intrinsic
 def read_only_view(typing_context, words, fields):
-    """The same for a state whose components are only read."""
+    """A view, as `packed_view`, on a state whose components are only read."""
     return _new_view(PackedView(len(words), False), words, fields)
 
 
@@ -136,7 +136,7 @@ def fault(typing_context, view):
 
 @intrinsic
 def clear_fault(typing_context, view):
-    """Forget the fault."""
+    """Set the fault back to 0."""
 
     def codegen(context, builder, sig, args):
         builder.store(ir.Constant(_WORD, 0), _view(context, builder, sig, args).fault)
@@ -146,7 +146,7 @@ def clear_fault(typing_context, view):
 
 
 def _checked_component(builder, view, index):
-    """`index` as in Python (negative from the end); where there is no such component, component 0 and a fault."""
+    """The component `index` as in Python (negative from the end); component 0 and a fault where there is none."""
     checked = cgutils.alloca_once_value(builder, index)
     with builder.if_then(builder.icmp_unsigned(">=", index, view.length), likely=False):
         wrapped = builder.add(index, view.length)
@@ -196,11 +196,13 @@ def _set_component(typing_context, view, index, value):
         word, shift = _place(builder, view, sig.args[0], index)
         mask = _column(builder, view, index, _MASK)
         offset = builder.sub(args[2], _column(builder, view, index, _LOW))
+        # a value out of range becomes the lowest one, and a fault
         inside = builder.icmp_unsigned("<", offset, _column(builder, view, index, _SIZE))
         harmless = cgutils.alloca_once_value(builder, offset)
         with builder.if_then(builder.not_(inside), likely=False):
             _note_fault(builder, view, index)
             builder.store(ir.Constant(_WORD, 0), harmless)
+        # replace the bits of the component in its word
         field = builder.shl(builder.load(harmless), shift)
         place = view.words
         if sig.args[0].in_register:

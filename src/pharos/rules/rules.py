@@ -2,12 +2,12 @@
 
 Two engines run them, the first that can:
 
-    compiled     by Numba, inside of the loops that search, step and draw (compiled.py)
+    compiled     by Numba, inside the loops that search, step and draw (compiled.py)
     interpreted  in Python, state by state; while building, in as many processes as there are workers (interpreted.py,
                  stepping.py)
 
-Here stands, once, what happens where Numba cannot compile a rule: one warning for each class of environments and use,
-and the other engine. Whatever the engine, a rule that fails is a RuleError that names the state and the action.
+Where Numba cannot compile a rule, this file gives one warning for each class of environments and use, and takes the
+other engine. Whatever the engine, a rule that fails is a RuleError that names the state and the action.
 """
 
 import contextlib
@@ -42,12 +42,11 @@ Reasons = dict[tuple[object, ...] | None, str]  # signature of the instances -> 
 
 
 class Expansion(Protocol):
-    """Successors of packed states, looked up in a table of states (kernels/hash_table.py). See exploration.py for the
-    arrays.
+    """Successors of packed states, looked up in a table of states (kernels/hash_table.py).
 
-    A state has B branches: one for each of A actions, or, with chance, branch a K + k for outcome k of action a, of
-    which impossible ones lead to the state itself. `probabilities` (rows, B) gets how likely they are; it has no rows
-    without chance.
+    See exploration.py for the arrays. A state has B branches: one for each of A actions, or, with chance, branch a K +
+    k for outcome k of action a, of which impossible ones lead to the state itself. `probabilities` (rows, B) gets those
+    of the branches; it has no rows without chance.
 
     Raises:
         RuleError: a rule failed, or left the declared ranges.
@@ -56,7 +55,7 @@ class Expansion(Protocol):
     is_compiled: bool
 
     def threads(self, workers: int) -> int:
-        """How many threads may call `expand_and_find` at a time, of `workers`."""
+        """Number of threads that may call `expand_and_find` at a time, of `workers`."""
 
     def explore(
         self,
@@ -70,9 +69,7 @@ class Expansion(Protocol):
         room: int,
         progress: np.ndarray,
     ) -> None:
-        """Breadth-first search: expand and number states in order until `last`, until `room` is used up, or for a
-        while.
-        """
+        """Breadth-first search: expand and number states until `last`, until `room` is used up, or for a while."""
 
     def expand_and_find(
         self,
@@ -86,9 +83,7 @@ class Expansion(Protocol):
         probabilities: np.ndarray,
         table: np.ndarray,
     ) -> None:
-        """Successors of states [start, stop) to keys, and their indices to indices; -1 - slot where the table
-        has none.
-        """
+        """Write successors of states [start, stop) to keys, and to indices their indices, or -1 - slot if missing."""
 
     def close(self) -> None:
         """End the processes that run rules, if there are any."""
@@ -98,10 +93,10 @@ class TransitionRewards(Protocol):
     """Rewards of stored transitions of packed states."""
 
     def threads(self, workers: int) -> int:
-        """How many threads may call `block` at a time, of `workers`."""
+        """Number of threads that may call `block` at a time, of `workers`."""
 
     def block(self, states: np.ndarray, successors: Indices, terminal: np.ndarray, start: int, stop: int) -> np.ndarray:
-        """(stop - start, A) float64, of states [start, stop); 0 in terminal states.
+        """Rewards (stop - start, A) float64 of states [start, stop); 0 in terminal states.
 
         Raises:
             RuleError: the rule raised an exception.
@@ -116,7 +111,7 @@ class TransitionRewards(Protocol):
         stop: int,
         ranks: np.ndarray = COUNTED,
     ) -> np.ndarray:
-        """The same with chance: what executing an action pays on average.
+        """Expected rewards (stop - start, A) of states [start, stop), with chance.
 
         Args:
             outcomes: three arrays: which (N,) int64, ascending, (s - start) A + a of each outcome; successors
@@ -130,7 +125,7 @@ class Ages(Protocol):
     """Ages of packed states, of a class that has them."""
 
     def block(self, states: np.ndarray, start: int, stop: int) -> np.ndarray:
-        """(stop - start,) int64, of states [start, stop)."""
+        """Ages (stop - start,) int64 of states [start, stop)."""
 
 
 class Stepping(Protocol):
@@ -146,7 +141,7 @@ class Stepping(Protocol):
     def outcome_one(
         self, parameters: tuple[object, ...], state: np.ndarray, action: int, u: float, /
     ) -> tuple[int, float]:
-        """(outcome, its probability) of an action, by a number in [0, 1)."""
+        """(outcome, its probability) of an action, drawn by a number u in [0, 1)."""
 
     def step_one(
         self,
@@ -155,29 +150,29 @@ class Stepping(Protocol):
         scale: np.ndarray,
         state: np.ndarray,
         branch: int,
-        following: np.ndarray,
+        next_state: np.ndarray,
         vector: np.ndarray,
         /,
     ) -> tuple[float, int]:
-        """(reward, code) of one step, by an action, or by the branch a K + k for outcome k of K of action a;
-        -1 - a: by action a without effect.
+        """(reward, code) of one step; next_state gets the next state, vector its vector.
+
+        branch: an action, or a K + k for outcome k of K of action a; -1 - a: action a without effect.
         """
 
     def step_many(
         self, parameters: tuple[object, ...], setting: Setting, batch: EnvironmentBatch, first: int, last: int, /
     ) -> int:
-        """One step of many environments; -1, or which component of which left its range."""
+        """One step of many environments; returns -1, or i D + c where component c of environment i left its range."""
 
     def is_terminal_one(self, parameters: tuple[object, ...], state: np.ndarray, /) -> bool:
         """Whether a state is terminal."""
 
     def step_and_draw_one(self, *arguments: object) -> Callable[..., tuple[float, int]] | None:
-        """The function that steps and draws, of these arguments after the parameters; None where there is none."""
+        """The function that steps and draws, for these arguments after the parameters; None where there is none."""
 
 
 class Rules:
-    """The rules of one environment, each use at the highest speed that they allow; nothing is compiled before it is
-    used.
+    """The rules of one environment, each use by the fastest engine that can; nothing is compiled before it is used.
 
     Attributes:
         env: the environment. layout: where its components sit in packed states.
@@ -201,26 +196,26 @@ class Rules:
 
     @cached_property
     def first_exploration(self) -> Expansion:
-        """Interpreted, for the first states, which are all of a small space."""
+        """The interpreted engine, for the first states, which are all of a small space."""
         from pharos.rules.interpreted import InterpretedExpansion
 
         return InterpretedExpansion(self.env, self.layout)
 
     @property
     def is_ready(self) -> bool:
-        """Whether this process explores by rules of the class compiled."""
+        """Whether this process has compiled rules of the class, and explores by them."""
         return type(self.env) in explored
 
     @cached_property
     def is_kept(self) -> bool:
-        """Whether compiled exploration is at hand sooner than many states are interpreted."""
+        """Whether compiled exploration is loaded sooner than many states are interpreted: it is on disk."""
         try:
             return is_kept(self.env, self.layout)
-        except Exception:  # what Numba does not compile is told where it is compiled
+        except Exception:  # the warning comes where it is compiled
             return False
 
     def rewards_of(self, num_states: int) -> TransitionRewards:
-        """For so many states in all: those of a few are interpreted."""
+        """Rewards of the transitions of `num_states` states in all; few are interpreted."""
         from pharos.rules.interpreted import InterpretedRewards
 
         is_small = num_states * self.env.num_actions * self.env.outcomes < compiling.SMALL // 4
@@ -256,11 +251,11 @@ class Rules:
     def drawing(
         self, kernel: str, interpreted: Callable[..., None], *arguments: object, motion: bool = False
     ) -> Callable[..., None]:
-        """A function that draws states.
+        """A function that draws states, compiled where Numba can.
 
         Args:
             kernel: its name in interaction.py.
-            interpreted: what runs where Numba does not compile it.
+            interpreted: the function that draws where Numba cannot compile it.
             arguments: of a first call, for no states, which compiles it.
             motion: whether the planes of `draw_motion` follow those of `draw`.
         """
@@ -269,7 +264,7 @@ class Rules:
         return interpreted if compiled is None else compiled
 
     def reason_not_compiled(self) -> str:
-        """Why Numba does not compile the rules of exploration and rewards; "" where it does. Warns of nothing."""
+        """The reason why Numba does not compile exploration and rewards; "" where it does. Does not warn."""
         return "".join(_reason(engine, self.env, self.layout)[1] for engine in (CompiledExpansion, CompiledRewards))
 
 
@@ -279,13 +274,13 @@ def rules_of(env: Environment, *, workers: int = 1) -> Rules:
     Args:
         workers: processes that share the work of rules that Numba cannot compile (cost only).
     Raises:
-        RuleError: what the class says of its outcomes is not as the contract has it.
+        RuleError: the class declares its outcomes otherwise than the contract says.
     """
     _ = env.has_chance
     return Rules(env, workers)
 
 
-# of (engine, class)
+# by (engine, class)
 _reasons: dict[tuple[object, type], Reasons] = {}
 _warned: set[tuple[type, object]] = set()
 
@@ -300,24 +295,25 @@ def compiled_or_none(engine: Callable[..., Engine], env: Environment, *arguments
 
 
 def not_compiled(reason: str) -> str:
-    """The sentence that says so."""
+    """The sentence that says why rules are interpreted."""
     how = "interpreted, by all workers of a build, up to 100 times slower"
     return f"Numba cannot compile its rules, so they run {how}: {reason}"
 
 
 def _reason(engine: Callable[..., Engine], env: Environment, *arguments: object) -> tuple[Engine | None, str]:
-    """The engine and "", or None and why there is none; what failed to compile once is not tried again."""
+    """(engine, ""), or (None, the reason why there is none); a class that failed to compile once is not tried again."""
     failed = _reasons.setdefault((engine, type(env)), {})
     try:
         key = (signature_of(env), *(each for each in arguments if isinstance(each, str))) if failed else None
         if key not in failed:
             return engine(env, *arguments), ""
     except Exception as error:  # Numba raises its own errors, and others from inside of it
-        return None, _note(failed, env, arguments, reason_of(error))
+        return None, _record_failure(failed, env, arguments, reason_of(error))
     return None, failed[key]
 
 
-def _note(failed: Reasons, env: Environment, arguments: tuple, reason: str) -> str:
-    with contextlib.suppress(Exception):  # of a parameter that cannot be asked for: it is asked for again
+def _record_failure(failed: Reasons, env: Environment, arguments: tuple, reason: str) -> str:
+    """Store why instances like `env` do not compile; returns the reason."""
+    with contextlib.suppress(Exception):  # of a parameter that cannot be read: the class is tried again
         failed[signature_of(env), *(each for each in arguments if isinstance(each, str))] = reason
     return reason
