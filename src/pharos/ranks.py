@@ -1,8 +1,8 @@
-"""Several processes that compute one thing together: ranks, and how they exchange arrays.
+"""Several processes that compute one thing together: ranks, and their exchange of arrays.
 
 Rank 0 is the one that the user sees: it alone reads and writes files, reports and raises the errors of all. The others
-run a function that answers it. MPI carries what they exchange (extra `mpi`: mpi4py), among ranks that `mpiexec` has
-started; tests run ranks as threads.
+run a function that answers it. Messages go by MPI (extra `mpi`: mpi4py), among ranks that `mpiexec` has started; tests
+run ranks as threads.
 
 Halos are borders of ranges of rows, one range for each rank: the rows of other ranks that a rank reads. Their values
 come in messages from those ranks alone that have some of them. They travel while the ranks compute: the values of the
@@ -23,8 +23,8 @@ import numpy as np
 from pharos import errors
 from pharos.errors import MissingExtra, ParameterError, PharosError
 
-NUMBERS = 3  # that a rank tells all others in one go, at most
-_ROWS = 1 << 20  # that rank 0 sends to each in one exchange
+NUMBERS = 3  # most numbers that a rank sends to all others with the header of an exchange
+_ROWS = 1 << 20  # most rows that rank 0 sends to each rank in one exchange
 
 
 class RankFailed(PharosError):
@@ -32,7 +32,7 @@ class RankFailed(PharosError):
 
 
 class Rank(ABC):
-    """One of `size` processes.
+    """One of `size` processes that compute together.
 
     Attributes:
         rank: its number. size: how many there are. neighbors: how many of them are on this machine.
@@ -54,25 +54,26 @@ class Rank(ABC):
             RankFailed: a rank failed or died, in place of answering.
         """
 
-    # From one to one: arrays that move while the ranks compute -------------------------------------------------------
+    # Point to point: arrays that move while the ranks compute ---------------------------------------------------------
 
     @abstractmethod
     def send(self, to: int, array: np.ndarray) -> None:
         """Begin to send an array to a rank, which begins to receive one of this shape and dtype, now or later.
 
-        Nobody changes the array before `finish`. What one rank sends to another arrives in that order.
+        Nobody changes the array before `finish`. Arrays from one rank to another arrive in
+        the order in which they are sent.
         """
 
     @abstractmethod
     def receive(self, source: int, into: np.ndarray) -> None:
-        """Begin to receive an array, C-contiguous: until `finish` nobody knows what is in it."""
+        """Begin to receive an array into `into`, C-contiguous; its content is undefined until `finish`."""
 
     def progress(self) -> None:  # noqa: B027
-        """Let what was begun move on: to be called now and then while this process computes."""
+        """Let pending messages move on: to be called now and then while this process computes."""
 
     @abstractmethod
     def finish(self) -> None:
-        """Wait until this rank has received all that it began to, and may change what it sent.
+        """Wait until this rank has received all pending arrays, and may change those that it sent.
 
         Exchanges may stand before it: after one, the others have begun to send what they began before it.
 
@@ -85,29 +86,29 @@ class Rank(ABC):
         """Abort: every exchange and message of the other ranks, pending or later, raises."""
 
     def scatter(self, parts: Sequence[np.ndarray] | None, like: np.ndarray) -> np.ndarray:
-        """Rank 0 sends parts[q] to each rank q, which gets it; `like` is an array of that type for the others."""
+        """Send parts[q] from rank 0 to each rank q, and return it there; `like` is an array of that type."""
         return self.exchange(parts or [like[:0]] * self.size)[0]
 
-    def scatter_rows(self, whole: np.ndarray | None, cuts: np.ndarray, into: np.ndarray) -> None:
-        """Rank 0 sends rank q the rows [cuts[q], cuts[q + 1]) of an array that it alone has, into its first rows."""
+    def scatter_rows(self, array: np.ndarray | None, cuts: np.ndarray, into: np.ndarray) -> None:
+        """Send rank q the rows [cuts[q], cuts[q + 1]) of an array that rank 0 alone has, into its first rows."""
         for first in range(0, int(np.diff(cuts).max()), _ROWS):
             parts = None
-            if whole is not None:
+            if array is not None:
                 stops = np.minimum(cuts[:-1] + first + _ROWS, cuts[1:])
-                parts = [np.array(whole[cuts[q] + first : max(stops[q], 0)]) for q in range(self.size)]
+                parts = [np.array(array[cuts[q] + first : max(stops[q], 0)]) for q in range(self.size)]
             rows = self.scatter(parts, into)
             into[first : first + len(rows)] = rows
 
     def broadcast(self, array: np.ndarray | None, like: np.ndarray) -> np.ndarray:
-        """What rank 0 has sent."""
+        """The array of rank 0, at all ranks."""
         return self.scatter(None if array is None else [array] * self.size, like)
 
     def gather(self, array: np.ndarray) -> list[np.ndarray]:
-        """At rank 0 what each rank gave, in their order; elsewhere empty arrays."""
+        """The arrays of all ranks, in their order, at rank 0; elsewhere empty arrays."""
         return self.exchange([array if rank == 0 else array[:0] for rank in range(self.size)])
 
     def allgather(self, array: np.ndarray) -> list[np.ndarray]:
-        """What each rank gave, in their order, at all of them."""
+        """The arrays of all ranks, in their order, at all of them."""
         return self.exchange([array] * self.size)
 
     def allgather_numbers(self, *numbers: float) -> np.ndarray:
@@ -116,7 +117,7 @@ class Rank(ABC):
 
 
 class Alone(Rank):
-    """The only rank."""
+    """The only rank: this process alone."""
 
     rank, size, neighbors = 0, 1, 1
 
@@ -130,19 +131,19 @@ class Alone(Rank):
         raise ValueError("there is no other rank")
 
     def finish(self) -> None:
-        """Nothing is on its way."""
+        """Return at once: there are no messages."""
 
     def fail(self, error: BaseException) -> None:
-        """Nobody waits."""
+        """Do nothing: no other rank waits."""
 
 
 def text_of(error: BaseException) -> str:
-    """An error as text, to be sent to other ranks; see `error_of`."""
+    """Text of an error, to be sent to other ranks; see `error_of`."""
     return f"{type(error).__name__}\n{error}"
 
 
 def error_of(text: str, rank: int) -> PharosError:
-    """The error of another rank: of the same class, where that is one of pharos.errors; a RankFailed otherwise."""
+    """The error of another rank, from its text: of the same class if pharos.errors has it, else a RankFailed."""
     name, _, message = text.partition("\n")
     kind = getattr(errors, name, None)
     # those whose first argument is no message cannot be made of one
@@ -158,12 +159,12 @@ _LOW = 8  # one part in so many of a range is sent last
 
 
 def cuts_of(num_rows: int, ranks: int) -> np.ndarray:
-    """(P + 1,) int64: where the ranges of P ranks begin and end, which share the rows evenly."""
+    """Bounds (P + 1,) int64 of the ranges of P ranks, which share the rows evenly."""
     return np.array([num_rows * i // ranks for i in range(ranks + 1)])
 
 
 class Halo:
-    """The rows outside of a rank's range that it reads.
+    """The rows outside a rank's range that it reads.
 
     Attributes:
         rows: (H,) int64, ascending.
@@ -190,7 +191,7 @@ class Halo:
         return len(self.rows)
 
     def is_boundary(self, num_rows: int) -> np.ndarray:
-        """(n,) bool: whether some other rank reads a row of this one."""
+        """Whether some other rank reads each row of this one, (n,) bool."""
         result = np.zeros(num_rows, np.bool_)
         for rows in self.wanted:
             result[rows] = True
@@ -199,7 +200,7 @@ class Halo:
     # While messages travel: receive, then send all or high and low ones, then finish --------------------------------
 
     def receive(self, like: np.ndarray, in_two: bool = False) -> None:
-        """Begin to receive values of the halo, rows as those of `like`; in one message from each rank, or in two."""
+        """Begin to receive values of the halo, rows like those of `like`; in one message from each rank, or in two."""
         received = self._received
         if received is None or received.dtype != like.dtype or received.shape[1:] != like.shape[1:]:
             self._received = received = np.empty((len(self), *like.shape[1:]), like.dtype)
@@ -210,19 +211,19 @@ class Halo:
                     self._rank.receive(source, received[piece])
 
     def send(self, values: np.ndarray) -> None:
-        """Begin to send what others read of the values (n or more, ...) of this rank's rows."""
+        """Begin to send the values that others read, from values (n or more, ...) of this rank's rows."""
         self._send(values, 0, len(values))
 
     def send_high(self, values: np.ndarray) -> None:
-        """The same, of the high rows alone."""
+        """Begin to send the values of the high rows that others read."""
         self._send(values, self.low, len(values))
 
     def send_low(self, values: np.ndarray) -> None:
-        """The same, of the low rows, which come second."""
+        """Begin to send the values of the low rows that others read, after those of the high ones."""
         self._send(values, 0, self.low)
 
     def finish(self, into: np.ndarray) -> None:
-        """Wait for the values of the halo (H, ...), where some were to be received."""
+        """Wait for the values (H, ...) of the halo, where some are to be received, and write them to `into`."""
         self._rank.finish()
         if self._received is not None:
             into[...] = self._received
@@ -237,7 +238,7 @@ class Halo:
 # MPI ------------------------------------------------------------------------------------------------------------------
 
 
-# (rank, size) as launchers tell their processes: MPICH's and Intel's, Open MPI's, MVAPICH's.
+# Environment variables of (rank, size) set by launchers: MPICH's and Intel's, Open MPI's, MVAPICH's.
 _LAUNCHERS = (
     ("PMI_RANK", "PMI_SIZE"),
     ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
@@ -245,14 +246,14 @@ _LAUNCHERS = (
 )
 _FAILED = -1
 _VALUES, _NOTICE = 0, 1  # tags of messages
-_LOOKS = 100  # at messages that have not come before others get the processor
+_LOOKS = 100  # tests of pending messages before other processes get the processor
 _STARTED = "PHAROS_STARTED"  # variable of processes that pharos itself has started under mpiexec
 
 T = TypeVar("T")
 
 
 def check_processes(processes: int | str) -> None:
-    """ParameterError unless it is 1, or "mpi"."""
+    """Raise a ParameterError unless `processes` is 1 or "mpi"."""
     if processes != "mpi" and (processes != 1 or isinstance(processes, bool)):
         raise ParameterError(
             f"processes is {processes!r}; expected 1, or 'mpi' in a program that `mpiexec -n 8 python PROGRAM` starts; "
@@ -261,13 +262,13 @@ def check_processes(processes: int | str) -> None:
 
 
 def check_ranks(num_states: int, ranks: int) -> None:
-    """Raise ParameterError where there are more ranks than states."""
+    """Raise a ParameterError where there are more ranks than states."""
     if ranks > max(num_states, 1):
         raise ParameterError(f"{ranks} processes for {num_states} states; expected at most one for each state")
 
 
 def run_spmd(processes: int | str, program: Callable[[Rank], T]) -> T:
-    """Return what `program(rank)` returns at this rank, while the others run it, too.
+    """The result of `program(rank)` at this rank, while the other ranks run it, too.
 
     Args:
         processes: 1 for this process alone; or "mpi", those that `mpiexec` has started, all of which make this call.
@@ -304,8 +305,9 @@ def start_under_mpiexec(size: int) -> NoReturn:
 
 
 def launched() -> tuple[int, int]:
-    """(rank, size) of this process among those that a launcher has started; (0, 1) where none has. Nothing of MPI is
-    loaded.
+    """(rank, size) of this process among those that a launcher has started; (0, 1) where none has.
+
+    MPI is not loaded.
     """
     for rank, size in _LAUNCHERS:
         if os.environ.get(rank, "").isdigit() and os.environ.get(size, "").isdigit():
@@ -314,7 +316,7 @@ def launched() -> tuple[int, int]:
 
 
 def mpi_rank() -> Rank:
-    """This process among those that the launcher started.
+    """The rank of this process among those that the launcher started.
 
     Raises:
         MissingExtra: mpi4py is not installed. ParameterError: there is no MPI library, or another one.
@@ -332,6 +334,8 @@ def mpi_rank() -> Rank:
 
 
 class _Mpi(Rank):
+    """The rank of this process under MPI."""
+
     needs_progress = True
 
     def __init__(self, library: Any):
@@ -341,7 +345,7 @@ class _Mpi(Rank):
         self.neighbors = self._world.Split_type(library.COMM_TYPE_SHARED).Get_size()
         self._is_over = False  # somebody failed: nobody waits for this rank any more
         self._requests: list[Any] = []
-        self._kept: list[np.ndarray] = []  # what is on its way
+        self._kept: list[np.ndarray] = []  # arrays of pending messages
         size = launched()[1]
         if size > 1 and size != self.size:
             raise ParameterError(
@@ -363,9 +367,9 @@ class _Mpi(Rank):
         return self._numbers[:, : len(numbers)]
 
     def _counts(self, rows: np.ndarray, numbers: Sequence[float] = ()) -> np.ndarray:
-        """How many rows each rank sends here. All that ranks do together begins with it, so that all learn who failed.
+        """Number of rows that each rank sends here; every collective call begins with it, so that all learn who failed.
 
-        numbers: to be told to all; theirs are `_numbers` (P, NUMBERS) then.
+        numbers: to be sent to all ranks; theirs are in `_numbers` (P, NUMBERS) then.
         """
         received = self._headers(rows, numbers)
         failed = np.flatnonzero(received == _FAILED)
@@ -375,6 +379,7 @@ class _Mpi(Rank):
         return received
 
     def _headers(self, rows: np.ndarray, numbers: Sequence[float] = ()) -> np.ndarray:
+        """Exchange headers: numbers of rows, or _FAILED, and `numbers`; returns the first entry of each rank's."""
         sent, received = np.zeros((2, self.size, 1 + NUMBERS), np.int64)
         sent[:, 0] = rows
         sent[:, 1 : 1 + len(numbers)] = np.array(numbers, np.float64).view(np.int64)
@@ -400,7 +405,7 @@ class _Mpi(Rank):
             if looks % _LOOKS == 0:
                 time.sleep(0)
                 if self._world.Iprobe(self._library.ANY_SOURCE, _NOTICE):
-                    self._counts(np.zeros(self.size, np.int64))  # raises: who failed comes to it, and so do the others
+                    self._counts(np.zeros(self.size, np.int64))  # raises, as at the failed rank and all others
         self._requests.clear()
         self._kept.clear()
 
@@ -408,7 +413,7 @@ class _Mpi(Rank):
         if self._is_over:
             return
         self._is_over = True
-        for rank in range(self.size):  # those who wait for a message of this one
+        for rank in range(self.size):  # wake those that wait for a message of this rank
             if rank != self.rank:
                 self._requests.append(self._world.Isend(np.zeros(0), rank, _NOTICE))
         received = self._headers(np.full(self.size, _FAILED))

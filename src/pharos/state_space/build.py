@@ -1,8 +1,8 @@
-"""build: enumerate the reachable states of an environment, onto disk. Algorithm 1 of the paper, compiled.
+"""Build a state space: enumerate the reachable states of an environment onto disk (Algorithm 1 of the paper, compiled).
 
 Breadth-first search: the array of states, in the order of discovery, is the queue; a table of indices keyed by hash is
-the only other memory (table.py). The search (search.py) expands states and numbers what is new; the journal
-(journal.py) appends what it finds to files and commits them.
+the only other memory (table.py). The search (search.py) expands states and numbers new ones; the journal (journal.py)
+appends both to files and commits them.
 """
 
 import contextlib
@@ -107,7 +107,7 @@ def _build(
     progress: BuildProgressCallback | bool | None,
     hold: Hold,
 ) -> bool:
-    """Make the folder hold the finished state space; returns whether it did before."""
+    """Complete the state space in the folder; returns whether it was complete before."""
     from pharos.state_space.journal import remove_parts
     from pharos.state_space.ranked_table import RankedSearch
     from pharos.state_space.search import Search, check_size, journal_of
@@ -131,10 +131,12 @@ def _build(
 
 
 def _waiting(path: Path) -> contextlib.ExitStack:
-    def tell(text: str) -> None:
+    """The lock of a folder, after waiting, with a warning, for another process that builds there."""
+
+    def warn(text: str) -> None:
         warnings.warn(text, RuntimeWarning, stacklevel=4)
 
-    return storage.waiting_lock(path, StateSpaceLocked, "building", tell)
+    return storage.waiting_lock(path, StateSpaceLocked, "building", warn)
 
 
 def cached_folder(env: Environment) -> Path:
@@ -143,14 +145,14 @@ def cached_folder(env: Environment) -> Path:
 
 
 def folder_of(plan: Plan) -> Path:
-    """The same, of a plan."""
+    """The folder of a plan's state space in the user's cache."""
     content = json.dumps([plan.identity, plan.fingerprint, plan.format_version], sort_keys=True)
     digest = hashlib.sha256(content.encode()).hexdigest()[:16]
     return storage.cache_directory() / "spaces" / f"{plan.env.name}-{digest}"
 
 
 def _manifest_of(plan: Plan, path: Path) -> dict[str, Any] | None:
-    """The manifest of a folder that is to hold this state space; None where there is none yet."""
+    """The manifest of a folder for this state space; None where there is none yet."""
     manifest = read_manifest(path)
     if manifest is None:
         if path.is_dir() and any(not _is_ours(item.name) for item in path.iterdir()):
@@ -158,6 +160,7 @@ def _manifest_of(plan: Plan, path: Path) -> dict[str, Any] | None:
                 return _manifest_of(plan, path)
             raise ParameterError(f"{path}: is not empty and holds no state space; choose another folder")
         return None
+    # the folder must be of the same environment
     for key, expected in plan.identity.items():
         if key != "class" and manifest.get(key) != expected:
             raise StateSpaceMismatch(
@@ -169,7 +172,7 @@ def _manifest_of(plan: Plan, path: Path) -> dict[str, Any] | None:
 
 
 def is_of_state_space(folder: Path) -> bool:
-    """Whether a folder holds a state space, whole, unfinished or damaged, as far as the names of its files tell."""
+    """Whether a folder holds a state space, complete, unfinished or damaged, as far as the names of its files tell."""
     if not folder.is_dir():
         return False
     return (folder / MANIFEST).is_file() or all(_is_ours(item.name) for item in folder.iterdir())

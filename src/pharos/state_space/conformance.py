@@ -1,4 +1,4 @@
-"""check_environment: does a class of environments keep the contract that `Environment` states?
+"""Check of a class of environments against the contract that `Environment` states: `check_environment`.
 
 Run it on every new class, on a few small instances. It looks at the declarations (`check_declarations`), then calls the
 rules on many states, interpreted (guarded_rules.py) and compiled, and names the rule and the state that broke the
@@ -34,7 +34,7 @@ RULES = ("transition", "is_terminal", "reward", "draw", "probability", "age", "d
 
 @dataclass(frozen=True)
 class Conformance:
-    """What `check_environment` looked at, and what it noted without calling it an error.
+    """Result of `check_environment`: how much was checked, and notes on things that are no errors.
 
     Attributes:
         environment: the instance, as text.
@@ -114,9 +114,10 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
 
 
 def _some_states(env: Environment, check: InterpretedCheck, max_states: int, seed: int) -> tuple[list[State], bool]:
-    """Expanded states, in the order of discovery, and whether these are all that can be reached."""
+    """(expanded states in the order of discovery, whether these are all reachable ones)."""
     starts, _ = start_distribution(env)
     states = dict.fromkeys(starts)
+    # breadth-first: the states nearest to the start, all of them where they are few
     queue = deque(starts)
     while queue and len(states) <= max_states:
         for successor in check.expand(queue.popleft()):
@@ -125,43 +126,46 @@ def _some_states(env: Environment, check: InterpretedCheck, max_states: int, see
                 queue.append(successor)
     if not queue:
         return list(states), True
-    chosen = dict.fromkeys(list(check.terminal)[: (max_states + 1) // 2])
+    # a half of these, and states far from the start, by a random depth-first search
+    sample = dict.fromkeys(list(check.terminal)[: (max_states + 1) // 2])
     rng = random.Random(seed)
     stack, visited = list(starts), set()
-    while stack and len(chosen) < max_states:
+    while stack and len(sample) < max_states:
         state = stack.pop()
         if state in visited:
             continue
         visited.add(state)
-        chosen[state] = None
+        sample[state] = None
         if state not in check.terminal:
             check.expand(state)
         if not check.terminal[state]:
             successors = [check.transitions[state, *branch] for branch in check.branches(state)]
             stack += rng.sample(successors, len(successors))
-    return list(chosen), False
+    return list(sample), False
 
 
 def _has_choice(check: InterpretedCheck, states: list[State], gamma: float = 0.99) -> bool:
-    """Whether some action, in some state, has another value than the rest, uniform play following."""
+    """Whether some action, in some state, has another value than the others, when uniform play follows."""
     number = {state: i for i, state in enumerate(states)}
     num_actions = check.env.num_actions
     rows = np.array([number[state] * num_actions + action for state, action, _ in check.transitions], np.int64)
     successors = np.array([number[state] for state in check.transitions.values()], np.int64)
-    likely, rewards = (np.array([*each.values()]) for each in (check.probabilities, check.rewards))
+    probabilities, rewards = (np.array([*each.values()]) for each in (check.probabilities, check.rewards))
     matrix = np.eye(len(states))
-    np.add.at(matrix, (rows // num_actions, successors), -gamma * likely / num_actions)
-    v = np.linalg.solve(matrix, np.bincount(rows // num_actions, likely * rewards / num_actions, len(states)))
-    q = np.bincount(rows, likely * (rewards + gamma * v[successors]), len(states) * num_actions)
+    np.add.at(matrix, (rows // num_actions, successors), -gamma * probabilities / num_actions)
+    v = np.linalg.solve(matrix, np.bincount(rows // num_actions, probabilities * rewards / num_actions, len(states)))
+    q = np.bincount(rows, probabilities * (rewards + gamma * v[successors]), len(states) * num_actions)
     return bool((np.ptp(q.reshape(-1, num_actions), axis=1) > 1e-9 * np.abs(q).max()).any())
 
 
 def _check_again(check: InterpretedCheck, states: list[State], seed: int) -> None:
+    """Call the rules again in some states, in random order: they must have no memory."""
     for state in random.Random(seed).sample(states, min(len(states), 200)):
         check.repeat(state)
 
 
 def _note_unseen_values(env: Environment, states: list[State], complete: bool, notes: list[str]) -> None:
+    """Note the variables that do not take all of their declared values."""
     components = env.components
     table = np.array(states, np.int64)
     where = "in any reachable state" if complete else f"in the {len(states)} states looked at"
@@ -179,7 +183,7 @@ def _note_unseen_values(env: Environment, states: list[State], complete: bool, n
 
 
 def _check_compiled(env: Environment, check: InterpretedCheck, states: list[State], notes: list[str]) -> bool:
-    """Run the compiled rules on the same states; False, and a note, where Numba cannot compile them."""
+    """Compare compiled rules with interpreted ones on `states`; False, and a note, where Numba cannot compile them."""
     from pharos.rules import CompiledExpansion, not_compiled, rules_of
 
     rules = rules_of(env)
@@ -191,10 +195,10 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
     packed = pack(layout, np.array(states, np.int64))
     keys = np.zeros((num_states * branches, layout.num_words), np.uint64)
     terminal = np.zeros(num_states, np.uint8)
-    likely = np.ones((num_states, branches))
+    probabilities = np.ones((num_states, branches))
     exploration = CompiledExpansion(env, layout)
     for i in range(num_states):  # one by one, to know the state of a fault
-        component = exploration.component_at_fault(packed, i, keys, terminal, likely)
+        component = exploration.component_at_fault(packed, i, keys, terminal, probabilities)
         if component is not None and component > len(env.components):
             raise RuleError(
                 f"{check.where('probability or age', states[i])}: compiled, it is not as the contract says; "
@@ -212,12 +216,13 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
                 f"{check.where('is_terminal', states[i])} says {bool(terminal[i])} compiled, "
                 f"{check.terminal[states[i]]} interpreted; expected the same"
             )
-    following = unpack(layout, keys)
+    # probability and next state of each branch
+    next_states = unpack(layout, keys)
     for j in range(len(keys)):
         i, branch = divmod(j, branches)
         if not terminal[i]:
             which = states[i], *divmod(branch, env.outcomes)
-            _check_compiled_branch(check, which, float(likely[i, branch]), tuple(following[j].tolist()))
+            _check_compiled_branch(check, which, float(probabilities[i, branch]), tuple(next_states[j].tolist()))
     _check_compiled_rewards(check, rules, states, np.concatenate([packed, keys]))
     if env.layers:
         _check_compiled_drawings(check, states, notes)
@@ -227,7 +232,7 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
 def _check_compiled_branch(
     check: InterpretedCheck, branch: tuple[State, int, int], probability: float, successor: State
 ) -> None:
-    """RuleError where an outcome of an action in a state is compiled another one than interpreted."""
+    """Raise a RuleError where an outcome of an action in a state differs between compiled and interpreted rules."""
     if probability != check.probabilities.get(branch, 0.0):
         raise RuleError(
             f"{check.where('probability', *branch)} is {probability} compiled, "
@@ -241,7 +246,7 @@ def _check_compiled_branch(
 
 
 def _check_compiled_rewards(check: InterpretedCheck, rules: "Rules", states: list[State], every: np.ndarray) -> None:
-    """RuleError where a reward is compiled another one than interpreted.
+    """Raise a RuleError where a reward differs between compiled and interpreted rules.
 
     Args:
         every: the states, packed, and then the successors of each one by all branches.
@@ -270,6 +275,7 @@ def _check_compiled_rewards(check: InterpretedCheck, rules: "Rules", states: lis
 
 
 def _check_compiled_drawings(check: InterpretedCheck, states: list[State], notes: list[str]) -> None:
+    """Raise a RuleError where a drawing differs between compiled and interpreted rules."""
     from pharos.rules import CompiledDrawing, CompiledMotion, reason_of
 
     planes = np.zeros((len(states), *check.drawings[states[0]].shape), np.uint8)
@@ -289,7 +295,7 @@ def _check_compiled_drawings(check: InterpretedCheck, states: list[State], notes
 
 
 def _check_built(env: Environment, check: InterpretedCheck, states: list[State]) -> None:
-    """Build the state space and compare it with the states found: same numbers, terminal states absorbing."""
+    """Build the state space and compare it with the checked states: same numbers, terminal states absorbing."""
     from pharos.state_space import build
 
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
@@ -313,19 +319,19 @@ def _check_built(env: Environment, check: InterpretedCheck, states: list[State])
                 )
             continue
         for a in range(env.num_actions):
-            row, likely = matrix[i * env.num_actions + a].toarray()[0], np.zeros(len(states) + 1)
-            likely[i] += ends
+            row, target = matrix[i * env.num_actions + a].toarray()[0], np.zeros(len(states) + 1)
+            target[i] += ends
             for outcome in range(env.outcomes):
                 if (branch := (state, a, outcome)) in check.transitions:
-                    likely[index[check.transitions[branch]]] += check.probabilities[branch]
-            if bool(terminal[i]) != ends or (abs(row - likely) > SUM_TOLERANCE).any():
+                    target[index[check.transitions[branch]]] += check.probabilities[branch]
+            if bool(terminal[i]) != ends or (abs(row - target) > SUM_TOLERANCE).any():
                 raise RuleError(
-                    f"{check.where('transition', state, a)}: built, it leads to {_text(row)}; expected {_text(likely)}"
+                    f"{check.where('transition', state, a)}: built, it leads to {_text(row)}; expected {_text(target)}"
                 )
 
 
 def _text(row: np.ndarray) -> str:
-    """A distribution over states, in words."""
+    """Text of a distribution over states."""
     return ", ".join(f"state {i} ({row[i]:.6g})" for i in np.flatnonzero(row))
 
 
@@ -336,9 +342,10 @@ SPRITE_LETTERS = set(".#123456789")
 
 
 def check_declarations(env: Environment) -> None:
-    """RuleError where an attribute, the parameters, the variables or the start states are not as the contract says."""
+    """Raise a RuleError where an attribute, the parameters, the variables or the start states break the contract."""
     cls = type(env)
     whose = cls.__name__
+    # attributes of the class
     parameters = getattr(cls, "__dataclass_params__", None)
     if parameters is None or not parameters.frozen or "__dataclass_params__" not in vars(cls):
         raise RuleError(f"{whose} is no frozen dataclass; decorate it with @dataclass(frozen=True, kw_only=True)")
@@ -358,6 +365,7 @@ def check_declarations(env: Environment) -> None:
         if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
             raise RuleError(f"{env}: {attribute} is {value!r}; expected an integer of at least 1")
     _ = env.has_chance  # which looks at `outcomes`
+    # parameters, which must survive JSON
     try:
         again = cls(**json.loads(json.dumps(env.parameters, allow_nan=False)))
     except (TypeError, ValueError) as error:
@@ -369,6 +377,7 @@ def check_declarations(env: Environment) -> None:
             f"{env}: read back from JSON it is {again}; expected an equal instance (JSON turns tuples into lists: "
             f"turn them back in validate, with object.__setattr__)"
         )
+    # variables and start states, the same at every call
     try:
         components = env.components
         starts = start_distribution(env)
@@ -382,7 +391,7 @@ def check_declarations(env: Environment) -> None:
 
 
 def check_layers(env: Environment, notes: list[str]) -> None:
-    """RuleError where a layer or the grid is not as the contract says; a note where there are no layers."""
+    """Raise a RuleError where a layer or the grid breaks the contract; a note where there are no layers."""
     whose = type(env).__name__
     if not isinstance(env.layers, dict) or not all(isinstance(name, str) for name in env.layers):
         raise RuleError(f"{whose}.layers is {env.layers!r}; expected a dict of name -> Layer")
@@ -416,7 +425,7 @@ def check_layers(env: Environment, notes: list[str]) -> None:
 
 
 def _check_layer(where: str, name: object, layer: object) -> None:
-    """RuleError where a layer, which a message calls `where`, is not as the contract says."""
+    """Raise a RuleError where a layer, called `where` in messages, breaks the contract."""
     if not isinstance(name, str) or not isinstance(layer, Layer):
         raise RuleError(f"{where} is {layer!r}; expected a Layer")
     glyphs = layer.glyph if isinstance(layer.glyph, tuple) else (layer.glyph,)
@@ -438,7 +447,7 @@ def _check_layer(where: str, name: object, layer: object) -> None:
 
 @contextlib.contextmanager
 def _named(whose: str) -> Iterator[None]:
-    """A name that nobody paints is a breach of the contract."""
+    """Context in which an unknown name, such as that of a shape, is a RuleError of `whose`."""
     try:
         yield
     except UnknownName as error:
@@ -446,6 +455,7 @@ def _named(whose: str) -> Iterator[None]:
 
 
 def _check_sprites(whose: str, sprite: Sequence[Any], num_values: int) -> None:
+    """Raise a RuleError where the sprites of a layer are no pixels, or too few or many for its values."""
     sprites = sprite if sprite and isinstance(sprite[0], tuple) else (sprite,)
     for rows in sprites:
         if not rows or len(set(map(len, rows))) != 1 or not rows[0] or set("".join(rows)) - SPRITE_LETTERS:

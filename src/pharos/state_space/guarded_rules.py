@@ -1,4 +1,4 @@
-"""Rules called on states and planes that notice what a rule may not do: `check_environment` asks everything twice."""
+"""Rules called on states and planes that notice forbidden access: `check_environment` calls every rule twice."""
 
 import math
 import numbers
@@ -12,24 +12,24 @@ from pharos.environments import Environment, Layer, State
 from pharos.errors import RuleError
 
 SUM_TOLERANCE = 1e-9
-"""By how much the probabilities of the outcomes of an action may sum to something else than 1."""
+"""Largest difference from 1 of the sum of the probabilities of an action's outcomes."""
 
 SAME = "expected the same answer to the same question"
 
 
 class _StateWritten(Exception):
-    """A rule wrote to what it may only read."""
+    """Raised when a rule writes to a state that it may only read."""
 
 
 class _ReadOnly(tuple):
-    """A state that says so when a rule writes to it."""
+    """A state that raises when a rule writes to it."""
 
     def __setitem__(self, index, value):
         raise _StateWritten
 
 
 class _Planes:
-    """Planes that say so when a drawing leaves them; compiled code would write elsewhere, or from the other end."""
+    """Planes that raise when a drawing leaves them; compiled code would write elsewhere, or from the other end."""
 
     def __init__(self, shape: tuple[int, int, int]):
         self.array = np.zeros(shape, np.uint8)
@@ -50,13 +50,13 @@ class _Planes:
 
 
 class InterpretedCheck:
-    """Calls the rules twice on guarded states and remembers their answers."""
+    """The rules of an environment, called twice on guarded states; answers are stored."""
 
     def __init__(self, env: Environment):
         self.env = env
         self.components = env.components
         self.terminal: dict[State, bool] = {}
-        # of each outcome that is possible: (state, action, outcome); outcome 0 without chance
+        # by possible outcome: (state, action, outcome); outcome 0 without chance
         self.transitions: dict[tuple[State, int, int], State] = {}
         self.rewards: dict[tuple[State, int, int], float] = {}
         self.probabilities: dict[tuple[State, int, int], float] = {}
@@ -83,13 +83,13 @@ class InterpretedCheck:
         return successors
 
     def branches(self, state: State) -> list[tuple[int, int]]:
-        """(action, outcome) of what is possible in an expanded state that is not terminal, in order."""
+        """Possible (action, outcome) pairs of an expanded state that is not terminal, in order."""
         outcomes = range(self.env.outcomes)
         pairs = ((action, outcome) for action in range(self.env.num_actions) for outcome in outcomes)
         return [pair for pair in pairs if (state, *pair) in self.transitions]
 
     def repeat(self, state: State) -> None:
-        """Ask again, with other questions asked in between: rules have no memory."""
+        """Call the rules in a state again, after calls in other states: rules have no memory."""
         if self._is_terminal(state) != self.terminal[state]:
             raise RuleError(f"{self.where('is_terminal', state)} now says {not self.terminal[state]}; {SAME}")
         if self.terminal[state]:
@@ -117,13 +117,14 @@ class InterpretedCheck:
                 )
 
     def drawing(self, state: State) -> None:
+        """Draw a state, and its motion, and store the planes."""
         self.drawings[state] = self._planes("draw", self.env.layers, state)
         if self.env.has_motion:
             motion = self._planes("draw_motion", self.env.motion_layers, state)
             self.drawings[state] = np.concatenate([self.drawings[state], motion])
 
     def _planes(self, rule: str, layers: Mapping[str, Layer], state: State) -> np.ndarray:
-        """(L, rows, columns) uint8: what a rule draws, checked."""
+        """Planes (L, rows, columns) uint8 that a rule draws, checked."""
         shape = (len(layers), *self.env.grid())
         where = self.where(rule, state)
         drawn = []
@@ -173,7 +174,7 @@ class InterpretedCheck:
         return float(answers[0])
 
     def _check_age(self, state: State, action: int, outcome: int, successor: State) -> None:
-        """RuleError where a successor is not older."""
+        """Raise a RuleError where a successor is not older."""
         before, after = self._age(state), self._age(successor)
         if after <= before:
             raise RuleError(
@@ -207,7 +208,7 @@ class InterpretedCheck:
         return results[0]
 
     def _checked(self, where: str, out: list) -> State:
-        """`out` as a state: D integers within their ranges."""
+        """`out` as a state: D integers within their ranges; else a RuleError."""
         components = self.components
         if len(out) != len(components):
             raise RuleError(f"{where} leaves {len(out)} components in `out`; expected {len(components)}")
@@ -242,14 +243,14 @@ class InterpretedCheck:
             raise RuleError(f"{where} raises {type(error).__name__}: {error}") from error
 
     def where(self, rule: str, state: State, action: int | None = None, outcome: int | None = None) -> str:
-        """How a message begins: whose rule, by which action and outcome, in which state."""
-        chosen = "" if action is None else f" of action {self.env.actions[action]!r}"
+        """Beginning of a message: the environment, the rule, the action and outcome, the state."""
+        branch = "" if action is None else f" of action {self.env.actions[action]!r}"
         if outcome is not None and self.env.takes_outcomes():
-            chosen = f" of outcome {outcome}{chosen}"
-        return f"{self.env}: {rule}{chosen} in state {self.text(state)}"
+            branch = f" of outcome {outcome}{branch}"
+        return f"{self.env}: {rule}{branch} in state {self.text(state)}"
 
     def text(self, state: State) -> str:
-        """A state, with the names of its components where they are few."""
+        """Text of a state, with the names of its components where they are few."""
         if len(state) > 8:
             return str(state)
         return "(" + ", ".join(f"{n}={v}" for n, v in zip(self.components.names, state, strict=True)) + ")"

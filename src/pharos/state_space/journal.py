@@ -1,11 +1,10 @@
-"""The files of a build: states, successors and terminal bits are appended in the background, and committed at
-checkpoints.
+"""The files of a build: states, successors and terminal bits, appended in the background, committed at checkpoints.
 
-Data first, then the manifest that speaks of it: whatever kills the process, the last manifest is true, and the same
+Data first, then the manifest that describes it: whatever kills the process, the last manifest is true, and the same
 command goes on from there.
 
-Chance. While the build goes on, possible outcomes are appended one after another, with a code for each state and
-action, whose vector in the palette says how many there are and how likely they are. Where there are more vectors than
+Chance. During the build, possible outcomes are appended one after another, with a code for each state and action. The
+code's vector in the palette has the number of outcomes and their probabilities. Where there are more vectors than
 codes, the probabilities are spelled out, once and for all. `OutcomeParts` makes the files of the finished build from
 these: rows are padded to equal length where little of that would be padding, and codes take one byte where that
 suffices.
@@ -55,7 +54,7 @@ BLOCK_BYTES = 1 << 22  # of a file that are copied at a time
 
 @dataclass
 class Position:
-    """Where a search stands.
+    """Position of a search: how many states are expanded and numbered.
 
     Attributes:
         first: states expanded. count: states numbered. level_end: states up to the end of the current level.
@@ -70,15 +69,15 @@ class Position:
     terminals: int = 0
 
     def progress(self) -> np.ndarray:
-        """As kernels take it: (first, count, level_end, depth, no fault)."""
+        """The position as an array for kernels: (first, count, level_end, depth, no fault)."""
         return np.array([self.first, self.count, self.level_end, self.depth, 0], np.int64)
 
     def take(self, progress: np.ndarray) -> None:
-        """Go on to where a kernel stopped."""
+        """Move to the position at which a kernel stopped."""
         self.first, self.count, self.level_end, self.depth = (int(value) for value in progress[:4])
 
     def to_dict(self) -> dict[str, int]:
-        """The entries of the manifest."""
+        """The position as entries of the manifest."""
         return {
             "num_states": self.count,
             "num_expanded": self.first,
@@ -89,7 +88,7 @@ class Position:
 
     @staticmethod
     def of_manifest(manifest: dict[str, Any]) -> "Position":
-        """The position of the last checkpoint."""
+        """The position of the last checkpoint, from its manifest."""
         names = ("num_expanded", "num_states", "level_end", "depth", "num_terminal_states")
         return Position(*(manifest[name] for name in names))
 
@@ -99,7 +98,7 @@ class Journal:
 
     Attributes:
         path: the folder.
-        appended: states handed over to the files.
+        appended: number of states that were appended, or wait to be.
         last_checkpoint: time of the last commit, `time.perf_counter()`.
     """
 
@@ -107,18 +106,18 @@ class Journal:
         self.path, self.plan = path, plan
         self.appended = 0
         self.last_checkpoint = time.perf_counter()
-        self._indices = SUCCESSORS  # of INDEX_TYPES
+        self._indices = SUCCESSORS  # a key of INDEX_TYPES
         self._files: dict[str, GrowingFile] = {}
         self._writes: list[Future] = []
-        self._written: dict[str, Any] | None = None  # what a checkpoint commits: counts and files that belong together
+        self._written: dict[str, Any] | None = None  # counts and files of the next checkpoint, consistent
         self._writer: ThreadPoolExecutor
 
     def open(self, manifest: dict[str, Any] | None) -> Position:
-        """Open the files, at the start states or at the last checkpoint; returns where the search stands."""
+        """Open the files, at the start states or at the last checkpoint; returns the position of the search."""
         arrays = manifest["arrays"] if manifest else {}
         names = self._names(arrays)
         for name in {*ARRAYS, *PARTS.values()} - set(names):
-            (self.path / name).unlink(missing_ok=True)  # left by a process killed while it made other files of some
+            (self.path / name).unlink(missing_ok=True)  # left by a process that was killed while it replaced some files
         for name in names:
             self._files[name] = GrowingFile(self.path / name, arrays.get(name))
         if manifest is None:
@@ -133,22 +132,22 @@ class Journal:
         return position
 
     def _names(self, arrays: dict[str, Any]) -> tuple[str, ...]:
-        """The files of a build, at the start or where it stopped with these arrays."""
+        """Names of the files of a build, at its start or at a checkpoint with these arrays."""
         self._indices = successors_name(arrays)
         return STATES, self._successors_name, TERMINAL
 
     @property
     def index_dtype(self) -> np.dtype:
-        """Of the successors while they are in memory."""
+        """Type of the successors while they are in memory."""
         return np.dtype(np.int32 if self._indices == SUCCESSORS else np.int64)
 
     @property
     def _successors_name(self) -> str:
-        """Their file."""
+        """Name of the file of successors."""
         return self._indices
 
     def stored_states(self, count: int) -> np.ndarray:
-        """(count, W) uint64, a memory map."""
+        """States (count, W) uint64 in the file, a memory map."""
         return np.memmap(self.path / STATES, "<u8", "r", shape=(count, self.plan.layout.num_words))
 
     def read_states(self, start: int, out: np.ndarray) -> None:
@@ -160,7 +159,7 @@ class Journal:
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
-        """While a thread writes in the background."""
+        """Context in which a thread writes in the background."""
         with ThreadPoolExecutor(1) as self._writer:
             yield
 
@@ -190,7 +189,7 @@ class Journal:
             self._writes.pop(0).result()
 
     def widen(self, position: Position) -> None:
-        """From indices of 32 to those of 40 bits: a new file; the old one goes once this is committed."""
+        """Replace the file of successors by one of 40-bit indices; the old one is deleted once this is committed."""
         self.finish_writes()
         narrow, self._indices = self._successors_name, SUCCESSORS40
         old = self._files[narrow]
@@ -202,7 +201,7 @@ class Journal:
         self._drop(narrow)
 
     def _drop(self, name: str) -> None:
-        """A file that nothing speaks of any more."""
+        """Close and delete a file that no manifest names any more."""
         file = self._files.pop(name)
         file.close()
         file.path.unlink()
@@ -215,10 +214,10 @@ class Journal:
         self.commit(complete=complete)
 
     def commit(self, *, complete: bool, written: dict[str, Any] | None = None) -> None:
-        """Commit what was written: data first, then the manifest that speaks of it.
+        """Commit the written data: data first, then the manifest that describes it.
 
         Args:
-            written: what the manifest says of it; None for what the thread that writes noted.
+            written: entries of the manifest; None for those of the thread that writes.
         """
         written = written or self._written
         if written is None:
@@ -253,11 +252,12 @@ class Journal:
         return {STATES: "<u8", self._successors_name: INDEX_TYPES[self._indices], TERMINAL: "|u1"}
 
     def _entries(self, position: Position) -> dict[str, Any]:
+        """Entries of the manifest at a position: counts and arrays."""
         arrays = {name: {"dtype": dtype, **self._files[name].entry()} for name, dtype in self._dtypes().items()}
         return {**position.to_dict(), "arrays": arrays}
 
     def _check_rules(self, position: Position) -> None:
-        """StateSpaceMismatch where the stored transitions are those of other rules."""
+        """Raise StateSpaceMismatch where the stored transitions are those of other rules."""
         if position.first == 0:
             return
         shape = (position.first, self.plan.env.num_actions)
@@ -268,15 +268,15 @@ class Journal:
 
 
 def blocks_of(file: GrowingFile, dtype: np.dtype, entries: int | None = None) -> Iterator[tuple[int, np.ndarray]]:
-    """(first, some of the numbers in a file, from the first one on), in their order.
+    """Blocks of the numbers in a file: pairs (index of the first one, array), in order.
 
     Args:
         entries: of a block, at most; None for BLOCK_BYTES.
     """
     size = file.bytes // dtype.itemsize
-    most = entries or max(1, BLOCK_BYTES // dtype.itemsize)
-    for first in range(0, size, most):
-        shape = (min(most, size - first),)
+    block_size = entries or max(1, BLOCK_BYTES // dtype.itemsize)
+    for first in range(0, size, block_size):
+        shape = (min(block_size, size - first),)
         yield first, np.memmap(file.path, dtype, "r", offset=first * dtype.itemsize, shape=shape)
 
 
@@ -290,7 +290,7 @@ ENTRIES = 1 << 18  # of rows of K, as many as are copied at a time
 
 
 class JournalRows(NamedTuple):
-    """Some rows: the number of the first one, and that of its first outcome; then R rows of N outcomes in all.
+    """Rows of outcomes: number of the first row, number of its first outcome; then R rows of N outcomes in all.
 
     counts (R,); codes (R,), None where probabilities are spelled out; successors (N,).
     """
@@ -304,7 +304,7 @@ class JournalRows(NamedTuple):
 
 @dataclass
 class OutcomeParts:
-    """What the files of a build that goes on hold of outcomes.
+    """The outcomes in the files of an unfinished build.
 
     Attributes:
         folder: where they are. rows: how many, A for each state. most_declared: the most outcomes that a row may have.
@@ -320,7 +320,7 @@ class OutcomeParts:
     palette: np.ndarray | None
 
     def parts(self) -> Iterator[JournalRows]:
-        """All rows, some at a time."""
+        """All rows of outcomes, some at a time."""
         for row, first, codes, counts in self._counts():
             yield self._part(row, first, codes, counts)
 
@@ -347,8 +347,8 @@ class OutcomeParts:
         successors = np.asarray(from_stored(stored))
         return JournalRows(row, first, counts, codes, successors)
 
-    def likely(self, part: JournalRows) -> np.ndarray:
-        """(N,) uint64, the bits of the probabilities of its outcomes."""
+    def bits(self, part: JournalRows) -> np.ndarray:
+        """Bits (N,) uint64 of the probabilities of the outcomes of some rows."""
         if self.palette is None:
             entries = len(part.successors)
             return np.fromfile(self.folder / PARTS[PROBABILITIES], "<u8", entries, offset=8 * part.first)
@@ -357,20 +357,21 @@ class OutcomeParts:
         return vectors[vectors != 0]
 
     def most(self) -> int:
-        """K, the most possible outcomes of a row."""
+        """Largest number of possible outcomes of a row, K."""
         if self.palette is not None:
             return int((self.palette != 0).sum(axis=1).max())
         return max(int(counts.max()) for _, _, _, counts in self._counts())
 
     def finish(self, written: dict[str, dict[str, Any]]) -> tuple[dict[str, dict[str, Any]], int]:
-        """Write the files of a finished build: name -> what the manifest says of it; and K, the most outcomes of a row.
+        """Write the files of a finished build; returns (entries of the manifest by file name, most outcomes of a row).
 
         Args:
-            written: the same of the files that there are.
+            written: entries of the files of the unfinished build.
         """
         most = self.most()
         successors, index_type = self.indices, INDEX_TYPES[self.indices]
         num_entries = written[PARTS[successors]]["bytes"] // dtype_of(index_type).itemsize
+        # form of the rows: padded to K, or with offsets; palette and codes, or probabilities
         is_dense = MOST_PADDING[1] * (self.rows * most - num_entries) <= MOST_PADDING[0] * self.rows * most
         dtypes = {successors: index_type}
         if not is_dense:
@@ -379,6 +380,7 @@ class OutcomeParts:
             dtypes[PROBABILITIES] = "<f8"
         else:
             dtypes |= {CODES: "|u1" if len(self.palette) <= 256 else "<u2", PALETTE: "<f8"}
+        # files of the build that have this form already are linked, the others written anew
         stay = {successors, OFFSETS, PROBABILITIES} if not is_dense else set()
         stay |= {CODES} if dtypes.get(CODES) == "<u2" else set()
         stay &= {name for name in dtypes if PARTS[name] in written}
@@ -400,6 +402,7 @@ class OutcomeParts:
         }, most
 
     def _fill(self, files: dict[str, GrowingFile], dtypes: dict[str, str], most: int, is_dense: bool) -> None:
+        """Write the new files, some rows at a time."""
         if OFFSETS in files:
             files[OFFSETS].append(np.zeros(1, np.int64))
         if self.palette is not None:
@@ -412,35 +415,36 @@ class OutcomeParts:
             if OFFSETS in files:
                 files[OFFSETS].append(part.first + np.cumsum(part.counts))
             if PROBABILITIES in files:
-                files[PROBABILITIES].append(_padded(self.likely(part), part.counts, most, fill_with_first=False))
+                files[PROBABILITIES].append(_padded(self.bits(part), part.counts, most, fill_with_first=False))
             if CODES in files and part.codes is not None:
                 files[CODES].append(part.codes.astype(dtypes[CODES]))
 
     def of_states(self, states: np.ndarray) -> dict[int, OutcomesOfState]:
-        """The outcomes of some states, ascending."""
+        """Outcomes of `states`, which are ascending, by state."""
         outcomes = {}
         for row, first, codes, counts in self._counts():
             for state in states[
                 (states >= row // self.num_actions) & (states < (row + len(counts)) // self.num_actions)
             ]:
                 place = int(state) * self.num_actions - row
-                here = slice(place, place + self.num_actions)
-                before = first + int(counts[:place].sum())
-                part = self._part(row + place, before, None if codes is None else codes[here], counts[here])
+                rows = slice(place, place + self.num_actions)
+                first_outcome = first + int(counts[:place].sum())
+                part = self._part(row + place, first_outcome, None if codes is None else codes[rows], counts[rows])
                 ends = np.cumsum(part.counts)[:-1]
-                likely = np.split(self.likely(part).view(np.float64), ends)
-                outcomes[int(state)] = list(zip(np.split(part.successors, ends), likely, strict=True))
+                probabilities = np.split(self.bits(part).view(np.float64), ends)
+                outcomes[int(state)] = list(zip(np.split(part.successors, ends), probabilities, strict=True))
         return outcomes
 
 
 def _padded(values: np.ndarray, counts: np.ndarray, most: int, *, fill_with_first: bool) -> np.ndarray:
+    """Rows (R, most) of values (N,), padded by their first value or by zeros."""
     out = np.empty((len(counts), most), values.dtype)
     kernels.padded(values, counts, fill_with_first, out)
     return out
 
 
 def _link(source: Path, target: Path) -> None:
-    """The same file by another name; a copy, where the file system has no such names."""
+    """Give a file another name; copy it where the file system has no hard links."""
     try:
         os.link(source, target)
     except OSError:
@@ -456,7 +460,7 @@ _SLOTS = 1 << 17  # of the table of the palette: twice as many as codes
 
 
 class OutcomeJournal(Journal):
-    """See `Journal`.
+    """The files of one build with chance; see `Journal`.
 
     Attributes:
         palette: (capacity, K) uint64, the bits of the vectors found; None where probabilities are spelled out.
@@ -487,7 +491,7 @@ class OutcomeJournal(Journal):
         return {**dtypes, PARTS[CODES]: "<u2", PARTS[PALETTE]: "<f8", TERMINAL: "|u1"}
 
     def _check_rules(self, position: Position) -> None:
-        """The same, of outcomes; and the palette of a build that goes on."""
+        """Load the palette of the build; StateSpaceMismatch where stored outcomes are those of other rules."""
         if self.palette is not None:
             vectors = np.fromfile(self.path / PARTS[PALETTE], "<u8").reshape(-1, self._most)
             self._vectors = len(vectors)
@@ -501,7 +505,7 @@ class OutcomeJournal(Journal):
             check_outcome_rules(self.path, self.plan.env, self.plan.layout, states, outcomes, bits)
 
     def _parts(self, states: int) -> OutcomeParts:
-        """What the files hold of the first `states` states."""
+        """The outcomes of the first `states` states in the files."""
         palette = None if self.palette is None else self.palette[: self._vectors]
         rows = states * self._num_actions
         return OutcomeParts(self.path, rows, self._num_actions, self._most, self._indices, palette)
@@ -518,12 +522,14 @@ class OutcomeJournal(Journal):
             raise
 
     def _write_outcomes(self, states: np.ndarray, block: BranchBlock, at: Position) -> None:
+        # possible outcomes alone, with the bits of their probabilities
         bits = np.ascontiguousarray(block.probabilities).view(np.uint64)
         counts = np.empty(len(bits) * self._num_actions, np.int64)
-        following, likely = np.empty(bits.size, self.index_dtype), np.empty(bits.size, np.uint64)
-        size = kernels.possible(block.successors, bits, self._num_actions, following, likely, counts)
+        successors, probability_bits = np.empty(bits.size, self.index_dtype), np.empty(bits.size, np.uint64)
+        size = kernels.possible(block.successors, bits, self._num_actions, successors, probability_bits, counts)
         num_vectors = self._vectors
-        codes = self._encoded(likely[:size], counts)
+        # codes in the palette; with more vectors than codes, probabilities from now on
+        codes = self._encoded(probability_bits[:size], counts)
         if codes is None and self.palette is not None:
             self._spell_out(num_vectors)
         files = self._files
@@ -531,22 +537,25 @@ class OutcomeJournal(Journal):
         if codes is None:
             before = files[PARTS[PROBABILITIES]].bytes // 8
             files[PARTS[OFFSETS]].append(before + np.cumsum(counts))
-            files[PARTS[PROBABILITIES]].append(likely[:size])
+            files[PARTS[PROBABILITIES]].append(probability_bits[:size])
         else:
             assert self.palette is not None
             files[PARTS[CODES]].append(codes)
             files[PARTS[PALETTE]].append(self.palette[num_vectors : self._vectors])
-        self._append_successors(following[:size])
+        self._append_successors(successors[:size])
         files[TERMINAL].append(np.packbits(block.terminal, bitorder="little"))
         self._written = self._entries(at)
 
-    def _encoded(self, likely: np.ndarray, counts: np.ndarray) -> np.ndarray | None:
-        """(rows,) uint16, the number in the palette of each row's probabilities; None where there are too many."""
+    def _encoded(self, bits: np.ndarray, counts: np.ndarray) -> np.ndarray | None:
+        """Codes (rows,) uint16 of the rows' probabilities in the palette; None where there are more vectors than codes.
+
+        bits: of the probabilities of all outcomes; counts (rows,): outcomes of each row.
+        """
         codes = np.empty(len(counts), np.uint16)
         row = first = 0
         while self.palette is not None:
             arrays = self.palette, self._vectors, self._table, codes
-            row, first, self._vectors = kernels.encode(likely, counts, row, first, *arrays)
+            row, first, self._vectors = kernels.encode(bits, counts, row, first, *arrays)
             if row == len(counts):
                 return codes
             if len(self.palette) >= MOST_CODES:
@@ -557,7 +566,7 @@ class OutcomeJournal(Journal):
         return None
 
     def _spell_out(self, num_vectors: int) -> None:
-        """From codes to probabilities, and where the rows begin.
+        """Replace the codes in the files by probabilities and the offsets of rows.
 
         num_vectors: vectors of the palette that are in its file.
         Runs in the thread that writes, between two chunks.
@@ -571,7 +580,7 @@ class OutcomeJournal(Journal):
         offsets.append(np.zeros(1, np.int64))
         for part in parts.parts():
             offsets.append(part.first + np.cumsum(part.counts))
-            probabilities.append(parts.likely(part))
+            probabilities.append(parts.bits(part))
         self.palette = None
         arrays = {name: {"dtype": dtype, **self._files[name].entry()} for name, dtype in self._dtypes().items()}
         self._written = {**self._written, "arrays": arrays}
@@ -601,7 +610,7 @@ class OutcomeJournal(Journal):
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove what a process left that was killed between the end of its build and its own."""
+    """Remove the files of a build in progress that are left where a process completed it and was killed then."""
     for name in PARTS.values():
         with contextlib.suppress(OSError):
             (folder / name).unlink(missing_ok=True)

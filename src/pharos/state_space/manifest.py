@@ -1,7 +1,7 @@
-"""The manifest of a state space, and the files that it speaks of.
+"""The manifest of a state space, and the files that it describes.
 
-A manifest is read, and what it says is checked before anything is made of it. `Plan` is what it needs to know of an
-environment. Files grow by appending, with a checksum for every block; one builder at a time.
+A manifest is read, and checked before anything is made of it. `Plan` has the facts of an environment that it needs.
+Files grow by appending, with a checksum for every block; one builder at a time.
 """
 
 import contextlib
@@ -27,30 +27,30 @@ from pharos.system.arrays import INT40
 
 FORMAT, FORMAT_VERSION = "pharos state space", 1
 OUTCOMES_VERSION = 2
-"""Of folders of environments with chance."""
+"""Format version of folders of environments with chance."""
 
 INT40_VERSION = 3
-"""Of folders whose successors have 40 bits, with chance and without."""
+"""Format version of folders whose successors have 40 bits, with chance and without."""
 
 IMPORTED_FORMAT = "pharos mdp"
-"""What `pharos import` writes in place of it."""
+"""The format in a manifest that `pharos import` writes."""
 
 MANIFEST = "manifest.json"
 STATES, SUCCESSORS, TERMINAL = "states.bin", "successors.bin", "terminal.bin"
 SUCCESSORS40, SUCCESSORS64 = "successors40.bin", "successors64.bin"
-"""In place of successors.bin beyond 2^31 states; of 64 bits only in folders that an earlier pharos began."""
+"""Files in place of successors.bin beyond 2^31 states; of 64 bits only in folders that an earlier pharos began."""
 
 INDEX_TYPES = {SUCCESSORS: "<i4", SUCCESSORS40: INT40, SUCCESSORS64: "<i8"}
 """The type of the indices in each of these files."""
 
 OFFSETS, CODES, PALETTE, PROBABILITIES = "offsets.bin", "codes.bin", "palette.bin", "probabilities.bin"
-"""Only with chance."""
+"""Files that exist only with chance."""
 
 ARRAYS = (STATES, *INDEX_TYPES, TERMINAL, OFFSETS, CODES, PALETTE, PROBABILITIES)
 """The files of arrays that a folder may hold."""
 
 PARTS = {name: f"building-{name}" for name in (*INDEX_TYPES, OFFSETS, CODES, PALETTE, PROBABILITIES)}
-"""With chance: what a build writes until it ends."""
+"""With chance: the file that a build writes in place of each of these until it ends."""
 
 MOST_CODES = 1 << 16
 """Vectors of probabilities that a palette may have."""
@@ -62,7 +62,7 @@ AGAIN = "delete the folder and build again"
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Return the manifest of a folder; None where there is none.
+    """The manifest of a folder; None where there is none.
 
     Raises:
         StateSpaceCorrupted: it is nonsense. StateSpaceMismatch: it is of another version of the format.
@@ -97,10 +97,10 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def successors_name(arrays: dict[str, Any], parts: dict[str, str] | None = None) -> str:
-    """The file of successors: its name depends on the width of the indices.
+    """Name of the file of successors, which depends on the width of the indices.
 
     Args:
-        parts: PARTS, where the arrays are those of a build with chance that goes on.
+        parts: PARTS, where the arrays are those of an unfinished build with chance.
     """
     names = parts or {name: name for name in INDEX_TYPES}
     return next((name for name in (SUCCESSORS40, SUCCESSORS64) if names[name] in arrays), SUCCESSORS)
@@ -119,7 +119,7 @@ def digest_of(manifest: dict[str, Any]) -> str:
 
 
 def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
-    """StateSpaceCorrupted where a file is missing or shorter than what was committed."""
+    """Raise StateSpaceCorrupted where a file is missing or shorter than its committed length."""
     for name, entry in manifest["arrays"].items():
         path = folder / name
         length = path.stat().st_size if path.is_file() else None
@@ -130,11 +130,11 @@ def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
             )
 
 
-# What a manifest says -------------------------------------------------------------------------------------------------
+# Checks of a manifest -------------------------------------------------------------------------------------------------
 
 
 def _check(manifest: dict[str, Any]) -> None:
-    """ValueError where a manifest, whoever wrote it, says what no state space can be."""
+    """Raise a ValueError where a manifest, whoever wrote it, describes no possible state space."""
     for name in ("num_states", "num_actions"):
         _whole(manifest[name], name, 1)
     for name in ("num_terminal_states", "num_expanded", "level_end"):
@@ -152,6 +152,7 @@ def _check(manifest: dict[str, Any]) -> None:
 
 
 def _check_layout(layout: dict[str, Any]) -> None:
+    """Raise a ValueError where components do not fit into the words of a state."""
     words = _whole(layout["num_words"], "num_words", 1)
     columns = [layout[name] for name in ("names", "low", "size", "bits", "word", "shift")]
     if not all(isinstance(column, list) and len(column) == len(columns[0]) for column in columns):
@@ -166,7 +167,7 @@ def _check_layout(layout: dict[str, Any]) -> None:
 
 
 def _check_start(manifest: dict[str, Any]) -> None:
-    """Start states are the first ones, in their order."""
+    """Raise a ValueError unless start states are the first ones, in their order, with probabilities that sum to 1."""
     probabilities = []
     for number, ((vector, probability), (index, again)) in enumerate(
         zip(manifest["start"], manifest["initial"], strict=True)
@@ -184,7 +185,7 @@ def _check_start(manifest: dict[str, Any]) -> None:
 
 
 def _check_arrays(manifest: dict[str, Any]) -> None:
-    """Each array has the length and the type that follow from the numbers of states, actions and outcomes."""
+    """Raise a ValueError unless types and lengths of arrays follow from the numbers of states, actions and outcomes."""
     arrays, states = manifest["arrays"], manifest["num_states"]
     has_40_bits = bool({SUCCESSORS40, PARTS[SUCCESSORS40]} & set(arrays))
     if has_40_bits != (manifest["format_version"] == INT40_VERSION):
@@ -215,7 +216,7 @@ def _check_arrays(manifest: dict[str, Any]) -> None:
 
 
 def _expected_outcomes(manifest: dict[str, Any]) -> dict[str, tuple[str, int]]:
-    """Type and length of the arrays of outcomes of a finished build."""
+    """(type, length) of the arrays of outcomes of a finished build, by name."""
     arrays = manifest["arrays"]
     most = _whole(manifest["num_outcomes"], "num_outcomes", 1)
     rows = manifest["num_states"] * manifest["num_actions"]
@@ -237,7 +238,7 @@ def _expected_outcomes(manifest: dict[str, Any]) -> dict[str, tuple[str, int]]:
 
 
 def _check_parts(arrays: dict[str, Any]) -> None:
-    """The files of a build with chance that goes on."""
+    """Raise a ValueError unless the arrays are the files of an unfinished build with chance."""
     names = set(arrays) - {STATES, TERMINAL}
     successors = PARTS[successors_name(arrays, PARTS)]
     spelled_out = {PARTS[OFFSETS], PARTS[PROBABILITIES]}
@@ -252,12 +253,12 @@ def _check_parts(arrays: dict[str, Any]) -> None:
 
 
 def _width(dtype: str) -> int:
-    """Bytes of a number of a type."""
+    """Bytes of a number of this type."""
     return int(dtype[-1])
 
 
 def _checked_size(name: str, entry: dict[str, Any]) -> int:
-    """The bytes of a file, each block of which has a checksum."""
+    """Bytes of a file; ValueError unless each block of it has a checksum."""
     size = _whole(entry["bytes"], f"bytes of {name}", 0)
     if len(entry["checksums"]) != -(-size // CHECKSUM_BYTES):
         raise ValueError(f"{name}: {len(entry['checksums'])} checksums for {size} bytes")
@@ -265,6 +266,7 @@ def _checked_size(name: str, entry: dict[str, Any]) -> int:
 
 
 def _whole(value: object, name: str, least: int) -> int:
+    """The value; ValueError unless it is a whole number from `least` to 2^63."""
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 2**63:
         raise ValueError(f"{name} is {repr(value)[:200]}; expected a whole number of at least {least}")
     return value
@@ -272,14 +274,13 @@ def _whole(value: object, name: str, least: int) -> int:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a state space needs to know of an environment, each computed once.
+    """The facts of an environment that a state space needs, each computed once.
 
     Attributes:
         env: the environment.
         layout: where its components sit in packed states.
         starts: its start states and their probabilities.
-        identity: what makes a state space its state space: kept in the manifest and hashed into the cache's folder
-            names.
+        identity: the entries of the manifest by which state spaces differ; hashed into the cache's folder names.
         fingerprint: of its rules.
     """
 
@@ -317,12 +318,12 @@ class Plan:
 
     @cached_property
     def branches(self) -> int:
-        """How many successors a state may have: the number of actions, times that of outcomes."""
+        """Number of branches of a state: the number of actions, times that of outcomes."""
         return self.env.num_actions * int(self.env.outcomes)
 
     @property
     def format_version(self) -> int:
-        """Of the folder."""
+        """Format version of the folder, for indices of 32 bits."""
         return OUTCOMES_VERSION if self.env.has_chance else FORMAT_VERSION
 
     @cached_property
@@ -332,19 +333,19 @@ class Plan:
 
 
 def _module_of(cls: type) -> str:
-    """The module of a class, as manifests name it: built-in classes without the folder of their file."""
+    """Module of a class, as manifests name it: built-in classes without the folder of their file."""
     return re.sub(r"^(pharos\.environments)\.(worlds|mini_grid)\b", r"\1", cls.__module__)
 
 
 # Files that grow ------------------------------------------------------------------------------------------------------
 
 
-# Appended bytes that are sent on to the disk together, while the search goes on.
+# Appended bytes that the system is asked to write to the disk together, while the search goes on.
 SENT_BYTES = 1 << 20
 
 
 class GrowingFile:
-    """A file that is appended to, its length, and one checksum for every CHECKSUM_BYTES of it."""
+    """A file that grows by appending, with its length and a checksum for every CHECKSUM_BYTES of it."""
 
     def __init__(self, path: Path, committed: dict[str, Any] | None = None):
         self.path = path
@@ -367,11 +368,11 @@ class GrowingFile:
                 raise
 
     def _take_over(self, committed: dict[str, Any]) -> None:
-        """Cut what was written after the last checkpoint; verify what was committed."""
+        """Truncate the file to the last checkpoint, and verify its checksums."""
         self._file.truncate(committed["bytes"])
         self._file.seek(0)
         while block := self._file.read(CHECKSUM_BYTES):
-            self._note(memoryview(block))
+            self._add_to_checksums(memoryview(block))
         self._sent = self.bytes
         if self.entry()["checksums"] != committed["checksums"] or self.bytes != committed["bytes"]:
             raise StateSpaceCorrupted(
@@ -390,12 +391,13 @@ class GrowingFile:
         except OSError as error:
             self._failure = cannot_write(self.path, error)
             raise self._failure from error
-        self._note(data)
+        self._add_to_checksums(data)
         if self.bytes - self._sent >= SENT_BYTES:
             storage.write_out(self._file.fileno(), self._sent, self.bytes - self._sent)
             self._sent = self.bytes
 
-    def _note(self, data: memoryview) -> None:
+    def _add_to_checksums(self, data: memoryview) -> None:
+        """Count appended bytes, and add them to the checksum of their block."""
         self.bytes += len(data)
         while len(data):
             size = min(len(data), CHECKSUM_BYTES - self._partial_bytes)
@@ -407,12 +409,12 @@ class GrowingFile:
                 self._partial, self._partial_bytes = xxhash.xxh3_128(), 0
 
     def entry(self) -> dict[str, Any]:
-        """What the manifest says of the file."""
+        """Entry of the file in the manifest: its length and checksums."""
         partial = [self._partial.hexdigest()] if self._partial_bytes else []
         return {"bytes": self.bytes, "checksums": self.checksums + partial}
 
     def sync(self) -> None:
-        """Wait until everything appended is on the disk; a second try after a failure would not tell the truth."""
+        """Wait until appended data are on the disk; after a failure it always raises: a second try may lie."""
         if self._unsynced:
             raise self._unsynced
         try:

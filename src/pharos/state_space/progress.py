@@ -1,4 +1,4 @@
-"""How far a build is: what a callback receives, and the bar on a terminal."""
+"""Progress of a build: the record that a callback receives, and the bar on a terminal."""
 
 import contextlib
 import sys
@@ -10,7 +10,7 @@ from pharos.environments import Environment
 
 @dataclass(frozen=True)
 class BuildProgress:
-    """What a progress callback receives.
+    """Progress of a build, as a callback receives it.
 
     Attributes:
         num_states, num_expanded: states numbered, and those of them that are expanded.

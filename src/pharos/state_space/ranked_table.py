@@ -1,23 +1,20 @@
-"""The table of states that several processes share: what each rank does in a search by ranks.
+"""The table of states and the search, shared by several processes: the work of each rank.
 
 A *superstep* expands a block of states, in four exchanges. Each rank has an even part of the block's rows, and owns the
 states whose hash falls to it (kernels/hash_table.py).
 
-1. Each rank expands its rows, and asks the owners of the successors for their numbers, saying at which place of the
-   block each stands: row x branches + branch, the order in which one process would meet them.
-2. An owner keeps, of the places that lead to a state that it has not heard of, the first, and tells the rank whose row
-   that is in.
+1. Each rank expands its rows, and asks the owners of the successors for their numbers, with the place of each in the
+   block: row x branches + branch, the order in which one process would meet them.
+2. An owner keeps the first of the places that lead to a new state, and sends it to the rank whose row that is in.
 3. Each rank counts the new states in its rows; with the sum of the ranks before it, they have the numbers that one
-   process would give them. It tells the owners.
+   process would give them. It sends these to the owners.
 4. Owners answer.
 
-So numbers, and all files, are the same whatever the number of ranks. Rank 0 hands out states and collects rows.
-
-A search by several processes: the files of one process, whatever their number.
+So numbers, and all files, are the same whatever the number of ranks. Rank 0 distributes states and collects rows.
 
 Rank 0 runs the search and writes the files. While the frontier is narrow (Freeway: 148 thousand levels of 9 states) it
 works alone, as exchanges would cost more than the states. Once it is wide, or the table does not fit, all ranks share
-the table and expand blocks together; what memory holds is then what all of them have.
+the table and expand blocks together; the memory for it is then that of all ranks.
 """
 
 import contextlib
@@ -49,7 +46,7 @@ _NOTHING = np.full(1 << 16, -1, np.int32)  # a table that holds nothing, where t
 
 
 def rows_of_rank(plan: Plan) -> int:
-    """Rows that a rank expands in a superstep, at most: a multiple of 8."""
+    """Number of rows that a rank expands in a superstep, at most: a multiple of 8."""
     return min(ROWS, max(8, SUCCESSORS // plan.branches // 8 * 8))
 
 
@@ -57,7 +54,7 @@ class Owner:
     """The states that one rank owns, and their numbers.
 
     Attributes:
-        table: the states, in the order in which this rank heard of them. numbers: (capacity,) int64, of each.
+        table: the states, in the order in which this rank received them. numbers: (capacity,) int64, of each.
         count: how many there are.
     """
 
@@ -74,7 +71,7 @@ class Owner:
         self.count = 0
 
     def claim(self, candidates: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """The entries of the states asked for; new ones wait for their numbers."""
+        """Entries of candidates; new ones wait for their numbers. `places`: where in the block candidates stand."""
         if self.table.is_full(self.count):
             self._grow()
         entries = np.empty(len(candidates), np.int64)
@@ -92,16 +89,16 @@ class Owner:
         self.table.grow(self.count, _INT32, None, 1)
 
     def release(self) -> None:
-        """Give the memory back."""
+        """Free the memory."""
         self.table.release()
         self.numbers = self.numbers[:0].copy()
 
 
 class RankedTable:
-    """One rank's part in a search; `answer` is the program of all but rank 0, which calls the other methods.
+    """One rank's part of the table; all ranks but rank 0 run `answer`, rank 0 calls the other methods.
 
-    A header tells the others what comes: (what to do, first, rows, count), for a superstep that expands states
-    [first, first + rows) when `count` are numbered.
+    A header announces each step to the others: (step, first, rows, count); a superstep expands states [first, first +
+    rows) when `count` are numbered.
     """
 
     def __init__(self, plan: Plan, rank: Rank, memory: int | None):
@@ -117,17 +114,17 @@ class RankedTable:
         self._probabilities = np.empty((rows if plan.env.has_chance else 0, self.branches))
 
     def close(self) -> None:
-        """Give the memory back."""
+        """Free the memory, and end processes that run rules."""
         self.owner.release()
         self.rules.close()
 
     # Rank 0 -----------------------------------------------------------------------------------------------------------
 
     def take(self, states: np.ndarray) -> None:
-        """Tell the owners of the states that are numbered already; state i has number i."""
+        """Send states that are numbered already to their owners; state i has number i."""
         for first in range(0, len(states), len(self._indices)):
             part = np.array(states[first : first + len(self._indices)], np.uint64)
-            self._say(_TAKE, first, len(part), first)
+            self._send_header(_TAKE, first, len(part), first)
             numbers = np.arange(first, first + len(part))
             self._indices[: len(part)] = -1
             order, counts = self._routed(part)
@@ -139,26 +136,27 @@ class RankedTable:
         Returns:
             (successors int64, terminal, probabilities) of the rows; and the new states, numbered from `count` on.
         """
-        self._say(_EXPAND, first, len(states), count)
+        self._send_header(_EXPAND, first, len(states), count)
         cuts = self._cuts(len(states))
         parts = [states[cuts[i] : cuts[i + 1]] for i in range(self.rank.size)]
         block, new = self._superstep(self.rank.scatter(parts, states[:0]), first, cuts, count)
         rows = [np.concatenate(self.rank.gather(array)) for array in block]
         return BranchBlock(*rows), np.concatenate(self.rank.gather(new))
 
-    def _say(self, *header: int) -> None:
+    def _send_header(self, *header: int) -> None:
+        """Announce a step to the other ranks."""
         self.rank.broadcast(np.array(header, np.int64), _HEADER)
 
     # The others -------------------------------------------------------------------------------------------------------
 
     def answer(self) -> None:
-        """Do what rank 0 says, until the end."""
+        """Run the steps that rank 0 announces, until the end."""
         no_states = np.empty((0, self.num_words), np.uint64)
         while True:
-            what, first, rows, count = map(int, self.rank.broadcast(None, _HEADER))
-            if what == _END:
+            step, first, rows, count = map(int, self.rank.broadcast(None, _HEADER))
+            if step == _END:
                 return
-            if what == _TAKE:
+            if step == _TAKE:
                 self._take([no_states] * self.rank.size, [np.empty(0, np.int64)] * self.rank.size)
                 continue
             states = self.rank.scatter(None, no_states)
@@ -169,6 +167,7 @@ class RankedTable:
     # All --------------------------------------------------------------------------------------------------------------
 
     def _take(self, states: list[np.ndarray], numbers: list[np.ndarray]) -> None:
+        """Exchange numbered states by owner; enter those that this rank owns."""
         for keys, number in zip(self.rank.exchange(states), self.rank.exchange(numbers), strict=True):
             for start in range(0, len(keys), self.rows * self.branches):
                 part = slice(start, start + self.rows * self.branches)
@@ -176,23 +175,29 @@ class RankedTable:
                 self.owner.numbers[entries] = number[part]
 
     def _cuts(self, rows: int) -> list[int]:
-        """Where the rows of each rank begin and end."""
+        """Bounds of the rows of each rank: rank q has [cuts[q], cuts[q + 1])."""
         return [rows * i // self.rank.size for i in range(self.rank.size + 1)]
 
     def _superstep(
         self, states: np.ndarray, first: int, cuts: list[int], count: int
     ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-        """See the head of this file; the rows of this rank, and the new states in them."""
+        """Expand the rows of this rank in a superstep; see the head of this file.
+
+        Returns:
+            (successors, terminal, probabilities) of the rows, and the new states in them.
+        """
         rank, owner, branches = self.rank, self.owner, self.branches
         row, size = cuts[rank.rank], len(states) * branches
         keys, indices = self._keys[:size], self._indices[:size]
         terminal, probabilities = self._terminal[: len(states)], self._probabilities[: len(states)]
+        # 1. expand the rows, and send the successors to their owners
         self.rules.expand_and_find(states, 0, len(states), 0, keys, indices, terminal, probabilities, _NOTHING)
         order, counts = self._routed(keys)
         candidates = rank.exchange(self._parts(keys[order], counts))
         places = rank.exchange(self._parts(order + row * branches, counts))
         before = owner.count
         entries = owner.claim(np.concatenate(candidates), np.concatenate(places))
+        # 2. the first place of each new state that this rank owns goes to the rank whose row it is in
         fresh = np.arange(before, owner.count)
         first_places = -1 - owner.numbers[fresh]
         by_place = np.argsort(first_places)
@@ -200,12 +205,14 @@ class RankedTable:
         bounds = np.searchsorted(first_places, np.array(cuts) * branches)
         wins = rank.exchange([first_places[bounds[i] : bounds[i + 1]] for i in range(rank.size)])
         wins = [each - row * branches for each in wins]
+        # 3. number the new states in the rows of this rank, and send the numbers to the owners
         is_new = np.zeros(size, bool)
         for each in wins:
             is_new[each] = True
         counts_of_new = rank.allgather(np.array([np.count_nonzero(is_new)]))
         numbers = count + int(sum(each[0] for each in counts_of_new[: rank.rank])) + np.cumsum(is_new) - 1
         owner.numbers[fresh[by_place]] = np.concatenate(rank.exchange([numbers[each] for each in wins]))
+        # 4. owners answer with the numbers of all successors
         lengths = np.cumsum([len(each) for each in candidates])[:-1]
         answers = rank.exchange(np.split(owner.numbers[entries], lengths))
         successors = first + row + indices
@@ -213,22 +220,23 @@ class RankedTable:
         return (successors.reshape(-1, branches), terminal, probabilities), keys[is_new]
 
     def _routed(self, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(candidates to be asked for, sorted by owner; how many of each owner)."""
+        """(candidates to look up, sorted by owner; number of each owner's)."""
         counts = np.empty(self.rank.size, np.int64)
         hash_table.route(keys, self._indices[: len(keys)], self.rank.size, self._order, counts)
         return self._order[: counts.sum()], counts
 
     def _parts(self, array: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
+        """The array cut into parts of these lengths, one for each rank."""
         return np.split(array, np.cumsum(counts)[:-1])
 
 
 def end(rank: Rank) -> None:
-    """Rank 0 lets the others go."""
+    """Announce the end of the search to the other ranks."""
     rank.broadcast(np.array([_END, 0, 0, 0], np.int64), _HEADER)
 
 
 def answer(plan: Plan, rank: Rank, memory: int | None) -> None:
-    """What all ranks but rank 0 do in a search."""
+    """Part of all ranks but rank 0 in a search, until its end."""
     table = RankedTable(plan, rank, memory)
     try:
         table.answer()
@@ -238,7 +246,7 @@ def answer(plan: Plan, rank: Rank, memory: int | None) -> None:
 
 @contextlib.contextmanager
 def rank_of_build(plan: Plan, memory: int | None) -> Iterator[Rank]:
-    """This process among those of `mpiexec`; all but the first have done their part when they get theirs."""
+    """Context of this process's rank among those of `mpiexec`; all but rank 0 do their part of the search on entry."""
     rank = mpi_rank()
     try:
         if rank.rank > 0:
@@ -294,16 +302,17 @@ class RankedSearch(Search):
             super()._expand_chunk(pool)
 
     def _spill(self, stored: np.ndarray | None = None) -> None:
-        """From now on all ranks have the table."""
+        """Share the table with all ranks from now on."""
         self._is_shared = True
 
     def _expand_chunk_beyond_memory(self, pool: ThreadPoolExecutor) -> None:
         position = self.position
         if self._queue.first < 0:
-            self._hand_out()
+            self._distribute_states()
         if self._needs_wide_indices(self.chunk * self.branches):
             self._widen_indices(pool)
         block, base, new = self._block(), position.first, []
+        # a superstep at a time, up to a chunk
         while position.first < min(base + self.chunk, position.count):
             first, rows = position.first, min(base + self.chunk, position.count) - position.first
             part, states = self._shared.expand(self._queue.next(rows), first, position.count)
@@ -318,8 +327,8 @@ class RankedSearch(Search):
         self.journal.append(np.concatenate(new), block, position)
         self._report()
 
-    def _hand_out(self) -> None:
-        """Give the owners the states that are there; from here on this rank keeps those that wait to be expanded."""
+    def _distribute_states(self) -> None:
+        """Send the numbered states to their owners; from here on this rank keeps those that wait to be expanded."""
         self.journal.finish_writes()
         self.table.release()
         self._blocks, self._spare, self._ahead = [], [], None
@@ -329,7 +338,7 @@ class RankedSearch(Search):
 
 
 class Queue:
-    """The states that wait to be expanded: those of the file up to some number, then those found since.
+    """The states that wait to be expanded: in the file up to some number, then in memory.
 
     Attributes:
         first: the number of the next one; -1 before there is one. stored: states that are read from the file.
@@ -341,12 +350,12 @@ class Queue:
         self.first, self.stored = -1, 0
 
     def add(self, states: np.ndarray) -> None:
-        """States (n, W) that were found, in the order of their numbers."""
+        """Append new states (n, W), in the order of their numbers."""
         if len(states):
             self._waiting.append(states)
 
     def next(self, rows: int) -> np.ndarray:
-        """(rows, W), the next ones."""
+        """The next states (rows, W)."""
         states = np.empty((rows, self._journal.plan.layout.num_words), np.uint64)
         done = max(0, min(rows, self.stored - self.first))
         if done:
@@ -362,15 +371,17 @@ class Queue:
         return states
 
 
-def pass_levels(position: Position, successors: np.ndarray, new: int) -> None:
-    """Go on by rows of successors, among which are `new` new states: as states are numbered in the order in which rows
-    lead to them, those known after a row are 1 + the highest number so far.
+def pass_levels(position: Position, successors: np.ndarray, num_new: int) -> None:
+    """Move a position on by rows of successors, among which are `num_new` new states, and count finished levels.
+
+    As states are numbered in the order in which rows lead to them, the number of states known after a row is 1 + the
+    highest number so far.
     """
     first, rows = position.first, len(successors)
     highest = np.maximum.accumulate(successors.max(axis=1))
-    passed = first  # rows whose end of a level was looked at
-    while passed < position.level_end <= first + rows:
-        passed = position.level_end
-        position.level_end = max(position.count, int(highest[passed - 1 - first]) + 1)
+    last_end = first  # end of the last level that was finished; `first` before there is one
+    while last_end < position.level_end <= first + rows:
+        last_end = position.level_end
+        position.level_end = max(position.count, int(highest[last_end - 1 - first]) + 1)
         position.depth += 1
-    position.first, position.count = first + rows, position.count + new
+    position.first, position.count = first + rows, position.count + num_new

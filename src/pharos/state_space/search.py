@@ -1,4 +1,4 @@
-"""The search: breadth-first, in the order of discovery, by one thread or by several.
+"""The search for reachable states: breadth-first, in the order of discovery, by one thread or by several.
 
 While the frontier is wide, threads compute successors and look up those that the table has, a piece ahead of the one
 thread that numbers the new ones in order: so states are numbered as one thread would number them. While it is narrow
@@ -37,7 +37,7 @@ PIECES = 4
 WIDE = 1 << 13
 # States that one thread expands before it looks at the width of the frontier again.
 NARROW = 2048
-# States from which on a table forgets those that a class with an age has left behind, and how many are asked at a time.
+# Number of states from which on a table drops those that a class with an age has left behind; ages computed at a time.
 WORTH_FORGETTING = 1 << 16
 FORGETTING_BLOCK = 1 << 18
 # A table that holds nothing, where the slot of a state is its bucket.
@@ -46,7 +46,7 @@ _NOTHING = np.full(1 << 16, -1, np.int32)
 
 @dataclass(frozen=True)
 class Options:
-    """What `build` was asked for; see there."""
+    """Arguments of `build` that a search needs; see there."""
 
     max_states: int | None
     memory: int | None
@@ -56,7 +56,7 @@ class Options:
 
 @dataclass
 class Piece:
-    """A piece of a wide frontier: what threads write, for the one that numbers the states."""
+    """A piece of a wide frontier: arrays that threads write, for the thread that numbers the states."""
 
     keys: np.ndarray
     indices: np.ndarray
@@ -77,7 +77,7 @@ class Search:
         self.workers = usable_workers(options.workers)
         self._rules = rules_of(plan.env, workers=self.workers)
         self.rules, self.threads = self._rules.first_exploration, 1
-        # the first ones are all of a small space
+        # states that are interpreted: all those of a small space, none where compiled rules are loaded
         self._interpreted = 0 if self._rules.is_ready else compiling.SMALL // 4 // self.branches // 8 * 8
         self.chunk = max(8, min(CHUNK, self._interpreted // 64 * 8))
         self.position = Position()
@@ -118,17 +118,20 @@ class Search:
         self._report(finished=True)
 
     def _is_large(self) -> bool:
-        """Whether compiled rules are worth their time: at once where they are at hand, but for the first chunk."""
+        """Whether compiled rules are worth the time that they take to load or compile.
+
+        At once for a class compiled in this process, after the first chunk for one on disk, else after many states.
+        """
         first = self.position.first
         return not self.in_memory or first >= self._interpreted or (first > 0 and self._rules.is_kept)
 
     def _compile(self) -> None:
-        """Go on with compiled rules, by larger chunks."""
+        """Continue with compiled rules, by larger chunks."""
         if self.rules is self._rules.first_exploration:
             self.rules = self._rules.exploration
             self.threads = self.rules.threads(self.workers)
-            most = CHUNK_OUTCOMES if self.env.has_chance else CHUNK_SUCCESSORS
-            self.chunk, self._blocks = min(CHUNK, max(8, most // self.branches // 8 * 8)), []
+            max_branches = CHUNK_OUTCOMES if self.env.has_chance else CHUNK_SUCCESSORS
+            self.chunk, self._blocks = min(CHUNK, max(8, max_branches // self.branches // 8 * 8)), []
 
     @property
     def in_memory(self) -> bool:
@@ -136,6 +139,7 @@ class Search:
         return self.spilled is None
 
     def _take_stored_states(self) -> None:
+        """Load the states of the last checkpoint; onto disk where memory does not hold them."""
         stored = self.journal.stored_states(self.position.count)
         if self.table.fits(self.position.count, self.journal.index_dtype):
             self.table.states[: self.position.count] = stored
@@ -147,6 +151,7 @@ class Search:
     def _expand_chunk(self, pool: ThreadPoolExecutor) -> None:
         """Expand up to a chunk of states, then append their rows to the files."""
         position, table = self.position, self.table
+        # more states than int32 can number: first make room for wider indices
         if self._needs_wide_indices(self.chunk * self.branches + 32 * self.branches):
             self._widen_indices(pool)
             if not self.in_memory:
@@ -159,19 +164,21 @@ class Search:
                 if not self.in_memory:
                     position.first -= (position.first - base) % 8  # what is appended has whole bytes of terminal bits
                     break
+            # expand by one thread or by several, as wide as the frontier is now
             is_wide = self.threads > 1 and min(last, position.count) - position.first >= WIDE
             if self._ahead or is_wide:
                 self._expand_wide(pool, block, base)
             else:
                 self._expand_narrow(block, base, last)
             self._check_size()
+        # append the rows of the chunk
         block = block.rows(0, position.first - base)
         position.terminals += int(block.terminal.sum())
         self.journal.append(table.states[self.journal.appended : position.count], block, position)
         self._report()
 
     def _block(self) -> BranchBlock:
-        """Room for the rows of a chunk; the journal lets two chunks wait, so the third one back is written."""
+        """Arrays for the rows of a chunk; the journal lets two chunks wait, so the third one back is written."""
         if len(self._blocks) == 3 and self._blocks[0].successors.dtype == self.journal.index_dtype:
             self._blocks.append(self._blocks.pop(0))
         else:
@@ -181,11 +188,11 @@ class Search:
         return self._blocks[-1]
 
     def _probabilities(self, rows: int) -> np.ndarray:
-        """Room for how likely the branches of some states are; none without chance."""
+        """Array for the probabilities of the branches of some states; no rows without chance."""
         return np.empty((rows if self.env.has_chance else 0, self.branches))
 
     def _expand_narrow(self, block: BranchBlock, base: int, last: int) -> None:
-        """One thread does everything; with several it looks at the width of the frontier again after a while."""
+        """Expand by one thread; with several threads it looks at the width of the frontier again after a while."""
         position, table = self.position, self.table
         stop = min(last, max(position.first + NARROW, position.count)) if self.threads > 1 else last
         progress = position.progress()
@@ -198,14 +205,17 @@ class Search:
         piece = self._ahead or self._expand_ahead(pool, position.first, position.first - base)
         assert piece is not None
         self._ahead = None
+        # the piece that threads have expanded
         wait(piece.futures)
         for future in piece.futures:
             future.result()
         rows = piece.stop - piece.first
         row = piece.first - base
+        # let them expand the next one
         if position.count - piece.stop >= WIDE:
             next_row = (row + rows) % self.chunk
             self._ahead = self._expand_ahead(pool, piece.stop, next_row, reserved=rows * self.branches)
+        # number the successors of this one meanwhile
         progress = position.progress()
         part = block.rows(row, row + rows)
         self.table.find_or_number(piece.keys, piece.indices, part.successors, progress)
@@ -219,12 +229,12 @@ class Search:
 
         None where the table has no room left beside `reserved` other states: it grows while nobody reads it.
         """
-        table, most = self.table, -(-self.chunk // PIECES)
+        table, piece_rows = self.table, -(-self.chunk // PIECES)
         room = (table.room - self.position.count - reserved) // self.branches
-        rows = min(most, self.chunk - row, self.position.count - first, room)
+        rows = min(piece_rows, self.chunk - row, self.position.count - first, room)
         if rows < 1:
             return None
-        piece = self._spare.pop() if self._spare else self._new_piece(most)
+        piece = self._spare.pop() if self._spare else self._new_piece(piece_rows)
         cuts = [first + rows * i // self.threads for i in range(self.threads + 1)]
         piece.first, piece.stop = first, first + rows
         arrays = (first, piece.keys, piece.indices, piece.terminal, piece.probabilities, table.slots)
@@ -239,20 +249,22 @@ class Search:
         return Piece(keys, np.empty(len(keys), np.int64), np.empty(rows, np.uint8), self._probabilities(rows))
 
     def _grow_table(self, pool: ThreadPoolExecutor) -> None:
-        """A larger table; on disk where memory is not enough."""
-        count, dtype, parts = self.position.count, self.journal.index_dtype, self._within_reach()
+        """Grow the table; on disk where memory is not enough."""
+        count, dtype, parts = self.position.count, self.journal.index_dtype, self._reachable_states()
         if self.table.fits(count, dtype, 0 if parts is None else count - sum(map(len, parts))):
             self.table.grow(count, dtype, pool, self.workers, parts)
         else:
             self._spill()
 
-    def _within_reach(self) -> list[np.ndarray] | None:
-        """The states that a successor may still be, where the class has an age: those older than the youngest that
-        waits to be expanded. None: all of them.
+    def _reachable_states(self) -> list[np.ndarray] | None:
+        """Parts of the states that successors may still be, where the class has an age; None: all states.
+
+        Those are the states older than the youngest one that waits to be expanded.
         """
         count = self.position.count
         if not self.env.has_age or count < WORTH_FORGETTING:
             return None
+        # the youngest age among the states that wait
         states, slots = self.table.states.view(), self.table.slots
         states.flags.writeable = False
         ages = rules_of(self.env).ages
@@ -261,6 +273,7 @@ class Search:
             ages.block(states, i, min(i + FORGETTING_BLOCK, count)) for i in range(first, count, FORGETTING_BLOCK)
         )
         youngest = min(int(part.min()) for part in waiting)
+        # states of the table that are older
         entries = slots if len(slots) else np.arange(count)
         parts = []
         for i in range(0, len(entries), FORGETTING_BLOCK):
@@ -272,12 +285,12 @@ class Search:
         return parts
 
     def _needs_wide_indices(self, successors: int) -> bool:
-        """Whether as many more states may be more than int32 can number."""
+        """Whether this many more states may be more than int32 can number."""
         starts = len(self.plan.starts[0])
         return self.journal.index_dtype.itemsize == 4 and self.position.count + successors + starts > INT32_STATES
 
     def _widen_indices(self, pool: ThreadPoolExecutor) -> None:
-        """From indices of 32 bits to those of 40 in the file, of 64 in the table."""
+        """Replace indices of 32 bits by indices of 40 in the file, of 64 in the table."""
         self.journal.finish_writes()
         if self._ahead:  # its slots are those of the old table: it is expanded again
             wait(self._ahead.futures)
@@ -289,7 +302,7 @@ class Search:
     # The table on disk ------------------------------------------------------------------------------------------------
 
     def _spill(self, stored: np.ndarray | None = None) -> None:
-        """Go on with the table on disk, filled from the one in memory, or from the states of the last checkpoint."""
+        """Continue with the table on disk, filled from the one in memory, or from the states of the last checkpoint."""
         memory = self.options.memory
         if memory is None:
             memory = max(machine.LEAST_MEMORY, machine.available_memory() // 2)
@@ -304,18 +317,20 @@ class Search:
         self.spilled = spilled
 
     def _expand_chunk_beyond_memory(self, pool: ThreadPoolExecutor) -> None:
-        """Successors of a chunk are looked up in the order of the table, many at once, and then numbered."""
+        """Expand a chunk: look up many successors at once, in the order of the table on disk, then number them."""
         position, spilled = self.position, self.spilled
         assert spilled is not None
         if self._needs_wide_indices(spilled.rows * self.branches):
             self._widen_indices(pool)
         self.journal.finish_writes()
+        # the table in memory is not needed any more
         if len(self.table.states):
             self.table.release()
             self._blocks, self._spare = [], []
         base, last = position.first, position.first + spilled.rows
         block = spilled.block(self.journal.index_dtype)
         spilled.appended = self.journal.appended
+        # expand, look up and number
         while position.first < min(last, position.count):
             first, rows = position.first, min(last, position.count) - position.first
             size = rows * self.branches
@@ -326,6 +341,7 @@ class Search:
             spilled.find_or_number(keys, indices, part.successors, progress)
             position.take(progress)
             self._check_size()
+        # append the rows of the chunk
         block = block.rows(0, position.first - base)
         position.terminals += int(block.terminal.sum())
         self.journal.append(spilled.states[: position.count - self.journal.appended], block, position)
@@ -334,7 +350,7 @@ class Search:
     def _expand_rows(
         self, pool: ThreadPoolExecutor, states: np.ndarray, keys: np.ndarray, indices: np.ndarray, block: BranchBlock
     ) -> None:
-        """Successors of states to keys; to indices -1 - bucket, or in terminal states their own row."""
+        """Write the successors of states to keys; to indices -1 - bucket, or in terminal states their own row."""
         threads = self.threads if len(states) >= WIDE else 1
         cuts = [len(states) * i // threads for i in range(threads + 1)]
         arrays = (0, keys, indices, block.terminal, block.probabilities, _NOTHING)
@@ -349,7 +365,7 @@ class Search:
             future.result()
 
     def _states(self, spilled: SpilledTable, start: int, stop: int) -> np.ndarray:
-        """States [start, stop): from their file, and those that are not in it yet."""
+        """States [start, stop), from their file and from memory."""
         states = np.empty((stop - start, self.num_words), np.uint64)
         in_file = max(0, min(stop, spilled.appended) - start)
         if in_file:
@@ -368,12 +384,12 @@ class Search:
 
 
 def journal_of(path: Path, plan: Plan) -> Journal:
-    """The files of a build."""
+    """The journal of a build, with or without chance."""
     return OutcomeJournal(path, plan) if plan.env.has_chance else Journal(path, plan)
 
 
 def check_size(env: Environment, count: int, left: int, max_states: int | None) -> None:
-    """StateSpaceTooLarge where there are more than `max_states` states, of which `left` are not expanded."""
+    """Raise StateSpaceTooLarge where there are more than `max_states` states, of which `left` are not expanded."""
     if count > INT40_STATES:
         raise StateSpaceTooLarge(f"{env} has more than {INT40_STATES} states, which indices of 40 bits cannot number")
     if max_states is None or count <= max_states:

@@ -1,4 +1,4 @@
-"""StateSpace: the folder on disk, read through memory maps. docs/format.md specifies it to the byte."""
+"""State spaces on disk: a folder, read through memory maps. docs/format.md specifies it to the byte."""
 
 import itertools
 import math
@@ -87,7 +87,7 @@ class StateSpace:
 
     @cached_property
     def packed_states(self) -> np.ndarray:
-        """(S, W) uint64, read-only memory map.
+        """Packed states (S, W) uint64, a read-only memory map.
 
         Raises:
             StateSpaceCorrupted: a component of a state is out of its range. The first access looks at all of them.
@@ -97,7 +97,7 @@ class StateSpace:
 
     @cached_property
     def successors(self) -> Indices:
-        """(S, A) int32, or, beyond 2^31 states, `PackedIndices` of five bytes each; a read-only memory map.
+        """Next states (S, A) int32, or, beyond 2^31 states, `PackedIndices` of five bytes each; a read-only memory map.
 
         Raises:
             StateSpaceCorrupted: one is no state, or a terminal state does not lead to itself. The first access looks at
@@ -110,7 +110,7 @@ class StateSpace:
 
     @cached_property
     def outcomes(self) -> OutcomeRows:
-        """What each action may lead to, where it has several outcomes, as the files hold it; `dynamics` hides the form.
+        """Outcomes of each action, where it has several, in the form of the files, which `dynamics` hides.
 
         Raises:
             StateSpaceCorrupted: an index is no state, probabilities do not sum to 1, or rows or codes are out of range.
@@ -122,7 +122,7 @@ class StateSpace:
 
     @cached_property
     def dynamics(self) -> "Dynamics":
-        """What executing an action leads to, whether there is chance or not."""
+        """Transitions, with one interface whether there is chance or not."""
         from pharos.mdp import OutcomeTable, Table
 
         if not self.has_chance:
@@ -131,7 +131,7 @@ class StateSpace:
 
     @cached_property
     def ages(self) -> np.ndarray:
-        """(S,) int64, the age of each state, in memory.
+        """Ages (S,) int64 of the states, in memory.
 
         Raises:
             StateSpaceError: the class declares no age.
@@ -167,19 +167,22 @@ class StateSpace:
 
     @cached_property
     def terminal_bits(self) -> np.ndarray:
-        """(ceil(S / 8),) uint8, read-only memory map: state i is terminal where bit i % 8 of byte i // 8 is set."""
+        """Terminal bits (ceil(S / 8),) uint8, a read-only memory map.
+
+        State i is terminal where bit i % 8 of byte i // 8 is set.
+        """
         return self._map(TERMINAL, "|u1", (-(-self.num_states // 8),))
 
     @cached_property
     def terminal(self) -> np.ndarray:
-        """(S,) bool, in memory."""
+        """Whether each state is terminal, (S,) bool, in memory."""
         terminal = np.unpackbits(self.terminal_bits, count=self.num_states, bitorder="little").view(np.bool_)
         terminal.flags.writeable = False
         return terminal
 
     @cached_property
     def layout(self) -> Layout:
-        """Where each component of a state sits in its words."""
+        """Place of each component of a state in its words."""
         table = self.manifest["layout"]
         return Layout(
             word=np.array(table["word"], np.uint64),
@@ -196,7 +199,7 @@ class StateSpace:
         return tuple(self.manifest["layout"]["names"])
 
     def states(self, indices: "slice | Sequence[int] | np.ndarray" = slice(None)) -> np.ndarray:
-        """(N, D) int64, the states with these indices (an array of integers or a slice)."""
+        """States (N, D) int64 with these indices (an array of integers or a slice)."""
         return unpack(self.layout, np.atleast_2d(self.packed_states[indices]))
 
     def state(self, i: int) -> State:
@@ -210,14 +213,14 @@ class StateSpace:
         return bool(self.terminal_bits[i // 8] >> (i % 8) & 1)
 
     def index(self, state: Sequence[int]) -> int:
-        """The number of a state.
+        """The number of a state; ParameterError where it is not reachable.
 
-        ParameterError where it is not reachable. The first call indexes all states, in O(S).
+        The first call indexes all states, in O(S).
         """
         return int(self.indices(np.array([tuple(state)]))[0])
 
     def indices(self, states: np.ndarray) -> np.ndarray:
-        """(N, D) integers -> (N,) int64, the numbers of these states; ParameterError where one is not reachable."""
+        """Numbers (N,) int64 of states (N, D); ParameterError where one is not reachable."""
         from pharos.kernels.hash_table import find
 
         states = np.asarray(states)
@@ -337,11 +340,11 @@ def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environ
 
 
 def _check_outcome_rules(space: StateSpace, env: Environment) -> None:
-    """StateSpaceMismatch where the rules of `env` disagree with the stored outcomes of 64 states."""
-    chosen = states_to_check(space.num_states)
-    outcomes = outcomes_to_check(space.folder, space.manifest, space._stored_outcomes, chosen)
-    looked_at = np.concatenate([chosen, *(successors for each in outcomes.values() for successors, _ in each)])
-    check_states(space.folder / STATES, space.layout, space._stored_states[looked_at])
+    """Raise StateSpaceMismatch where the rules of `env` disagree with the stored outcomes of 64 states."""
+    states = states_to_check(space.num_states)
+    outcomes = outcomes_to_check(space.folder, space.manifest, space._stored_outcomes, states)
+    all_states = np.concatenate([states, *(successors for each in outcomes.values() for successors, _ in each)])
+    check_states(space.folder / STATES, space.layout, space._stored_states[all_states])
     check_outcome_rules(space.folder, env, space.layout, space._stored_states, outcomes, space.terminal_bits)
 
 

@@ -1,6 +1,7 @@
-"""The files of a finished state space: mapped, and checked for what they must hold.
+"""The files of a finished state space: mapped, and checked for consistent content.
 
-States and successors are in their ranges, and what the rules say; likewise the outcomes of an environment with chance.
+States and successors must be in their ranges, and agree with the rules; likewise the outcomes of an environment with
+chance.
 
 Shards: the files of a state space as ranges in several folders, which an earlier pharos wrote; they are read on. The
 folder of the space has its manifest and `shards.json`, a list of folders. Each of these has a range of every file,
@@ -50,7 +51,7 @@ _FIXED, _SHARED, _READ = 0x10, 0x01, 0x01  # MAP_FIXED, MAP_SHARED, PROT_READ
 
 
 def check_files(folder: Path, manifest: dict[str, Any]) -> None:
-    """StateSpaceCorrupted where a file is missing, or shorter than what was committed; of shards see `parts_of`."""
+    """Raise StateSpaceCorrupted where a file is missing, or shorter than committed; of shards see `parts_of`."""
     if not (folder / SHARDS).exists():
         return check_lengths(folder, manifest)
     for name in manifest["arrays"]:
@@ -58,11 +59,11 @@ def check_files(folder: Path, manifest: dict[str, Any]) -> None:
 
 
 def parts_of(folder: Path, manifest: dict[str, Any], name: str) -> list[Path]:
-    """The files whose bytes, in this order, are a file of a state space: itself, or its ranges in shards.
+    """Paths of the files that make up a file of a state space, in order: itself, or its ranges in shards.
 
     Raises:
         StateSpaceError: a shard is missing. StateSpaceMismatch: one is of another build. StateSpaceCorrupted: the list
-        of shards, or a range, is not what was written.
+        of shards, or a range, is not as it was written.
     """
     listed = folder / SHARDS
     if (folder / name).exists() or not listed.exists():
@@ -93,10 +94,10 @@ def parts_of(folder: Path, manifest: dict[str, Any], name: str) -> list[Path]:
 
 
 def mapped(parts: Sequence[Path], dtype: str | np.dtype) -> np.ndarray:
-    """(N,) read-only: the numbers in files, mapped one behind the other.
+    """The numbers (N,) in files, mapped one behind the other, read-only.
 
     Raises:
-        ParameterError: there are several, and this system cannot map them so.
+        ParameterError: there are several files, and this system cannot map them so.
     """
     if len(parts) == 1:
         return np.memmap(parts[0], dtype, "r")
@@ -106,18 +107,18 @@ def mapped(parts: Sequence[Path], dtype: str | np.dtype) -> np.ndarray:
         )
     sizes = [part.stat().st_size for part in parts]
     memory = mmap.mmap(-1, sum(sizes), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=mmap.PROT_READ)
-    whole = np.frombuffer(memory, np.uint8)
+    array = np.frombuffer(memory, np.uint8)
     library = ctypes.CDLL(None, use_errno=True)
     library.mmap.restype = ctypes.c_void_p
     library.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_longlong]
-    place = whole.ctypes.data
+    place = array.ctypes.data
     for part, size in zip(parts, sizes, strict=True):  # in the place of what was reserved; goes when `memory` goes
         with open(part, "rb") as file:
             if library.mmap(place, size, _READ, _SHARED | _FIXED, file.fileno(), 0) != place:
                 error = ctypes.get_errno()
                 raise OSError(error, os.strerror(error), str(part))
         place += size
-    return whole.view(dtype)
+    return array.view(dtype)
 
 
 def blocks_of(parts: Sequence[Path], size: int) -> Iterator[bytes]:
@@ -140,15 +141,15 @@ _BLOCK_ENTRIES = 1 << 17
 
 
 def check_environment(folder: Path, env: Environment, manifest: dict[str, Any]) -> None:
-    """StateSpaceMismatch where the actions or the components of a state are not those of the environment."""
-    theirs = {"actions": list(env.actions), "names": list(env.components.names), "outcomes": int(env.outcomes)}
+    """Raise StateSpaceMismatch where the actions or the components of a state are not those of the environment."""
+    expected = {"actions": list(env.actions), "names": list(env.components.names), "outcomes": int(env.outcomes)}
     stored = {
         "actions": manifest["actions"],
         "names": manifest["layout"]["names"],
         "outcomes": manifest.get("outcomes", 1),
     }
     sizes = env.components.low.tolist(), env.components.size.tolist()
-    if theirs != stored or sizes != (manifest["layout"]["low"], manifest["layout"]["size"]):
+    if expected != stored or sizes != (manifest["layout"]["low"], manifest["layout"]["size"]):
         raise StateSpaceMismatch(
             f"{folder}: holds {manifest['environment']} with the actions {stored['actions']} of at most "
             f"{stored['outcomes']} outcomes and states of {stored['names']}, which are not those of {env}; choose "
@@ -157,22 +158,22 @@ def check_environment(folder: Path, env: Environment, manifest: dict[str, Any]) 
 
 
 def states_to_check(num_states: int) -> np.ndarray:
-    """Numbers of 64 states, spread over all of them, in which rules are compared with what is stored."""
+    """Numbers of 64 states, spread over all of them, in which rules are compared with stored transitions."""
     return np.unique(np.linspace(0, num_states - 1, 64).astype(np.int64))
 
 
 def check_rules(
     folder: Path, env: Environment, layout: Layout, states: np.ndarray, successors: Indices, bits: np.ndarray
 ) -> None:
-    """StateSpaceMismatch where the rules of `env` disagree with the stored transitions of 64 states."""
-    chosen = states_to_check(len(successors))
-    _check_range(folder / SUCCESSORS, successors[chosen], len(states), chosen)
-    following = unpack(layout, states[successors[chosen].ravel()]).tolist()
-    check_states(folder / STATES, layout, states[chosen])
-    check_states(folder / STATES, layout, states[successors[chosen].ravel()])
-    for n, (i, row) in enumerate(zip(chosen.tolist(), unpack(layout, states[chosen]).tolist(), strict=True)):
+    """Raise StateSpaceMismatch where the rules of `env` disagree with the stored transitions of 64 states."""
+    indices = states_to_check(len(successors))
+    _check_range(folder / SUCCESSORS, successors[indices], len(states), indices)
+    next_states = unpack(layout, states[successors[indices].ravel()]).tolist()
+    check_states(folder / STATES, layout, states[indices])
+    check_states(folder / STATES, layout, states[successors[indices].ravel()])
+    for n, (i, row) in enumerate(zip(indices.tolist(), unpack(layout, states[indices]).tolist(), strict=True)):
         state = tuple(row)
-        stored = [tuple(row) for row in following[n * env.num_actions : (n + 1) * env.num_actions]]
+        stored = [tuple(row) for row in next_states[n * env.num_actions : (n + 1) * env.num_actions]]
         try:
             ended = bool(env.is_terminal(state))
             outcomes = [state if ended else env.next_state(state, action) for action in range(env.num_actions)]
@@ -189,7 +190,7 @@ def check_rules(
 
 
 def check_successors(path: Path, successors: Indices, terminal_bits: np.ndarray, num_terminal: int) -> None:
-    """StateSpaceCorrupted where an index is no state, or a terminal state does not lead to itself.
+    """Raise StateSpaceCorrupted where an index is no state, or a terminal state does not lead to itself.
 
     Cost: one pass over the successors, in blocks that fit into a processor's cache.
     """
@@ -215,7 +216,7 @@ def check_successors(path: Path, successors: Indices, terminal_bits: np.ndarray,
 
 
 def _check_range(path: Path, block: np.ndarray, num_states: int, numbers: Sequence[int] | np.ndarray) -> None:
-    """StateSpaceCorrupted where an index is no state; the rows are those of the states with these numbers."""
+    """Raise StateSpaceCorrupted where an index is no state; `numbers`: the states whose rows are in the block."""
     if block.min() < 0 or block.max() >= num_states:
         row, action = map(int, np.argwhere((block < 0) | (block >= num_states))[0])
         raise StateSpaceCorrupted(
@@ -225,7 +226,7 @@ def _check_range(path: Path, block: np.ndarray, num_states: int, numbers: Sequen
 
 
 def check_states(path: Path, layout: Layout, states: np.ndarray) -> None:
-    """StateSpaceCorrupted where a component of a packed state is out of its range."""
+    """Raise StateSpaceCorrupted where a component of a packed state is out of its range."""
     mask = layout.mask.astype(np.uint64)
     narrow = [i for i in range(len(mask)) if int(mask[i]) + 1 != int(layout.size[i])]  # the others cannot be
     if not narrow:
@@ -246,7 +247,7 @@ def check_states(path: Path, layout: Layout, states: np.ndarray) -> None:
 
 
 def stored_outcomes(folder: Path, manifest: dict[str, Any]) -> OutcomeRows:
-    """The arrays of a folder, memory maps; nothing is read yet."""
+    """The arrays of outcomes of a folder, as memory maps; nothing is read yet."""
     arrays, successors = manifest["arrays"], successors_name(manifest["arrays"])
     pairs = manifest["num_states"], manifest["num_actions"]
     of_outcomes = (manifest["num_transitions"],) if OFFSETS in arrays else (*pairs, manifest["num_outcomes"])
@@ -267,7 +268,7 @@ def stored_outcomes(folder: Path, manifest: dict[str, Any]) -> OutcomeRows:
 
 
 def check_outcomes(folder: Path, manifest: dict[str, Any], stored: OutcomeRows, terminal_bits: np.ndarray) -> None:
-    """StateSpaceCorrupted where the arrays are not those of a state space.
+    """Raise StateSpaceCorrupted where the arrays are not outcomes of a state space.
 
     Cost: one pass over them, in blocks that fit into a processor's cache.
     """
@@ -306,7 +307,7 @@ def _corrupted(folder: Path, manifest: dict[str, Any], error: WrongOutcomes) -> 
 def outcomes_to_check(
     folder: Path, manifest: dict[str, Any], stored: OutcomeRows, states: np.ndarray
 ) -> dict[int, OutcomesOfState]:
-    """The outcomes of some states, of arrays that nobody has looked at yet; StateSpaceCorrupted where they are none."""
+    """Outcomes of some states, from arrays that are not checked yet; StateSpaceCorrupted where they are none."""
     shape = manifest["num_states"], manifest["num_actions"]
     try:
         check = OutcomeCheck(stored, shape, manifest["num_outcomes"], 0)
@@ -325,11 +326,11 @@ def check_outcome_rules(
     outcomes: dict[int, OutcomesOfState],
     bits: np.ndarray,
 ) -> None:
-    """StateSpaceMismatch where the rules of `env` disagree with the stored outcomes of some states.
+    """Raise StateSpaceMismatch where the rules of `env` disagree with the stored outcomes of some states.
 
     Args:
         states: (S, W), packed. bits: which ones are terminal.
-        outcomes: those of the states that are looked at.
+        outcomes: those of the states that are compared.
     """
     for i, of_actions in outcomes.items():
         state = tuple(unpack(layout, states[i : i + 1])[0].tolist())
@@ -342,24 +343,24 @@ def check_outcome_rules(
                 f"build in another folder"
             ) from error
         for action, (successors, probabilities) in enumerate(of_actions):
-            following = [tuple(row) for row in unpack(layout, states[successors]).tolist()]
-            wanted, likely = expected[action]
-            agree = following == wanted and np.abs(probabilities - likely).max() <= SUM_TOLERANCE
+            next_states = [tuple(row) for row in unpack(layout, states[successors]).tolist()]
+            wanted, p = expected[action]
+            agree = next_states == wanted and np.abs(probabilities - p).max() <= SUM_TOLERANCE
             if not agree or ended != bool(bits[i // 8] >> (i % 8) & 1):
                 raise StateSpaceMismatch(
                     f"{folder}: was built with other rules: from state {state} action {env.actions[action]!r} leads to "
-                    f"{_text(following, probabilities)}, by the rules of this {env.name} to {_text(wanted, likely)}; "
+                    f"{_text(next_states, probabilities)}, by the rules of this {env.name} to {_text(wanted, p)}; "
                     f"build in another folder, and raise `version` when you change rules"
                 )
 
 
 def _outcomes_of(env: Environment, state: tuple, action: int, ended: bool) -> tuple[list[tuple], np.ndarray]:
-    """Next states and their probabilities, possible outcomes alone."""
+    """(next states, probabilities) of the possible outcomes of an action, by the rules."""
     if ended:
         return [state], np.ones(1)
-    likely = [float(env.probability(state, action, outcome)) for outcome in range(env.outcomes)]
-    possible = [outcome for outcome, probability in enumerate(likely) if probability > 0]
-    return [env.next_state(state, action, outcome) for outcome in possible], np.array(likely)[possible]
+    probabilities = [float(env.probability(state, action, outcome)) for outcome in range(env.outcomes)]
+    possible = [outcome for outcome, probability in enumerate(probabilities) if probability > 0]
+    return [env.next_state(state, action, outcome) for outcome in possible], np.array(probabilities)[possible]
 
 
 def _text(states: list[tuple], probabilities: np.ndarray) -> str:

@@ -1,6 +1,6 @@
-"""The table of states of a search: in memory beside all states, or on disk. Both number states by `find_or_number`.
+"""The table of the states that a search has found: in memory beside all states, or on disk.
 
-kernels/hash_table.py has the layout of the table on disk.
+Both forms number states by `find_or_number`. kernels/hash_table.py has the layout of the table on disk.
 """
 
 import contextlib
@@ -27,7 +27,9 @@ LEFT_OVER = 1 << 12  # states that may pass the end of a part of the table, whic
 
 
 class BranchBlock(NamedTuple):
-    """What is found of some states, by B branches each: actions, or outcomes of actions (see `rules.Exploration`).
+    """Rows of a search: results of expanding some states, by B branches each: actions, or outcomes of actions.
+
+    See `rules.Expansion`.
 
     Attributes:
         successors: (rows, B) indices. terminal: (rows,) uint8. probabilities: (rows, B), of no rows without chance.
@@ -38,17 +40,17 @@ class BranchBlock(NamedTuple):
     probabilities: np.ndarray
 
     def rows(self, start: int, stop: int) -> "BranchBlock":
-        """Some of them."""
+        """The rows [start, stop)."""
         return BranchBlock(self.successors[start:stop], self.terminal[start:stop], self.probabilities[start:stop])
 
 
 class MemoryTable:
-    """All states, and a table of their indices.
+    """All states, and a hash table of their indices.
 
     Attributes:
         states: (capacity, W) uint64, in the order of discovery.
         slots: index of a state, or -1; see kernels/hash_table.py.
-        forgotten: how many states the table leaves out, as no search comes to them again.
+        forgotten: number of states that the table leaves out, as the search does not come to them again.
     """
 
     def __init__(self, num_words: int, margin: int, memory: int | None, share: int = 1):
@@ -79,19 +81,21 @@ class MemoryTable:
         return count + self._margin <= len(self.states) and self._size_for(count, dtype, forgotten) is not None
 
     def _size_for(self, count: int, dtype: np.dtype, forgotten: int) -> tuple[int, float] | None:
-        """(slots, share of them that may be used) of a larger table: with room for about twice as many states, or
-        fuller and as large as memory allows; None where that would be hardly more than there are."""
+        """(slots, share of them that may be used) of a larger table; None where it would hold hardly more states.
+
+        It has room for about twice as many states, or is fuller and as large as memory allows.
+        """
         memory, bytes_of_state = self._limit(count), self.states.shape[1] * 8
         slots = self._slots_for(count - forgotten)
         if slots * dtype.itemsize + (int(slots * LOAD) + forgotten) * bytes_of_state <= memory:
             return slots, LOAD
-        each = dtype.itemsize + FULLEST * bytes_of_state
-        slots = int((memory - forgotten * bytes_of_state) / each) // SLOTS * SLOTS
+        bytes_of_slot = dtype.itemsize + FULLEST * bytes_of_state
+        slots = int((memory - forgotten * bytes_of_state) / bytes_of_slot) // SLOTS * SLOTS
         enough = slots * FULLEST >= 1.1 * (count - forgotten) + self._margin
         return (slots, FULLEST) if enough else None
 
     def _limit(self, count: int) -> int:
-        """Bytes for table and states: what is asked for; or what is free, and what they have already."""
+        """Bytes for table and states: those asked for; or the free ones, and those that they have already."""
         if self._memory is not None:
             return self._memory
         return machine.available_memory() // self._share + self.slots.nbytes + count * self.states.shape[1] * 8
@@ -104,14 +108,15 @@ class MemoryTable:
         workers: int,
         parts: list[np.ndarray] | None = None,
     ) -> None:
-        """A larger table, see `fits`, filled from the array of states.
+        """Replace the table by a larger one, see `fits`, filled from the array of states.
 
-        parts: indices of the only ones that are wanted, part by part; None: all.
+        parts: indices of the only states that are wanted, part by part; None: all.
         """
         self.forgotten = 0 if parts is None else count - sum(map(len, parts))
         size = self._size_for(count, dtype, self.forgotten) or (self._slots_for(count - self.forgotten), LOAD)
         slots = max(size[0], len(self.slots) if parts is not None else 0)
         self._load = size[1]
+        # the new table, in the place of the old one where that can grow
         self.slots = np.empty(0, dtype)  # free the old one first, where it cannot grow in its place
         if self._space.nbytes < slots * dtype.itemsize:
             self._space = huge_pages(slots, dtype)
@@ -121,6 +126,7 @@ class MemoryTable:
             for part in parts:
                 fill_more(self.slots, self.states, part.astype(np.int64))
             return
+        # fill it by one thread, or by several, a part of the slots each
         if pool is None or workers == 1 or count < PARALLEL_FILL:
             self._fill(count)
             return
@@ -135,6 +141,7 @@ class MemoryTable:
         if max(left) > left_over.shape[1]:  # only where a bad hash crowds the end of a part
             self._fill(count)
             return
+        # states that found no slot in their part
         for i, over in enumerate(left):
             fill_more(self.slots, self.states, left_over[i, :over])
 
@@ -151,7 +158,7 @@ class MemoryTable:
         insert_missing(self.slots, self.states, keys, indices, successors, progress)
 
     def release(self) -> None:
-        """Give the memory back, also where a traceback keeps this table alive."""
+        """Free the memory, also where a traceback keeps this table alive."""
         self.states, self.slots = self.states[:0].copy(), self.slots[:0].copy()
         self._space = self._space[:0].copy()
 
@@ -182,8 +189,8 @@ class SpilledTable:
         self.indices, self._slots = np.empty(candidates, np.int64), np.empty(candidates, np.int64)
         self._order = np.empty(candidates, np.int32)
         self.appended = count
-        likely = np.empty((self.rows if has_chance else 0, branches))
-        self._block = BranchBlock(np.empty((0, branches), np.int32), np.empty(self.rows, np.uint8), likely)
+        probabilities = np.empty((self.rows if has_chance else 0, branches))
+        self._block = BranchBlock(np.empty((0, branches), np.int32), np.empty(self.rows, np.uint8), probabilities)
         self._table = DiskTable(path, num_words, memory // 4, 2 * count)
 
     def fill(self, states: np.ndarray) -> None:
@@ -192,11 +199,11 @@ class SpilledTable:
             self._table.fill(np.array(states[start : start + self.rows], np.uint64), start)
 
     def take_over(self, table: MemoryTable) -> None:
-        """Enter the states of the table in memory into the empty one."""
+        """Copy the states of the table in memory into the empty one on disk."""
         self._table.take_over(table.slots, table.states)
 
     def block(self, dtype: np.dtype) -> BranchBlock:
-        """The rows of the chunk."""
+        """The block for the rows of the chunk, with successors of this type."""
         successors = self._block.successors
         if len(successors) != self.rows or successors.dtype != dtype:
             self._block = self._block._replace(successors=np.empty((self.rows, successors.shape[1]), dtype))
@@ -205,20 +212,21 @@ class SpilledTable:
     def find_or_number(
         self, keys: np.ndarray, indices: np.ndarray, successors: np.ndarray, progress: np.ndarray
     ) -> None:
-        """As `MemoryTable.find_or_number`; indices: -1 - bucket, or the own row of a terminal state."""
+        """Number the successors that are new, in their order; see `MemoryTable.find_or_number`.
+
+        indices: -1 - bucket, or the own row of a terminal state.
+        """
         first, count = int(progress[0]), int(progress[1])
         self._table.grow(count + len(keys))
         looked_up = self._table.look_up(keys, indices, first, self._order, self._slots)
         from pharos.kernels import hash_table
 
         hash_table.number(keys, indices, successors, self.states, self.appended, progress)
-        self._table.settle(looked_up, indices, self._order, self._slots)
+        self._table.assign_numbers(looked_up, indices, self._order, self._slots)
 
 
 def rows_of_chunk(memory: int, num_words: int, branches: int, has_chance: bool = False) -> int:
-    """Rows of which half of the memory holds the candidates: a multiple of 8, so that terminal bits fill whole
-    bytes.
-    """
+    """Rows of a chunk, whose candidates take half of the memory: a multiple of 8, as terminal bits fill whole bytes."""
     candidate = 2 * 8 * num_words + 8 + 8 + 8 + 4  # words here and as a state, index, slots, a successor, order
     candidate += 24 * has_chance  # a probability, and once more with its successor when it is written
     bytes_of_a_row = branches * candidate + 8 * num_words + 1
@@ -235,7 +243,7 @@ _AROUND = 1 << 19  # bytes that the system may bring along with a page (large fo
 
 
 class DiskTable:
-    """The table, in a file without a name: it is gone with the process, whatever becomes of it.
+    """The table on disk, in a file without a name: it is gone with the process, whatever becomes of it.
 
     Attributes:
         capacity: states that it can hold before it must grow.
@@ -261,7 +269,7 @@ class DiskTable:
         self._touched = 0
 
     def take_over(self, table: np.ndarray, states: np.ndarray) -> None:
-        """Fill it from the table in memory."""
+        """Fill the table from the one in memory."""
         self._sweep(len(table), lambda low, high: kernels.place_from_memory(self.entries, table, states, low, high))
 
     def fill(self, states: np.ndarray, first: int) -> None:
@@ -272,7 +280,7 @@ class DiskTable:
         self._sweep(size, lambda low, high: kernels.place(self.entries, states, order, low, high, first))
 
     def grow(self, states: int) -> None:
-        """Make room for a number of states."""
+        """Grow the table until it can hold a number of states."""
         slots = len(self.entries)
         while slots * DISK_LOAD < states:
             slots *= 2
@@ -288,28 +296,26 @@ class DiskTable:
         self._sweep(size, lambda low, high: kernels.look_up(self.entries, keys, order, low, high, indices, slots))
         return size
 
-    def settle(self, size: int, indices: np.ndarray, order: np.ndarray, slots: np.ndarray) -> None:
-        """Give what was new its numbers."""
+    def assign_numbers(self, size: int, indices: np.ndarray, order: np.ndarray, slots: np.ndarray) -> None:
+        """Write the numbers of new states into their entries."""
         self._sweep(size, lambda low, high: kernels.assign_numbers(self.entries, order, low, high, indices, slots))
 
     def _sweep(self, size: int, work: Callable[[int, int], None], also: mmap.mmap | None = None) -> None:
-        """Do work(low, high) for parts of range(size), in order of slots, so that a part touches no more than the
-        window.
-        """
-        each = min(_AROUND, self.entries.nbytes // max(size, 1) + 64)  # bytes that one of them may touch
-        step = max(1, self.window // each)
+        """Call work(low, high) for parts of range(size), in order of slots; a part touches no more than the window."""
+        entry_bytes = min(_AROUND, self.entries.nbytes // max(size, 1) + 64)  # bytes that an entry may touch
+        step = max(1, self.window // entry_bytes)
         for low in range(0, size, step):
             high = min(low + step, size)
             work(low, high)
-            self._touched += (high - low) * each
+            self._touched += (high - low) * entry_bytes
             if self._touched >= self.window:
                 for mapping in filter(None, (self._mapping, also)):
-                    _let_go(mapping)
+                    _release_pages(mapping)
                 self._touched = 0
 
 
-def _let_go(mapping: mmap.mmap) -> None:
-    """Take the pages of the file out of this process's memory; they are written when the system sees fit."""
+def _release_pages(mapping: mmap.mmap) -> None:
+    """Release the pages of the file from this process's memory; they are written when the system sees fit."""
     if hasattr(mmap, "MADV_DONTNEED"):
         with contextlib.suppress(OSError):
             mapping.madvise(mmap.MADV_DONTNEED)
