@@ -81,6 +81,7 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
     if max_states < 1:
         raise ParameterError(f"check_environment: max_states={max_states}; expected at least 1")
     notes: list[str] = []
+    # declarations, then the rules: interpreted, called again, compiled, and in a built state space
     check_declarations(env)
     check_layers(env, notes)
     check = InterpretedCheck(env)
@@ -307,6 +308,7 @@ def _check_built(env: Environment, check: InterpretedCheck, states: list[State])
         del space
     if built != states:
         raise RuleError(f"{env}: the builder finds {len(built)} states, calling the rules one by one {len(states)}")
+    # successors of each state, or with chance the distribution of next states of each pair
     index = {state: i for i, state in enumerate(states)}
     for i, state in enumerate(states):
         ends = check.terminal[state]

@@ -73,6 +73,7 @@ def parts_of(folder: Path, manifest: dict[str, Any], name: str) -> list[Path]:
     if not isinstance(names, list) or not names or not all(isinstance(each, str) for each in names):
         raise StateSpaceCorrupted(f"{listed}: expected a list of folders under `folders`")
     shards = [folder / each for each in names]
+    # each shard must be there, and belong to this build
     for number, shard in enumerate(shards):
         which = f"{shard}: shard {number} of {len(shards)} of {folder}"
         if not (shard / SHARD).exists():
@@ -83,6 +84,7 @@ def parts_of(folder: Path, manifest: dict[str, Any], name: str) -> list[Path]:
         expected = {"digest": manifest["digest"], "number": number, "count": len(shards)}
         if not isinstance(record, dict) or expected.items() - record.items():
             raise StateSpaceMismatch(f"{which} is another one, or of another build, says its {SHARD}; mount its disk")
+    # the ranges of the file, which must have its length together
     parts = [shard / name for shard in shards]
     sizes = [part.stat().st_size if part.exists() else 0 for part in parts]
     if sum(sizes) != manifest["arrays"][name]["bytes"]:
