@@ -350,7 +350,7 @@ def huber(q, q_next, q_choice, actions, rewards, discounts, dq, loss):
     for i in range(q.shape[0]):
         total = 0.0
         for b in range(num_rows):
-            # temporal difference to the target of the next state
+            # temporal difference: q of the action less reward + discount * best next q
             best = 0
             for a in range(num_actions):
                 dq[i, b, a] = 0.0
@@ -520,7 +520,7 @@ def clipped_loss(scores, values, minibatch, clip_ranges, entropy_weights, value_
             bound = advantage[i, b] * min(max(ratio, low), high)
             error = values[i, b, 0] - returns[i, b]
             total += -min(free, bound) - entropy_weights[i] * entropy + value_weights[i] * error * error
-            # gradients by value and scores; the clipped objective has none by the ratio
+            # gradients by value and scores; none through the ratio where clipping is active
             of_log_p = -free / number if free <= bound else 0.0
             dvalues[i, b, 0] = value_weights[i] * 2.0 * error / number
             for a in range(num_actions):

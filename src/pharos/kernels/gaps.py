@@ -68,7 +68,7 @@ def add_up(gap, weight, counted, minimal, tolerance, error, regularizer, sums, c
         for a in range(gap.shape[1]):
             regularized += 1.0 / (gap[i, a] + regularizer)
         _add(sums, 3, weight[i] * regularized)
-        # sums and counts of one row, then as often as it counts
+        # sums and counts of one row, added as often as it counts
         times = counted[i]
         if times == 0:
             continue
