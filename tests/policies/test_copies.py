@@ -11,7 +11,7 @@ from pharos.agents.batched import make_batch
 from pharos.mdp import TabularMDP, lazy_actions, sticky_actions
 from pharos.policies import Evaluation, TableAnswers, is_small_table, table_values
 from pharos.training import ChanceSetting, RunConfig, TaskCache, evaluate_agent
-from pharos.training.curve import values_together
+from pharos.training.curve import joint_values
 
 SETTING = {"steps": 300, "horizon": 16, "evaluation_interval": 100, "engine": "batched"}
 
@@ -97,6 +97,6 @@ def test_the_runs_of_a_batch_have_the_values_that_each_has_alone(agent):
     group = [members.member(seed, config(sticky, seed), None) for sticky, seed in cells]
     batch = make_batch(agent, [member.run for member in group])
     batch.learn([150], lambda point: None)
-    together = values_together(batch, group)
-    assert together == {i: evaluate_agent(batch.policy(i), member.task) for i, member in enumerate(group)}
-    assert len({each.value for each in together.values()}) > 1
+    values = joint_values(batch, group)
+    assert values == {i: evaluate_agent(batch.policy(i), member.task) for i, member in enumerate(group)}
+    assert len({each.value for each in values.values()}) > 1

@@ -25,18 +25,18 @@ from pharos.system import compiling
 from pharos.system.storage import digest_of_json, lock, read_json, remove_leftovers, replace_json
 from pharos.system.wording import in_one_line, pluralize
 from pharos.training import results as _results
-from pharos.training.curve import values_together
+from pharos.training.curve import joint_values
 from pharos.training.learners import FailedRun, Learner, Member, TaskCache, make_learner
 from pharos.training.results import Checkpoint, Record, TrainingResult, clear_run, finished_result
 from pharos.training.task import RunConfig
 
-# What a member is begun anew from, where its batch is halved.
+# Fields from which a member is made anew where its batch is halved.
 BEGINNING = ("place", "config", "folder", "task", "hyperparameters", "run", "key")
 
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """How far the runs of `train_configs` are, told after each evaluation.
+    """Progress of the runs of `train_configs` after an evaluation.
 
     Attributes:
         done, total: environment steps of all runs together.
@@ -55,7 +55,7 @@ ProgressCallback = Callable[[TrainingProgress], None]
 
 
 class CallbackError(BaseException):
-    """What the caller's own function raised, which is not an error of a run."""
+    """An error of the caller's own progress function, which is not one of a run."""
 
 
 def train_configs(
@@ -90,8 +90,8 @@ def train_configs(
     if device not in (None, members.device):
         raise ParameterError(f"device is {device!r}, and the members are for {members.device!r}; expected one device")
     _check_device(members.device)
-    made = [config if isinstance(config, RunConfig) else RunConfig.from_dict(config) for config in configs]
-    return TrainingJobs(made, folders, checkpoints, progress, members, lane).run()
+    run_configs = [config if isinstance(config, RunConfig) else RunConfig.from_dict(config) for config in configs]
+    return TrainingJobs(run_configs, folders, checkpoints, progress, members, lane).run()
 
 
 def _check_device(device: str) -> None:
@@ -138,7 +138,7 @@ class TrainingJobs:
         self.reasons: set[str] = set()
 
     def run(self) -> list[TrainingResult | FailedRun]:
-        """Train all; their results in order."""
+        """Train all runs; return their results in order."""
         for group in self._groups():
             TrainingGroup(self, group).train()
         if self.checkpoints is not None and self.checkpoints.is_dir():
@@ -148,7 +148,7 @@ class TrainingJobs:
         return [self.results[place] for place in range(len(self.configs))]
 
     def fail(self, place: int, error: Exception) -> None:
-        """A run could not begin."""
+        """Record that a run could not begin; raise its error where `raises` is set."""
         if self.raises:
             raise error
         config, folder = self.configs[place], self.folders[place]
@@ -159,7 +159,7 @@ class TrainingJobs:
             Record(folder, config, config.hyperparameters).write("failed", error=in_one_line(error))
 
     def report(self, rows: Mapping[int, Mapping[str, Any]], done: int) -> None:
-        """Tell the caller; what that raises is not an error of the runs."""
+        """Call the progress function; CallbackError for what it raises, which is not an error of the runs."""
         if self.progress is None:
             return
         failed = sum(isinstance(each, FailedRun) for each in self.results.values())
@@ -173,6 +173,7 @@ class TrainingJobs:
     def _groups(self) -> Iterator[list[Member]]:
         """Yield runs that train alone; then batches restored from checkpoints, and the rest by what fits together."""
         alone, waiting = [], {}
+        # Finished runs need no training; others train alone or wait for a batch
         for place, config in enumerate(self.configs):
             try:
                 folder = self.folders[place]
@@ -192,6 +193,7 @@ class TrainingJobs:
             if (member := self._member(place, is_alone=True)) is not None:
                 yield [member]
         yield from self._stored_groups(waiting)
+        # Runs with equal keys, in lanes
         groups: dict[Hashable, list[Member]] = defaultdict(list)
         for place in waiting:
             if (member := self._member(place)) is not None:
@@ -202,7 +204,7 @@ class TrainingJobs:
                 yield group[first : first + width]
 
     def _is_shared_table(self, place: int, config: RunConfig) -> bool:
-        """Whether it learns a table that is evaluated with others: of few states, and not half learnt alone."""
+        """Whether a run learns a table together with others: it has few states, and no checkpoint of a run alone."""
         if not config.is_tabular or len(self.configs) == 1:
             return False
         folder = self.folders[place]
@@ -258,17 +260,17 @@ class TrainingGroup:
         self.held = contextlib.ExitStack()  # the folder of checkpoints, or that of a run alone
 
     def train(self) -> None:
-        """All of it; in halves where it needs too much memory, or where one run ends the program."""
+        """Train the group; in halves where it needs too much memory, or where one run ends the program."""
         before = self.jobs.done
         with self.held:
             try:
                 self._train()
                 return
             except CallbackError as stop:
-                (said,) = stop.args
-                if self.jobs.raises and self.is_alone and isinstance(said, Exception):
-                    self.group[0].fail(said)
-                raise said from None
+                (cause,) = stop.args
+                if self.jobs.raises and self.is_alone and isinstance(cause, Exception):
+                    self.group[0].fail(cause)
+                raise cause from None
             except Exception as error:
                 failure = error
                 vars(self).pop("learner", None)
@@ -319,13 +321,13 @@ class TrainingGroup:
 
     @property
     def _folder(self) -> Path | None:
-        """Where the checkpoints of a batch are."""
+        """The folder for checkpoints of a batch; None for a run alone, or where none are written."""
         if self.is_alone or self.jobs.checkpoints is None:
             return None
         return self.jobs.checkpoints / digest_of_json([member.config.id for member in self.group])[:16]
 
     def _is_finished(self) -> bool:
-        """Hold the folder of a run alone; whether another process has finished it meanwhile."""
+        """Lock the folder of a run alone; return whether another process has finished it meanwhile."""
         folder, place = self.group[0].folder, self.group[0].place
         if folder is None or place is None:
             return False
@@ -340,7 +342,7 @@ class TrainingGroup:
         return done is not None
 
     def _checkpoint(self) -> Checkpoint | None:
-        """None where there is no folder, or where another process trains the same batch."""
+        """The checkpoint of the group; None where it has no folder, or where another process trains the same batch."""
         if self.is_alone:
             folder = self.group[0].folder
             return None if folder is None else Checkpoint(folder / "checkpoint", self.config.id)
@@ -366,7 +368,7 @@ class TrainingGroup:
     # Learning --------------------------------------------------------------------------------------------------------
 
     def _learn(self, checkpoint: Checkpoint | None, began: float) -> None:
-        """Learn from the last row of the curves on, with evaluations at each point."""
+        """Train from the last row of the curves on, with an evaluation at each point."""
         steps, interval = self.config.steps, self.config.evaluation_interval
         count, before = sum(member.place is not None for member in self.group), self.jobs.done
         if not any(member.curve.rows for member in self.group):
@@ -399,8 +401,8 @@ class TrainingGroup:
         self.jobs.done = before + steps * count
 
     def _evaluate(self, step: int) -> dict[int, dict[str, Any]]:
-        """A row for each run that has not failed, by its place in the group."""
-        rows, values = {}, {} if self.is_alone else values_together(self.learner, self.group)
+        """Evaluate the policies: a row for each run that has not failed, by its place in the group."""
+        rows, values = {}, {} if self.is_alone else joint_values(self.learner, self.group)
         episodes, returns = self.learner.episodes, self.learner.returns
         for i, member in enumerate(self.group):
             if member.error is not None:
@@ -415,7 +417,7 @@ class TrainingGroup:
         return rows
 
     def _publish(self, seconds: float, compiled: float) -> None:
-        """What each run leaves; its seconds are its share of those of the batch."""
+        """Write and keep the result of each run; its seconds are its share of those of the batch."""
         size = {"runs": len(self.group), "seconds": seconds, "device": self.jobs.members.device}
         share = seconds - compiled if self.is_alone else seconds / len(self.group)
         entries = {"compiling_seconds": compiled} if self.is_alone else {"batch": size}
@@ -440,7 +442,7 @@ class TrainingGroup:
             clear_run(folder)
 
     def _fail(self, error: Exception) -> None:
-        """The only run has failed."""
+        """Record that the only run of the group has failed."""
         (member,) = self.group
         if member.place is None:
             return

@@ -1,4 +1,4 @@
-"""The value of what agents have learnt, of one or of a batch together; and the curves that runs write of it.
+"""Values of learnt policies, of one or of a batch at once; and the curves that runs write of them.
 
 A row of a curve has the exact value of the policy at an evaluation, and the regret of the episodes before it.
 """
@@ -85,7 +85,7 @@ class PolicyBatch(Protocol):
         ...
 
     def policy(self, i: int) -> PolicyLike:
-        """What run i has learnt."""
+        """The policy that run i has learnt."""
         ...
 
 
@@ -94,14 +94,14 @@ class BestActions(Protocol):
     """Policies of several runs that act at once."""
 
     def best_actions(self, states: np.ndarray) -> np.ndarray:
-        """(N,) the action that each run likes best in its own state (N,), or history (N, k)."""
+        """(N,) the greedy action of each run in its own state (N,), or history (N, k)."""
         ...
 
 
-def values_together(batch: PolicyBatch, members: "Sequence[Member]") -> dict[int, Evaluation]:
-    """place in the batch -> value of the run's policy, where that is had for less than one by one; others are left out.
+def joint_values(batch: PolicyBatch, members: "Sequence[Member]") -> dict[int, Evaluation]:
+    """Values of policies by place in the batch, where computing them at once costs less; others are left out.
 
-    These are DQN where nothing is random, and runs that share a task of few states and see one frame.
+    These are policies of DQN where nothing is random, and of runs that share a task of few states and see one frame.
     """
     walks = [i for i, each in enumerate(members) if each.error is None and _walks(each)]
     values = _values_of_walks(batch, members, walks)
@@ -120,12 +120,12 @@ def _walks(member: "Member") -> bool:
 
 
 def _frames(member: "Member") -> int:
-    """How many states the agent sees."""
+    """Number of states in one observation of the agent: more than 1 where frames are stacked."""
     return 1 if member.config.is_tabular else member.task.observer.frames
 
 
 def _values_of_walks(batch: PolicyBatch, members: "Sequence[Member]", places: Sequence[int]) -> dict[int, Evaluation]:
-    """An episode of a thousand steps costs a thousand calls of the networks of all runs, not of each."""
+    """Values by place: an episode of T steps costs T calls of the networks of all runs at once, not of each."""
     if not places:
         return {}
     assert isinstance(batch, BestActions)
@@ -142,7 +142,7 @@ def _values_of_walks(batch: PolicyBatch, members: "Sequence[Member]", places: Se
 
 
 def _values_of_tables(batch: PolicyBatch, task: Task, places: Sequence[int]) -> dict[int, Evaluation]:
-    """Each policy is asked once about every state. One that gives no probabilities is left out."""
+    """Values by place, each policy queried once in every state. One that gives no probabilities is left out."""
     actions = batch.greedy_actions(places)
     if actions is not None:
         return dict(zip(actions, table_values(task.mdp, list(actions.values())), strict=True))
@@ -168,7 +168,7 @@ def _values_of_tables(batch: PolicyBatch, task: Task, places: Sequence[int]) -> 
 
 @dataclass
 class Curve:
-    """The rows so far, and the regret of the episodes between evaluations.
+    """Learning curve of a run: a row for each evaluation so far, with the regret of the episodes between them.
 
     Attributes:
         table: the policy of the last row, where it is a table.
@@ -186,8 +186,8 @@ class Curve:
         agent: PolicyLike | Evaluation | None,
         evaluation: Evaluation | None = None,
     ) -> dict[str, Any]:
-        """Evaluate the policy after `step` steps and `episodes` finished episodes, whose returns sum to `returns`;
-        unless its `evaluation` is there.
+        """Add the row of the policy after `step` steps and `episodes` finished episodes, whose returns sum to
+        `returns`; the policy is evaluated unless its `evaluation` is there.
         """
         if evaluation is None:
             assert agent is not None and not isinstance(agent, Evaluation)
@@ -258,7 +258,7 @@ class RegretCurve:
 
     @staticmethod
     def read(folder: str | os.PathLike) -> "RegretCurve":
-        """That of a finished run.
+        """The curve of a finished run.
 
         Raises:
             FileFormatError: the folder holds no finished run.
@@ -338,7 +338,7 @@ def bootstrap_interval(
         """The statistic of the drawn samples and of those that have nothing to draw from."""
         parts, batch = iter(drawn), drawn[0].shape[:-1]
         single = (
-            next(parts) if array.shape[-1] > 1 else np.broadcast_to(_beside(array, len(batch)), (*batch, 1))
+            next(parts) if array.shape[-1] > 1 else np.broadcast_to(_with_axis(array, len(batch)), (*batch, 1))
             for array in arrays
         )
         return statistic(*single, axis=axis)
@@ -357,6 +357,6 @@ def bootstrap_interval(
     return np.asarray(result.confidence_interval.low), np.asarray(result.confidence_interval.high)
 
 
-def _beside(array: np.ndarray, axes: int) -> np.ndarray:
+def _with_axis(array: np.ndarray, axes: int) -> np.ndarray:
     """A sample (..., 1) with an axis for the resamples before its last, where the batch has one."""
     return array if array.ndim == axes + 1 else np.expand_dims(array, -2)

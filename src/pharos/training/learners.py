@@ -1,4 +1,4 @@
-"""Runs with their tasks, and what learns them: N >= 1 runs under one loop, each as it is alone.
+"""Runs with their tasks, and their learners: N >= 1 runs under one loop, each with the result that it has alone.
 
 A `Member` is a run before it is trained: with its task, what it sees, and its hyperparameters, checked. Learners are
 `Tables` of Q-learning, `Networks` of the batched engine, or one model of Stable-Baselines3 (`Deep`); all of each can be
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pharos.interaction import SB3VecEnv
 
 T = TypeVar("T")
-# What of a configuration decides about rewards and states, about the task, about what is seen
+# Entries of a configuration that decide about rewards and states, about the task, about observations
 WORLD = ("environment", "parameters", "gamma", "sources")
 TASK = ("environment", "parameters", "chance", "observation", "observation_options", "gamma", "horizon", "sources")
 SIGHT = ("environment", "parameters", "observation", "observation_options", "sources")
@@ -55,7 +55,7 @@ class FailedRun:
 
 @dataclass(eq=False)
 class Member:
-    """A run that waits for its learner, or is learnt.
+    """A run before and while it is trained, with its task and hyperparameters.
 
     Attributes:
         place: among the configurations; None for a run of a checkpoint that nobody asks for.
@@ -80,17 +80,17 @@ class Member:
 
     @property
     def record(self) -> Record:
-        """Its run.json."""
+        """The run.json of the run."""
         return Record(self.folder, self.config, self.hyperparameters)
 
     def fail(self, error: Exception) -> None:
-        """It has failed; the reason is kept in run.json."""
+        """Mark the run as failed; the reason is kept in run.json."""
         self.error = error
         self.record.write("failed", error=in_one_line(error))
 
 
 class TaskCache:
-    """Makes members of batches; what several runs share is made once: spaces, rewards, solved values, observations.
+    """Members of batches by configuration; runs share spaces, rewards, solved values and observations.
 
     Args:
         values: config -> values at the start of its task, where they are known.
@@ -107,14 +107,14 @@ class TaskCache:
         device: str = "cpu",
     ):
         self.values, self.trust, self.strict, self.device = values, trust, strict, device
-        self.made: dict[str, Any] = {}
+        self.shared: dict[str, Any] = {}
 
     def task(self, config: RunConfig) -> Task:
         """The task of a run, the same object for all that have it; spaces and rewards are those of other tasks."""
         return self._once("task", config, TASK, lambda: self._task(config))
 
     def adopt(self, config: RunConfig, task: Task) -> None:
-        """Take a task that is made already for that of a run."""
+        """Keep a task that exists already as that of a run."""
         self._once("task", config, TASK, lambda: task)
 
     def _task(self, config: RunConfig) -> Task:
@@ -134,7 +134,7 @@ class TaskCache:
         Raises:
             ParameterError: a hyperparameter is wrong, or the engine lacks it.
         """
-        chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
+        settings = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
         key: Hashable = (config.agent, config.steps, config.evaluation_interval)
         if config.engine != "batched":
             algorithm, task = config.algorithm(trust=self.trust, strict=self.strict), self.task(config)
@@ -148,17 +148,17 @@ class TaskCache:
                     time_limit=limit,
                     reward_noise=noise,
                     reward_delay=delay,
-                    **chosen,
+                    **settings,
                 )
 
             if config.is_tabular and not is_alone:
-                table()  # what is wrong is said before others are concerned
+                table()  # an error is raised before others are concerned
             make = table if config.is_tabular else algorithm
-            return Member(place, config, folder, task, chosen, make, key, is_alone)
+            return Member(place, config, folder, task, settings, make, key, is_alone)
         from pharos.agents.batched import OURS, BatchRun, ObservationSource, group_key, supports
 
-        check_hyperparameters(config.agent, chosen, OURS)
-        lacking = supports(config.agent, chosen)
+        check_hyperparameters(config.agent, settings, OURS)
+        lacking = supports(config.agent, settings)
         if lacking is not None:
             raise ParameterError(f"the batched engine: {lacking}; the engine sb3 has it")
         task, chance = self.task(config), config.chance
@@ -166,7 +166,7 @@ class TaskCache:
             mdp=replace(chance, lazy=0.0).of(self._world(config, task)[1]) if chance.lazy else task.mdp,
             observe=self._once("sight", config, SIGHT, lambda: ObservationSource.of(task.space, task.observer.observe)),
             time_limit=task.time_limit,
-            hyperparameters=chosen,
+            hyperparameters=settings,
             steps=config.steps,
             seed=config.seed,
             key=int(config.id, 16),
@@ -175,25 +175,25 @@ class TaskCache:
             chance=chance,
             staying=self._once("staying", config, WORLD, lambda: _staying(task)) if chance.lazy else None,
         )
-        return Member(place, config, folder, task, chosen, run, (key, group_key(config.agent, run, self.device)))
+        return Member(place, config, folder, task, settings, run, (key, group_key(config.agent, run, self.device)))
 
     def _once(self, what: str, config: RunConfig, names: Sequence[str], make: Callable[[], T]) -> T:
         entry = config.to_dict()
         key = json.dumps([what, *(entry.get(name) for name in names)], sort_keys=True)
-        if key not in self.made:
-            self.made[key] = make()
-        return self.made[key]
+        if key not in self.shared:
+            self.shared[key] = make()
+        return self.shared[key]
 
 
 def _staying(task: Task) -> np.ndarray:
-    """(S, A) what an action without effect pays."""
+    """(S, A) rewards of actions without effect."""
     from pharos.mdp import rewards_of_staying
 
     return rewards_of_staying(task.space).array.astype(float)
 
 
 def _drawn_rewards(task: Task) -> np.ndarray | None:
-    """What each outcome pays where the rules have chance; None where rewards belong to pairs."""
+    """Rewards of each outcome where the rules have chance; None where rewards belong to pairs."""
     from pharos.mdp import rewards_of_outcomes
 
     return rewards_of_outcomes(task.space) if task.space.has_chance else None
@@ -207,7 +207,7 @@ AtPoint = Callable[[int], Mapping[str, Any] | None]
 
 
 class Learner(Protocol):
-    """N runs that learn.
+    """Learner of N runs.
 
     Attributes:
         episodes: (N,) int64, finished ones; returns: (N,) float64, the sums of their returns.
@@ -220,22 +220,22 @@ class Learner(Protocol):
     def returns(self) -> np.ndarray: ...
 
     def learn(self, points: Sequence[int], at_point: AtPoint) -> None:
-        """Go on until the last of `points`, and call `at_point` at each."""
+        """Train until the last of `points`, and call `at_point` at each."""
 
     def policy(self, i: int) -> PolicyLike:
-        """What run i has learnt, as `evaluate_agent` takes it."""
+        """The policy of run i, as `evaluate_agent` takes it."""
 
     def greedy_actions(self, places: Sequence[int]) -> dict[int, np.ndarray] | None:
         """(S,) actions of each of some runs whose policies are tables of states; None where none is."""
 
     def save(self, folder: Path) -> None:
-        """Write what `load` needs to go on."""
+        """Write the state that `load` goes on from."""
 
     def load(self, folder: Path) -> None:
         """Go on from what `save` wrote. FileFormatError: it cannot be read."""
 
     def publish(self, i: int, folder: Path) -> None:
-        """Write what run i has learnt into its folder, as `load_agent` reads it."""
+        """Write the policy of run i into its folder, as `load_agent` reads it."""
 
 
 def make_learner(members: Sequence[Member], device: str = "cpu", logs: Path | None = None) -> Learner:
@@ -266,7 +266,7 @@ class _Arrays:
         np.savez(folder / self.file, **self.state())  # type: ignore[attr-defined]
 
     def load(self, folder: Path) -> None:
-        with _said_to_be_damaged(folder), np.load(folder / self.file, allow_pickle=False) as stored:
+        with _reading_checkpoint(folder), np.load(folder / self.file, allow_pickle=False) as stored:
             self.restore({name: stored[name] for name in stored.files})  # type: ignore[attr-defined]
 
 
@@ -309,7 +309,7 @@ class Tables(_Arrays):
             table.restore(state_of(state, i))
 
     def publish(self, i: int, folder: Path) -> None:
-        """The greedy policy, as policy.npy."""
+        """Write the greedy policy, as policy.npy."""
         results.write_policy(folder, self.tables[i].policy_table())
 
 
@@ -330,7 +330,7 @@ class Networks(_Arrays):
         return self.batch.returns
 
     def publish(self, i: int, folder: Path) -> None:
-        """The network, as `Deep` reads it, with the names of parameters in the policy of Stable-Baselines3."""
+        """Write the network, as `Deep` reads it, with the names of parameters in the policy of Stable-Baselines3."""
         import torch
 
         place = folder / results.AGENT
@@ -376,7 +376,7 @@ class Deep:
         return None
 
     def learn(self, points: Sequence[int], at_point: AtPoint) -> None:
-        """As `Learner` says; the last point comes after the last update.
+        """Train until the last of `points`, which comes after the last update, and call `at_point` at each.
 
         Algorithms that learn from whole rollouts, such as PPO, take the steps of their last rollout although fewer are
         left; episodes that end after the last point are not counted.
@@ -410,7 +410,7 @@ class Deep:
             call(waiting)
 
     def save(self, folder: Path) -> None:
-        """Tensors (torch's own format, read back with weights_only), arrays and JSON."""
+        """Write tensors (torch's own format, read back with weights_only), arrays and JSON."""
         import torch
 
         folder.mkdir(parents=True, exist_ok=True)
@@ -424,11 +424,11 @@ class Deep:
             np.savez(folder / "replay.npz", **_buffer_arrays(buffer))  # type: ignore[arg-type]
 
     def load(self, folder: Path) -> None:
-        """Go on from what was saved; the episode that was running is started anew."""
+        """Restore what `save` wrote; the episode that was running is started anew."""
         import torch
 
         model = self.model
-        with _said_to_be_damaged(folder):
+        with _reading_checkpoint(folder):
             parameters = torch.load(folder / "parameters.pt", weights_only=True)  # noqa: TID251
             if set(parameters) == {"policy"}:  # of the batched engine: what was learnt, without an optimiser
                 model.policy.load_state_dict(parameters["policy"])
@@ -446,13 +446,13 @@ class Deep:
         model.set_random_seed(model.seed + model.num_timesteps)
 
     def publish(self, i: int, folder: Path) -> None:
-        """The network, in the folder agent."""
+        """Write the network into the folder agent."""
         self.save(folder / results.AGENT)
 
 
 @contextlib.contextmanager
-def _said_to_be_damaged(folder: Path) -> Iterator[None]:
-    """Whatever goes wrong in reading a checkpoint, as one line that names its folder."""
+def _reading_checkpoint(folder: Path) -> Iterator[None]:
+    """Raise FileFormatError, one line that names the folder, for any error in reading a checkpoint."""
     try:
         yield
     except Exception as error:  # torch and NumPy have many

@@ -10,7 +10,7 @@ from pharos.mdp import ChanceSetting
 from pharos.system.records import flat
 
 ENGINES = ("sb3", "batched")
-"""What trains networks: Stable-Baselines3, one run in a process; or many runs as one program."""
+"""Engines that train networks: Stable-Baselines3, one run in a process; or many runs as one program."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Horizon:
 @flat
 @dataclass(frozen=True, kw_only=True)
 class TrainingOptions:
-    """How an agent is trained, and in which setting its policies are measured.
+    """Options of training: the agent, its task, and the setting in which its policies are measured.
 
     Attributes:
         agent: q_learning, dqn, ppo, a2c, or module:Class for Stable-Baselines3. A file of one's own is `file.py:Class`.
@@ -85,7 +85,7 @@ class TrainingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ExecutionOptions:
-    """How the runs of a study are executed.
+    """Options of executing the runs of a study.
 
     Attributes:
         shard: only the I-th of N parts, such as 1/8. So N machines share a folder.

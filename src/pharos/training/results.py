@@ -63,7 +63,7 @@ _TRUTHS = {"True": True, "False": False}
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
+    """Versions of Python, pharos and the packages that a result depends on."""
     import platform
     from importlib import metadata
 
@@ -120,7 +120,7 @@ def _has_pyarrow() -> bool:
 
 
 def read_record(folder: str | os.PathLike) -> dict[str, Any]:
-    """Return what run.json says.
+    """Return the record in run.json.
 
     Raises:
         FileFormatError: there is none, or it is not of a run. ResultCorrupted: it was cut short or changed after it was
@@ -195,7 +195,7 @@ def _curve_file(folder: Path) -> Path:
 
 
 def _read_text(path: Path) -> dict[str, np.ndarray]:
-    """Name -> values, of a curve.csv.
+    """Columns of a curve.csv by name.
 
     Raises:
         ResultCorrupted: it was cut short or changed.
@@ -221,7 +221,7 @@ def _check_digest(path: Path, columns: Mapping[str, np.ndarray]) -> None:
 
 
 def check_agent(folder: Path) -> None:
-    """Check the files of what the agent has learnt against the checksums in run.json.
+    """Check the files of the trained agent against the checksums in run.json.
 
     Raises:
         ResultCorrupted: one is missing or was changed after it was written.
@@ -269,7 +269,7 @@ def read_table(path: Path, advice: str = AGAIN) -> "pa.Table":
 
 
 def digest_of_curve(table: "pa.Table") -> str:
-    """XXH3-128 of what a curve says, whatever the order of its columns or the version of Parquet that holds it.
+    """XXH3-128 of the columns of a curve, whatever their order or the version of Parquet that holds them.
 
     For each column, by name: its name, type and number of rows, and its values as little-endian int64, float64 (NaN
     where there is none) or bytes of truth; of other types as JSON.
@@ -322,7 +322,7 @@ def _expected_checksums(folder: Path) -> dict[str, str]:
 
 
 def write_policy(folder: Path, policy: object) -> None:
-    """Replace policy.npy: what a tabular agent has learnt, as `pharos evaluate --policy` takes it."""
+    """Replace policy.npy: the policy of a tabular agent, as `pharos evaluate --policy` takes it."""
     storage.replace_array(folder / POLICY, policy)
 
 
@@ -330,18 +330,18 @@ def write_policy(folder: Path, policy: object) -> None:
 
 
 class Stored(Protocol):
-    """What a checkpoint keeps."""
+    """An object whose state a checkpoint keeps."""
 
     def save(self, folder: Path) -> None:
-        """Write what `load` needs."""
+        """Write the state that `load` goes on from."""
 
     def load(self, folder: Path) -> None:
-        """Go on from what `save` wrote."""
+        """Restore the state that `save` wrote."""
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What a run gave.
+    """Result of a run: its summary, curve and agent.
 
     Attributes:
         config: of the run.
@@ -376,7 +376,7 @@ class Record:
             self.run["rules_version"] = rules.version
 
     def write(self, status: str, **entries: object) -> None:
-        """Replace it: the run is "running", "failed" or "finished"."""
+        """Replace run.json: the run is "running", "failed" or "finished"."""
         if self.folder is None:
             return
         record = {**self.run, "status": status, "hyperparameters": self.hyperparameters, **entries}
@@ -384,7 +384,7 @@ class Record:
 
 
 def finished_result(folder: Path, config: RunConfig) -> TrainingResult | None:
-    """The result that lies there; None where there is none; ParameterError where it is that of another run."""
+    """The result in a folder; None where there is none; ParameterError where it is that of another run."""
     if not (folder / "run.json").exists():
         return None
     record = read_record(folder)
@@ -408,7 +408,7 @@ def finished_result(folder: Path, config: RunConfig) -> TrainingResult | None:
 
 
 def clear_run(folder: Path) -> None:
-    """Remove what a finished run does not need; of kills in the middle of replacing or removing it, too."""
+    """Remove checkpoints and locks of a finished run, also those that a kill left while they were replaced."""
     for leftover in folder.glob("checkpoint*"):
         shutil.rmtree(leftover, ignore_errors=True)
     for name in (LOCK, CLAIM):  # whoever waits for it finds a finished run
@@ -423,7 +423,7 @@ def _digests(folder: Path) -> dict[str, str]:
 
 
 def _digest(record: Mapping[str, Any]) -> str:
-    """Of a record that may hold infinities and nan."""
+    """Digest of a record that may hold infinities and NaN."""
     return digest_of_bytes(json.dumps(record, sort_keys=True).encode())
 
 
@@ -435,7 +435,7 @@ class Checkpoint:
         self._next = -math.inf
 
     def save(self, learner: Stored, rows: list[Any], seconds: float) -> None:
-        """Write one, unless the last is not ten seconds old, or writing would take more than SHARE_OF_TIME."""
+        """Write a checkpoint, unless the last is not ten seconds old, or writing would take more than SHARE_OF_TIME."""
         began = time.monotonic()
         if began < self._next:
             return
@@ -482,7 +482,7 @@ class Checkpoint:
 
 
 def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task, Any]:
-    """The task of a finished run, and what it learnt, as `evaluate_agent` and `pharos.evaluate_policy` take it.
+    """The task of a finished run, and its policy, as `evaluate_agent` and `pharos.evaluate_policy` take it.
 
     Args:
         trust: whether code that the run names may be imported: an environment, observation or agent of its own. What

@@ -1,4 +1,4 @@
-"""Training an agent on a task, with the exact regret of its policy at chosen steps; what is done stays done.
+"""Training an agent on a task, with the exact regret of its policy at chosen steps; runs that are killed resume.
 
     FOLDER/run.json         configuration, versions, status, result
     FOLDER/curve.parquet    a row for each evaluation (curve.csv where pyarrow is not installed)
@@ -150,7 +150,7 @@ def _train(
     progress: RunProgress | None,
     tensorboard: bool = False,
 ) -> TrainingResult:
-    """A single run, whose errors are raised."""
+    """Train a single run; its errors are raised."""
     if tensorboard and config.engine == "batched":
         raise ParameterError("TensorBoard's logs are those of Stable-Baselines3; expected the engine sb3, or none")
     if tensorboard and (folder is None or config.is_tabular):
@@ -179,12 +179,12 @@ def _runs(
     """The task, and the configuration of a run with each of the seeds; `options` as `train` takes them."""
     training, parameters = split(TrainingOptions, options)
     agent, hyperparameters, table = training.agent, training.hyperparameters, options.get("hyperparameters")
-    sight = agent_kind(agent).observation(training.observation)
+    name = agent_kind(agent).observation(training.observation)
     task = Task.of(
         environment,
         parameters,
         chance=training.chance,
-        observation=own_observation(sight) or sight,
+        observation=own_observation(name) or name,
         observation_options=dict(training.observation_options or {}),
         gamma=training.gamma,
         horizon=training.horizon,
@@ -217,7 +217,7 @@ def train_parts(
     device: str,
     progress: ProgressCallback | None,
 ) -> list[TrainingResult | FailedRun]:
-    """As `train_configs`, each part in a process of its own, which ends with this one."""
+    """Train as `train_configs` does, each part in a process of its own, which ends with this one."""
     done, finished, failed = [0] * len(parts), [0] * len(parts), [0] * len(parts)
     total = sum(config.steps for config in configs)
     with Workers() as workers:
@@ -242,8 +242,8 @@ def _train_part(
     device: str,
     tell: ProgressCallback,
 ) -> None:
-    """What a process does: it tells how far it is, and ends at once where it is told to, as it has nothing to give back
-    and whoever repeats the call wants its locks."""
+    """Body of a process: train its part and send the progress. SIGTERM ends it at once, as there is nothing to clean
+    up, and a repeated call needs its locks."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     configs, folders = zip(*entries, strict=True)
     members = TaskCache(trust=True, device=device)  # of code that the process which started this one has imported
@@ -251,13 +251,13 @@ def _train_part(
 
 
 def _end(config: RunConfig, folder: Path) -> TrainingResult | FailedRun:
-    """What a run has left."""
+    """The result in the folder of a run, or why there is none."""
     try:
         done = finished_result(folder, config)
         if done is not None:
             return done
-        said = _results.read_record(folder).get("error") if (folder / _results.RECORD).exists() else None
+        text = _results.read_record(folder).get("error") if (folder / _results.RECORD).exists() else None
     except (ParameterError, FileFormatError) as error:
         return FailedRun(config.to_dict(), folder, error)
-    text = said or f"{folder}: the process that trained it ended without a result; the same command goes on from there"
+    text = text or f"{folder}: the process that trained it ended without a result; the same command goes on from there"
     return FailedRun(config.to_dict(), folder, PharosError(text))

@@ -1,4 +1,4 @@
-"""What is trained: a task, and the configuration of a run.
+"""The task of an agent, and the configuration of a run.
 
 A `Task` is an environment with chance, an observation, and the setting in which values and returns are measured.
 
@@ -45,19 +45,19 @@ class TaskValues:
 
     @staticmethod
     def from_dict(entry: Mapping[str, Any]) -> "TaskValues":
-        """Read what `to_dict` gave."""
+        """Read the entries that `to_dict` returns."""
         low, high = entry["return_range"]
         return TaskValues(ReferenceValues(**entry["reference"]), (low, high))
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
+        """The attributes, JSON-able."""
         return {"reference": asdict(self.reference), "return_range": list(self.return_range)}
 
 
 @flat
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What an agent learns, and what its policies are measured against.
+    """An environment with chance and an observation, and the setting in which policies on it are measured.
 
     Value and return are always in the same setting: undiscounted returns (gamma = 1) of episodes of at most `horizon`
     steps, the time limit of the environment, unless told otherwise. With `horizon=None` values are discounted without a
@@ -190,7 +190,7 @@ class Task:
 
     @property
     def reference(self) -> ReferenceValues:
-        """What regret is measured against: values at the start of the optimal, the uniform and the worst policy."""
+        """Reference values of regret: those at the start of the optimal, the uniform and the worst policy."""
         return self._solved_reference if self.values is None else self.values.reference
 
     @cached_property
@@ -219,7 +219,7 @@ class Task:
         return float(low.v[starts].min() - low.error_bound), float(high.v[starts].max() + high.error_bound)
 
     def _episodes(self, mdp: TabularMDP) -> TabularMDP:
-        """The states that an episode can meet: of a Freeway of a million, some thousand."""
+        """The MDP of the states that an episode can visit: of a Freeway of a million states, some thousand."""
         return mdp if self.horizon_steps is None else mdp.within(self.horizon_steps)
 
 
@@ -260,7 +260,7 @@ KEYS = (
 @flat
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(TrainingOptions):
-    """What determines the result of a training run: the options of training, on an environment, with a seed.
+    """Configuration that determines the result of a run: options of training, an environment, and a seed.
 
     Attributes:
         environment: name of the class of environments.
@@ -373,7 +373,7 @@ class RunConfig(TrainingOptions):
         return agent_kind(self.agent).is_tabular
 
     def make_environment(self, *, trust: bool = False, strict: bool = False) -> Environment:
-        """The environment.
+        """The environment of the run.
 
         Args:
             trust: whether code of the user's own may be imported; what was imported before needs no trust.
@@ -389,7 +389,7 @@ class RunConfig(TrainingOptions):
         return make(self.environment, **parameters)
 
     def task(self, values: "TaskValues | None" = None, *, trust: bool = False, strict: bool = False) -> "Task":
-        """What the agent learns.
+        """The task of the run.
 
         Args:
             values: at the start, which are not computed again where they are given.
@@ -416,7 +416,7 @@ class RunConfig(TrainingOptions):
         return (class_called(self.environment), *(registered(self.observation) or ()))
 
     def algorithm(self, *, trust: bool = False, strict: bool = False) -> "str | type":
-        """The agent: its name, or the class of the user's own.
+        """The agent of the run: its name, or the class of the user's own.
 
         Raises:
             UntrustedCode: see `make_environment`.

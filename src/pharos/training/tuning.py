@@ -85,12 +85,12 @@ SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
         "ent_coef": ("log", 1e-4, 0.1),
     },
 }
-"""What is searched for each agent: between two bounds on a logarithmic or a linear scale, or one of some values."""
+"""Search space of each agent: between two bounds on a logarithmic or a linear scale, or one of some values."""
 
 
 @dataclass(frozen=True)
 class TuningResult:
-    """What a search found.
+    """Best hyperparameters of a search, and its trials.
 
     Attributes:
         agent, environment, observation: whose hyperparameters these are; `environment` is the name of the class.
@@ -216,7 +216,7 @@ def tune(  # noqa: PLR0913
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Search:
-    """What is searched: hyperparameters of an agent in `space`, on `instances` of the class `environment`."""
+    """Specification of a search: hyperparameters of an agent in `space`, on `instances` of the class `environment`."""
 
     agent: str
     instances: Sequence[Environment]
@@ -233,7 +233,7 @@ class _Search:
 
     @cached_property
     def observation_name(self) -> str:
-        """The name of what the agent sees."""
+        """The name of the observation."""
         return str(self._observed)
 
     @cached_property
@@ -248,12 +248,12 @@ class _Search:
 
     @cached_property
     def table(self) -> dict[str, Any]:
-        """The hyperparameters of now, which the first trial has, and every trial for what is not searched."""
+        """Hyperparameters of the library: of the first trial, and of every trial for what is not searched."""
         return hyperparameters_of(self.agent, self.environment, self.observation_name)
 
     @cached_property
     def config(self) -> dict[str, Any]:
-        """What determines the search, as tuning.json keeps it."""
+        """Configuration that determines the search, as tuning.json keeps it."""
         chance = [kind.to_dict() for kind in self.kinds]
         config = {
             "agent": self.agent,
@@ -272,7 +272,7 @@ class _Search:
         return json.loads(json.dumps(config))
 
     def check_tasks(self) -> None:
-        """ParameterError for a task on which regret cannot be normalised."""
+        """Raise ParameterError for a task on which regret cannot be normalised."""
         for task in self.tasks:
             if not math.isfinite(task.reference.spread()):
                 raise ParameterError(
@@ -335,7 +335,7 @@ def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dic
 
 
 def suggested_value(trial: "optuna.Trial", name: str, choices: tuple[Any, ...]) -> object:
-    """The value that Optuna's trial takes."""
+    """The value of a hyperparameter that Optuna's trial suggests."""
     kind, *values = choices
     if kind == "one of":
         return trial.suggest_categorical(name, values)
@@ -343,7 +343,7 @@ def suggested_value(trial: "optuna.Trial", name: str, choices: tuple[Any, ...]) 
 
 
 def _default_value(agent: str, name: str) -> object:
-    """What the agent itself takes for a hyperparameter that the table leaves out; None: it says nothing."""
+    """The agent's own default of a hyperparameter that the table leaves out; None where it has none."""
     if agent_kind(agent).is_tabular:
         return Q_LEARNING_DEFAULTS.get(name)
     parameter = inspect.signature(algorithm(agent)).parameters.get(name)
@@ -392,7 +392,7 @@ def _most_promising(
     trials: int,
     predicted: Callable[[Mapping[str, Any]], float],
 ) -> dict[str, Any]:
-    """Of `search.shortlist` proposals for the next trial the one of the least predicted number; the first of equals."""
+    """The proposal for the next trial with the least predicted number of `search.shortlist`; the first of equals."""
     scratch, proposals = _study(optuna, search, records), []
     for number in range(search.shortlist):
         scratch.sampler = _sampler(optuna, search, len(records), trials, number)
@@ -403,7 +403,7 @@ def _most_promising(
 def _sampler(
     optuna: ModuleType, search: _Search, done: int, trials: int, *number: int
 ) -> "optuna.samplers.BaseSampler":
-    """What proposes the next trial, from those that are done: a search that was killed goes on as it would have."""
+    """Sampler of the next trial, seeded by the number of trials done: a killed search goes on as it would have."""
     seed = int(np.random.SeedSequence([search.search_seed, done, *number]).generate_state(1)[0])
     return optuna.samplers.TPESampler(
         seed=seed,
@@ -464,8 +464,8 @@ def _earlier_trials(optuna: ModuleType, search: _Search, folder: Path) -> list[d
         old = optuna.load_study(study_name=run_id(search.config), storage=backend)
         return [_record(trial) for trial in old.trials if trial.state.name in _STATUS]
     except Exception as error:  # Optuna trusts what it reads
-        said = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise FileFormatError(f"{journal}: is not as Optuna wrote it ({said}); {_AGAIN}") from error
+        message = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise FileFormatError(f"{journal}: is not as Optuna wrote it ({message}); {_AGAIN}") from error
 
 
 def _write(folder: Path, search: _Search, trials: Sequence[dict[str, Any]]) -> None:
