@@ -14,7 +14,7 @@ from pharos.errors import ParameterError
 from pharos.study import tables
 from pharos.study import worker as _worker
 from pharos.study.figures import returns_table
-from pharos.study.tables import _chosen, _last_return, _number
+from pharos.study.tables import _last_return, _number, _row_of_measures
 from refusals import failing
 
 MEASURES = ["sum_of_reciprocal_gaps", "diameter"]
@@ -135,7 +135,7 @@ def test_an_interval_enters_as_its_geometric_mean_and_only_if_it_has_an_upper_en
 def test_a_measure_that_does_not_exist_under_chance_is_that_without_and_noted():
     own = {"num_states": 16, "measures": {"a": {"why": "no chance, please"}, "b": {"value": 2.0, "exact": True}}}
     plain = {"num_states": 16, "measures": {"a": {"value": 3.0, "exact": True}, "b": {"value": 1.0, "exact": True}}}
-    row = _chosen(["a", "b", "c"], own, plain)
+    row = _row_of_measures(["a", "b", "c"], own, plain)
     assert (row["a"], row["b"]) == (3.0, 2.0) and np.isnan(row["c"])
     assert row["notes"] == "a: without chance, because no chance, please; c: none, because it is undefined"
 
@@ -143,9 +143,9 @@ def test_a_measure_that_does_not_exist_under_chance_is_that_without_and_noted():
 def test_a_proven_interval_enters_where_it_is_narrow():
     plain = {"num_states": 16, "measures": {"a": {"value": 3.0, "exact": True}}}
     narrow, wide = ({"value": 6.0, "lower": low, "upper": 36 / low, "exact": False} for low in (4.5, 4.0))
-    row = _chosen(["a"], {"num_states": 16, "measures": {"a": narrow}}, plain)
+    row = _row_of_measures(["a"], {"num_states": 16, "measures": {"a": narrow}}, plain)
     assert row["a"] == 6 and row["notes"] == "a: geometric mean of the proven interval 4.5 to 8"
-    row = _chosen(["a"], {"num_states": 16, "measures": {"a": wide}}, plain)
+    row = _row_of_measures(["a"], {"num_states": 16, "measures": {"a": wide}}, plain)
     assert row["a"] == 3 and row["notes"] == "a: without chance, because only 4 to 9 is proven within the budget"
 
 

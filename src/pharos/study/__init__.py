@@ -1,4 +1,4 @@
-"""From hardness and regret to the paper's models, figures and tables."""
+"""Studies: grids of runs, their execution, and models, figures and tables of hardness and regret."""
 
 from typing import TYPE_CHECKING
 

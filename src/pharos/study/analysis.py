@@ -1,6 +1,6 @@
-"""What a study says: intervals, linear models, correlation of agents, and each beside what the paper printed.
+"""Statistics of a study: intervals, linear models, correlation of agents; and their comparison with the paper.
 
-What the paper printed, as tables: the returns of its appendix C and the fits of its section 4.3.
+Numbers that the paper printed, as tables: the returns of its appendix C and the fits of its section 4.3.
 """
 
 from collections.abc import Sequence
@@ -58,11 +58,11 @@ class Models:
     agent: str = "dqn"
 
     def suffix(self, first: str) -> str:
-        """What the names of this agent's files end with; nothing for the first agent of a study."""
+        """Ending of the names of this agent's files; empty for the first agent of a study."""
         return "" if self.agent == first else "_" + "".join(c if c.isalnum() else "_" for c in self.agent)
 
     def get(self, model: str, subset: str) -> Fit | None:
-        """One of the fits."""
+        """The fit of a model to a subset of the rows; None where there is none."""
         return next((one for one in self.fits if (one.model, one.subset) == (model, subset)), None)
 
 
@@ -103,15 +103,15 @@ def models(
             outside = leave_one_class_out_r_squared(rows, used)
         except ParameterError as error:
             notes.append(str(error))
-    together = (_together(fits, "representation"), _together(fits, "class"))
-    return Models(regret, fits, notes, *together, outside, alone, agent)
+    pooled = (_pooled_r_squared(fits, "representation"), _pooled_r_squared(fits, "class"))
+    return Models(regret, fits, notes, *pooled, outside, alone, agent)
 
 
 def _has_positive(rows: "pd.DataFrame", measure: str) -> bool:
     return measure in rows and bool((np.isfinite(rows[measure].to_numpy(float)) & (rows[measure] > 0)).any())
 
 
-def _together(fits: Sequence[Fit], model: str) -> float | None:
+def _pooled_r_squared(fits: Sequence[Fit], model: str) -> float | None:
     parts = [one for one in fits if one.model == model]
     return aggregate_r_squared(parts) if len(parts) > 1 else None
 
@@ -169,7 +169,7 @@ def agreement(cells: "pd.DataFrame", value: str, agents: tuple[str, str] = ("dqn
 
 
 def paper_agreement() -> float:
-    """The same correlation over the returns that the paper prints in appendix C."""
+    """Pearson correlation of DQN and PPO over the returns that the paper prints in appendix C."""
     wide = paper_returns().pivot_table(
         index=["environment", "instance", "randomization", "observation"], columns="agent", values="mean"
     )
@@ -193,7 +193,7 @@ class PaperComparison:
 
 
 def compare(cells: "pd.DataFrame", runs: Sequence[Run], models: Sequence[Models]) -> PaperComparison:
-    """Our value beside each number that the paper prints, where the study has one; NaN elsewhere."""
+    """Comparison of each number that the paper prints with ours; NaN where the study has none."""
     numbers = {run.instance: paper_instance(run.config["environment"], run.config["parameters"]) for run in runs}
     ours: dict[tuple, tuple[float, ...]] = {}
     for row in cells.to_dict("records"):

@@ -167,11 +167,11 @@ def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
 
 
 def _study(file: Path, text: str, table: "pa.Table", trust: bool) -> Specification:
-    """The packed study; with the defaults of then, where the library had others when it was packed."""
+    """The packed study, with the defaults of hyperparameters that the library had when it was packed."""
     study = parse(text, str(file), folder=file.absolute().parent, trust=trust)
     if not study.defaults and not set(table["id"].to_pylist()) <= {run.id for run in study.runs}:
-        said = yaml.safe_dump({"defaults": EARLIER})
-        return parse(f"{text}\n{said}", str(file), folder=file.absolute().parent, trust=trust)
+        defaults = yaml.safe_dump({"defaults": EARLIER})
+        return parse(f"{text}\n{defaults}", str(file), folder=file.absolute().parent, trust=trust)
     return study
 
 
@@ -183,7 +183,7 @@ def _rows(file: Path, table: "pa.Table") -> list[dict[str, Any]]:
 
 
 def _digest(id: str, record: str, curve: "pa.Table") -> str:
-    """The digest of a run: of its id, its record as text, and the values of its curve."""
+    """Digest of a run: of its id, its record as text, and the values of its curve."""
     return storage.digest_of_json([id, record, training.digest_of_curve(curve)])
 
 
@@ -218,7 +218,7 @@ def _curve(file: Path, id: str, row: dict[str, list | None], schema: "pa.Schema"
 
 
 def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> bool:
-    """Whether the run was added: a finished one that is there already stays."""
+    """Write a run into the folder; False where a finished one is there already, which stays."""
     target = place / "partial" / id
     storage.remove_leftovers(target)
     if _worker.read_status(place / "runs" / id) == _worker.FINISHED:

@@ -61,7 +61,7 @@ def stored_values(config: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def has_regret(config: Mapping[str, Any]) -> bool:
-    """False where the stored values of the task say that no policy is better than uniform play."""
+    """Whether a policy may be better than uniform play: False where stored values of the task tell otherwise."""
     values = stored_values(config)
     return values is None or not math.isnan(ReferenceValues(**values["reference"]).spread())
 
@@ -71,7 +71,7 @@ def _cache() -> ResultCache:
 
 
 def _dependencies(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What the values depend on: parameters, rules by their code, start states, chance and setting."""
+    """Key of stored values: parameters, rules by their code, start states, chance and setting."""
     from pharos.rules import fingerprint_of_rules
 
     env = task_of(config).env
@@ -96,7 +96,7 @@ def _dependencies(config: Mapping[str, Any]) -> dict[str, Any]:
 def train_batch(
     configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], checkpoints: Path, *, device: str = "cpu"
 ) -> list[str | None]:
-    """The usual one: `pharos.training.train_configs`, with the values that the study has solved already."""
+    """Train runs by `pharos.training.train_configs`, with the values that the study has solved already."""
     from pharos.training import FailedRun, RunConfig, TaskCache, TaskValues, train_configs
 
     def values(config: RunConfig) -> TaskValues | None:
@@ -109,7 +109,7 @@ def train_batch(
 
 
 class Batches:
-    """Which of the missing runs are trained together.
+    """Batches of the missing runs of a study: which runs are trained as one program.
 
     Args:
         folder: of the study.
@@ -119,14 +119,14 @@ class Batches:
     def __init__(self, folder: Path, device: str = "cpu"):
         self.device = device
         self.folder = folder / BATCHES
-        self.most: dict[str, int] = {}  # of runs whose batch was too large for memory: how many may be together
-        self.seen: dict[str, SimpleNamespace] = {}
+        self.sizes: dict[str, int] = {}  # id -> largest batch of a run whose batch was too large for memory
+        self.observations: dict[str, SimpleNamespace] = {}
         self.keys: dict[str, Hashable] = {}  # by id
         self.stored: dict[str, frozenset[str]] = {}
         self.scan_checkpoints()
 
     def scan_checkpoints(self) -> None:
-        """Which batches have checkpoints: their runs stay together."""
+        """Read which batches have checkpoints: their runs stay together."""
         self.stored = {id: ids for ids in self._checkpoints().values() for id in ids}
 
     def _checkpoints(self) -> dict[Path, frozenset[str]]:
@@ -138,32 +138,32 @@ class Batches:
         return batches
 
     def next_batch(self, run: Run, pending: "deque[tuple[float, Run]]") -> tuple[Run, ...]:
-        """The runs that are trained with this one; they are taken from `pending`."""
+        """The batch of a run: itself and the runs that are trained with it, which are taken from `pending`."""
         if run.engine != "batched":
             return (run,)
         now, key, width = time.monotonic(), self.key(run), self.width(run)
-        others = self.stored.get(run.id)
-        chosen = [run]
+        stored = self.stored.get(run.id)
+        batch = [run]
         for entry in list(pending):
             due, other = entry
-            if others is not None:
-                fits = other.id in others
+            if stored is not None:
+                fits = other.id in stored
             else:
-                fits = len(chosen) < width and due <= now and other.id not in self.stored
+                fits = len(batch) < width and due <= now and other.id not in self.stored
                 fits = fits and other.engine == "batched" and self.width(other) >= width and self.key(other) == key
             if fits:
                 pending.remove(entry)
-                chosen.append(other)
-        return tuple(chosen)
+                batch.append(other)
+        return tuple(batch)
 
     def width(self, run: Run) -> int:
-        """How many runs may be in a batch of this one."""
-        is_image = not run.configuration.is_tabular and len(self._seen(run).shape) == 3
+        """Largest number of runs in a batch with this one."""
+        is_image = not run.configuration.is_tabular and len(self._observation(run).shape) == 3
         usual = TABLES if run.configuration.is_tabular else lane_width(is_image, self.device)
-        return min(usual, self.most.get(run.id, usual))
+        return min(usual, self.sizes.get(run.id, usual))
 
     def key(self, run: Run) -> Hashable:
-        """Runs with equal keys fit together; one whose key cannot be told is alone."""
+        """Key of a run: runs with equal keys fit together; one whose key cannot be computed is alone."""
         if run.id not in self.keys:
             self.keys[run.id] = self._key(run)
         return self.keys[run.id]
@@ -178,20 +178,20 @@ class Batches:
             env = config.make_environment(trust=True)
             mdp = SimpleNamespace(num_actions=env.num_actions, num_states=most_states(env))
             run_in_short: Any = SimpleNamespace(
-                observe=self._seen(run), mdp=mdp, hyperparameters=config.hyperparameters, steps=config.steps
+                observe=self._observation(run), mdp=mdp, hyperparameters=config.hyperparameters, steps=config.steps
             )
             key = group_key(config.agent, run_in_short, self.device)
         except Exception:  # what is wrong with it, the run will say
             return run.id
         return (config.agent, config.steps, config.evaluation_interval, key)
 
-    def _seen(self, run: Run) -> Any:
-        """Shape, type and frames of what the agent sees, and whether it is an image; told without the states."""
+    def _observation(self, run: Run) -> Any:
+        """Shape, type and frames of the observation, and whether it is an image; needs no state space."""
         config = run.configuration
         entry = run.config
         names = ("environment", "parameters", "observation", "observation_options")
         key = json.dumps([entry[name] for name in names], sort_keys=True)
-        if key not in self.seen:
+        if key not in self.observations:
             from pharos.observations import observe
 
             try:
@@ -201,13 +201,13 @@ class Batches:
                 is_image, frames = len(shape) == 3 and dtype == "uint8", observation.frames
             except Exception:
                 shape, dtype, is_image, frames = (), key, False, 1
-            self.seen[key] = SimpleNamespace(shape=shape, dtype=dtype, is_image=is_image, frames=frames)
-        return self.seen[key]
+            self.observations[key] = SimpleNamespace(shape=shape, dtype=dtype, is_image=is_image, frames=frames)
+        return self.observations[key]
 
     def halve(self, batch: Sequence[Run]) -> None:
-        """The process of this batch was killed too often: its runs go on in halves, from the beginning."""
+        """Halve a batch whose process was killed too often: its runs start anew, in batches of half its size."""
         ids = {run.id for run in batch}
-        self.most |= dict.fromkeys(ids, max(1, len(batch) // 2))
+        self.sizes |= dict.fromkeys(ids, max(1, len(batch) // 2))
         for folder, others in self._checkpoints().items():
             if ids & others:
                 shutil.rmtree(folder, ignore_errors=True)
@@ -215,5 +215,5 @@ class Batches:
 
 
 def most_states(environment: Environment) -> float:
-    """At most how many states an environment has: the product of the ranges of its variables."""
+    """Upper bound of the number of states of an environment: the product of the ranges of its variables."""
     return float(np.prod(environment.components.size.astype(float)))

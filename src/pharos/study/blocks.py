@@ -1,4 +1,4 @@
-"""What the YAML file of a study consists of, as pydantic models, and the runs that they stand for."""
+"""Parts of the YAML file of a study, as pydantic models, and the runs that they stand for."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,7 +32,7 @@ try:
 except ImportError as error:
     raise MissingExtra("a study", str(error.name), "study") from error
 
-# So that a mistake in a number of seeds is told at once.
+# Limit that reports a mistake in a number of seeds at once
 MOST_RUNS = 1_000_000
 NAME = r"^([A-Za-z0-9][A-Za-z0-9 ._-]*)?$"
 
@@ -46,7 +46,7 @@ class Run:
         instance: name of the environment as the specification gives it, such as "frozen_lake/4x4".
         engine: "batched" where it is trained together with others; a table, too, whose configuration does not say so.
         family: what it counts as where classes are compared: the class of its environment, unless the study says else.
-        setting: what tells its cell from that of other blocks, where the study says so: "tuned".
+        setting: name that tells its cell from that of other blocks, where the study says so: "tuned".
         observation: the name of its observation in tables.
     """
 
@@ -77,7 +77,7 @@ class Run:
 
     @property
     def cell(self) -> dict[str, str]:
-        """The cell of the grid that it is a seed of, by the names that tables have."""
+        """The cell of the grid that the run is a seed of, by the columns of tables."""
         config = self.configuration
         return {
             "environment": self.family or config.environment,
@@ -89,12 +89,12 @@ class Run:
 
     @property
     def chance(self) -> str:
-        """`plain`, or such as `sticky 0.25`."""
+        """The kind of chance: `plain`, or such as `sticky 0.25`."""
         return str(self.configuration.chance)
 
     @property
     def chance_in_words(self) -> str:
-        """For people: also "of the world", where the rules have chance."""
+        """The kind of chance in words: also "of the world", where the rules have chance."""
         if not self.configuration.task(trust=True).env.has_chance:
             return self.chance
         return f"of the world and {self.chance}" if self.configuration.chance else "of the world"
@@ -133,7 +133,7 @@ class _Part(BaseModel):
 
 
 class _Named(_Part):
-    """What has a name; of one's own it is looked for in a folder."""
+    """An entry with a name; a name of the user's own code is looked for in a folder."""
 
     name: str
     _folder: Path | None = PrivateAttr(None)
@@ -158,7 +158,7 @@ class ObservationEntry(_Named):
 
     @cached_property
     def own(self) -> OwnObservation | None:
-        """The observation of one's own that is meant; None for one of pharos."""
+        """The observation of the user's own of that name; None for one of pharos."""
         return own_observation(self.name, self._folder)
 
 
@@ -182,7 +182,7 @@ class EnvironmentEntry(_Named):
 
     @property
     def counts_as(self) -> str:
-        """Its family; an imported MDP without one is a class of its own; "": the class of the environment."""
+        """Its family; for an imported MDP without one its label; "" where the class of the environment counts."""
         return self.family or (self.label if self.is_imported else "")
 
     @cached_property
@@ -194,8 +194,7 @@ class EnvironmentEntry(_Named):
 
 
 class Hardness(_Part):
-    """Which measures of hardness are taken, with which discount, and how many seconds each may take for one
-    instance."""
+    """Measures of hardness that are computed, their discount, and the seconds that each may take for one instance."""
 
     gamma: float = Field(default=0.99, ge=0, le=1)
     measures: list[str] = Field(default_factory=lambda: [name for name in MEASURES if name in registered()])
@@ -211,8 +210,7 @@ class Hardness(_Part):
 
     @property
     def predictors(self) -> list[str]:
-        """Those measures that explain regret in the linear models: the paper's three, or all where none of them is
-        taken.
+        """Measures that explain regret in the linear models: the paper's three, or all where none of them is taken.
 
         The stationary effective horizon stands for the effective horizon where that is not taken.
         """
@@ -262,7 +260,7 @@ class Block(_Part):
 
 
 class Specification(_Part):
-    """A study: its blocks, and what holds for every block that does not say otherwise."""
+    """Specification of a study: its blocks, and the settings of those that have none of their own."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     description: str = ""
@@ -295,20 +293,22 @@ class Specification(_Part):
         )
 
     def to_yaml(self, **changes: object) -> str:
-        """As a YAML file says it; with other values for what it says."""
-        said = self.model_dump(mode="json", exclude_unset=True)
-        said |= {name: value for name, value in changes.items() if name in said}
-        return yaml.safe_dump(said, sort_keys=False, width=120)
+        """Text of a YAML file with these entries; `changes` replace some of them."""
+        entries = self.model_dump(mode="json", exclude_unset=True)
+        entries |= {name: value for name, value in changes.items() if name in entries}
+        return yaml.safe_dump(entries, sort_keys=False, width=120)
 
     def runs_of(self, block: Block) -> Iterator[Run]:
         """The runs of one block."""
         names = ("steps", "evaluations", "gamma", "horizon", "seeds")
-        steps, evaluations, gamma, horizon, seeds = (self.said(block, name) for name in names)
+        steps, evaluations, gamma, horizon, seeds = (self.option_of(block, name) for name in names)
         for environment, chance, agent in product(block.environments, block.chance, block.agents):
             instance, agent_from = environment.instance, agent_source(agent, self.folder, check=False)
             observations: Sequence[ObservationEntry] = environment.observations or block.observations
+            # Tabular agents see the state itself, whatever the block says
             if agent_kind(agent).is_tabular:
                 observations = [ObservationEntry(name=TABULAR_OBSERVATION)]
+            # A run for each observation and seed
             for observation, seed in product(observations, seeds):
                 sources = {
                     "environment": source_of(type(instance)),
@@ -334,18 +334,18 @@ class Specification(_Part):
                 )
                 yield Run(config, environment.label, engine, environment.counts_as, block.setting)
 
-    def said(self, block: Block, name: str) -> Any:
-        """What a block says, or else the study."""
+    def option_of(self, block: Block, name: str) -> Any:
+        """The option of a block, or else of the study: steps, evaluations, gamma, horizon, seeds or engine."""
         own = getattr(block, name)
         return getattr(self, name) if own is None else own
 
     def engine_of(self, block: Block, agent: str) -> str:
-        """What trains an agent of a block: "sb3" or "batched"."""
-        said = self.said(block, "engine")
-        return said if isinstance(said, str) else said.get(agent, "sb3")
+        """The engine that trains an agent of a block: "sb3" or "batched"."""
+        engine = self.option_of(block, "engine")
+        return engine if isinstance(engine, str) else engine.get(agent, "sb3")
 
     def _hyperparameters(self, block: Block, agent: str, environment: str, observation: str) -> dict[str, Any]:
-        """All of them, the defaults included (of the study, else of the library): with others these are other runs."""
+        """Every hyperparameter, with defaults of the study, else of the library: with others these are other runs."""
         entry = block.hyperparameters.get(agent, {})
         own = self.hyperparameters[entry] if isinstance(entry, str) else entry
         usual = self.defaults.get(agent, {}).get(environment, {}).get(observation)

@@ -92,7 +92,7 @@ def _has_work(runs: Iterable[Run], place: Path, retry_failed: bool) -> bool:
 
 
 def run_shard(folder: str, options: dict[str, Any]) -> dict[str, Any]:
-    """What a job does: its part of the study whose specification stands in the folder."""
+    """Execute a job's part of the study whose specification stands in the folder; the Status as a dictionary."""
     return run(specification(folder, trust=True), folder, **options).to_dict()
 
 
@@ -135,7 +135,7 @@ def run_on_ray(
 
 
 def _attempt(*job: Any) -> None:
-    """Execute one run or a batch; what another process is at is left to it."""
+    """Execute one run or a batch, but for runs that another process holds."""
     _worker.use_one_thread()
     *arguments, again, resume = job
     _worker.attempt(*arguments, again=again, resume=resume)

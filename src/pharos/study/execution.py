@@ -1,9 +1,9 @@
-"""Executes what is missing of a study: one process a run, from a process that has loaded everything already.
+"""Execution of the missing runs of a study: one process a run, forked from one that has loaded everything already.
 
 Runs are independent, named by the hash of their config, and appear whole or not at all (worker.py): runner or workers
 may be killed at any moment, several runners may share a folder, and the same command goes on from there.
 
-What comes before the runs of a study: state spaces are built, and tasks solved, once for all runs on them.
+Before the runs of a study, state spaces are built and tasks solved, once for all runs on them.
 """
 
 import contextlib
@@ -36,10 +36,10 @@ __all__ = ["Execution", "Status", "claim", "duration", "opened", "run", "shard_o
 ATTEMPTS = 3
 STATUS_SECONDS = 2.0
 BUSY_SECONDS = 0.5
-# Between two looks at what other runners have finished in the same folder
+# Between two counts of the runs that other runners have finished in the same folder
 OTHERS_SECONDS = 20.0
-# How often in a row the process that forks workers is begun again, and what multiprocessing says of a worker whose
-# server is gone
+# How often in a row the process that forks workers is begun again, and the exit code that multiprocessing gives a
+# worker whose server is gone
 LOST_SERVERS = 10
 SERVER_LOST = 255
 
@@ -48,7 +48,7 @@ Job = tuple[_worker.BatchRunner, list[dict[str, Any]], list[str], Path, set[str]
 
 
 def train(config: Mapping[str, Any], folder: Path) -> None:
-    """The runner of studies: trains as `config` says and writes run.json and curve.parquet into `folder`."""
+    """Train a run as `config` says, and write run.json and curve.parquet into `folder`: the runner of studies."""
     from pharos.training import TaskValues, train_config
 
     values = _batches.stored_values(config)
@@ -149,7 +149,7 @@ class Execution:
                 self.pending.append((0.0, run))
 
     def forecast(self) -> Forecast:
-        """How long the runs that are missing will take."""
+        """Forecast of the missing runs: their number, their steps, and the seconds that they will take."""
         steps = sum(run.config["steps"] for _, run in self.pending)
         return Forecast(len(self.pending), steps, self.num_workers, self._remaining())
 
@@ -159,7 +159,7 @@ class Execution:
         prepare_instances(prepare, [run for _, run in self.pending], self.report)
 
     def run(self) -> Status:
-        """Execute what is pending; the Status at the end."""
+        """Execute the pending runs; return the Status at the end."""
         try:
             with self.workers:
                 while self.pending or self.running:
@@ -176,14 +176,14 @@ class Execution:
         return self.report(final=True)
 
     def _refresh(self) -> None:
-        """Count what other runners have finished: one listing of the folder."""
+        """Count the runs that other runners have finished, by one listing of the folder."""
         self.last_listing = time.monotonic()
         with contextlib.suppress(OSError):
-            there = set(os.listdir(self.folder / "runs"))
+            ids = set(os.listdir(self.folder / "runs"))
             self.pending = deque(
                 (due, run)
                 for due, run in self.pending
-                if run.id not in there or run.id in self.repeated or not self.record_result(run)
+                if run.id not in ids or run.id in self.repeated or not self.record_result(run)
             )
 
     def _start(self) -> None:
@@ -206,7 +206,7 @@ class Execution:
             self.running[run.id] = (batch, time.monotonic())
 
     def _server_lost(self, error: Exception) -> None:
-        """The process that forks workers is gone: wait a little, and the next start begins another."""
+        """Wait a little for another process that forks workers, as it is gone; PharosError after LOST_SERVERS times."""
         self.lost_servers += 1
         if self.lost_servers > LOST_SERVERS:
             raise PharosError(
@@ -222,7 +222,7 @@ class Execution:
             self.workers.start(batch[0].id, _worker.main, self.job(batch), definitions)
 
     def next_batch(self, run: Run) -> tuple[Run, ...]:
-        """The runs that are executed by one process with this one; they are taken from `pending`."""
+        """A run and those that the same process executes, which are taken from `pending`."""
         return (run,) if self.batch_runner is None else self.batches.next_batch(run, self.pending)
 
     def job(self, batch: Sequence[Run]) -> Job:
@@ -247,7 +247,7 @@ class Execution:
                 self.workers.kill(id)
 
     def _ended(self, batch: tuple[Run, ...], code: int) -> None:
-        """A process is over: what it has not left behind is done again."""
+        """Count the results of a process that has ended; its other runs are executed again."""
         is_killed = code not in (0, _worker.EXIT_BUSY)
         left = [run for run in batch if not self.record_result(run, is_killed and run.id in self.repeated)]
         if code == SERVER_LOST and left and self.lost_servers < LOST_SERVERS:
@@ -258,7 +258,7 @@ class Execution:
         self.pending.extend((time.monotonic() + BUSY_SECONDS, run) for run in left)  # another process is at them
 
     def _killed(self, batch: Sequence[Run], code: int) -> None:
-        """Without results: again, up to ATTEMPTS times; then a batch is halved, and a run has failed."""
+        """Repeat runs without results up to ATTEMPTS times; then halve their batch, or mark a single run as failed."""
         for run in batch:
             self.kills[run.id] += 1
         most = max((self.kills[run.id] for run in batch), default=0)
@@ -274,7 +274,7 @@ class Execution:
         self.pending.extend((0.0, run) for run in batch)
 
     def _mark_failed(self, run: Run, code: int) -> None:
-        """A run has failed: its process was killed too often, or took too long."""
+        """Publish a run as failed, because its process was killed too often, or took too long."""
         if self.kills[run.id] > ATTEMPTS:
             self.fail(run, f"took longer than {self.options.timeout:g} s")
         else:
@@ -282,7 +282,7 @@ class Execution:
             self.fail(run, f"its process ended {how}, {ATTEMPTS} times; was there memory enough?")
 
     def fail(self, run: Run, error: str) -> None:
-        """Publish a run that has failed, with what its process has left behind."""
+        """Publish a run that has failed, with the files that its process has left behind."""
         folder = self.folder / "partial" / run.id
         folder.mkdir(parents=True, exist_ok=True)
         _worker.write_failure(folder, run.config, run.id, error, 0.0)
@@ -290,7 +290,7 @@ class Execution:
         self.record_result(run, False)
 
     def record_result(self, run: Run, again: bool = False) -> bool:
-        """Read the run's result, if it is over; False where it has to be executed, a damaged one again."""
+        """Read and count the result of a run that is over; False where it has to be executed, a damaged one again."""
         try:
             record = _worker.read_record(self.folder / "runs" / run.id)
         except FileFormatError as error:
@@ -324,6 +324,7 @@ class Execution:
         return seconds / self.num_workers
 
     def report(self, preparing: str = "", *, final: bool = False) -> Status:
+        """The Status now, which `progress` is called with; every STATUS_SECONDS it is written into the folder."""
         now = Status(
             name=self.study.name,
             folder=str(self.folder),
@@ -348,7 +349,7 @@ class Execution:
 
 
 def _clear(folder: Path, runs: Iterable[Run]) -> None:
-    """Remove what only running needs, once every run is over."""
+    """Remove the folders that only running needs, once every run is over."""
     for run in runs:
         for name in (f"partial/{run.id}", f"partial/{run.id}.failed", f"locks/{run.id}"):
             shutil.rmtree(folder / name, ignore_errors=True)
@@ -372,7 +373,7 @@ def prepare_instance(config: Mapping[str, Any]) -> None:
 def prepare_instances(
     prepare: Callable[[Mapping[str, Any]], Any], runs: Iterable[Run], tell: Callable[[str], Any]
 ) -> None:
-    """Call `prepare` with one config of each instance of the runs, and `tell` what it is at; failures are not told.
+    """Call `prepare` with one config of each instance of the runs, and `tell` with its progress; failures are ignored.
 
     A process of their own prepares them one after the other; where it dies, another goes on with the next.
     """
@@ -389,8 +390,8 @@ def prepare_instances(
                 workers.start("", _prepare_all, (prepare, [run.config for run in todo]), definitions)
             number, run = len(instances) - len(todo) + 1, todo[0]
             tell(f"preparing {run.instance}, {run.chance} ({number} of {len(instances)}){waits_for}")
-            for _, said in workers.events(POLL_SECONDS):
-                waits_for = f"; {said}" if isinstance(said, str) and said else ""
+            for _, message in workers.events(POLL_SECONDS):
+                waits_for = f"; {message}" if isinstance(message, str) and message else ""
                 if not waits_for and todo:  # one is prepared, or its process has died
                     todo.popleft()
 
@@ -398,7 +399,7 @@ def prepare_instances(
 def _prepare_all(
     prepare: Callable[[Mapping[str, Any]], Any], configs: Iterable[Mapping[str, Any]], send: Callable[[str], None]
 ) -> None:
-    """Prepare instances one after the other; send "" after each, and why where it waits."""
+    """Prepare instances one after the other; send "" after each, and the reason where one waits."""
     for config in configs:
         with contextlib.suppress(Exception):  # the runs of this instance will fail with the same error, and say so
             unless_locked(prepare, config, send)

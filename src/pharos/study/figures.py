@@ -53,7 +53,7 @@ class Line:
         label: in words, `DQN, image`.
         color, dash: `#0072B2`; as matplotlib writes it, such as `--`.
         x: (T,) where it is known; mean, lower, upper: (T,) the line and the ends of its interval.
-        runs: what each run is called -> (T,) its values.
+        runs: name of each run -> (T,) its values.
     """
 
     label: str
@@ -90,7 +90,7 @@ class Curves:
     draws_runs: bool = False
 
     def to_json(self) -> str:
-        """What the page needs to draw them: numbers of DIGITS digits; runs where there are at most MOST_RUNS."""
+        """The curves as the page draws them: numbers of DIGITS digits; runs where there are at most MOST_RUNS."""
         panels = []
         for panel in self.panels:
             num_runs = sum(len(line.runs) for line in panel.lines)
@@ -114,7 +114,7 @@ def _short(values: np.ndarray) -> list[float | int | None]:
 
 
 def label(agent: str, observation: str) -> str:
-    """`DQN, image`, `tabular Q-learning`."""
+    """Label of an agent and its observation: `DQN, image`, `tabular Q-learning`."""
     words = OBSERVATIONS.get(observation, observation)
     return f"{agent_name(agent)}, {words}" if words else agent_name(agent)
 
@@ -129,15 +129,15 @@ def regret_curves(
     """
     panels, observations = [], list(dict.fromkeys(points["observation"]))
     for name, part in points.groupby(by, sort=False):
-        drawn = []
+        panel_lines = []
         for (agent, observation), each in part.groupby(["agent", "observation"], sort=True):
             steps, tasks, runs = same_steps(each)
             mean, lower, upper = mean_curve(tasks, resamples=resamples)
             color = observation_color(observation, observations)
             words, dash = label(agent, observation), LINES.get(agent, ":")
-            drawn.append(Line(words, color, dash, steps, mean, lower, upper, runs))
+            panel_lines.append(Line(words, color, dash, steps, mean, lower, upper, runs))
         text = name if isinstance(name, str) else ", ".join(map(str, name))
-        panels.append(Panel(in_words(text), drawn))
+        panels.append(Panel(in_words(text), panel_lines))
     return Curves(panels, "steps", "cumulative regret", draws_runs=draws_runs)
 
 
@@ -165,17 +165,17 @@ def performance_profiles(profiles: "pd.DataFrame") -> Curves:
     """A panel for each class: the share of runs above each score, a line for each agent and observation."""
     panels, observations = [], list(dict.fromkeys(profiles["observation"]))
     for name, part in profiles.groupby("environment", sort=False):
-        drawn = []
+        panel_lines = []
         for (agent, observation), line in part.groupby(["agent", "observation"], sort=True):
             color = observation_color(observation, observations)
             values = (line[column].to_numpy(np.float64) for column in ("score", "share", "lower", "upper"))
-            drawn.append(Line(label(agent, observation), color, LINES.get(agent, ":"), *values))
-        panels.append(Panel(in_words(str(name)), drawn))
+            panel_lines.append(Line(label(agent, observation), color, LINES.get(agent, ":"), *values))
+        panels.append(Panel(in_words(str(name)), panel_lines))
     return Curves(panels, "score: 1 - normalised regret", "share of runs above it", share=True)
 
 
 def all_curves(points: "pd.DataFrame", profiles: "pd.DataFrame") -> dict[str, Curves]:
-    """Name of the figure -> its curves."""
+    """Curves by the name of their figure."""
     curves = {"regret": regret_curves(points), "regret_by_instance": regret_curves(points, by="instance")}
     curves["profiles"] = performance_profiles(profiles)
     for environment, part in points.groupby("environment", sort=False):
@@ -307,10 +307,10 @@ def fitted_against_actual(fits: Sequence[Fit], regret: str) -> "Figure":
 def all_figures(
     curves: Mapping[str, Curves], cells: "pd.DataFrame", models: Sequence[Models], agents: Sequence[str]
 ) -> dict[str, Callable[[], "Figure | None"]]:
-    """Name -> function that draws it; fits are drawn for the first agent."""
-    drawn: dict[str, Callable[[], Figure | None]] = {name: partial(lines, each) for name, each in curves.items()}
+    """Functions that draw the figures, by name; fits are drawn for the first agent."""
+    figures: dict[str, Callable[[], Figure | None]] = {name: partial(lines, each) for name, each in curves.items()}
     for agent, image in pairs_of(cells, agents):
-        drawn[representations_figure(agent, image)] = partial(representations, cells, agent=agent, image=image)
+        figures[representations_figure(agent, image)] = partial(representations, cells, agent=agent, image=image)
     for each in models:
         if each.agent != models[0].agent:
             continue
@@ -318,12 +318,12 @@ def all_figures(
         kinds = {"single": "single_model", "representation": "representation_models", "class": "class_models"}
         for kind, file in kinds.items():
             fits = [fit for fit in each.fits if fit.model == kind]
-            drawn[f"{file}_{name}"] = partial(_fits, fits, REGRETS[each.regret])
+            figures[f"{file}_{name}"] = partial(_fits, fits, REGRETS[each.regret])
     for i, one in enumerate(agents):
         for two in agents[i + 1 :]:
             both = partial(agents_against_each_other, cells, "normalized_regret", (one, two))
-            drawn[agents_figure(one, two)] = both
-    return drawn
+            figures[agents_figure(one, two)] = both
+    return figures
 
 
 def _fits(fits: Sequence[Fit], regret: str) -> "Figure | None":
@@ -340,7 +340,7 @@ CHANCES = {"plain": "None", "random": "random", "sticky": "stick"}
 
 
 def tables_of(cells: "pd.DataFrame", measured: "pd.DataFrame", models: Sequence[Models]) -> dict[str, str]:
-    """Name -> LaTeX: the returns of each class, hardness, and the fits for each agent and kind of regret."""
+    """LaTeX tables by name: the returns of each class, hardness, and the fits for each agent and kind of regret."""
     tables = {
         f"returns_{environment}": returns_table(cells, environment)
         for environment in dict.fromkeys(cells["environment"])

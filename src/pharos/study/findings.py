@@ -92,7 +92,7 @@ def _row(
 
 
 def _power_of_mean(effect: float, deviation: float, number: int) -> float:
-    """That a two-sided test at LEVEL finds a mean difference; the rank test needs pi / 3 as many of normal ones."""
+    """Probability that a two-sided test at LEVEL finds a mean difference; ranks need pi / 3 as many normal values."""
     from scipy import stats
 
     if number < 2:
@@ -104,7 +104,7 @@ def _power_of_mean(effect: float, deviation: float, number: int) -> float:
 
 
 def _power_of_f(added: int, free: int, r_squared: float, without: float = 0.0) -> float:
-    """That an F test at LEVEL finds parameters that raise R2 from `without` to `r_squared`.
+    """Probability that an F test at LEVEL finds parameters that raise R2 from `without` to `r_squared`.
 
     Source: Cohen (1988), Statistical power analysis, chapter 9: f2 (u + v + 1) is the noncentrality.
     """
@@ -123,7 +123,7 @@ def _nothing(finding: str, of: str, paper: str, why: str) -> dict[str, Any]:
 def _compared(
     cells: "pd.DataFrame", finding: str, environment: str, paper: str, sides: Mapping[str, tuple[str, str]]
 ) -> dict[str, Any]:
-    """Which of two pairs of agent and observation has more regret on the tasks of a class, both named in `sides`."""
+    """Finding on which of two pairs of agent and observation, in `sides`, has more regret on the tasks of a class."""
     from scipy import stats
 
     part = cells[cells["environment"] == environment]
@@ -151,7 +151,7 @@ def _shift(differences: np.ndarray) -> Effect:
     """
     first, second = np.triu_indices(len(differences))
     averages = np.sort((differences[first] + differences[second]) / 2)
-    chances = np.ones(1)  # of each sum of the ranks that are positive, by chance alone
+    chances = np.ones(1)  # probabilities of each sum of the positive ranks under the null hypothesis
     for rank in range(1, len(differences) + 1):
         chances = (np.pad(chances, (0, rank)) + np.pad(chances, (rank, 0))) / 2
     excluded = int((np.cumsum(chances) <= LEVEL / 2).sum())
@@ -208,7 +208,7 @@ def _tasks(fit: Fit) -> _Tasks:
 
 
 def _rest(design: np.ndarray, values: np.ndarray) -> float:
-    """The sum of squares that least squares leaves."""
+    """The residual sum of squares of least squares."""
     return float(((values - design @ np.linalg.lstsq(design, values, rcond=None)[0]) ** 2).sum())
 
 
@@ -221,8 +221,8 @@ def _f_test(small: float, large: float, added: int, free: int) -> tuple[float, f
 
 
 def _share(statistic: float, added: int, free: int) -> Effect:
-    """The share of what a smaller model leaves that a larger one explains, of the F test between them; the interval
-    is that of the noncentrality.
+    """Effect of an F test: the share of the smaller model's residual squares that the larger one explains; its
+    interval is that of the noncentrality.
 
     Source: Steiger (2004), Beyond the F test, with f2 (u + v + 1) as the noncentrality.
     """
@@ -349,7 +349,7 @@ def _vectors_explained_better(models: Models, resamples: int) -> dict[str, Any]:
 
 
 def _power_of_error(effect: float, error: float) -> float:
-    """That an interval of 95 % whose ends are NORMAL errors away does not hold 0."""
+    """Probability that an interval of 95 % whose ends are NORMAL errors away does not hold 0."""
     from scipy import stats
 
     return float(stats.norm.sf(NORMAL - effect / error)) if error > 0 else 1.0

@@ -34,7 +34,7 @@ def log(
     progress: Callable[[str], None] | None = None,
     trust: bool | None = None,
 ) -> int:
-    """Write the curves of the finished runs that were not written yet; how many these are.
+    """Write the curves of the finished runs that were not written yet; return how many.
 
     Nothing is trained, and nothing of the results changes. A run keeps its name and identity, and may be written again.
 
@@ -54,7 +54,7 @@ def log(
 
 @dataclass
 class RunLog:
-    """What remembers which runs of a study were written.
+    """Log of the runs of a study, which remembers those that were written.
 
     A file in `tensorboard/written` or `wandb/written` stands for each run.
     """
@@ -72,7 +72,7 @@ class RunLog:
         self.write = self._tensorboard() if self.to == "tensorboard" else self._wandb()
 
     def update(self, progress: Callable[[str], None] = lambda _: None) -> int:
-        """Write the runs that are finished and not written yet; how many these are."""
+        """Write the runs that are finished and not written yet; return how many."""
         written = self.place / self.to / "written"
         number = 0
         for run, name in named(self.study):
@@ -145,7 +145,7 @@ class RunLog:
 
 
 def named(study: Specification) -> Iterator[tuple[Run, str]]:
-    """(run, what it is called): INSTANCE/CHANCE/AGENT/SEED, as far as that tells it from all others; then its id."""
+    """Yield (run, its name): INSTANCE/CHANCE/AGENT/SEED, and its id where others have the same name."""
     names = [_name(run) for run in study.runs]
     often = Counter(names)
     for run, name in zip(study.runs, names, strict=True):
@@ -153,20 +153,20 @@ def named(study: Specification) -> Iterator[tuple[Run, str]]:
 
 
 def _name(run: Run) -> str:
-    said = described(run)
-    parts = (run.instance, run.chance, label(said["agent"], said["observation"]))
-    return "/".join((*(slug(part.replace(", ", "-")) for part in parts), f"seed-{said['seed']}"))
+    columns = described(run)
+    parts = (run.instance, run.chance, label(columns["agent"], columns["observation"]))
+    return "/".join((*(slug(part.replace(", ", "-")) for part in parts), f"seed-{columns['seed']}"))
 
 
 def _settings(run: Run) -> dict[str, Any]:
-    """What one compares runs by: words and numbers."""
+    """Settings by which runs are compared: words and numbers."""
     own = {f"hyperparameters/{key}": value for key, value in run.config["hyperparameters"].items()}
     return {key: value if _is_number(value) or isinstance(value, str) else str(value) for key, value in
             {**described(run), **own}.items()}  # fmt: skip
 
 
 def _points(curve: "pd.DataFrame") -> Iterator[tuple[int, float, dict[str, float]]]:
-    """(step, seconds since the run began, what was measured there), each finite."""
+    """Yield (step, seconds since the run began, finite values of SCALARS) for each evaluation."""
     for row in curve.to_dict("records"):
         values = {key: float(row[key]) for key in SCALARS if key in row}
         yield (

@@ -148,7 +148,7 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
 
 
 def _tasks(rows: "pd.DataFrame") -> tuple[str, ...]:
-    """The task of each row; empty where the rows do not say."""
+    """The task of each row; empty where the rows have no instance and chance."""
     if not {"instance", "chance"} <= {*rows}:
         return ()
     return tuple(map(" ".join, zip(rows["instance"], rows["chance"], strict=True)))

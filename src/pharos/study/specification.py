@@ -1,4 +1,4 @@
-"""What a study runs: a YAML file of blocks, checked key by key, and the list of runs that it stands for.
+"""Specification of a study: a YAML file of blocks, checked key by key, and the list of runs that it stands for.
 
     name: lakes
     steps: 50000                       # of every block that does not say otherwise; so do evaluations, seeds, gamma,
@@ -19,7 +19,7 @@ Environments, observations and agents of one's own are named as module:Name or f
 imported where the user names a folder, for the study.yaml beside results, or for a packed study, which somebody else
 may have written, unless it is trusted.
 
-The nodes of a YAML file: where they stand, and that no specification would have them so.
+Nodes of a YAML file: their lines, for messages, and a refusal of those that no specification needs.
 """
 
 import os
@@ -45,7 +45,7 @@ from pharos.study.blocks import (
 from pharos.system import mdp_files
 from pharos.system.sources import is_reference
 
-# So that every mistake is told at once, and aliases do not stand for millions of entries.
+# Limit that reports every mistake at once, and keeps aliases from standing for millions of entries
 MOST_NODES = 1_000_000
 Loc = tuple[int | str, ...]
 
@@ -88,7 +88,7 @@ def check_nodes(root: "yaml.Node", name: str) -> None:
     sizes: dict[int, int] = {}
 
     def size(node: "yaml.Node") -> int:
-        """How many nodes stand below this one, aliases written out."""
+        """Number of nodes of the tree from this one on, aliases written out."""
         if id(node) in sizes:
             if not sizes[id(node)]:
                 raise ParameterError(f"{name}:{node.start_mark.line + 1}: an alias stands within what it names")
@@ -168,9 +168,9 @@ def specification(
         return _validated(source, "specification", None, Path.cwd(), trust is not False, entries)
     if str(source) in presets():
         file = resources.files("pharos.study").joinpath("presets", f"{source}.yaml")
-        beside = None if environments is None else Path(environments).absolute().parent
+        folder = None if environments is None else Path(environments).absolute().parent
         text = file.read_text(encoding="utf-8")
-        return parse(text, f"preset {source}", folder=beside, trust=bool(trust), entries=entries)
+        return parse(text, f"preset {source}", folder=folder, trust=bool(trust), entries=entries)
     path = Path(source)
     if path.is_dir():
         path = path / STUDY_FILE
@@ -285,7 +285,7 @@ def parse(
 
 
 def _nodes_and_data(text: str, name: str) -> tuple["yaml.Node | None", Any]:
-    """The root of a text in YAML, and what it says; None for an empty one."""
+    """(root node, data) of a text in YAML; both None for an empty one."""
     try:
         root = yaml.compose(text, Loader)
         if root is not None:
@@ -330,24 +330,24 @@ def _validated(
 
 
 def _with_environments(data: Mapping[str, Any], name: str, entries: list[Any] | None) -> Mapping[str, Any]:
-    """With the given environments in blocks that ask for them.
+    """The data with the given environments in blocks that ask for them.
 
     Raises:
         ParameterError: some ask and none are given, or none asks.
     """
     blocks = data.get("blocks")
     listed = blocks if isinstance(blocks, list) else []
-    asking = [isinstance(block, Mapping) and block.get("environments") == GIVEN for block in listed]
-    if any(asking) and entries is None:
+    are_open = [isinstance(block, Mapping) and block.get("environments") == GIVEN for block in listed]
+    if any(are_open) and entries is None:
         raise ParameterError(f"{name}: has no environments of its own; give a list of them: --environments FILE")
     if entries is None:
         return data
-    if not any(asking):
+    if not any(are_open):
         raise ParameterError(
             f"{name}: has environments of its own; --environments is for blocks with `environments: given`"
         )
-    pairs = zip(listed, asking, strict=True)
-    return {**data, "blocks": [{**block, "environments": entries} if asks else block for block, asks in pairs]}
+    pairs = zip(listed, are_open, strict=True)
+    return {**data, "blocks": [{**block, "environments": entries} if is_open else block for block, is_open in pairs]}
 
 
 def _references(data: Mapping[str, Any]) -> Iterator[tuple[Loc, str]]:
@@ -363,27 +363,29 @@ def _references(data: Mapping[str, Any]) -> Iterator[tuple[Loc, str]]:
 
 
 def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
-    """What only the whole specification shows: names of agents and of hyperparameters, environments that cannot be
-    made."""
+    """Yield (path, message) for mistakes that only the whole specification shows: names of agents and of
+    hyperparameters, environments that cannot be made."""
     number = 0
     for agent in specification.defaults:
         if not _is_agent(agent):
             yield ("defaults", agent), str(UnknownName("agent", agent, AGENTS))
     for i, block in enumerate(specification.blocks):
         kinds = len(block.environments) * len(block.chance) * len(block.agents) * len(block.observations)
-        number += kinds * len(specification.said(block, "seeds"))
+        number += kinds * len(specification.option_of(block, "seeds"))
         if number > MOST_RUNS:
             yield ("blocks", i), f"{number:,} runs up to here; a study has at most {MOST_RUNS:,}"
             return
+        # Environments and the setting
         for j, entry in enumerate(block.environments):
             try:
                 _ = entry.instance
             except ParameterError as error:
                 yield ("blocks", i, "environments", j), str(error)
-        if specification.said(block, "horizon") == "none" and specification.said(block, "gamma") == 1:
+        if (specification.option_of(block, "horizon"), specification.option_of(block, "gamma")) == ("none", 1):
             yield ("blocks", i), "gamma is 1 and horizon is none, so values may be infinite; expected a gamma below 1"
-        said = specification.said(block, "engine")
-        for agent in said if isinstance(said, dict) else ():
+        # Agents and their engines
+        engine = specification.option_of(block, "engine")
+        for agent in engine if isinstance(engine, dict) else ():
             if not _is_agent(agent):
                 where: Loc = ("engine",) if block.engine is None else ("blocks", i, "engine")
                 yield where, str(UnknownName("agent", agent, AGENTS))
@@ -399,6 +401,7 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
                     )
             except ParameterError as error:
                 yield ("blocks", i, "agents", j), str(error)
+        # Hyperparameters
         for agent, own in block.hyperparameters.items():
             loc = ("blocks", i, "hyperparameters", agent)
             if agent not in block.agents:
@@ -412,7 +415,7 @@ def _is_agent(name: str) -> bool:
 
 
 def _messages(error: ValidationError, name: str, root: object) -> str:
-    said: dict[str, None] = {}
+    messages: dict[str, None] = {}  # in order, each once
     for problem in error.errors():
         loc = problem["loc"]
         if "hyperparameters" in loc and loc[-1] in ("str", "dict[str,any]"):
@@ -429,5 +432,5 @@ def _messages(error: ValidationError, name: str, root: object) -> str:
         else:
             expected = problem["msg"][0].lower() + problem["msg"][1:]
             message = f"{key}: found {problem['input']!r}; expected: {expected.removeprefix('input should be ')}"
-        said[f"{where(name, root, loc)}: {message}"] = None
-    return "; ".join(said)
+        messages[f"{where(name, root, loc)}: {message}"] = None
+    return "; ".join(messages)

@@ -7,7 +7,7 @@ resampled within each task.
 Source: Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice, section 4; computed
 through scipy.stats (the authors' library does not import beside pandas 3).
 
-Which states of a study's instances look alike, counted once and kept in its folder.
+Aliasing, the states of a study's instances that share an observation, counted once and kept in its folder.
 """
 
 import json
@@ -111,7 +111,7 @@ def profiles(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame":
 
 
 def improvements(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame":
-    """For each class and each two agents or observations: how probable it is that the first scores higher.
+    """Probability that the first of two agents or observations scores higher, for each class and each two of them.
 
     Args:
         runs: as from `table`.
@@ -140,7 +140,7 @@ def improvements(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame
 
 
 def _scores(part: "pd.DataFrame") -> dict[Any, np.ndarray]:
-    """Task -> scores of its runs."""
+    """Scores of the runs of each task."""
     defined = part[np.isfinite(part["normalized_regret"].to_numpy(float))]
     return {task: 1.0 - own["normalized_regret"].to_numpy(float) for task, own in defined.groupby(TASK, sort=True)}
 
@@ -177,7 +177,7 @@ def aliasing_table(
         if progress is not None:
             progress(f"states that share an observation: {', '.join(key)}")
         try:
-            count = _counted(folder, run.config)
+            count = _aliasing_of(folder, run.config)
         except PharosError:
             continue
         rows[key] = {"environment": run.cell["environment"], "instance": key[0], "observation": key[1]}
@@ -186,17 +186,17 @@ def aliasing_table(
     return pd.DataFrame(list(rows.values()), columns=columns)
 
 
-def with_aliasing(cells: "pd.DataFrame", counted: "pd.DataFrame") -> "pd.DataFrame":
+def with_aliasing(cells: "pd.DataFrame", counts: "pd.DataFrame") -> "pd.DataFrame":
     """Cells with `aliasing` beside their regret: the share of states whose observation another state has; NaN where it
     was not counted, 0 for the number of the state.
     """
-    shares = counted[["environment", "instance", "observation", "share"]].rename(columns={"share": "aliasing"})
+    shares = counts[["environment", "instance", "observation", "share"]].rename(columns={"share": "aliasing"})
     joined = cells.merge(shares.astype({"aliasing": float}), on=["environment", "instance", "observation"], how="left")
     joined.loc[joined["observation"] == TABULAR_OBSERVATION, "aliasing"] = 0.0
     return joined
 
 
-def _counted(folder: Path, config: Mapping[str, Any]) -> Aliasing:
+def _aliasing_of(folder: Path, config: Mapping[str, Any]) -> Aliasing:
     from pharos.observations import observe
     from pharos.state_space import build
     from pharos.study.batches import task_of

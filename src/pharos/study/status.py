@@ -1,6 +1,6 @@
-"""How far a study is, told by the files in its folder.
+"""Progress of a study, by the files in its folder.
 
-Code of the user's own in a study: what has changed since its runs were trained.
+Warnings of code of the user's own that has changed since the study's runs were trained.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ from pharos.training import read_record
 
 @dataclass(frozen=True)
 class Status:
-    """How far a study is.
+    """Progress of a study.
 
     Attributes:
         name, folder: of the study.
@@ -62,7 +62,7 @@ class Status:
         return self.total - self.finished - self.failed
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
+        """The attributes and `missing`, JSON-able."""
         return {**asdict(self), "missing": self.missing}
 
     def __str__(self) -> str:
@@ -82,7 +82,7 @@ class Status:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What the missing runs of a study will take.
+    """Forecast of the missing runs of a study.
 
     Attributes:
         runs, steps: how many are missing.
@@ -104,7 +104,7 @@ class Forecast:
 
 
 def duration(seconds: float) -> str:
-    """`40 s`, `12 min`, `3.5 h`."""
+    """A duration in words: `40 s`, `12 min`, `3.5 h`."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
@@ -117,7 +117,7 @@ def opened(
     trust: bool | None = None,
     environments: str | os.PathLike | None = None,
 ) -> tuple[Specification, Path]:
-    """A study and where its results are: `folder`; else the source, if it is a study's folder; else studies/NAME.
+    """A study and the folder of its results: `folder`; else the source, if it is a study's folder; else studies/NAME.
 
     Args:
         trust, environments: as for `specification`.
@@ -131,8 +131,9 @@ def opened(
 
 
 def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
-    """How far a study is, from its files; `remaining` is what its runners last said."""
+    """The progress of a study, from its files; `remaining` is the last estimate of its runners."""
     study, place = opened(source, folder)
+    # Records of runs that are over
     errors, damaged, finished = {}, {}, 0
     for run in study.runs:
         try:
@@ -143,14 +144,15 @@ def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
         if record is not None and record["status"] == _worker.FAILED:
             errors[run.id] = str(record.get("error"))
         finished += record is not None and record["status"] == _worker.FINISHED
+    # Status files of runners that are alive
     running, remaining = 0, None
     for file in sorted(place.glob("status*.json")):
         with contextlib.suppress(ValueError, OSError, KeyError, TypeError, OverflowError):
-            said = read_json(file)
-            if _lives(said):
-                running += said["running"]
-                if said["remaining"] is not None:
-                    remaining = max(remaining or 0.0, said["remaining"])
+            record = read_json(file)
+            if _is_alive(record):
+                running += record["running"]
+                if record["remaining"] is not None:
+                    remaining = max(remaining or 0.0, record["remaining"])
     return Status(
         name=study.name,
         folder=str(place),
@@ -164,18 +166,18 @@ def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
     )
 
 
-def _lives(said: Mapping[str, Any]) -> bool:
-    """Whether the runner that wrote a status file is there: told exactly on its own machine, by the file's age
-    elsewhere."""
-    if said["host"] != socket.gethostname():
-        return time.time() - said["updated"] < 60
+def _is_alive(record: Mapping[str, Any]) -> bool:
+    """Whether the runner that wrote a status file is alive: by the age of the file, and on its own machine by its
+    process."""
+    if record["host"] != socket.gethostname():
+        return time.time() - record["updated"] < 60
     try:
-        os.kill(said["process"], 0)
+        os.kill(record["process"], 0)
     except ProcessLookupError:
         return False
     except PermissionError:
         pass
-    return time.time() - said["updated"] < 60
+    return time.time() - record["updated"] < 60
 
 
 def claim(study: Specification, folder: Path) -> None:

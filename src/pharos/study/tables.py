@@ -41,7 +41,7 @@ WIDEST = 2
 # Part of the evaluations at the end over which the return is averaged
 LAST = 0.1
 NUMBERS = ("cumulative_regret", "normalized_regret", "final_value", "value_optimal", "value_uniform")
-"""What the result of a run says at least, numbers or null."""
+"""Entries that the result of every run has, numbers or null."""
 POINTS = ("step", "episodes", "value", "cumulative_expected_regret", "normalized_regret", "mean_return")
 DATE = "%Y-%m-%dT%H:%M:%SZ"
 # Numbers beyond this are no results, and no figure can hold them
@@ -50,7 +50,7 @@ LARGEST = 1e100
 
 @dataclass(frozen=True)
 class FinishedRuns:
-    """What is finished of a study.
+    """Finished runs of a study, as tables.
 
     Attributes:
         runs: a row for each run; see `table`.
@@ -93,7 +93,7 @@ def finished_runs(study: Specification, place: Path) -> FinishedRuns:
 
 
 def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
-    """One row a finished run; runs whose files are damaged are left out, with a warning that names them.
+    """Table of the finished runs, a row each; runs with damaged files are left out, with a warning that names them.
 
     Returns:
         Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`,
@@ -109,7 +109,7 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
 
 
 def curves(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
-    """One row an evaluation of a finished run: the columns of curve.parquet, and those that describe the run."""
+    """Table of the evaluations of finished runs, a row each: columns of curve.parquet, and of the run."""
     return _warned(finished_runs(*opened(source, folder))).points
 
 
@@ -144,7 +144,7 @@ def _result_of(record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _began(record: Mapping[str, Any]) -> str:
-    """When a run began, told by when its record was written and how long its program took; "": it does not say."""
+    """Date at which a run began: that of its record less the seconds of its program; "" where the record lacks it."""
     try:
         seconds = float(record.get("batch", {}).get("seconds") or record["seconds"])
         began = datetime.strptime(record["written"], DATE).replace(tzinfo=UTC) - timedelta(seconds=seconds)
@@ -154,7 +154,7 @@ def _began(record: Mapping[str, Any]) -> str:
 
 
 def _exactness(curve: "pd.DataFrame", row: Mapping[str, Any]) -> tuple[bool, float]:
-    """Whether a curve has no estimate; by how much its normalised regret may be wrong if every estimate errs alike."""
+    """(whether a curve has no estimate, the error of its normalised regret if all estimates err in one direction)."""
     if "exact" not in curve or bool(curve["exact"].all()) or "error_bound" not in curve:
         return bool("exact" not in curve or curve["exact"].all()), 0.0
     episodes = curve["episodes"].to_numpy(float)
@@ -209,7 +209,7 @@ def _last_return(curve: "pd.DataFrame") -> float:
 
 
 def described(run: Run) -> dict[str, Any]:
-    """What a run is of: the columns of tables that say so."""
+    """Columns of tables that describe a run: its cell, seed and steps."""
     return {**run.cell, "seed": run.config["seed"], "steps": run.config["steps"]}
 
 
@@ -249,12 +249,12 @@ def hardness_table(
         own = _measured(study, place, run.config)
         without = _measured(study, place, plain) if run.chance != "plain" else own
         rows[key] = {"environment": run.cell["environment"], "instance": run.instance, "chance": run.chance}
-        rows[key] |= _chosen(study.hardness.measures, own, without)
+        rows[key] |= _row_of_measures(study.hardness.measures, own, without)
     return pd.DataFrame(list(rows.values()))
 
 
 def hardness_cost(study: Specification, place: Path, tasks: Container[tuple[str, str]]) -> tuple[int, float]:
-    """How many instances and kinds of chance `hardness_table` has to measure, and the seconds that this takes at most.
+    """(number of tasks that `hardness_table` has to measure, the seconds that this takes at most).
 
     Building the state spaces comes on top.
     """
@@ -263,12 +263,13 @@ def hardness_cost(study: Specification, place: Path, tasks: Container[tuple[str,
         if (run.instance, run.chance) in tasks:
             for config in (run.config, {**run.config, "chance": PLAIN}):
                 cache, dependencies = ResultCache(place / "hardness"), _dependencies(study, config)
-                there = (cache.get(dependencies) or {"measures": {}})["measures"]
-                missing[cache.file(dependencies)] = sum(name not in there for name in study.hardness.measures)
+                stored = (cache.get(dependencies) or {"measures": {}})["measures"]
+                missing[cache.file(dependencies)] = sum(name not in stored for name in study.hardness.measures)
     return sum(number > 0 for number in missing.values()), sum(missing.values()) * study.hardness.budget
 
 
-def _chosen(names: Sequence[str], own: Mapping[str, Any], plain: Mapping[str, Any]) -> dict[str, Any]:
+def _row_of_measures(names: Sequence[str], own: Mapping[str, Any], plain: Mapping[str, Any]) -> dict[str, Any]:
+    """The measures of a task as columns: with chance where that is known, else without, which `notes` say."""
     row: dict[str, Any] = {"num_states": own.get("num_states") or plain.get("num_states")}
     notes = []
     for name in names:
@@ -285,14 +286,14 @@ def _chosen(names: Sequence[str], own: Mapping[str, Any], plain: Mapping[str, An
 
 
 def _usable(measure: dict[str, Any]) -> dict[str, Any]:
-    """The measure, or why it says too little: a proven interval that is too wide to be one number."""
+    """The measure, or the reason against it: a proven interval that is too wide to be one number."""
     if measure.get("value") is None or measure.get("exact", True) or measure["upper"] <= WIDEST * measure["lower"]:
         return measure
     return {"value": None, "why": f"only {measure['lower']:g} to {measure['upper']:g} is proven within the budget"}
 
 
 def _dependencies(study: Specification, config: Mapping[str, Any]) -> dict[str, Any]:
-    """What the measures of a run's task depend on."""
+    """Key of stored measures: what those of a run's task depend on."""
     dependencies = {name: config[name] for name in ("environment", "parameters", "chance", "horizon")}
     dependencies["gamma"] = study.hardness.gamma
     if "environment" in config.get("sources", {}):  # a class of the user's own, which may change
@@ -314,8 +315,8 @@ def _measured(study: Specification, place: Path, config: Mapping[str, Any]) -> d
 def _measure(
     study: Specification, config: Mapping[str, Any], names: Sequence[str], stored: dict[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What is kept with the measures added (value, lower, upper, exact; or why there is none); the same with those that
-    failed."""
+    """(stored measures with new ones added, the same with those that failed): value, lower, upper and exact of each, or
+    why there is none."""
     from pharos.hardness import report
 
     environment = make(config["environment"], **config["parameters"])
@@ -337,7 +338,7 @@ def _measure(
 def build_mdp(
     environment: str, parameters: Mapping[str, Any], chance: Mapping[str, float], gamma: float
 ) -> "TabularMDP":
-    """The tabular MDP that a run is about; its state space is built, or taken from the cache."""
+    """The tabular MDP of a run; its state space is built, or taken from the cache."""
     from pharos.state_space import build
 
     mdp = build(make(environment, **parameters), progress=False).mdp(gamma=gamma)
@@ -346,13 +347,13 @@ def build_mdp(
 
 def _number(value: Mapping[str, Any] | float | None, exact: bool) -> dict[str, Any]:
     """A measure as one positive number: itself, or the geometric mean of an interval with a finite upper end."""
-    said = value if isinstance(value, Mapping) else {"value": value}
-    exact = bool(said.get("exact", exact))
-    lower, upper, number = said.get("lower"), said.get("upper"), said.get("value")
+    entry = value if isinstance(value, Mapping) else {"value": value}
+    exact = bool(entry.get("exact", exact))
+    lower, upper, number = entry.get("lower"), entry.get("upper"), entry.get("value")
     why = "it is infinite or undefined"
     if lower is None or (upper is None and exact):
         lower = upper = number = None if number is None else float(number)
-    elif said.get("exact"):
+    elif entry.get("exact"):
         number = lower
     elif upper is not None and np.isfinite(upper):
         number = float(np.sqrt(lower * upper))
@@ -401,7 +402,7 @@ def predict(
     observations: Sequence[str] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> "pd.DataFrame":
-    """Return what is predicted of each cell of a study whose agent learns from observations: a row each.
+    """Return predictions for each cell of a study whose agent learns from observations: a row each.
 
     Args:
         source, folder: as for `run`; no run is looked at.

@@ -45,7 +45,7 @@ def read_status(folder: Path) -> str | None:
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
-    """What run.json of one run says; None where there is none.
+    """The record in run.json of a run; None where there is none.
 
     Raises:
         FileFormatError: it is not the record of a run that is over. ResultCorrupted: it, or the curve of a finished
@@ -79,7 +79,7 @@ def attempt(
     again: Container[str] = (),
     resume: bool = False,
 ) -> list[str]:
-    """Execute those of the runs that are not over: FINISHED, FAILED or BUSY (another process is at it) for each.
+    """Execute the runs that are not over; return FINISHED, FAILED or BUSY (held by another process) for each.
 
     A run that raises is FAILED: its error stands in run.json and its log; those in `again` are repeated. With `resume`
     the runner gets what an attempt that was killed left behind, else empty folders.
@@ -134,13 +134,13 @@ def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, P
 def run_alone(
     runner: Runner, configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], _: Path
 ) -> Sequence[str | None]:
-    """A runner of one run as one of batches, for `functools.partial`."""
+    """Call a runner of single runs with a batch of one; with `functools.partial` a BatchRunner."""
     runner(configs[0], folders[0])
     return [None]
 
 
 def write_failure(folder: Path, config: Mapping[str, Any], id: str, error: str, seconds: float) -> None:
-    """A run.json that says why there is no result."""
+    """Write a run.json that says why there is no result."""
     record = {"format": 1, "id": id, "config": dict(config), "status": FAILED, "error": error, "seconds": seconds}
     storage.replace_json(folder / "run.json", storage.sealed(record))
 
@@ -173,7 +173,7 @@ def _remove(path: Path) -> None:
 
 @contextlib.contextmanager
 def log(path: Path):
-    """What this process prints goes to a file."""
+    """Redirect the output of this process to a file."""
     sys.stdout.flush()
     sys.stderr.flush()
     saved = os.dup(1), os.dup(2)
@@ -217,7 +217,7 @@ def main(
 
 
 def use_one_thread() -> None:
-    """One thread for PyTorch, if it is loaded, and for Numba; a process per run keeps the processors busy."""
+    """Set one thread for PyTorch, if it is loaded, and for Numba; a process per run keeps the processors busy."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
     if "numba" in sys.modules:

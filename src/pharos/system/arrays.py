@@ -132,7 +132,7 @@ def blocks_of(indices: Indices) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def rows_of(indices: Indices, start: int, stop: int) -> Indices:
-    """Rows [start, stop), where they are: nothing is copied."""
+    """View of rows [start, stop): nothing is copied."""
     return indices.rows(start, stop) if isinstance(indices, PackedIndices) else indices[start:stop]
 
 

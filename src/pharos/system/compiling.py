@@ -38,7 +38,7 @@ def seconds() -> float:
 
 
 class Stopwatch:
-    """Seconds since it was made, of work and of compiling."""
+    """Stopwatch of work and of compiling, which counts from its creation on."""
 
     def __init__(self) -> None:
         self._began, self._compiled = time.perf_counter(), seconds()

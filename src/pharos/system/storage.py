@@ -210,7 +210,7 @@ def _host() -> str:
 
 
 def _is_alive(process: int) -> bool:
-    """Whether a process of this machine lives; True where that cannot be told."""
+    """Whether a process of this machine is alive; True where that is unknown."""
     if os.name == "nt":
         return True
     try:
@@ -312,7 +312,7 @@ def _flock(file: TextIO, folder: Path, error: type[PharosError], activity: str) 
 
 
 def has_no_locks(problem: OSError) -> bool:
-    """Whether a file system answers so that it has no locks."""
+    """Whether an error means that the file system has no locks."""
     return problem.errno in _UNSUPPORTED
 
 
@@ -477,13 +477,13 @@ def digest_of_file(path: str | os.PathLike, block_bytes: int = BLOCK_BYTES) -> s
 
 
 def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
-    """A record, as JSON has it, with the digest of all that it says under the key `digest`."""
+    """A record, as JSON has it, with the digest of its other entries under the key `digest`."""
     content = {key: value for key, value in plain(record).items() if key != DIGEST}
     return {**content, DIGEST: digest_of_json(content)}
 
 
 def is_intact(record: Mapping[str, Any]) -> bool:
-    """Whether a record says what it said when it was sealed.
+    """Whether a record is as it was when it was sealed.
 
     True for one without a digest, as older versions wrote them.
     """
@@ -492,7 +492,7 @@ def is_intact(record: Mapping[str, Any]) -> bool:
 
 
 class ResultCache:
-    """A folder of results, each sealed in a file that is named by a digest of all that it depends on."""
+    """A folder of results, each sealed in a file that is named by a digest of its dependencies."""
 
     def __init__(self, folder: Path):
         self.folder = folder

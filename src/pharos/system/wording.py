@@ -20,7 +20,7 @@ def in_words(name: str) -> str:
 
 
 def in_one_line(error: BaseException) -> str:
-    """An error as pharos says it, or with its type."""
+    """An error in one line, with its type unless it is one of pharos."""
     text = " ".join(str(error).split())
     return text if isinstance(error, PharosError) else f"{type(error).__name__}: {text}"
 

@@ -226,8 +226,7 @@ def without_interrupts() -> Iterator[None]:
 
 
 def end_with_parent() -> None:
-    """End this process when the one that started it is gone, however it went: cleanly, and if that takes long, at
-    once."""
+    """End this process when the one that started it is gone: by SIGTERM, and after CLEAN_SECONDS at once."""
     parent = multiprocessing.parent_process()
     if parent is None:
         return

@@ -68,7 +68,7 @@ def train_configs(
     device: str | None = None,
     lane: int | None = None,
 ) -> list[TrainingResult | FailedRun]:
-    """Train as each configuration says; those of the batched engine that fit together as one program.
+    """Train a run for each configuration; those of the batched engine that fit together train as one program.
 
     Args:
         folders: of the runs, one for each; None: nothing is written. Finished runs there are returned.
@@ -107,7 +107,7 @@ def _check_device(device: str) -> None:
 
 
 class TrainingJobs:
-    """The runs of one call, by their place among the configurations: which train alone, and which together.
+    """The runs of one call, by their place among the configurations, and their grouping into batches.
 
     Args:
         raises: whether errors of runs are raised, instead of being recorded as a FailedRun.
@@ -148,7 +148,7 @@ class TrainingJobs:
         return [self.results[place] for place in range(len(self.configs))]
 
     def fail(self, place: int, error: Exception) -> None:
-        """Record that a run could not begin; raise its error where `raises` is set."""
+        """Raise the error of a run that could not begin where `raises` is set, else record it as a FailedRun."""
         if self.raises:
             raise error
         config, folder = self.configs[place], self.folders[place]
@@ -275,6 +275,7 @@ class TrainingGroup:
                 failure = error
                 vars(self).pop("learner", None)
                 self._remove_checkpoint()
+        # One run alone has failed; several are tried again in halves
         if len(self.group) == 1:
             self._fail(failure)
             return
@@ -373,6 +374,7 @@ class TrainingGroup:
         count, before = sum(member.place is not None for member in self.group), self.jobs.done
         if not any(member.curve.rows for member in self.group):
             self._evaluate(0)
+        # Steps of the evaluations to come, after those of a checkpoint
         start = max(member.curve.rows[-1]["step"] for member in self.group if member.curve.rows)
         points = [point for point in [*range(interval, steps, interval), steps] if point > start]
 

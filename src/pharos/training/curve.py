@@ -329,6 +329,7 @@ def bootstrap_interval(
         )
     if not all(np.isfinite(array).all() for array in arrays):
         raise ParameterError("a bootstrap needs finite results; found NaN or infinity")
+    # SciPy resamples samples of several observations; those of one stay as they are
     varying = [array for array in arrays if array.shape[-1] > 1]
     if not varying:
         value = np.asarray(statistic(*arrays, axis=-1))

@@ -110,7 +110,7 @@ class TaskCache:
         self.shared: dict[str, Any] = {}
 
     def task(self, config: RunConfig) -> Task:
-        """The task of a run, the same object for all that have it; spaces and rewards are those of other tasks."""
+        """The task of a run, the same object for all runs on it; tasks share spaces and rewards."""
         return self._once("task", config, TASK, lambda: self._task(config))
 
     def adopt(self, config: RunConfig, task: Task) -> None:
@@ -129,7 +129,7 @@ class TaskCache:
         return self._once("world", config, WORLD, lambda: (task.space, task.space.mdp(gamma=task.gamma)))
 
     def member(self, place: int | None, config: RunConfig, folder: Path | None, *, is_alone: bool = False) -> Member:
-        """A run, ready to be grouped.
+        """A run as a member of a batch, with its task and its key.
 
         Raises:
             ParameterError: a hyperparameter is wrong, or the engine lacks it.
@@ -297,7 +297,7 @@ class Tables(_Arrays):
         return self.tables[i]
 
     def greedy_actions(self, places: Sequence[int]) -> dict[int, np.ndarray]:
-        """(S,) actions; runs that look back at the previous action are left out."""
+        """(S,) greedy actions by place; runs whose policy depends on the previous action are left out."""
         tables = {i: self.tables[i].policy_table() for i in places}
         return {i: table for i, table in tables.items() if table.ndim == 1}
 

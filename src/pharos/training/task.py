@@ -412,7 +412,7 @@ class RunConfig(TrainingOptions):
 
     @property
     def definitions(self) -> tuple[Any, ...]:
-        """The registered class of its environment, and what its observation was registered with, where they are."""
+        """The registered class of the environment, and the registration of the observation, where there are any."""
         return (class_called(self.environment), *(registered(self.observation) or ()))
 
     def algorithm(self, *, trust: bool = False, strict: bool = False) -> "str | type":

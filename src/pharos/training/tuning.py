@@ -165,6 +165,7 @@ def tune(  # noqa: PLR0913
         raise ParameterError(f"{len(seeds)} seeds and {trials} trials; expected at least one of each")
     if shortlist < 1 or (shortlist > 1 and predicted is None):
         raise ParameterError(f"shortlist is {shortlist}; expected at least 1, and `predicted` where it is more")
+    # What is searched
     search = _Search(
         agent=agent,
         instances=instances,
@@ -183,6 +184,7 @@ def tune(  # noqa: PLR0913
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
             held.enter_context(storage.lock(folder, FolderLocked, "tuning"))
+        # Trials one by one, after those that the folder holds
         records = [] if folder is None else _earlier_trials(optuna, search, folder)
         search.check_tasks()
         study = _study(optuna, search, records)
@@ -248,7 +250,7 @@ class _Search:
 
     @cached_property
     def table(self) -> dict[str, Any]:
-        """Hyperparameters of the library: of the first trial, and of every trial for what is not searched."""
+        """Hyperparameters without the search: those of the first trial, and of every trial where none is searched."""
         return hyperparameters_of(self.agent, self.environment, self.observation_name)
 
     @cached_property
@@ -289,6 +291,7 @@ class _Search:
         interval = max(1, self.steps // EVALUATIONS)
         configs: list[RunConfig] = []
         regrets: list[float] = []
+        # A run for each task and seed
         for seed, task in product(self.seeds, self.tasks):
             config = RunConfig.of_task(
                 task,
@@ -308,6 +311,7 @@ class _Search:
             if trial.should_prune():
                 raise pruned
 
+        # Train them, reporting means on the way
         for group in [configs] if self.engine == "batched" else [[config] for config in configs]:
             for end in train_configs(group, progress=progress, members=self.members):
                 if isinstance(end, FailedRun):
@@ -359,7 +363,7 @@ def _allows(choices: tuple[Any, ...], value: object) -> bool:
 
 
 def _study(optuna: ModuleType, search: _Search, records: Sequence[Mapping[str, Any]]) -> "optuna.Study":
-    """Optuna's study with the trials that are over; its first trial is what the table says."""
+    """Optuna's study with the trials that are over; its first trial has the hyperparameters of the table."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # what fails is raised
     pruner = optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=10)
     study = optuna.create_study(pruner=pruner, direction="minimize")

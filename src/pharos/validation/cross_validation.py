@@ -188,7 +188,7 @@ def p_of(value: float, permuted: np.ndarray) -> float:
 
 
 def ceiling(means: np.ndarray, noise: np.ndarray, classes: np.ndarray) -> float:
-    """The largest R2 that anything could have, as the mean of a cell's seeds is not its expectation.
+    """The largest R2 that a predictor can reach, as the mean of a cell's seeds is not its expectation.
 
         1 - mean of noise / variance of the cells' means, classes weighing alike
 

@@ -57,6 +57,7 @@ def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
 
     numbers: dict[str, Any] = dict.fromkeys(PREDICTORS, math.nan)
     row = {**numbers, "network": "", "estimated_error": math.nan, "curve": "", "adam_curve": "", "notes": ""}
+    # Measures of the kernel of the run's network, and of the learners with it
     try:
         task = RunConfig.from_dict(config).task(trust=True, strict=True)
         name, initialisation = network_of(config, task)
@@ -71,6 +72,7 @@ def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
             row |= _of_walks(_sampled(config, task.mdp, options).value)
     except PharosError as error:
         return {**row, "notes": str(error)}
+    # Their values as columns
     row |= {"num_states": float(task.mdp.num_states), "network": f"{name}, {initialisation}"}
     regret = measures["kernel_regret"].value
     if regret is not None:

@@ -307,6 +307,7 @@ def predict(
     parameters = {name: value for name, value in options.items() if name not in TAKEN}
     env, chance = Task.of(environment, parameters).env, training.chance
     width, cells, states, overrides = calibration.half_width(), [], 0, dict(training.hyperparameters or {})
+    # A cell for each observation and network
     for name, view in _observations(observations):
         task = Task.of(env, chance=chance, observation=name, observation_options=view, horizon=training.horizon)
         states = _checked_states(task.space.num_states, env)
@@ -436,7 +437,7 @@ Predictions: TypeAlias = "tuple[pd.DataFrame, Mapping[str, str]]"
 
 
 class NamedStudy(Protocol):
-    """A study, as far as its predictions name it."""
+    """A study by its name, which files of predictions keep."""
 
     @property
     def name(self) -> str: ...

@@ -1,8 +1,8 @@
 """The report of a study: one HTML file that needs nothing else, its figures as PNG and PDF, its tables as CSV and
 LaTeX.
 
-results.py    everything a report is made of, read and computed once: `Results`
-sections.py   what each section says; a section that has nothing to say is left out
+results.py    the data of a report, read and computed once: `Results`
+sections.py   the content of each section; empty ones are left out
 page.py       the HTML page, by the templates beside it
 files.py      the tables, and `report`, which writes it all
 """

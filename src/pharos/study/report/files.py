@@ -1,4 +1,4 @@
-"""Makes a report: the page, the figures and the tables."""
+"""Report of a study: writes the page, the figures and the tables."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +27,7 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 @dataclass(frozen=True)
 class StudyReport:
-    """What was written.
+    """Files of a report, and notes on it.
 
     Attributes:
         html: the file to open.
@@ -73,6 +73,7 @@ def report(
     results = results_of(study, place, tell)
     target = Path(out) if out is not None else place / "report"
     target.mkdir(parents=True, exist_ok=True)
+    # Figures of the results
     figures: dict[str, dict[str, bytes] | None] = {}
     curves = all_curves(results.points, results.profiles)
     for name, draw in all_figures(curves, results.cells, results.models, results.agents).items():
@@ -80,6 +81,7 @@ def report(
         images = figures[name] = save_for_page(draw, target / "figures" / name)
         if images and name in curves:
             images["curves"] = curves[name].to_json().encode()
+    # Predictors on classes left out, with their figures and tables
     tell("leaving out classes")
     judgement, outcomes = judged(results, predicted)
     more = {"outcomes": outcomes}
@@ -90,6 +92,7 @@ def report(
     if judgement is not None:
         more["predictions" if predicted is not None else "unseen_classes"] = judgement
     tables = _write_tables(target / "tables", results, more)
+    # The page
     tell("drawing instances")
     sections = sections_of(results, figures)
     if judgement is not None:
@@ -97,11 +100,11 @@ def report(
         sections.insert(models + 1, unseen_section(judgement, results, predicted, figures))
     page = render(f"Study {study.name}", study.description, sections)
     replace_file(target / "report.html", page)
-    drawn = [
+    image_files = [
         target / "figures" / f"{name}.{kind}" for name, images in figures.items() if images for kind in ("png", "pdf")
     ]
     notes = [*results.notes, *(doubts(results, predicted) if predicted is not None else ())]
-    return StudyReport(target / "report.html", drawn, tables, notes)
+    return StudyReport(target / "report.html", image_files, tables, notes)
 
 
 def _write_tables(folder: Path, results: Results, more: "Mapping[str, pd.DataFrame]") -> list[Path]:
@@ -135,7 +138,7 @@ def spreadsheet_safe(data: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def _no_formula(value: object) -> object:
-    """Text that a spreadsheet would run gets an apostrophe, which spreadsheets take for "this is text"."""
+    """A value, with an apostrophe before text that a spreadsheet would run: it marks text."""
     if not isinstance(value, str) or not value.startswith(FORMULA):
         return value
     try:

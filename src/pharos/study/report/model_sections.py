@@ -53,16 +53,16 @@ def _models_of(models: Models, results: Results, figures: Figures) -> dict[str, 
         "classes that the model has not seen": models.leave_one_class_out,
     }
     suffix = models.suffix(results.models[0].agent)
-    drawn = []
+    images = []
     for kind, number in (("single_model", 4), ("representation_models", 5), ("class_models", 6)):
         text = f"Fitted against actual {what}, {kind.replace('_', ' ')}."
         text += f" The paper's figure {number}." if paper else ""
-        drawn.append(image(figures, f"{kind}_{models.regret.removesuffix('_regret')}{suffix}", text))
+        images.append(image(figures, f"{kind}_{models.regret.removesuffix('_regret')}{suffix}", text))
     return {
         "title": heading,
         "table": table(fits, caption) if models.fits else None,
         "together": [f"R² of {name}: {value:.2f}" for name, value in values.items() if value is not None],
-        "figures": [each for each in drawn if each is not None],
+        "figures": [each for each in images if each is not None],
         "coefficients": table(coefficients(models), digits=4) if models.fits else None,
         "notes": list(models.notes),
     }
@@ -95,7 +95,7 @@ def _predictor(name: str) -> str:
 
 def agreement_section(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
     """The correlation of agents over cells; None where too few are common: `left_out` says so."""
-    lines, drawn = [], []
+    lines, images = [], []
     for i, one in enumerate(results.agents):
         for two in results.agents[i + 1 :]:
             for value in ("return", "normalized_regret", "cumulative_regret"):
@@ -103,7 +103,7 @@ def agreement_section(results: Results, figures: Figures, left_out: list[str]) -
                     names = f"{agent_name(one)} and {agent_name(two)}, {REGRETS.get(value, value)}"
                     lines.append(f"{names}: r = {pair[0]:.2f} over {pluralize(pair[1], 'cell')}")
             caption = f"Normalised regret of {agent_name(two)} against that of {agent_name(one)}."
-            drawn.append(image(figures, agents_figure(one, two), caption))
+            images.append(image(figures, agents_figure(one, two), caption))
     if not lines:
         left_out.append(
             "Agreement of agents: there are fewer than three cells that both DQN and PPO have, or two other agents."
@@ -118,7 +118,7 @@ def agreement_section(results: Results, figures: Figures, left_out: list[str]) -
         "agreement",
         text=text + ".",
         lines=lines,
-        figures=[each for each in drawn if each is not None],
+        figures=[each for each in images if each is not None],
     )
 
 
@@ -153,7 +153,7 @@ def unseen_section(
     predictions: "PredictedCells | None",
     figures: Figures,
 ) -> Section:
-    """What came true of predictors on classes, MDPs and observations; baselines beside."""
+    """The section on predictors of unseen classes, MDPs and observations: how well they predict, with baselines."""
     parts = []
     for agent in dict.fromkeys(judgement["agent"]):
         for outcome in dict.fromkeys(judgement["outcome"]):
@@ -165,7 +165,7 @@ def unseen_section(
         "Unseen classes",
         "unseen",
         text=_text(judgement),
-        said=_said(results, predictions),
+        provenance=_provenance(results, predictions),
         parts=parts,
     )
 
@@ -193,14 +193,14 @@ def winners(judgement: "pd.DataFrame") -> list[str]:
             for is_baseline, some in rows.dropna(subset="r_squared").groupby("baseline")
         }
         if best:
-            said = [f"{best[key]['predictor']} (R² {best[key]['r_squared']:.2f})" for key in sorted(best)]
-            beside = f"; of the baselines {said[1]}" if len(said) > 1 else ""
-            sentences.append(f"{agent_name(str(agent))}: on classes left out {said[0]} predicts best{beside}.")
+            texts = [f"{best[key]['predictor']} (R² {best[key]['r_squared']:.2f})" for key in sorted(best)]
+            baseline = f"; of the baselines {texts[1]}" if len(texts) > 1 else ""
+            sentences.append(f"{agent_name(str(agent))}: on classes left out {texts[0]} predicts best{baseline}.")
     return sentences
 
 
-def _said(results: Results, predictions: "PredictedCells | None") -> list[str]:
-    """What files of predictions say of themselves, and whether they came first."""
+def _provenance(results: Results, predictions: "PredictedCells | None") -> list[str]:
+    """Date, version and hash of files of predictions, and whether they were written before the runs; a line each."""
     if predictions is None:
         return ["Without predictions (pharos study predict), of tabular measures alone."]
     lines = [
@@ -211,7 +211,7 @@ def _said(results: Results, predictions: "PredictedCells | None") -> list[str]:
 
 
 def doubts(results: Results, predictions: "PredictedCells") -> list[str]:
-    """Why predictions may be none: runs that had begun when they were written, or that do not say when they were."""
+    """Reasons to doubt predictions: runs that began before these were written, or that do not say when they began."""
     before, unknown = predictions.late(results.runs)
     total, reasons = f"of {pluralize(len(results.runs), 'run')}", []
     if before:
@@ -224,7 +224,7 @@ def doubts(results: Results, predictions: "PredictedCells") -> list[str]:
 def _part(agent: str, outcome: str, rows: "pd.DataFrame", figures: Figures) -> dict[str, Any]:
     from pharos.validation import OUTCOMES
 
-    drawn = []
+    images = []
     if outcome == "greedy":
         texts = {
             "predicted_by_class": "Regret against what was predicted for it when its class was left out; a point a "
@@ -235,11 +235,11 @@ def _part(agent: str, outcome: str, rows: "pd.DataFrame", figures: Figures) -> d
             "seeds; of actor-critics the distribution over actions) and of the greedy policy of the idealised learner "
             "(dashed), which was never trained.",
         }
-        drawn = [image(figures, f"{name}_{slug(agent)}", text) for name, text in texts.items()]
+        images = [image(figures, f"{name}_{slug(agent)}", text) for name, text in texts.items()]
     return {
         "title": f"{agent_name(agent)}: {OUTCOMES[outcome]}",
         "tables": [each for each in (_left_out(rows), _within(rows), _mixed(rows)) if each is not None],
-        "figures": [each for each in drawn if each is not None],
+        "figures": [each for each in images if each is not None],
     }
 
 

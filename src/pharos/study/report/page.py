@@ -30,7 +30,7 @@ class Section:
 
     @property
     def anchor(self) -> str:
-        """Where links lead to."""
+        """The anchor of the section, which links lead to."""
         return self.title.lower().replace(" ", "-")
 
     def __getitem__(self, name: str) -> object:
@@ -61,7 +61,7 @@ class ReportTable:
 class Image:
     """A figure for light and for dark pages, as data URLs; its name is that of its file.
 
-    `curves` is what its lines are made of, as JSON; the page draws them anew, to be pointed at. Empty for others.
+    `curves` has the numbers of its lines, as JSON: the page draws them anew, to be pointed at. Empty for other figures.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Image:
 
 
 def render(title: str, description: str, sections: Sequence[Section]) -> str:
-    """The page as text."""
+    """The HTML of the page."""
     page = templates("pharos.study.report", "the report of a study")
     script = page.get_template("page.js.j2").render()
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -83,11 +83,11 @@ def render(title: str, description: str, sections: Sequence[Section]) -> str:
 
 def image(figures: Figures, name: str, caption: str) -> Image | None:
     """A figure with its caption; None where it was not drawn."""
-    drawn = figures.get(name)
-    if not drawn:
+    images = figures.get(name)
+    if not images:
         return None
-    curves = drawn.get("curves", b"").decode()
-    return Image(name, caption, data_url(drawn["light"]), data_url(drawn["dark"]), curves)
+    curves = images.get("curves", b"").decode()
+    return Image(name, caption, data_url(images["light"]), data_url(images["dark"]), curves)
 
 
 def data_url(png: bytes) -> str:
@@ -96,7 +96,7 @@ def data_url(png: bytes) -> str:
 
 
 def table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> ReportTable:
-    """A frame as a table: numbers short and to the right, whole ones without digits; no column that says nothing."""
+    """A frame as a table: numbers short and to the right, whole ones without digits; empty columns are left out."""
     data = data[[name for name in data.columns if len(data) == 0 or not (data[name] == "").all()]]
     columns, digits_of = [], []
     for name in data.columns:

@@ -1,4 +1,4 @@
-"""Everything that a report is made of, in one object."""
+"""Results of a study, read and computed once, from which its report is made."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,10 +21,10 @@ PAPER_AGENTS = ("dqn", "ppo")
 
 @dataclass(frozen=True)
 class Results:
-    """What is known of a study.
+    """Results of a study: tables of its runs, and the statistics of its report.
 
     Attributes:
-        study, status: what was to be run, and how far it is.
+        study, status: its specification, and its progress.
         runs, points: a row for each finished run, and for each of its evaluations.
         damaged: what is wrong with results that cannot be read, by id.
         hardness: a row for each instance and kind of chance that has finished runs.
@@ -59,7 +59,7 @@ class Results:
 
     @property
     def notes(self) -> list[str]:
-        """What is left out of the report, and why."""
+        """Notes on what is left out of the report, and why."""
         notes = list(self.damaged.values())
         if not self.agents:
             notes.append(f"{_listed(self.runs)} the index of the state: models are of agents that see observations")
@@ -76,7 +76,7 @@ class Results:
 
 
 def results_of(study: Specification, place: Path, progress: Callable[[str], None] = lambda _: None) -> Results:
-    """Read the results of a study, and compute what its report says of them.
+    """Read the results of a study, and compute the statistics of its report.
 
     Only instances and kinds of chance that have finished runs are measured.
 
@@ -85,6 +85,7 @@ def results_of(study: Specification, place: Path, progress: Callable[[str], None
     """
     progress("reading results")
     done = finished_runs(study, place)
+    # Tasks with finished runs, their hardness and aliasing
     tasks = set(zip(done.runs["instance"], done.runs["chance"], strict=True))
     number, seconds = hardness_cost(study, place, tasks)
     if number:
@@ -93,6 +94,7 @@ def results_of(study: Specification, place: Path, progress: Callable[[str], None
     sizes = dict(zip(hardness["instance"], hardness["num_states"].astype(float), strict=True))
     aliasing = aliasing_table(study, place, sizes, progress)
     table = with_aliasing(cells(done.runs, hardness), aliasing)
+    # Models of regret, for each agent and kind of regret
     progress("fitting models")
     agents = observing_agents(done.runs) or [PAPER_AGENTS[0]]
     fitted = [
@@ -120,7 +122,7 @@ def results_of(study: Specification, place: Path, progress: Callable[[str], None
 
 
 def _listed(runs: "pd.DataFrame") -> str:
-    """Whom a study without observations has: "q_learning sees", "q_learning and sarsa see"."""
+    """Agents of a study without observations, and their verb: "q_learning sees", "q_learning and sarsa see"."""
     names = sorted(runs["agent"].unique())
     return f"{' and '.join(names)} {'sees' if len(names) == 1 else 'see'}"
 

@@ -1,4 +1,4 @@
-"""What each section of the page says; None where it has nothing to say. Texts only: the templates make HTML of them."""
+"""Contents of the sections of the page; None for an empty one. Texts only: the templates make HTML of them."""
 
 import io
 import platform
@@ -28,7 +28,7 @@ PICTURE_PIXELS = 220
 
 
 def sections_of(results: Results, figures: Figures) -> list[Section]:
-    """The sections of the page, in order; those that have something to say."""
+    """The sections of the page in order, without empty ones."""
     left_out: list[str] = []
     sections = [
         _summary(results),
@@ -41,10 +41,10 @@ def sections_of(results: Results, figures: Figures) -> list[Section]:
         agreement_section(results, figures, left_out),
         _hardness(results),
         _returns(results),
-        _beside(results),
+        _paper_comparison(results),
         _instances(results.study),
         _each_instance(results, figures),
-        _made(results, left_out),
+        _provenance(results, left_out),
     ]
     return [section for section in sections if section is not None]
 
@@ -82,7 +82,7 @@ def _summary(results: Results) -> Section:
 
 
 def _estimated(runs: "pd.DataFrame") -> str | None:
-    """Which regret is an estimate, and how wrong it may be."""
+    """Sentences on the regret that is estimated, and how wrong it may be; None where all regret is exact."""
     estimates = runs[~runs["exact"].astype(bool)]
     if len(estimates) == 0:
         return None
@@ -149,7 +149,7 @@ def _regret(results: Results, figures: Figures) -> Section:
 
 
 def _profiles(results: Results, figures: Figures) -> Section | None:
-    """Where there is more than one agent or observation to compare."""
+    """Profiles and improvements; None where there is but one agent and observation."""
     if len(results.improvements) == 0:
         return None
     shown = results.improvements.assign(
@@ -234,9 +234,9 @@ def _aliasing(results: Results) -> Section | None:
 
 
 def _hardness(results: Results) -> Section:
-    counted = results.aliasing
+    aliasing = results.aliasing
     complete = ""
-    if len(counted) and not (counted["share"] > 0).any():
+    if len(aliasing) and not (aliasing["share"] > 0).any():
         complete = "No two states share an observation, on any instance and for any observation that was counted."
     return Section(
         "Hardness of the instances",
@@ -265,8 +265,8 @@ def _return(row: Mapping[str, Any]) -> str:
     return f"{row['return']:.2f}" + (f" ± {row['return_deviation']:.2f}" if row["seeds"] > 1 else "")
 
 
-def _beside(results: Results) -> Section | None:
-    """Our numbers beside those of the paper, where there are both."""
+def _paper_comparison(results: Results) -> Section | None:
+    """Our numbers beside those of the paper; None where no number is in both."""
     if results.comparison is None:
         return None
     ours = [name for name in results.comparison.regressions.columns if name.startswith("ours_")]
@@ -328,16 +328,16 @@ def _each_instance(results: Results, figures: Figures) -> Section:
             f"Cumulative regret on each instance of {in_words(environment)} under each kind of chance: the mean, its "
             "95 % bootstrap interval, and thin a line for each seed."
         )
-        drawn = image(figures, f"regret_by_task_{slug(environment)}", caption)
-        parts.append({"title": f"{in_words(environment)}, each kind of chance and each seed", "figure": drawn})
+        figure = image(figures, f"regret_by_task_{slug(environment)}", caption)
+        parts.append({"title": f"{in_words(environment)}, each kind of chance and each seed", "figure": figure})
     text = "Cumulative regret on each instance, all kinds of chance together."
     return Section("Each instance", "each_instance", figure=image(figures, "regret_by_instance", text), parts=parts)
 
 
-def _made(results: Results, left_out: Sequence[str]) -> Section:
+def _provenance(results: Results, left_out: Sequence[str]) -> Section:
     import pharos
 
-    made = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
-    facts = f"pharos {pharos.__version__}, Python {platform.python_version()}, {made} UTC"
+    date = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
+    facts = f"pharos {pharos.__version__}, Python {platform.python_version()}, {date} UTC"
     text = results.study.to_yaml()
     return Section("How it was made", "made", facts=facts, left_out=list(left_out), specification=text)
