@@ -440,8 +440,8 @@ def test_a_report_has_them_where_there_is_a_representation_and_keeps_them(grid):
     assert again["kernel_regret"].value == json.loads(json.dumps(first["kernel_regret"].value))
     other = hardness.report(mdp, chosen, representation=representation(grid, "one_hot", "mlp16"), schedule=SHORT)
     assert [name for name in chosen if other[name].kept] == ["minimal_gap"]
-    assert {"kernel_regret", "aliasing_floor"} <= {measure.name for measure in hardness.chosen(None, True)}
-    assert "kernel_regret" not in {measure.name for measure in hardness.chosen(None)}
+    assert {"kernel_regret", "aliasing_floor"} <= {measure.name for measure in hardness.selected_measures(None, True)}
+    assert "kernel_regret" not in {measure.name for measure in hardness.selected_measures(None)}
     assert (
         hardness.report(mdp, "minimal_gap").to_dict()["conventions"].keys().isdisjoint({"representation", "schedule"})
     )

@@ -72,9 +72,9 @@ def hardness(
     """
     needs_rewards = True
     if measures is not None:
-        from pharos.hardness import chosen
+        from pharos.hardness import selected_measures
 
-        wanted = chosen(measures)  # an unknown name is told before anything is built
+        wanted = selected_measures(measures)  # an unknown name is told before anything is built
         needs_rewards = any(each.depends != "structure" for each in wanted)
     of_network = {"network": network, "initialisation": initialisation, "optimizer": optimizer, "landmarks": landmarks}
     useless = [name for name, value in {"option": option or None, **of_network}.items() if value is not None]

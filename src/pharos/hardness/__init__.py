@@ -1,8 +1,8 @@
-"""How hard an MDP is to learn: how long it takes to get around, to tell actions apart, and to look ahead.
+"""Hardness measures of MDPs: how long it takes to get around, to tell actions apart, and to look ahead.
 
 Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation complexity: `gaps`,
 `sum_of_reciprocal_gaps`, `minimal_gap`, `environmental_value_norm`. Planning: `effective_horizon`. All of them:
-`report`; one of your own: `register`.
+`report`; `register` adds your own.
 """
 
 from pharos.hardness.diameter import (
@@ -29,7 +29,7 @@ from pharos.hardness.kernel_regret import (
     kernel_regret,
     kernel_sample_complexity,
 )
-from pharos.hardness.registry import Measure, Problem, chosen, measures, register
+from pharos.hardness.registry import Measure, Problem, measures, register, selected_measures
 from pharos.hardness.report import Report, Result, report
 from pharos.hardness.representation import LearningCurve, Representation, Rollouts, Schedule
 from pharos.hardness.sampled_regret import SampledRegret, Sampling, sampled_regret

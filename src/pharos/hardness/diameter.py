@@ -7,7 +7,7 @@ where it does not close (Then et al. 2014), and an argument of ours for spaces t
 The diameter as Colosseum defines it for episodes of a fixed length. Source: Conserva and Rauber (2022).
 
 Where searches do not fit in memory (`LeanSweep`): two bytes a node and bound, and the table read in order. The
-algorithm is that of sum_sweep.py, without what needs room for more. Distances come from sweeps over the table
+algorithm is that of sum_sweep.py, without the parts that need more memory. Distances come from sweeps over the table
 (kernels/graph.py) in place of searches with a queue and a reversed graph, which takes 8 bytes an edge. Arrays that
 memory has no room for are mapped files; bounds may be in files that outlive the process, of which the search in
 progress is all that is lost.
@@ -149,9 +149,9 @@ def start_eccentricity_interval(
             num_starts = pluralize(len(starts), "start state")
             note = f"budget spent after the searches from {spending.searches} of {num_starts}"
             break
-        reached, largest, _ = graph.search_forward(int(start), distance)
+        num_reached, largest, _ = graph.search_forward(int(start), distance)
         spending.searches += 1
-        if reached < graph.num_nodes:
+        if num_reached < graph.num_nodes:
             infinite = True
             break
         mean += weight * distance
@@ -272,7 +272,7 @@ class KeptBounds:
     """The bounds of one graph in a folder: `bounds.npy` (4, N), and `bounds.json`, which says of which graph.
 
     Attributes:
-        dtype: of the bounds that are there, or None: there are none yet.
+        dtype: of the existing bounds, or None: there are none yet.
     """
 
     def __init__(self, folder: Path, graph: Graph):
@@ -295,7 +295,7 @@ class KeptBounds:
         self.dtype = np.dtype(np.int16 if record.get("bytes") == 2 else np.int32)
 
     def arrays(self, dtype: np.dtype) -> np.ndarray:
-        """(4, N): lower bounds on out(v) and in(v), then upper ones; what is there, or 0 and the largest number.
+        """(4, N): lower bounds on out(v) and in(v), then upper ones; those of the file, or 0 and the largest number.
 
         The record is written once these are on the disk: after a power failure a file may hold what it held before.
         """
@@ -316,13 +316,13 @@ class KeptBounds:
         return bounds
 
     def remove(self) -> None:
-        """The diameter is known: the files are not needed any more."""
+        """Delete the files, once the diameter is known."""
         for name in (_RECORD, _FILE):
             (self._folder / name).unlink(missing_ok=True)
 
 
 def digest_of(graph: Graph) -> str:
-    """What distances depend on: the table, which states end, and where these lead."""
+    """Digest of all that distances depend on: the table, the states that end, and the state to which these lead."""
     digest = xxhash.xxh3_128(f"{graph.next_states.shape} {graph.start} {graph.has_end}".encode())
     for rows in (graph.next_states, graph.ends):
         for start in range(0, len(rows), _BLOCK):
@@ -345,7 +345,7 @@ def needs_more_than_memory(graph: Graph) -> bool:
 def lean_diameter(graph: Graph, spending: BudgetClock, folder: str | os.PathLike | None = None) -> Interval:
     """The diameter, or the interval proven within the budget.
 
-    folder: where bounds are kept while they are tightened, and gone on from; None: in memory.
+    folder: where bounds are kept, and from which tightening goes on; None: in memory.
     """
     store = None if folder is None else KeptBounds(Path(folder), graph)
 
@@ -392,14 +392,14 @@ class LeanGraph:
         self.dtype, self.far = dtype, int(np.iinfo(dtype).max)
 
     def search_forward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
-        """distance[v] = d(source, v), `far` where there is no way; (nodes found, largest distance, sum of distances).
+        """Set distance[v] to d(source, v), or `far`; return (nodes found, largest distance, sum of distances).
 
         OverflowError where a distance does not fit.
         """
         return self._swept(kernels.lower_forward, source, distance, False)
 
     def search_backward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
-        """distance[v] = d(v, source); returns and raises as `search_forward`."""
+        """Set distance[v] to d(v, source); returns and raises as `search_forward`."""
         return self._swept(kernels.lower_backward, source, distance, True)
 
     def _swept(
@@ -419,7 +419,7 @@ class LeanGraph:
         return int(reach), int(largest), int(total)
 
     def _through_end(self, distance: np.ndarray, backward: bool) -> int:
-        """The one edge that is in no row: from the end to the start; whether it lowers a distance."""
+        """Follow the edge from the end to the start, which is in no row; return whether it lowers a distance."""
         if not self.has_end or self.start < 0:
             return 0
         here, there = (self.start, self.num_nodes - 1) if backward else (self.num_nodes - 1, self.start)
@@ -433,7 +433,7 @@ class LeanSweep(SumSweep):
     """`SumSweep` on a graph that is searched by sweeps, in little memory."""
 
     def __init__(self, graph: LeanGraph, spending: BudgetClock, store: KeptBounds | None = None):
-        """store: where the bounds are; None: in memory."""
+        """store: of the bounds, in files; None: in memory."""
         self.graph: Any = graph
         self.spending = spending
         size, dtype = graph.num_nodes, graph.dtype
@@ -450,7 +450,7 @@ class LeanSweep(SumSweep):
         self.method = "directed ExactSumSweep, by sweeps over the table"
 
     def interval(self) -> Interval:
-        """The diameter, or what is proven of it. OverflowError where bounds do not fit."""
+        """The diameter, or the interval proven within the budget. OverflowError where bounds do not fit."""
         graph = self.graph
         if not self._is_bounded() and not self._pivot(graph.pivot):
             note = "some states cannot be reached from others; how many pairs was not counted, for want of memory"

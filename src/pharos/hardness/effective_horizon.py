@@ -1,6 +1,7 @@
-"""The effective horizon: how far ahead one must look. Source: Laidlaw, Russell and Dragan (2023); stochastic: (2024).
+"""The effective horizon, the depth of lookahead that planning needs. Source: Laidlaw, Russell and Dragan (2023; chance:
+2024).
 
-Undiscounted episodes of T steps, time-indexed. All quantities live on the nodes that can be met: states, or under
+Undiscounted episodes of T steps, time-indexed. All quantities live on the nodes that can be reached: states, or under
 sticky actions pairs (state, previously executed action) and the starts without one.
 
 For deterministic MDPs of millions of states (`LargeHorizon`) the same numbers, compiled.
@@ -9,7 +10,7 @@ Q^k_t(s, a) = r(s, a) + W^{k-1}_{t+1}(next state) with W^0 = V of uniform play a
 number a state and step is kept instead of one for each action, and each k overwrites the one before, as step t needs
 only step t + 1 of it.
 
-What both effective horizons consist of (`LookAhead`): Laidlaw, Russell and Dragan (2023), theorem 5.4.
+`LookAhead` holds the parts of both effective horizons: Laidlaw, Russell and Dragan (2023), theorem 5.4.
 
 The effective horizon of discounted MDPs without time: one value a state, so that millions of states are feasible;
 pharos's own variant of Laidlaw, Russell and Dragan's (2023) measure; `effective_horizon` is theirs.
@@ -35,12 +36,12 @@ from pharos.system import memory
 
 @dataclass(frozen=True)
 class LookAhead:
-    """How far ahead one must look, and the samples that each depth takes.
+    """Effective horizon with its parts: the depth of lookahead, and the samples that each depth takes.
 
     Attributes:
         value: min over k of k + log_A m_k, at most the number of steps.
         k_min: smallest k for which acting greedily in Q^k is optimal, Q^1 being the value of uniform play.
-        effective_planning_window: the same from Q^1 = r: how many rewards ahead one must see.
+        effective_planning_window: the same from Q^1 = r: the number of rewards ahead that planning needs.
         ks, ms, gaps, vars: for each k that was tried and does not fail: k, the samples m_k, and gap and variance bound
             where m_k is attained.
     """
@@ -67,7 +68,7 @@ GREEDY_RETURNS = 5
 
 @dataclass(frozen=True)
 class EffectiveHorizon(LookAhead):
-    """How far ahead one must look in an MDP.
+    """Effective horizon of an MDP in episodes of T steps.
 
     Attributes:
         value, k_min, effective_planning_window, ks, ms, gaps, vars: see LookAhead; `value` is the effective horizon by
@@ -128,15 +129,15 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
     return EffectiveHorizon(**parts, tight=bound, conventions=conventions)
 
 
-def parts_of(play: "SmallHorizon | LargeHorizon") -> dict[str, Any]:
-    """What an `EffectiveHorizon` consists of."""
-    ahead, greedy = look_ahead(play, play.steps, play.num_actions, play.greedy_return)
-    returns = dict(zip(("optimal_return", "random_return", "worst_return"), play.returns, strict=True))
-    return {**vars(ahead), **returns, "greedy_returns": greedy, "num_states": play.num_visitable}
+def parts_of(values: "SmallHorizon | LargeHorizon") -> dict[str, Any]:
+    """Fields of an `EffectiveHorizon`, but for `tight` and `conventions`."""
+    ahead, greedy = look_ahead(values, values.steps, values.num_actions, values.greedy_return)
+    returns = dict(zip(("optimal_return", "random_return", "worst_return"), values.returns, strict=True))
+    return {**vars(ahead), **returns, "greedy_returns": greedy, "num_states": values.num_visitable}
 
 
-class Play(Protocol):
-    """Q^k for one k after the other, k = 1 at first: what both effective horizons ask."""
+class LookaheadValues(Protocol):
+    """Q^k for one k after the other, k = 1 at first, with the questions of both effective horizons."""
 
     def samples(self, log: float) -> tuple[int, float, float] | None:
         """(m_k, gap, variance where it is attained), log = ln(2 T A^k); None where k fails."""
@@ -145,48 +146,50 @@ class Play(Protocol):
         """Whether all actions greedy in Q^k, from the start on, are optimal."""
 
     def advance(self, spread: bool = True) -> None:
-        """From k to k + 1; spread: of the variances, too."""
+        """Go from k to k + 1; spread: of the variances, too."""
 
-    def look_at_rewards(self) -> None:
+    def restart_from_rewards(self) -> None:
         """Begin again with Q^1 = r."""
 
 
 def look_ahead(
-    play: Play,
+    values: LookaheadValues,
     steps: int,
     num_actions: int,
     greedy_return: Callable[[], float] | None = None,
     tell: Callable[[str], object] = str,
 ) -> tuple[LookAhead, list[float]]:
-    """How far ahead one must look in episodes of `steps` steps, and `greedy_return` for k = 1, ..., 5, where asked."""
+    """(LookAhead of episodes of `steps` steps, `greedy_return` for k = 1, ..., 5, where it is given)."""
     best, log_actions = float(steps), math.log(num_actions)
     rows: list[tuple[int, int, float, float]] = []
     greedy: list[float] = []
     last = 0 if greedy_return is None else GREEDY_RETURNS
     k_min, k = 0, 1
+    # Q^1 of uniform play, Q^2, ...: the smallest k + log_A m_k, and the smallest k that acts optimally.
     while k < best or k <= last or not k_min:
         tell(f"k = {k}, bound {best:.4g}")
-        if k < best and (needed := play.samples(math.log(2 * steps) + k * log_actions)) is not None:
+        if k < best and (needed := values.samples(math.log(2 * steps) + k * log_actions)) is not None:
             rows.append((k, *needed))
             best = min(best, k + (math.log(needed[0]) / log_actions if num_actions > 1 else 0.0))
-        if not k_min and (k >= steps or play.is_greedy_optimal()):
+        if not k_min and (k >= steps or values.is_greedy_optimal()):
             k_min = k
         if greedy_return is not None and k <= last:
             greedy.append(greedy_return())
-        play.advance()
+        values.advance()
         k += 1
-    play.look_at_rewards()
+    # The same from Q^1 = r.
+    values.restart_from_rewards()
     window = 1
-    while window < steps and not play.is_greedy_optimal():
+    while window < steps and not values.is_greedy_optimal():
         tell(f"window {window}")
-        play.advance(spread=False)
+        values.advance(spread=False)
         window += 1
     ks, ms, gaps, variances = (list(each) for each in zip(*rows, strict=True)) if rows else ([], [], [], [])
     return LookAhead(best, k_min, window, ks, ms, gaps, variances), greedy
 
 
 class SmallHorizon(FiniteHorizonValues):
-    """`Play` of MDPs whose action values of all steps are written out.
+    """Lookahead values of MDPs whose action values of all steps are written out.
 
     Attributes:
         values: (T, N, A) Q^k. variance: (T, N, A) var^k.
@@ -200,9 +203,9 @@ class SmallHorizon(FiniteHorizonValues):
 
     def samples(self, log: float) -> tuple[int, float, float] | None:
         worst: tuple[int, float, float] | None = None
-        met = self.first
+        is_reached = self.first
         for t in range(self.steps):
-            nodes = np.flatnonzero(met)
+            nodes = np.flatnonzero(is_reached)
             best = self.values[t, nodes].max(axis=1)
             second = np.where(self.optimal[t, nodes], -math.inf, self.values[t, nodes]).max(axis=1)
             if (best == second).any():
@@ -212,16 +215,16 @@ class SmallHorizon(FiniteHorizonValues):
                 worst = (samples, gap, spread)
             better = np.zeros((self.num_nodes, self.num_actions), np.bool_)
             better[nodes] = self.values[t, nodes] > second[:, None]
-            met = self.following(met, better)
+            is_reached = self.successors(is_reached, better)
         return worst
 
     def is_greedy_optimal(self) -> bool:
-        met = self.first
+        is_reached = self.first
         for t in range(self.steps):
             greedy = self.values[t] == self.values[t].max(axis=1, keepdims=True)
-            if (greedy & ~self.optimal[t])[met].any():
+            if (greedy & ~self.optimal[t])[is_reached].any():
                 return False
-            met = self.following(met, greedy)
+            is_reached = self.successors(is_reached, greedy)
         return True
 
     def advance(self, spread: bool = True) -> None:
@@ -232,7 +235,7 @@ class SmallHorizon(FiniteHorizonValues):
                 after[t] = self.choices.largest(self.variance[t + 1].max(axis=1))
             self.variance = after
 
-    def look_at_rewards(self) -> None:
+    def restart_from_rewards(self) -> None:
         self.values = np.broadcast_to(self.rewards, self.explored.shape)
 
     def greedy_return(self) -> float:
@@ -240,8 +243,8 @@ class SmallHorizon(FiniteHorizonValues):
         value = np.zeros(self.num_nodes)
         for t in range(self.steps - 1, -1, -1):
             greedy = self.values[t] == self.values[t].max(axis=1, keepdims=True)
-            followed = self.backup(value) if t < self.steps - 1 else self.rewards
-            value = np.where(greedy, followed, math.inf).min(axis=1)
+            q = self.backup(value) if t < self.steps - 1 else self.rewards
+            value = np.where(greedy, q, math.inf).min(axis=1)
         return self.at_start(value)
 
 
@@ -265,7 +268,7 @@ def applies(mdp: TabularMDP) -> bool:
 
 
 class LargeHorizon:
-    """`Play` of deterministic MDPs of millions of states: values of states at every step.
+    """Lookahead values of deterministic MDPs of millions of states: values of states at every step.
 
     Attributes:
         ahead: (T + 1, S) W^{k-1}, for the present k; row T is 0.
@@ -334,17 +337,17 @@ class LargeHorizon:
 
     def _walk(self, log: float, near: bool) -> Iterator[tuple[float | None, float, float]]:
         n, most = self._begin(), np.zeros(3)
-        now, following = self.nodes
+        now, after = self.nodes
         for t in range(self.steps):
             n = self.kernels.step_along(
                 *(self.next_states, self.rewards, self.ahead[t + 1], self.optimal[t], self.spread[t], log, near),
-                *(now, n, following, self.is_visited, most),
+                *(now, n, after, self.is_visited, most),
             )
             if n < 0:
                 yield None, 0.0, 0.0
                 return
             yield float(most[0]), float(most[1]), float(most[2])
-            now, following = following, now
+            now, after = after, now
             if not n:
                 return
 
@@ -356,7 +359,7 @@ class LargeHorizon:
                 after = self.spread[t + 1] if t + 1 < self.steps else nothing
                 self.kernels.largest(self.next_states, after, self.spread[t])
 
-    def look_at_rewards(self) -> None:
+    def restart_from_rewards(self) -> None:
         self.ahead[:] = 0.0
 
     def greedy_return(self) -> float:
@@ -373,7 +376,7 @@ class LargeHorizon:
 
 @dataclass(frozen=True)
 class StationaryHorizon(LookAhead):
-    """How far ahead one must look in a discounted MDP.
+    """Effective horizon of a discounted MDP, of values that do not depend on the step.
 
     Attributes:
         value, k_min, effective_planning_window, ks, ms, gaps, vars: see LookAhead; k_min is `steps` where no k will do.
@@ -413,13 +416,13 @@ def stationary_effective_horizon(
         tie_tolerance: an action is optimal if its value is within it of the best; None: 2.5 times the largest error of
             the values, at least 1e-9.
         tolerance: largest error of the values; a larger one is used where floats cannot reach it.
-        progress: called with a line on how far it is.
+        progress: called with a line on the progress.
     Raises:
         UndefinedMeasure: gamma is 1.
         ParameterError: an option is wrong, or `solution` is not of this MDP. PrecisionError: tie_tolerance is not above
             twice the error.
-    Exactness: Q^k is known up to an error; what differs by less than `slack`, four times that, counts as equal, which
-        makes k fail rather than pass.
+    Exactness: Q^k is known up to an error; values that differ by less than `slack`, four times that, count as equal,
+        which makes k fail rather than pass.
     Cost: three solutions, then a backup and a walk over the states met for each k. breakout/12x8x1 (2.4 million states)
         takes about ten seconds.
     Source: pharos; after Laidlaw, Russell and Dragan (2023), theorem 5.4.
@@ -454,7 +457,7 @@ def stationary_effective_horizon(
 
 
 class _ActionValues:
-    """r + gamma E value(next) of nodes; where each action leads to one node, computed where they are asked for."""
+    """Action values r + gamma E value(next) of nodes; computed on demand where each action leads to one node."""
 
     def __init__(self, nodes: "_Nodes", value: np.ndarray):
         self.nodes, self.value, self.table = nodes, value, np.empty(0)
@@ -463,7 +466,7 @@ class _ActionValues:
 
     @cached_property
     def best(self) -> np.ndarray:
-        """(N,): max over a."""
+        """(N,): the largest action value of each node."""
         from pharos.kernels import horizon
 
         if self.nodes.table is None:
@@ -473,14 +476,14 @@ class _ActionValues:
         return result
 
     def at(self, nodes: np.ndarray) -> np.ndarray:
-        """(n, A), of some nodes."""
+        """(n, A): the action values of some nodes."""
         if self.nodes.table is None:
             return self.table[nodes]
         return self.nodes.rewards[nodes] + self.nodes.gamma * self.value[self.nodes.table[nodes]]
 
 
 class _Nodes:
-    """`Play` without time, on nodes that can be met: states, or pairs with the previous action.
+    """Lookahead values without time, on nodes that can be reached: states, or pairs with the previous action.
 
     Attributes:
         rewards, best, worst, explored: (N, A) of choosing an action. error: the largest error of any of them.
@@ -507,7 +510,7 @@ class _Nodes:
         self.values = values[-1]
 
     def compare(self, tie: float, slack: float) -> None:
-        """Begin with Q^1 of uniform play; what is within `tie` of the best is optimal, within `slack` equal."""
+        """Begin with Q^1 of uniform play; actions within `tie` of the best are optimal, values within `slack` equal."""
         self.slack, self.optimal = slack, self.best >= self.best.max(axis=1, keepdims=True) - tie
         self.spread = ((self.explored - self.worst) * (self.best - self.worst)).max(axis=1)
 
@@ -539,12 +542,12 @@ class _Nodes:
     def advance(self, spread: bool = True) -> None:
         self.values = _ActionValues(self, self.values.best)
         if spread:
-            self.spread = self.gamma**2 * self.following_max(self.spread)
+            self.spread = self.gamma**2 * self.successor_max(self.spread)
 
-    def look_at_rewards(self) -> None:
+    def restart_from_rewards(self) -> None:
         self.values = _ActionValues(self, np.zeros(self.num_nodes))
 
-    def following_max(self, values: np.ndarray) -> np.ndarray:
+    def successor_max(self, values: np.ndarray) -> np.ndarray:
         """(N,): the largest of values (N,) >= 0 over the nodes that some action may lead to."""
         from pharos.kernels import horizon
 
@@ -555,7 +558,7 @@ class _Nodes:
         return result
 
     def closure(self, actions: Callable[[np.ndarray], np.ndarray | None]) -> np.ndarray | None:
-        """The nodes that can be met from the start by some actions; None where `actions` answers None.
+        """The nodes that can be reached from the start by some actions; None where `actions` returns None.
 
         actions: from nodes (n,) to (n, A) bool, the actions that are taken there.
         """
@@ -566,16 +569,16 @@ class _Nodes:
             allowed = actions(nodes)
             if allowed is None:
                 return None
-            following = self.choices.successors(nodes, allowed)
-            nodes = np.unique(following[~is_reached[following]])
+            next_nodes = self.choices.successors(nodes, allowed)
+            nodes = np.unique(next_nodes[~is_reached[next_nodes]])
             is_reached[nodes] = True
         return np.flatnonzero(is_reached)
 
 
 def _states_and_the_end(mdp: TabularMDP) -> ExpandedMDP:
-    """The states without chance, then the implicit end, by the table of where each action leads.
+    """A deterministic MDP written out: its states and the implicit end, with the table of next nodes.
 
-    What has ended stays where it is.
+    Terminal states and the end lead to themselves.
     """
     next_states = mdp.dynamics.deterministic_table()
     assert next_states is not None

@@ -37,11 +37,11 @@ _MEMORY = 8 * 2**30
 
 
 class Step(NamedTuple):
-    """A time step, or all where there is no horizon: x (S + 1, W), what follows it; which states count, how often."""
+    """Values of a time step, or of all where there is no horizon, and how often each state counts."""
 
-    own: np.ndarray
-    next_x: np.ndarray
-    later: np.ndarray
+    own: np.ndarray  # (S + 1, W) x of this step
+    next_x: np.ndarray  # (S + 1, W) x of the next step
+    later: np.ndarray  # (S,) see `steps_of`
     first: np.ndarray
 
 
@@ -49,9 +49,9 @@ class GapBlock(NamedTuple):
     """Gaps of a block of states.
 
     Attributes:
-        step: what they belong to. number: of that step.
+        step: of the gaps. number: of that step.
         states: (N,) indices. is_whole: whether they are a range.
-        rewards, following: (N, A), what executing an action pays, and the value of what follows.
+        rewards, next_values: (N, A), expected reward of executing an action, and expected value of the next state.
         gap: (N, A).
         scale: the probability that the chosen action is executed, which each gap is multiplied by.
         weight: (N,) how many pairs (state, previous action) a row stands for.
@@ -62,7 +62,7 @@ class GapBlock(NamedTuple):
     number: int
     states: np.ndarray
     rewards: np.ndarray
-    following: np.ndarray
+    next_values: np.ndarray
     gap: np.ndarray
     scale: float
     weight: np.ndarray
@@ -83,24 +83,24 @@ def _gaps_of_step(mdp: TabularMDP, step: Step, number: int, everywhere: bool) ->
         block = slice(first, min(first + _BLOCK, mdp.num_states))
         states = np.arange(block.start, block.stop)
         rewards = mdp.reward_table.rows(block)
-        following = mdp.dynamics.expected(step.next_x, block)
-        difference = kernels.differences(rewards, following, mdp.gamma)
+        next_values = mdp.dynamics.expected(step.next_x, block)
+        difference = kernels.differences(rewards, next_values, mdp.gamma)
         live = ~np.asarray(mdp.terminal[block])
         later = step.later[block].astype(np.int64)
         weight = later + (everywhere & (later == 0))
-        arrays = (number, states, rewards, following)
+        arrays = (number, states, rewards, next_values)
         gap = difference if chance.chosen == 1.0 else chance.chosen * difference
         yield GapBlock(step, *arrays, gap, chance.chosen, weight, np.where(live, later, 0))
         if step.first[block].any():
             some = np.flatnonzero(step.first[block])
-            arrays = (number, states[some], rewards[some], following[some])
+            arrays = (number, states[some], rewards[some], next_values[some])
             once = np.ones(some.size, np.int64)
             gap = chance.first_chosen * difference[some]
             yield GapBlock(step, *arrays, gap, chance.first_chosen, once, live[some] * once, False)
 
 
 def steps_of(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
-    """For each step t = 1, ..., T, or once: values, and how many times each state counts.
+    """Yield the values of each step t = 1, ..., T, or once, and how many times each state counts.
 
     later (S,): 1 for a reachable state, under sticky actions the number of actions by which it can be
     reached; first (S,) bool: start states, which count once more under sticky actions, without a previous action.
@@ -114,8 +114,8 @@ def steps_of(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
     nodes[mdp.starts[~lone[mdp.starts]]] = True
     for step in range(1, solution.horizon + 1):
         to_go = solution.horizon - step + 1
-        own, following = (_with_end(all_steps[n]) for n in (to_go, to_go - 1))
-        yield Step(own, following, nodes.sum(axis=1), lone)
+        own, next_x = (_with_end(all_steps[n]) for n in (to_go, to_go - 1))
+        yield Step(own, next_x, nodes.sum(axis=1), lone)
         nodes, lone = mdp.nodes_after(nodes, lone), np.zeros_like(lone)
 
 
@@ -148,18 +148,18 @@ _FIRST = 1 << 12
 
 
 class TieProof:
-    """The second proof, of one block of states after the other.
+    """The second proof of ties, of one block of states after the other.
 
     Attributes:
-        holds: whether it holds for all that was looked at.
+        holds: whether it holds for all blocks so far.
     """
 
     def __init__(self, mdp: TabularMDP):
         self.holds = mdp.dynamics.is_deterministic and not mdp.is_random
         self._step = -1
 
-    def look_at(self, part: GapBlock, own: np.ndarray) -> None:
-        """Take up a block of N states, whose computed values are `own` (N, W); blocks of one step come together."""
+    def add_block(self, part: GapBlock, own: np.ndarray) -> None:
+        """Extend the proof to a block of N states with values `own` (N, W); blocks of one step come together."""
         if not self.holds:
             return
         if part.number != self._step:  # values of different steps are different
@@ -168,15 +168,15 @@ class TieProof:
             nothing = np.zeros_like(part.rewards[:1])
             ended = np.zeros((1, own.shape[1])), nothing, nothing
             self._extend(*ended, np.zeros_like(part.gap[:1]), np.ones(1, np.int64))  # worth 0 for ever
-        self._extend(own, part.rewards, part.following, part.gap, part.counted)
+        self._extend(own, part.rewards, part.next_values, part.gap, part.counted)
 
     def _extend(
-        self, own: np.ndarray, rewards: np.ndarray, following: np.ndarray, gap: np.ndarray, counted: np.ndarray
+        self, own: np.ndarray, rewards: np.ndarray, next_values: np.ndarray, gap: np.ndarray, counted: np.ndarray
     ) -> None:
-        own, rewards, following = (np.ascontiguousarray(each).view(np.int64) for each in (own, rewards, following))
+        bits = [np.ascontiguousarray(each).view(np.int64) for each in (own, rewards, next_values)]
         begin = 0
         while self.holds and begin < len(gap):
-            begin, self._filled = kernels.extend(own, rewards, following, gap, counted, begin, self._map, self._filled)
+            begin, self._filled = kernels.extend(*bits, gap, counted, begin, self._map, self._filled)
             if begin < 0 or self._filled > MOST:
                 self.holds = False
             elif begin < len(gap):
@@ -192,7 +192,7 @@ def _empty_map(size: int, width: int) -> np.ndarray:
 def same_outcomes(
     mdp: TabularMDP, states: np.ndarray, rewards: np.ndarray, action: np.ndarray, other: np.ndarray
 ) -> np.ndarray:
-    """(K,) bool: the first proof, whether two actions pay the same and have the same outcomes; rewards (K, A) of the
+    """(K,) bool: whether two actions pay the same and have the same outcomes, the first proof; rewards (K, A) of the
     states (K,)."""
     rows = np.arange(len(states))
     same = rewards[rows, action] == rewards[rows, other]
@@ -208,11 +208,11 @@ def same_outcomes(
 
 
 class UnresolvedTies:
-    """Counts the ties that are not proven to be ties.
+    """Count of the ties that are not proven to be ties.
 
     Attributes:
-        small: gaps that are computed as larger than 0, and no larger than the tolerance; of a tolerance that is part of
-            what is asked for, gaps that are within their error of it.
+        small: gaps that are computed as larger than 0, and no larger than the tolerance; where the tolerance is part of
+            the definition, gaps that are within their error of it.
         equal: gaps that are computed as 0, beyond the first of a state.
     """
 
@@ -221,8 +221,8 @@ class UnresolvedTies:
         self.small = self.equal = 0
         self.proof = TieProof(mdp)
 
-    def look_at(self, part: GapBlock, small: int, equal: int) -> None:
-        """Take up the ties of a block: how many are small, and how many equal."""
+    def add_block(self, part: GapBlock, small: int, equal: int) -> None:
+        """Add the ties of a block, of which `small` are small, and `equal` equal."""
         if part.scale == 0.0:
             return  # nothing can be chosen: every action is worth the same
         if self.is_definition:
@@ -233,18 +233,18 @@ class UnresolvedTies:
         self.equal += equal
         if not self.small and self.proof.holds:
             own = part.step.own[part.states[0] : part.states[-1] + 1] if part.is_whole else part.step.own[part.states]
-            self.proof.look_at(part, own)
+            self.proof.add_block(part, own)
 
     def unresolved(self, parts: Iterator[GapBlock]) -> int:
-        """How many are not proven; `parts` once more, where that is to be seen one by one."""
+        """Number of ties that are not proven; `parts`: all blocks once more, for proofs one by one."""
         if self.is_definition or (not self.small and self.proof.holds):
             return self.small
         if self.small or not self.equal:
             return self.small + self.equal
-        return self.equal - sum(self._alike(part) for part in parts)
+        return self.equal - sum(self._num_same(part) for part in parts)
 
-    def _alike(self, part: GapBlock) -> int:
-        """Equal gaps of a block between actions that have the same outcomes."""
+    def _num_same(self, part: GapBlock) -> int:
+        """Number of equal gaps of a block between actions that have the same outcomes."""
         if part.scale == 0.0:
             return 0
         zero = (part.gap == 0.0) & (part.counted > 0)[:, None]
@@ -254,8 +254,8 @@ class UnresolvedTies:
         zero[np.arange(several.size), best] = False
         row, action = np.nonzero(zero)
         rows = several[row]
-        likely = part.following[rows, best[row]] == part.following[rows, action]
-        row, action, rows = row[likely], action[likely], rows[likely]
+        is_equal = part.next_values[rows, best[row]] == part.next_values[rows, action]
+        row, action, rows = row[is_equal], action[is_equal], rows[is_equal]
         same = same_outcomes(self.mdp, part.states[rows], part.rewards[rows], best[row], action)
         return int(part.counted[rows[same]].sum())
 
@@ -482,7 +482,7 @@ def gaps_of_states(
 
 
 def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
-    """The optimal solution of `mdp` that was given, or a new one, to 1e-9 or to what 64-bit floats reach.
+    """The optimal solution of `mdp`: the argument, or a new one to 1e-9 or to what 64-bit floats reach.
 
     Raises:
         ParameterError: it is of another kind or MDP.
@@ -521,7 +521,7 @@ def solved(solve: Callable[..., Solution], mdp: TabularMDP, tolerance: float, **
 
 
 def _error(mdp: TabularMDP, solution: Solution) -> float:
-    """By how much a gap may be off: values of all steps are within the error bound of the solution.
+    """Bound on the error of a gap: twice that of values, of which all steps are within the bound of the solution.
 
     With a horizon the bound is that of the first step. Where gamma is below 1, that of a later one may be larger: it is
     a sum of discounted rounding errors, in proportion to the largest reward and value of its own steps.
@@ -558,7 +558,7 @@ def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) ->
     tolerance = _tolerance(tie_tolerance, error)
     ties, added = UnresolvedTies(mdp, tolerance, error, tie_tolerance is not None), _Sums()
     for part in weighted_gaps(mdp, solution):
-        ties.look_at(part, *added.add(part, tolerance, error))
+        ties.add_block(part, *added.add(part, tolerance, error))
     unresolved = ties.unresolved(weighted_gaps(mdp, solution))
     total, low, high, regularized = added.sums[0].tolist()
     count, bins = int(added.counts[0]), np.flatnonzero(added.histogram)
@@ -582,7 +582,7 @@ def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) ->
 
 
 class _Sums:
-    """What is added up of the gaps of states, a block at a time; the arrays are those of `kernels.gaps`.
+    """Sums over the gaps of states, a block at a time; the arrays are those of `kernels.gaps`.
 
     Attributes:
         minimal: the smallest gap above the tolerance. num_rows: how many rows count.
@@ -594,7 +594,7 @@ class _Sums:
         self.minimal, self.num_rows = math.inf, 0
 
     def add(self, part: GapBlock, tolerance: float, error: float) -> tuple[int, int]:
-        """Add a block. Returns how many of its ties are small, and how many equal."""
+        """Add a block; return how many of its ties are small, and how many equal."""
         previous = self.counts.copy()
         arguments = (tolerance, error, REGULARIZER, self.sums, self.counts, self.histogram)
         self.minimal = kernels.add_up(part.gap, part.weight, part.counted, self.minimal, *arguments)

@@ -28,7 +28,7 @@ PARTS = 100  # of equal probability, into which BRIDGE cuts distributions
 
 @dataclass(frozen=True)
 class GorpBound:
-    """How many samples GORP needs.
+    """Bound on the samples that GORP needs, for each k.
 
     Attributes:
         value: the effective horizon by this bound, the smallest H_k; infinite where no number of samples is proven to
@@ -110,7 +110,7 @@ def gorp_bound(
 
 @dataclass(frozen=True, eq=False)
 class GorpRuns:
-    """What GORP did, once for each run.
+    """Returns and actions that runs of GORP found.
 
     Attributes:
         returns: (runs,) float64, the return of the sequence of actions that was found (its expectation under chance).
@@ -218,7 +218,7 @@ class GorpSearch:
         assert self.tree.table is not None
         self.nodes_at = [self.tree.first]
         for t in range(steps - 1):
-            self.nodes_at.append(self.tree.following(self.nodes_at[-1], self.tree.optimal[t]))
+            self.nodes_at.append(self.tree.successors(self.nodes_at[-1], self.tree.optimal[t]))
         most = float(self.tree.best.max())
         rewards = self.tree.rewards
         self.two_valued = most > 0 and bool(((rewards == 0) | (rewards == most)).all())
@@ -280,16 +280,16 @@ class GorpSearch:
         tree = self.tree
         assert tree.table is not None
         sequences = sequences_of(tree.num_actions, k)
-        paid, at = np.zeros((len(nodes), len(sequences))), np.repeat(nodes[:, None], len(sequences), axis=1)
+        rewards, at = np.zeros((len(nodes), len(sequences))), np.repeat(nodes[:, None], len(sequences), axis=1)
         last = min(k, tree.steps - t)
         for i in range(last - 1):
-            paid += tree.rewards[at, sequences[:, i]]
+            rewards += tree.rewards[at, sequences[:, i]]
             at = tree.table[at, sequences[:, i]]
         final, then = sequences[:, last - 1], t + last - 1
         return (
-            paid + tree.explored[then, at, final],
-            paid + tree.best[then, at, final],
-            paid + tree.worst[then, at, final],
+            rewards + tree.explored[then, at, final],
+            rewards + tree.best[then, at, final],
+            rewards + tree.worst[then, at, final],
         )
 
 

@@ -30,9 +30,8 @@ moved up and down by W with
 J + W then falls short of no step, J - W exceeds none: both certificates hold with 0. W is about 1e-12 of J. Where the
 linear solver itself has no correct digit (J beyond 1e15), the bounds of plain floats stand, wide as they are.
 
-Bounds of the hitting times of a target, and sums of two floats; see hitting_times for what they certify.
-
-The linear equations of the hitting times of one policy, with nodes that are alike as one unknown; shorter rows.
+The file also has the linear equations of the hitting times of one policy, with all restart nodes as one unknown, and
+the rows of the MDP without what the actions of a node share.
 """
 
 import math
@@ -78,8 +77,8 @@ class HittingTimeBounds:
         return self.at_most(self.largest) * PRODUCT
 
     def at_most(self, j: float) -> float:
-        """Upper bound of what is j in J, but for rounding: infinite where none is known, also where J is no more than
-        0."""
+        """Upper bound of a hitting time that is j in J, but for rounding: infinite where none is known, also where j is
+        at most 0."""
         return j * self.high if math.isfinite(self.high) else math.inf
 
     @property
@@ -145,7 +144,7 @@ FAILURES = 3
 
 
 class HittingTimes:
-    """The hitting times of one target after the other."""
+    """Solver of the hitting times of one target after the other."""
 
     def __init__(self, choices: ExpandedMDP):
         matrix = choices.matrix
@@ -200,8 +199,8 @@ class HittingTimes:
         j = np.maximum(self.distance, 0) * self.initial_scale
         if self.choices.is_connected:
             return j, count, None
-        sure, reached = np.empty_like(self.goal), np.empty_like(self.goal)
-        hitting.almost_surely(*self.support, self.goal, sure, reached)
+        sure, reachable = np.empty_like(self.goal), np.empty_like(self.goal)
+        hitting.almost_surely(*self.support, self.goal, sure, reachable)
         nodes = self.order[:count][sure[self.order[:count]]]
         self.order[: nodes.size] = nodes
         j[~sure] = TOP  # a choice that may lead there is never the best
@@ -216,7 +215,7 @@ class HittingTimes:
         return bounds
 
     def sweep(self, j: np.ndarray, count: int, sweeps: int, enough: float, spending: BudgetClock) -> HittingTimeBounds:
-        """Sweeps in place; ends early where the upper bound is at most `enough`, the budget ends, or J does not
+        """Bounds after sweeps in place, fewer where the upper bound is at most `enough`, the budget ends, or J does not
         move."""
         for number in range(sweeps):
             if self.swept < PLAIN_SWEEPS:
@@ -233,7 +232,7 @@ class HittingTimes:
         return self.bounds(j, count)
 
     def _sweep_with_mode(self, j: np.ndarray, count: int) -> float:
-        """A sweep of J and of the slow mode, along which J is moved now and then; the largest change by the sweep."""
+        """Sweep J and the slow mode, along which J is moved now and then; return the largest change by the sweep."""
         if self.mode is None:
             self.mode = np.zeros(len(j))
             self.mode[self.order[:count]] = ~self.goal[self.order[:count]]
@@ -288,7 +287,7 @@ class HittingTimes:
     def _converged(
         self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: BudgetClock
     ) -> HittingTimeBounds:
-        """Sweeps; as long as at their rate the bounds meet sooner than a linear solve takes, or nearly as soon.
+        """Bounds after sweeps, as long as at their rate these meet sooner than a linear solve takes, or nearly so.
 
         The rate is that of three times `SWEEPS` / 2 sweeps: moves along the slow mode set single ones back.
         """
@@ -414,7 +413,7 @@ class HittingTimes:
 
 @dataclass(frozen=True)
 class Factors:
-    """Factors of a linear system in which nodes that are alike are one unknown.
+    """Factors of a linear system in which all restart nodes are one unknown.
 
     first: (unknowns,) the first node of each. unknown: (inner nodes,) which one a node is.
     """
@@ -449,23 +448,25 @@ def factors_of(choices: ExpandedMDP, policy: np.ndarray, inner: np.ndarray) -> F
         return None
 
 
-def _numbered_once(alike: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(first member of each group, (N,) its group): nodes that are alike are one group, every other one a group."""
-    opens = ~alike
-    if alike.any():
-        opens[alike.argmax()] = True
+def _numbered_once(is_restart: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(first node of each group, (N,) group of each node): restart nodes are one group, every other node is one."""
+    opens = ~is_restart
+    if is_restart.any():
+        opens[is_restart.argmax()] = True
     group = np.cumsum(opens) - 1
-    if alike.any():
-        group[alike] = group[alike.argmax()]
+    if is_restart.any():
+        group[is_restart] = group[is_restart.argmax()]
     return np.flatnonzero(opens), group
 
 
 def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-    """What the actions of a node have in common is added up once: under random and sticky actions most of a row.
+    """Rows split into the part that all actions of a node share, to be added up once, and the rest of each action.
+
+    Under random and sticky actions most of a row is shared.
 
     Returns:
-        ((first, node, weight) of the rows without it, one for each action; (first, node, weight) of it, one for each
-        node).
+        ((first, node, weight) of the rest, one row for each action; (first, node, weight) of the shared part, one row
+        for each node).
     """
     nodes = matrix.shape[0] // num_actions
     row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))

@@ -1,4 +1,4 @@
-"""What a measure returns that may be out of reach: a proven interval; and how much may be spent on it."""
+"""Proven intervals of measures whose value may be out of reach, and budgets for computing them."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -85,7 +85,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Certified:
-    """A number and what is proven of it.
+    """A number, and the proven interval of the true one.
 
     Attributes:
         value: the number as computed.
@@ -114,7 +114,7 @@ class Certified:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What is proven of a measure.
+    """Proof of a measure's value: exact, a proven interval, or none.
 
     Attributes:
         kind: "exact", proven to be the value (counted, or to a relative width of 1e-6 and less); "interval", proven to
@@ -141,7 +141,7 @@ class Certificate:
 
 
 def certificate_of(outcome: object) -> Certificate:
-    """What a measure's result says of itself: by `exact`, `lower`, `upper` and `note`, where it has them."""
+    """Certificate of a measure's result, from its `exact`, `lower`, `upper` and `note`, where it has them."""
     if not hasattr(outcome, "exact"):
         return Certificate("float64", note=getattr(outcome, "note", ""))
     kind = "exact" if outcome.exact else "interval"
@@ -151,7 +151,7 @@ def certificate_of(outcome: object) -> Certificate:
 
 
 def conventions_of(mdp: TabularMDP, restart: bool) -> dict[str, Any]:
-    """What the steps between states refer to."""
+    """Conventions behind the steps between states, JSON-able: restart, starts and chance."""
     return {
         "restart": restart,
         "start_states": len(mdp.start_states),
@@ -166,7 +166,7 @@ def conventions_of(mdp: TabularMDP, restart: bool) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """What may be spent before a proven interval is returned instead of the exact value. The first limit met counts.
+    """Limits of a measure: at the first one reached it returns the interval proven by then, not the exact value.
 
     Attributes:
         seconds: of wall clock, those of compiling apart, looked at between searches.
@@ -198,8 +198,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class MeasureProgress:
-    """How far a measure is: the interval so far, the searches done, how many candidates are left, and seconds since the
-    start."""
+    """Progress of a measure: the interval so far, searches done, candidates left, and seconds since the start."""
 
     lower: float
     upper: float
@@ -209,7 +208,7 @@ class MeasureProgress:
 
 
 class BudgetClock:
-    """A budget being spent: tells when to stop, and reports progress at most every tenth of a second.
+    """Clock of a budget: when to stop, and reports of progress at most every tenth of a second.
 
     Seconds of compiling do not count: what is proven must not depend on whether the code was compiled before.
     """
@@ -220,7 +219,7 @@ class BudgetClock:
         progress: Callable[[MeasureProgress], None] | None,
         conventions: Mapping[str, Any] = MappingProxyType({}),
     ):
-        """conventions: what the values refer to that are measured meanwhile."""
+        """conventions: of the values that are measured meanwhile."""
         self.budget, self.progress, self.conventions = budget, progress, dict(conventions)
         self._watch = Stopwatch()
         self.searches = 0
@@ -233,11 +232,11 @@ class BudgetClock:
 
     @property
     def is_over(self) -> bool:
-        """Whether a limit is met."""
+        """Whether a limit is reached."""
         return self.searches >= self.budget.searches or self.seconds >= self.budget.seconds
 
     def signed(self, interval: Interval) -> Interval:
-        """The interval, with what it took and refers to."""
+        """The interval, with its conventions, searches and seconds."""
         return replace(interval, conventions=self.conventions, searches=self.searches, seconds=self.seconds)
 
     def report(self, lower: float, upper: float, candidates: int, *, now: bool = False) -> None:

@@ -11,8 +11,8 @@ tangent kernel, rollouts are exact expected visits, and so are the returns towar
 by which the policy does. With the identity in the place of the kernel it is tabular softmax policy gradient (Agarwal et
 al., 2021) with a learnt baseline.
 
-`kernel_learning_time`, `kernel_sample_complexity`, `aliasing_floor`: how the optimal values lie to the spectrum of the
-kernel, without a learner.
+`kernel_learning_time`, `kernel_sample_complexity`, `aliasing_floor`: how the optimal values align with the spectrum of
+the kernel, without a learner.
 """
 
 from collections.abc import Callable, Mapping
@@ -76,7 +76,7 @@ class KernelRegret:
 
     @property
     def note(self) -> str:
-        """What is approximate."""
+        """Landmarks and the error that they are estimated to cause; empty where the kernel is exact."""
         if self.landmarks is None:
             return ""
         return (
@@ -238,7 +238,7 @@ def kernel_policy_regret(
 
 
 class PolicyLearner(IdealisedLearner):
-    """An MDP, and actor-critics on it."""
+    """Idealised actor-critics on an MDP."""
 
     measure = "kernel_policy_regret"
     step_weights = "d"
@@ -350,7 +350,7 @@ class Spectral:
 
     @property
     def note(self) -> str:
-        """What is approximate."""
+        """Sampled observations and the error that they are estimated to cause; empty where all were decomposed."""
         if self.observations == self.of:
             return ""
         return (
@@ -461,7 +461,7 @@ def _spectral(
     horizon: int | None,
     function: Callable[[np.ndarray, np.ndarray, np.ndarray], float],
 ) -> Spectral:
-    """A function of (kernel (C, C), weights (C,), mean values (C, A)) of the different observations."""
+    """Spectral result of a function of (kernel (C, C), weights (C,), mean values (C, A)) of the observations."""
     setting = _setting(mdp, representation, schedule, horizon, name)
     states = np.flatnonzero(setting.states > 0)
     observations = Grouped(representation.classes, states)

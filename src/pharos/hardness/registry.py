@@ -1,4 +1,4 @@
-"""The measures of a report: name, function, definition and source; how users add one; and those of pharos, in order."""
+"""Registry of the measures of a report: name, function, definition and source of each; those of pharos, in order."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -37,9 +37,9 @@ class Problem:
         horizon: number of steps T for measures of episodes; that of the MDP where it has one; or None.
         tolerance: largest error of a value, in units of return; a larger one is used where floats cannot reach it.
         restart: convention of the diameter: terminal states lead back to the start.
-        budget: what each measure may spend before it returns a proven interval.
-        progress: called with the name of the running measure and a line on how far it is.
-        representation: what the agent's network makes of the states, for measures that need one; or None.
+        budget: of each measure, after which it returns a proven interval.
+        progress: called with the name of the running measure and a line on its progress.
+        representation: of the states by the agent's network, for measures that need one; or None.
         schedule: of the idealised learner.
         rollouts: of the idealised actor-critic; None: those of `Rollouts`.
         sampling: of the learner that draws; None: that of `Sampling`.
@@ -116,9 +116,9 @@ class Measure:
 
     Attributes:
         name: key of the result.
-        function: Problem -> a number, or an object with `to_dict()`; UndefinedMeasure where it does not exist. What is
-            proven of it the result says itself, by attributes `exact`, `lower`, `upper`, `note`; a plain number says
-            nothing, and the report says so: "float64". `Certified` is a number that has them.
+        function: Problem -> a number, or an object with `to_dict()`; UndefinedMeasure where it does not exist. The
+            result's attributes `exact`, `lower`, `upper`, `note`, as of `Certified`, state its proven interval; a plain
+            number has none, and is reported as "float64".
         definition: formula, in a line.
         source: who defined it.
         complexity: "visitation", "estimation", "planning", "representation" or "other".
@@ -181,7 +181,7 @@ def measures() -> dict[str, Measure]:
     return dict(_MEASURES)
 
 
-def chosen(names: str | Iterable[str] | None, is_seen: bool = False) -> list[Measure]:
+def selected_measures(names: str | Iterable[str] | None, is_seen: bool = False) -> list[Measure]:
     """The measures of these names; None: all but those on request; "all": these as well.
 
     Args:
@@ -227,7 +227,7 @@ def _minimal_gap(problem: Problem) -> Certified:
     return result
 
 
-# What several of them have in common
+# Settings that several measures share
 _VALUES: dict[str, Any] = {"complexity": "estimation", "version": 2, "depends": "values"}
 _REPRESENTATION: dict[str, Any] = {
     "complexity": "representation",
@@ -372,8 +372,8 @@ register(
 )
 
 
-def _seen(function: Callable[..., Outcome], problem: Problem, *options: str) -> Outcome:
-    """A measure of what the agent sees; options: of the problem, beside schedule and horizon."""
+def _represented(function: Callable[..., Outcome], problem: Problem, *options: str) -> Outcome:
+    """Result of a measure of the representation; options: names in `problem`, beside schedule and horizon."""
     representation = problem.seen(function.__name__)
     return function(
         problem.mdp, representation, **{name: getattr(problem, name) for name in ("schedule", "horizon", *options)}
@@ -382,7 +382,7 @@ def _seen(function: Callable[..., Outcome], problem: Problem, *options: str) -> 
 
 register(
     "kernel_regret",
-    lambda problem: _seen(kernel_regret, problem, "solution"),
+    lambda problem: _represented(kernel_regret, problem, "solution"),
     definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of expected Q-learning "
     "in the tangent kernel of the agent's network; as played; and both of tabular Q-learning",
     source="pharos; after Sirignano and Spiliopoulos (2019)",
@@ -390,7 +390,7 @@ register(
 )
 register(
     "sampled_regret",
-    lambda problem: _seen(sampled_regret, problem, "solution", "sampling"),
+    lambda problem: _represented(sampled_regret, problem, "solution", "sampling"),
     definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of Q-learning from "
     "drawn transitions in the tangent kernel of the agent's network and in its root; and that of a table",
     source="pharos; after Mnih et al. (2015)",
@@ -398,7 +398,7 @@ register(
 )
 register(
     "kernel_policy_regret",
-    lambda problem: _seen(kernel_policy_regret, problem, "solution", "rollouts"),
+    lambda problem: _represented(kernel_policy_regret, problem, "solution", "rollouts"),
     definition="mean over learning of (V* - V of the most probable actions) / (V* - V of uniform play) of an expected "
     "actor-critic in the tangent kernel of the agent's network; as played; and both of a table",
     source="pharos; Sutton et al. (2000), Schulman et al. (2016, 2017)",
@@ -406,21 +406,21 @@ register(
 )
 register(
     "kernel_learning_time",
-    lambda problem: _seen(kernel_learning_time, problem),
+    lambda problem: _represented(kernel_learning_time, problem),
     definition="time after which gradient flow in the kernel (trace 1) has learnt 90 % of the energy of A* = Q* - V*",
     source="pharos; Jacot, Gabriel and Hongler (2018)",
     **_REPRESENTATION,
 )
 register(
     "kernel_sample_complexity",
-    lambda problem: _seen(kernel_sample_complexity, problem),
+    lambda problem: _represented(kernel_sample_complexity, problem),
     definition="samples from which kernel regression explains 90 % of the variance of Q*",
     source="Simon, Dickens, Karkada and DeWeese (2023)",
     **_REPRESENTATION,
 )
 register(
     "aliasing_floor",
-    lambda problem: _seen(aliasing_floor, problem),
+    lambda problem: _represented(aliasing_floor, problem),
     definition="E Var(Q* | observation) / Var Q*: what no function of the observation explains",
     source="pharos",
     **_REPRESENTATION,

@@ -18,7 +18,7 @@ import xxhash
 
 from pharos.errors import PrecisionError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of, finite
-from pharos.hardness.registry import Measure, Problem, chosen
+from pharos.hardness.registry import Measure, Problem, selected_measures
 from pharos.hardness.representation import Representation, Rollouts, Schedule
 from pharos.hardness.sampled_regret import Sampling
 from pharos.mdp import TabularMDP, check_horizon, require_mdp
@@ -33,7 +33,7 @@ class Result:
 
     Attributes:
         name, definition, source, complexity: of the measure.
-        value: a number, or what the measure's result says of itself as a dictionary; None where it is undefined.
+        value: a number, or the measure's result as a dictionary; None where it is undefined.
         text: the value for people.
         undefined: why there is no value, and what would define it; empty where there is one.
         seconds: time that it took, when it was computed.
@@ -162,7 +162,7 @@ def report(  # noqa: PLR0913
     watch = Stopwatch()
     horizon = mdp.horizon if horizon is None else horizon
     check_horizon(horizon)
-    wanted = chosen(measures, representation is not None)
+    wanted = selected_measures(measures, representation is not None)
     schedule = schedule or Schedule()
     options = (representation, schedule, rollouts, sampling, None if folder is None else Path(folder))
     problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress, *options)
@@ -195,7 +195,7 @@ def _measured(measure: Measure, problem: Problem, file: "ResultsFile | None") ->
 
 
 def _error_bound(problem: Problem) -> float | None:
-    """How wrong the optimal values may be; None where no measure has asked for them."""
+    """Error bound of the optimal values; None where no measure has used them."""
     return problem.solution.error_bound if "solution" in vars(problem) else None
 
 
@@ -307,8 +307,10 @@ class ResultsFile:
         return {"value": content["value"], "text": text, "seconds": seconds, "certificate": certificate}
 
     def put(self, measure: Measure, result: Result, budget: Budget, error_bound: float | None) -> None:
-        """Keep a result, and how wrong the optimal values behind it may be. A folder that cannot be written to
-        (another's, or a full disk) keeps nothing."""
+        """Keep a result, and the error bound of the optimal values behind it.
+
+        Nothing is kept where the folder cannot be written to (another's, or a full disk).
+        """
         if self.path is None or measure.version is None:
             return
         content = {
@@ -366,7 +368,7 @@ class ResultsFile:
         return {}
 
     def _warn(self, what: str) -> None:
-        """Once for each report."""
+        """Warn about the file, once for each report."""
         if not self._has_warned:
             self._has_warned = True
             warnings.warn(f"{self.path}: {what}; it is measured anew", stacklevel=2)

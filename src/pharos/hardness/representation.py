@@ -1,7 +1,7 @@
-"""What a network makes of the states of an MDP: which look alike, and how much learning at one changes another.
+"""Representation of an MDP's states by a network: which look alike, and how learning at one changes another.
 
 Products with its kernel are those of the kernel itself, the identity, or landmarks and a diagonal (Nyström).
-`IdealisedLearner` is Q-learning of a network in expectation, what `kernel_regret` builds on.
+`IdealisedLearner` is Q-learning of a network in expectation, on which `kernel_regret` builds.
 """
 
 import math
@@ -50,7 +50,7 @@ class Representation:
 
     @staticmethod
     def of_matrix(kernel: ArrayLike, classes: ArrayLike | None = None, **options: Any) -> "Representation":
-        """From a kernel (S, S), and numbers of observations (S,); None: every state looks different.
+        """Make a representation of a kernel (S, S) and numbers of observations (S,); None: every state looks different.
 
         Raises:
             ParameterError: it is not square, symmetric and finite, there is not one number for each state, or there
@@ -98,7 +98,7 @@ class Grouped:
         return len(self.representatives)
 
     def sums(self, values: np.ndarray) -> np.ndarray:
-        """(C, ...), of values (N, ...) of the states."""
+        """(C, ...) sums of values (N, ...) over the states of each observation."""
         if values.ndim == 1:
             return np.bincount(self.groups, values, minlength=len(self))
         return np.stack([self.sums(column) for column in values.T], axis=1)
@@ -162,7 +162,7 @@ class KernelOperator:
         raise NotImplementedError
 
     def descended(self, weights: np.ndarray, error: np.ndarray, rate: float, steps: int) -> np.ndarray:
-        """What gradient descent adds to Q in `steps` steps Q += rate K (weights (target - Q)), from error = target - Q.
+        """Change of Q by `steps` steps of gradient descent, Q += rate K (weights (target - Q)); error = target - Q.
 
         It is K times rate weights times the sum of the errors on the way, a polynomial of degree steps - 1 in
         rate K diag(weights), whose eigenvalues lie in [0, 1]: a Chebyshev series of about 3.5 sqrt(steps) terms has it
@@ -183,7 +183,7 @@ class KernelOperator:
 
 
 class Identity(KernelOperator):
-    """No likeness between observations: a table."""
+    """The identity: no generalisation between observations, as in a table."""
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         return z
@@ -249,7 +249,7 @@ class Landmarks(KernelOperator):
         return np.empty((0, 0), np.float32), self.features, np.ascontiguousarray(self.diagonal[:, 0])
 
     def preconditioned(self, weights: np.ndarray) -> None:
-        """Of the features and of the diagonal, each for itself."""
+        """Precondition the features and the diagonal separately."""
         column = weights.astype(np.float32)[:, None]
         values, vectors = np.linalg.eigh((self.features.T @ (column * self.features)).astype(np.float64))
         is_large = values > 1e-7 * values[-1]
@@ -259,7 +259,7 @@ class Landmarks(KernelOperator):
         self.diagonal = np.sqrt(self.diagonal / column)
 
     def summed(self, weights: np.ndarray, error: np.ndarray, rate: float, series: np.ndarray) -> np.ndarray:
-        """As for others, with one pass over the features a term in place of two."""
+        """The sum of the series, with one pass over the features a term in place of two."""
         from pharos.kernels import linear_algebra
 
         if len(series) < 3:
@@ -300,7 +300,7 @@ WORST_GREEDY, WORST_PLAYED = 1.5, 3.0  # a policy's regret counts no more than t
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """How the idealised learner learns.
+    """Schedule of the idealised learner: steps, target network, exploration, discount, optimizer.
 
     Attributes:
         steps: of the environment.
@@ -347,7 +347,7 @@ class Schedule:
 
 @dataclass(frozen=True, kw_only=True)
 class Rollouts:
-    """How the idealised actor-critic learns.
+    """Rollouts and gradient steps of the idealised actor-critic.
 
     Attributes:
         steps: of the environment in a rollout, after which policy and values learn.
@@ -377,7 +377,7 @@ class Rollouts:
 
 @dataclass(frozen=True, eq=False)
 class LearningCurve:
-    """What the idealised learner does in each of its J phases; regrets are normalised: 0 optimal, 1 uniform play.
+    """Regret of the idealised learner in each of its J phases, normalised: 0 optimal, 1 uniform play.
 
     Attributes:
         steps: (J,) at the beginning of a phase.
@@ -412,13 +412,13 @@ class LearningCurve:
 
 
 class IdealisedLearner:
-    """An MDP, and what learners on it have in common.
+    """Idealised Q-learning on an MDP, and the base of other idealised learners.
 
     Attributes:
-        measure: what is said to be undefined, or estimated.
+        measure: its name in errors and notes.
         step_weights: how d weighs the kernel in the step size, in words.
         whole: the MDP as given; mdp: without states that its horizon keeps out of reach.
-        states: (N,) those that an episode can meet and that are not terminal; numbers: (N,) in the MDP as given.
+        states: (N,) those that an episode can reach and that are not terminal; numbers: (N,) in the MDP as given.
         episode: its steps.
         observations: the states by what the agent sees; table: each for itself.
     Raises:
@@ -446,14 +446,14 @@ class IdealisedLearner:
         if math.isnan(self.spread):
             raise UndefinedMeasure(f"{self.measure}: uniform play is optimal, so that there is no regret to speak of")
         self.whole = self.mdp = mdp
-        met = mdp.states_within(episode)
-        met[mdp.start_states] = True
-        if mdp.horizon is not None and mdp.horizon == episode and not met.all():
-            self.mdp, numbers = mdp.within(episode), np.flatnonzero(met)
+        is_reachable = mdp.states_within(episode)
+        is_reachable[mdp.start_states] = True
+        if mdp.horizon is not None and mdp.horizon == episode and not is_reachable.all():
+            self.mdp, numbers = mdp.within(episode), np.flatnonzero(is_reachable)
             self.states = np.flatnonzero(~np.asarray(self.mdp.terminal))
             self.numbers = numbers[self.states]
         else:
-            self.states = self.numbers = np.flatnonzero(met & ~np.asarray(mdp.terminal))
+            self.states = self.numbers = np.flatnonzero(is_reachable & ~np.asarray(mdp.terminal))
         self.observations = Grouped(representation.classes, self.numbers)
         self.table = Grouped(np.arange(mdp.num_states), self.numbers)
         self.visits = OfPolicies(lambda policy: visits_of(self.mdp, self.everywhere(policy), self.episode))
@@ -485,25 +485,25 @@ class IdealisedLearner:
 
     @cached_property
     def weights(self) -> np.ndarray:
-        """(C,) of observations, at the standard occupancy."""
+        """(C,) weights of observations at the standard occupancy."""
         standard = standard_occupancy(self.whole, self.schedule.gamma, self.episode)
         return self.observations.sums(standard.states[self.numbers])
 
     def operators(self) -> tuple[Iterable[KernelOperator], int | None]:
-        """([the kernel over observations], None); or, where they are too many, (it by landmarks, then by half of these;
-        how many landmarks), drawn by `weights`."""
+        """([the kernel over observations], None); or, where they are too many, (the kernel by landmarks, then by half
+        of them; the number of landmarks), drawn by `weights`."""
         kernel, observed = self.representation.kernel, self.observations.representatives
         landmarks = self.representation.landmarks
         if landmarks is None and len(observed) > MOST_EXACT:
             landmarks = LANDMARKS
         if not landmarks or landmarks >= len(observed):
             return [Exact(kernel, observed)], None
-        chosen = observed[drawn(self.weights, landmarks)]
-        parts = (chosen, chosen[: landmarks // 2])
+        sample = observed[drawn(self.weights, landmarks)]
+        parts = (sample, sample[: landmarks // 2])
         return (Landmarks(kernel, observed, some) for some in parts), landmarks  # one at a time
 
     def conventions(self, settings: Mapping[str, Any], clipped: Mapping[str, float]) -> dict[str, Any]:
-        """What a regret refers to; settings: of the learner."""
+        """Conventions of a regret, JSON-able; settings: of the learner."""
         return {
             **settings,
             "episode": self.episode,
@@ -520,11 +520,11 @@ class IdealisedLearner:
         return self.mdp.gamma == 1.0 and self.mdp.horizon == self.episode
 
     def regret(self, value: float) -> float:
-        """Normalised, of a policy's value."""
+        """Normalised regret of a policy's value."""
         return (self.optimal - value) / self.spread
 
     def _value(self, policy: np.ndarray) -> float:
-        """Of a policy (N, A) of the states, at the start."""
+        """Start value of a policy (N, A)."""
         if self.is_return:
             return float((self.visits(policy).executed * self.mdp.rewards).sum())
         if policy.max(axis=1).min() == 1.0:
@@ -534,7 +534,7 @@ class IdealisedLearner:
         return evaluate_policy(self.mdp, self.everywhere(policy), ACCURACY * self.spread).value_at_start
 
     def everywhere(self, policy: np.ndarray) -> np.ndarray:
-        """(S, A), uniform where nobody acts."""
+        """(S, A) probabilities of a policy (N, A), uniform in states outside `states`."""
         table = np.full((self.mdp.num_states, self.mdp.num_actions), 1 / self.mdp.num_actions)
         table[self.states] = policy
         return table
@@ -591,9 +591,9 @@ class Memory:
         if not self.mdp.is_sticky:
             return chance.chosen_values(q), later
         mean, visits = q.mean(axis=1, keepdims=True), self.first + later
-        chosen = chance.first_chosen * self.first + chance.chosen * later
+        choice = chance.first_chosen * self.first + chance.chosen * later
         uniform = chance.first_uniform * self.first + chance.uniform * later
-        total = chosen * q + uniform * mean + chance.previous * np.einsum("sba,sb->sa", self.later, q)
+        total = choice * q + uniform * mean + chance.previous * np.einsum("sba,sb->sa", self.later, q)
         return np.divide(total, visits, out=q.copy(), where=visits > 0), visits
 
 
@@ -610,7 +610,7 @@ Answer = TypeVar("Answer")
 
 
 class OfPolicies(Generic[Answer]):
-    """A function of policies that knows its last answers: what is learnt settles, and is asked about again."""
+    """A function of policies with its last results cached, as policies repeat once learning has settled."""
 
     def __init__(self, function: Callable[[np.ndarray], Answer], last: int = 4):
         self.function, self.known = function, deque[tuple[np.ndarray, Answer]](maxlen=last)

@@ -34,7 +34,7 @@ LOOKS = 30
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """What the sampled learner draws.
+    """Draws of the sampled learner: walks, minibatches, replay memory, noise.
 
     Attributes:
         walks: independent ones, of which the mean is taken.
@@ -125,7 +125,7 @@ class SampledRegret:
 
     @property
     def note(self) -> str:
-        """What is random, and what is approximate."""
+        """Deviation between walks, and the landmarks with their estimated error, as text."""
         count = len(self.descent.greedy)
         text = f"sampled_regret: a mean over {count} walks, one of which deviates by {self.deviation:.2g}"
         if count == 1:
@@ -223,25 +223,25 @@ def sampled_regret(
 
 
 class SampledLearner(IdealisedLearner):
-    """An MDP, and learners that walk on it."""
+    """Q-learning in a kernel, from drawn transitions of an MDP."""
 
     measure = "sampled_regret"
     sampling: Sampling
 
     @cached_property
     def outcomes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Where the outcomes of each pair begin; next states, -1 for the end; rewards; cumulative probabilities."""
+        """(offsets of the outcomes of each pair; next states, -1 for the end; rewards; cumulative probabilities)."""
         pairs = self.whole.num_states * self.whole.num_actions
         which, states, rewards, probabilities = paid_outcomes(self.whole)
         offsets = np.searchsorted(which, np.arange(pairs + 1))
         cumulative = np.cumsum(probabilities)
         begin = np.append(0.0, cumulative)[offsets[:-1]]
-        likely = (cumulative - begin[which]) / np.add.reduceat(probabilities, offsets[:-1])[which]
+        levels = (cumulative - begin[which]) / np.add.reduceat(probabilities, offsets[:-1])[which]
         ends = np.where(states == self.whole.num_states, -1, states)
-        return offsets, ends, np.asarray(rewards, np.float64), likely
+        return offsets, ends, np.asarray(rewards, np.float64), levels
 
     def both(self, operator: KernelOperator) -> tuple[SampledCurve, SampledCurve]:
-        """With a kernel, and with its root."""
+        """(regret with a kernel, regret with its root)."""
         observations = self.observations
         root = copy.copy(operator)  # whose arrays are replaced, not changed
         root.preconditioned(np.full(len(observations), 1 / len(observations)))
@@ -285,7 +285,7 @@ class SampledLearner(IdealisedLearner):
         cumulative = np.append(np.cumsum(mdp.start_probabilities[:-1]), 1.0)
         vector, largest_step = np.full((count, 1), count**-0.5), 0.0
         stops = np.unique([*looks, *range(0, schedule.steps, schedule.period)])
-        for step, following in zip(stops, [*stops[1:], schedule.steps], strict=True):
+        for step, next_stop in zip(stops, [*stops[1:], schedule.steps], strict=True):
             if step in looks:
                 values = np.empty((count, num_actions))
                 kernels.values(kernel, learnt, values)
@@ -300,5 +300,5 @@ class SampledLearner(IdealisedLearner):
                 *(self.outcomes, np.asarray(mdp.terminal, np.bool_), group),
                 *(np.asarray(mdp.start_states, np.int64), cumulative, (chance[0], chance[1], 0.0, chance[2])),
                 *(self.episode, kernel, learnt, target, memory, visits, place, word, noise, numbers),
-                *(largest_step, int(following - step)),
+                *(largest_step, int(next_stop - step)),
             )

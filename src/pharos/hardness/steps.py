@@ -1,4 +1,4 @@
-"""Values of every step of an episode of T steps, under optimal, worst and exploring play: what planning measures share.
+"""Values of every step of an episode of T steps, under optimal, worst and exploring play, for planning measures.
 
 Undiscounted and time-indexed, on the nodes of `choices`: states, or under sticky actions pairs (state, previously
 executed action) and the starts without one. Source: Laidlaw, Russell and Dragan (2023).
@@ -24,7 +24,7 @@ LARGEST = 1e150
 
 
 def steps_of(name: str, mdp: TabularMDP, horizon: int | None) -> int:
-    """T: what was given, else the horizon of the MDP."""
+    """T: the argument, else the horizon of the MDP; UndefinedMeasure where there is neither."""
     steps = mdp.horizon if horizon is None else horizon
     if steps is None:
         raise UndefinedMeasure(f"{name} is defined for episodes of T steps: give a horizon")
@@ -47,7 +47,7 @@ class FiniteHorizonValues:
         choices: the MDP written out; rewards (N, A); table (N, A) where each choice has one outcome, else None.
         best, worst, explored: (T, N, A) action values; explored_value (T, N), clipped to [worst, best].
         optimal: (T, N, A) bool.
-        met: (T, N) bool, whether a node can be met at step t.
+        first: (N,) bool, the start nodes. num_visitable: states (pairs under sticky actions) that can be visited.
     """
 
     def __init__(self, mdp: TabularMDP, steps: int):
@@ -77,18 +77,18 @@ class FiniteHorizonValues:
         self.first = np.zeros(self.num_nodes, np.bool_)
         self.first[[node for node, _ in self.starts]] = True
         everything = np.ones((self.num_nodes, self.num_actions), np.bool_)
-        visitable, reached = self.first.copy(), self.first
+        visitable, current = self.first.copy(), self.first
         inside, ended = choices.underlying < mdp.num_states, False
         for _ in range(steps - 1):
-            ended |= bool((reached & ~inside).any())
-            reached = self.following(reached, everything)
-            visitable |= reached
+            ended |= bool((current & ~inside).any())
+            current = self.successors(current, everything)
+            visitable |= current
         if mdp.is_sticky:  # as BRIDGE counts
             pairs = {
                 (int(s), 0) for s in choices.underlying[self.first]
             }  # a start stands for itself with the first action
-            met = visitable & (inside | (not ended)) & (choices.previous < mdp.num_actions)
-            pairs |= set(zip(choices.underlying[met].tolist(), choices.previous[met].tolist(), strict=True))
+            mask = visitable & (inside | (not ended)) & (choices.previous < mdp.num_actions)
+            pairs |= set(zip(choices.underlying[mask].tolist(), choices.previous[mask].tolist(), strict=True))
             self.num_visitable = len(pairs) + ended * mdp.num_actions  # an end leads to itself, by every action
         else:
             self.num_visitable = int((visitable & inside).sum())
@@ -97,9 +97,9 @@ class FiniteHorizonValues:
         """(N, A): r + E value(next)."""
         return self.rewards + self.choices.expected(value)
 
-    def following(self, met: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """(N,) bool: nodes that some of these actions (N, A) lead to from the nodes that are met."""
-        result, nodes = np.zeros(self.num_nodes, np.bool_), np.flatnonzero(met)
+    def successors(self, is_reached: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """(N,) bool: nodes that some of these actions (N, A) lead to from nodes, (N,) bool."""
+        result, nodes = np.zeros(self.num_nodes, np.bool_), np.flatnonzero(is_reached)
         result[self.choices.successors(nodes, actions[nodes])] = True
         return result
 
@@ -108,7 +108,7 @@ class FiniteHorizonValues:
         return float(sum(p * values[node] for node, p in self.starts))
 
     def lookahead(self, values: np.ndarray) -> np.ndarray:
-        """(T, N, A): Q^{k+1} from Q^k."""
+        """(T, N, A): Q^{k+1}, from Q^k."""
         result = np.empty(self.best.shape)
         result[-1] = self.rewards
         for t in range(self.steps - 1):
@@ -146,8 +146,8 @@ class ReturnDistribution:
 
     def quantile(self, level: float) -> float:
         """The smallest return that is exceeded with probability 1 - level at most."""
-        reached = np.flatnonzero(np.cumsum(self.probabilities) >= level - 1e-12)
-        return float(self.returns[reached[0] if len(reached) else -1])
+        indices = np.flatnonzero(np.cumsum(self.probabilities) >= level - 1e-12)
+        return float(self.returns[indices[0] if len(indices) else -1])
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
@@ -196,32 +196,34 @@ def _backward(mdp: TabularMDP, policy: TablePolicy | None, steps: int) -> tuple[
     states, num_actions, chance = mdp.num_states, mdp.num_actions, mdp.chance
     table = PolicyTable.of(mdp, policy)
     rewards = np.where(np.asarray(mdp.terminal)[:, None], 0.0, mdp.rewards)
-    paid, which = np.unique(rewards, return_inverse=True)
+    distinct, which = np.unique(rewards, return_inverse=True)
     which = which.reshape(rewards.shape)
     support, values = np.zeros(1), np.ones((states + 1, mdp.width, 1))
     for t in range(steps - 1, -1, -1):
-        sums = np.sort(np.append((paid[:, None] + support).ravel(), 0.0))  # what has ended has return 0
-        following = sums[np.concatenate([[True], np.diff(sums) > SAME])]
-        if 8 * states * num_actions * len(following) * 3 > MEMORY:
+        # Returns that are possible from this step on.
+        sums = np.sort(np.append((distinct[:, None] + support).ravel(), 0.0))  # ended episodes have return 0
+        returns = sums[np.concatenate([[True], np.diff(sums) > SAME])]
+        if 8 * states * num_actions * len(returns) * 3 > MEMORY:
             raise UndefinedMeasure(
-                f"return_distribution: {len(following)} returns are possible in {steps - t} steps from {states} "
+                f"return_distribution: {len(returns)} returns are possible in {steps - t} steps from {states} "
                 f"states, more than {MEMORY / 2**30:.0f} GiB hold; a smaller horizon or instance would define it"
             )
-        executed = np.zeros((states, num_actions, len(following)))
+        # Distribution of the return after executing each action, then of the chosen one.
+        executed = np.zeros((states, num_actions, len(returns)))
         after = mdp.dynamics.expected(values)
-        for i, reward in enumerate(paid):
+        for i, reward in enumerate(distinct):
             s, a = np.nonzero(which == i)
-            place = np.searchsorted(following, reward + support + SAME / 2) - 1
-            block = np.zeros((len(s), len(following)))
+            place = np.searchsorted(returns, reward + support + SAME / 2) - 1
+            block = np.zeros((len(s), len(returns)))
             block[:, np.maximum(place, 0)] = after[s, a]
             executed[s, a] = block
         if mdp.is_sticky and t == 0:
-            chosen = chance.first.choice(executed, table.first_value(executed))
+            choice = chance.first.choice(executed, table.first_value(executed))
         else:
-            chosen = chance.choice(executed, table.value(executed))
-        now = np.zeros((states + 1, *chosen.shape[1:]))
-        now[states, :, int(np.abs(following).argmin())] = 1.0
-        now[:states] = chosen
+            choice = chance.choice(executed, table.value(executed))
+        now = np.zeros((states + 1, *choice.shape[1:]))
+        now[states, :, int(np.abs(returns).argmin())] = 1.0
+        now[:states] = choice
         live = (now > 0).any(axis=(0, 1))
-        support, values = following[live], now[..., live]
+        support, values = returns[live], now[..., live]
     return support, values

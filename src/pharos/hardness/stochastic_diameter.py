@@ -202,7 +202,7 @@ class HubBounds:
 
     @cached_property
     def _into(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which outcomes lead to each node; made anew for shortening, as many MDPs need none, and it is large."""
+        """Outcomes that lead to each node, a large table; computed on demand, as only shortening needs it."""
         first, _, node, _ = self._outcomes
         return hitting.outcomes_into(node, len(first) - 1)
 
@@ -215,8 +215,7 @@ class HubBounds:
 
 
 def _outcomes(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(first, action, node, probability) of what executing each action in each state may lead to; -1: whatever
-    action."""
+    """(first, action, node, probability) of the outcomes of executing each action in each state; action -1: any."""
     terminal = np.asarray(mdp.terminal)
     executed, ends = outcomes_of(mdp, terminal)
     num_states, num_actions = mdp.num_states, mdp.num_actions
@@ -302,7 +301,7 @@ class TargetBounds:
         return float(times.max())
 
     def report(self) -> None:
-        """Report how far the bounds are."""
+        """Report the progress of the bounds."""
 
     @property
     def num_open(self) -> int:
@@ -335,7 +334,7 @@ class TargetBounds:
         self.upper[self.upper <= self.lower] = -math.inf
 
     def interval(self, lower: float, upper: float, is_infinite: bool) -> Interval:
-        """What is proven, from bounds of what is finite."""
+        """The proven interval, given bounds of the finite part."""
         left = self.num_open
         exact = is_infinite or (not left and math.isfinite(upper) and upper - lower <= 2 * self.tolerance * upper)
         note = ""
@@ -372,10 +371,10 @@ class _Diameter(TargetBounds):
         with ThreadPoolExecutor(len(self.threads)) as pool:
             if connected:
                 for batch in self._widest():
-                    self._look_at(batch, pool, bounding=True)
+                    self._solve_batch(batch, pool, bounding=True)
             if not self.many:  # else, where not connected: it is infinite, and that is all that can be said
                 for batch in self._promising():
-                    self._look_at(batch, pool, bounding=False)
+                    self._solve_batch(batch, pool, bounding=False)
         left, is_infinite = self.num_open, bool(self.unreachable) or not connected
         result = self.interval(self.lower, self._upper(), is_infinite)
         self.spending.report(result.lower, result.upper, left, now=True)
@@ -437,7 +436,7 @@ class _Diameter(TargetBounds):
             batch = [each for each in (widest, int(others.argmax())) if self.upper[each] > -math.inf]
             batch = list(dict.fromkeys(batch))[: int(min(2, left))]
 
-    def _look_at(self, batch: list[int], pool: ThreadPoolExecutor, bounding: bool) -> None:
+    def _solve_batch(self, batch: list[int], pool: ThreadPoolExecutor, bounding: bool) -> None:
         """Solve the targets of a batch, in threads. What a target must exceed is the same for all of a batch.
 
         So results do not depend on the number of threads. `bounding`: their hitting times bound those of other targets.
@@ -445,7 +444,7 @@ class _Diameter(TargetBounds):
         threads = self.threads
         scaling = bounding or not self.spending.searches
         looks = [
-            pool.submit(self._looks, own, part, self.lower, scaling, bounding)
+            pool.submit(self._solved, own, part, self.lower, scaling, bounding)
             for i, own in enumerate(threads)
             if (part := batch[i :: len(threads)])
         ]
@@ -465,9 +464,9 @@ class _Diameter(TargetBounds):
             own.initial_scale = self.targets.initial_scale
         self.report()
 
-    def _looks(
+    def _solved(
         self, targets: HittingTimes, some: Sequence[int], enough: float, scaling: bool, bounding: bool
-    ) -> "list[_Look]":
+    ) -> "list[_TargetResult]":
         """Solve each of `some`; one with an upper bound of at most `enough` no further than that."""
         looks = []
         for target in some:
@@ -478,7 +477,7 @@ class _Diameter(TargetBounds):
             limited = bounds.limited and not bounds.meets(self.tolerance)
             scale = targets.scale_of(j) if scaling else 1.0
             lower = max(bounds.lower, targets.least)
-            looks.append(_Look(target, lower, bounds.upper, limited, missing, scale, times))
+            looks.append(_TargetResult(target, lower, bounds.upper, limited, missing, scale, times))
         return looks
 
 
@@ -503,8 +502,8 @@ def shortened(travel: HubBounds, times: np.ndarray, away: np.ndarray, spending: 
 
 
 @dataclass
-class _Look:
-    """What is known of a target: bounds of its largest hitting time, and how many states do not surely reach it.
+class _TargetResult:
+    """Result for a target: bounds of its largest hitting time, and how many states do not surely reach it.
 
     Attributes:
         limited: whether floats allow no closer bounds.
@@ -560,7 +559,7 @@ class _Eccentricity(TargetBounds):
         target = int(self.choices.underlying[self.nodes[0]])
         ruled_out = hubs = 0
         while not (self.infinite or self.spending.is_over) and self.upper[target] > -math.inf:
-            times = self._look_at(target)
+            times = self._settle(target)
             if times is not None and self.has_hubs:
                 before = self.num_open
                 self.bound_others(target, times)
@@ -571,7 +570,7 @@ class _Eccentricity(TargetBounds):
                     self.has_hubs = False
             target = int(self.upper.argmax())
 
-    def _look_at(self, target: int) -> np.ndarray | None:
+    def _settle(self, target: int) -> np.ndarray | None:
         """Settle a target; returns upper bounds (nodes,) of its hitting times, where all are known."""
         targets, rounding = self.targets, 1 + (len(self.nodes) + 8) * UNIT
         self.spending.searches += 1
@@ -593,5 +592,5 @@ class _Eccentricity(TargetBounds):
         return j * bounds.high if lost is None and math.isfinite(bounds.high) else None
 
     def _mean(self, j: np.ndarray) -> float:
-        """Of the starts; no hitting time is below 0, which J may be before there is an upper bound."""
+        """Mean of J over the starts, at least 0 each, below which J may be before there is an upper bound."""
         return float(self.weights @ np.maximum(j[self.nodes], 0.0))

@@ -10,7 +10,7 @@ more. A shortest path from the start s does not pass it again, so d(s, v) is tha
 
     d(u, v) = min(d_H(u, v), e(u) + d(s, v)).
 
-e and d(s, .) are what the searches from the start say. Where all cycles of H are multiples of P steps long, as where
+e and d(s, .) come from the searches from the start. Where all cycles of H are multiples of P steps long, as where
 traffic goes by, all edges of H lead from one layer {v: d(s, v) = j modulo P} to the next. Searches in H backward from
 many targets then stand in one layer if each begins when that of its target has its turn (`kernels.search_in_step`):
 that one layer is read for all targets, while levels, counted from each target, are as many layers as targets have. They
@@ -78,11 +78,11 @@ class Graph:
         return self._reversed
 
     def search_forward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
-        """distance[v] = d(source, v); (nodes found, largest distance, sum of distances)."""
+        """Set distance[v] to d(source, v); return (nodes found, largest distance, sum of distances)."""
         return kernels.search((self.next_states, self.ends), None, self.start, source, distance, self.queue)
 
     def search_backward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
-        """distance[v] = d(v, source); (nodes found, largest distance, sum of distances)."""
+        """Set distance[v] to d(v, source); return (nodes found, largest distance, sum of distances)."""
         return kernels.search(None, self.backward, self.start, source, distance, self.queue)
 
 
@@ -220,7 +220,7 @@ class HiddenClock(NamedTuple):
 
 # Widths of searches from many nodes, in words of 64 sources: eight words are a cache line.
 _WORDS = (1, 8)
-# Levels up to which every node is asked on every level. Breakout has six times as many, puzzles half of them.
+# Levels up to which every node pulls on every level. Breakout has six times as many, puzzles half of them.
 _FEW_LEVELS = 100
 # Orbits from each of which a search is made.
 _FEW_ORBITS = 64
@@ -323,7 +323,7 @@ class SumSweep:
         """Search where it pays: the kind that closed most nodes for its cost, the others now and then.
 
         The kinds: from the node of the largest upper bound forward, or backward; from the middle in both directions;
-        from up to 512 open nodes at once, telling their neighbours or, where levels are few, asking them. Costs are
+        from up to 512 open nodes at once, pushing to neighbours or, where levels are few, pulling from them. Costs are
         counted in table entries read, not in seconds, so that the searches made are the same on every machine.
         """
         one = max(1, self.graph.num_nodes * self.graph.next_states.shape[1])
@@ -359,7 +359,7 @@ class SumSweep:
         return 24 * words * self.graph.num_nodes <= _BATCH_MEMORY
 
     def _limit(self, words: int) -> int:
-        """How many searches at once `words` and the budget allow for."""
+        """Number of searches at once that `words` and the budget allow for."""
         return int(min(64 * words, max(1, self.spending.budget.searches - self.spending.searches)))
 
     def _farthest(self, upper: np.ndarray, words: int) -> np.ndarray:
@@ -368,7 +368,7 @@ class SumSweep:
         return nodes[np.argsort(-upper[nodes].astype(np.int64), kind="stable")[: self._limit(words)]]
 
     def _search_many(self, outward: bool, words: int) -> int:
-        """The exact eccentricities of the open nodes with the largest upper bounds; table entries read, times words."""
+        """Find the eccentricities of the open nodes of largest upper bounds; return table entries read, times words."""
         graph = self.graph
         upper, lower = (self.out_upper, self.out_lower) if outward else (self.in_upper, self.in_lower)
         nodes = np.sort(self._farthest(upper, words))
@@ -386,12 +386,13 @@ class SumSweep:
         return int(reads) * (1 + words)
 
     def _search_densely(self) -> int:
-        """The exact in(v) of up to 512 open nodes, and what follows along edges; the cost, in table entries.
+        """Find the exact in(v) of up to 512 open nodes, and bounds along edges; return the cost, in table entries.
 
         Where most eccentricities are nearly equal, as in puzzles whose moves can be taken back, no pivot rules many
         nodes out; but a node with in(u) < D does so for its successors, as in(v) <= 1 + in(u). So none of the nodes is
         a successor of another one, and those with many successors come first: they lie in the middle and close most.
-        A line asked for takes an eighth of the time of one told (0.25 s for 512 nodes of the 8-puzzle, 2.8 s).
+        A line that is pulled takes an eighth of the time of one that is pushed (512 nodes of the 8-puzzle: 0.25 s in
+        place of 2.8 s).
         """
         graph = self.graph
         table, ends, start = graph.next_states, graph.ends, graph.start
@@ -417,7 +418,7 @@ class SumSweep:
     # Symmetries -------------------------------------------------------------------------------------------------------
 
     def _search_orbits(self) -> None:
-        """Where symmetries leave few orbits of states, the exact out(v) of all, by a search from one of each."""
+        """Find the exact out(v) of all states by a search from one of each orbit, where symmetries leave few orbits."""
         graph = self.graph
         orbit = orbits(graph.next_states, graph.ends, graph.start, graph.pivot, lambda: self.spending.is_over)
         if orbit is None:
@@ -435,7 +436,7 @@ class SumSweep:
     # Clocks -----------------------------------------------------------------------------------------------------------
 
     def _search_in_step(self) -> None:
-        """Where only restarts hide a clock, in(v) of all that are open, the farthest first."""
+        """Find in(v) of all open nodes, the farthest first, where the graph without restarts has a clock."""
         is_tried = self._open()[0] and self._fits(1)
         clock = HiddenClock.of(self.graph, self.to, self.away) if is_tried else None
         while clock is not None and self._open()[0] and not self.spending.is_over:
@@ -496,19 +497,19 @@ def _infinite_diameter(graph: Graph, spending: BudgetClock) -> Interval:
     words = 8 if 24 * 8 * size <= _BATCH_MEMORY else 1
     origins, front, coming = (np.zeros((size, words), np.uint64) for _ in range(3))
     scratch = (origins, front, coming, graph.queue, np.empty_like(graph.queue))
-    reached = finite = done = 0
+    num_reached = finite = done = 0
     while done < size and not spending.is_over and spending.seconds < end:
         sources = np.arange(done, min(done + 64 * words, size), dtype=graph.dtype)
         origins[:] = 0
         largest = np.empty(len(sources), np.int64)
         table = (graph.next_states, graph.ends)
         pairs, _ = many_searches.search_from_many(table, None, graph.start, sources, *scratch, largest)
-        reached += int(pairs)
+        num_reached += int(pairs)
         finite = max(finite, int(largest.max()))
         done += len(sources)
         spending.searches += len(sources)
         spending.report(finite, math.inf, size - done)
-    unreachable = done * (size - 1) - reached
+    unreachable = done * (size - 1) - num_reached
     counted = done == size
     note = "some states cannot be reached from others"
     if not counted:

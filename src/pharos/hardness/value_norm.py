@@ -1,6 +1,6 @@
 """The environmental value norm. Source: Maillard, Mann and Mannor (2014), "How hard is my MDP?".
 
-How often actions are nearly as good as each other: the action-gap regularity.
+Action-gap regularity: how often actions are nearly as good as each other.
 """
 
 import math
@@ -62,8 +62,8 @@ def certified_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> C
         first = lone[block]
         largest = max(largest, _largest_variance(mdp.chance.first, means[first], within[first], 0))
         for previous in range(mdp.width):
-            met = nodes[block, previous]
-            largest = max(largest, _largest_variance(mdp.chance, means[met], within[met], previous))
+            is_node = nodes[block, previous]
+            largest = max(largest, _largest_variance(mdp.chance, means[is_node], within[is_node], previous))
     value = math.sqrt(largest) * scale
     error = solution.error_bound + (3 * mdp.num_actions + mdp.dynamics.operations + 16) * _UNIT * size
     lower, upper = max(0.0, value - error), value + error
@@ -71,8 +71,8 @@ def certified_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> C
 
 
 def _outcomes(mdp: TabularMDP, x: np.ndarray, states: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """((N, A) mean less that of the row, (N, A) variance) of the value of what follows the execution of each action,
-    over `scale`."""
+    """((N, A) mean less that of the row, (N, A) variance) of the next state's value under each executed action, over
+    `scale`."""
     means = mdp.dynamics.expected(x, states) / scale
     within: np.ndarray = np.zeros_like(means)
     if not mdp.dynamics.is_deterministic:
@@ -86,8 +86,8 @@ def _outcomes(mdp: TabularMDP, x: np.ndarray, states: np.ndarray, scale: float) 
 
 
 def _largest_variance(chance: Chance, means: np.ndarray, within: np.ndarray, previous: int) -> float:
-    """The largest variance of what follows a choice: within the outcomes of what is executed, and between their
-    means."""
+    """The largest variance of the next state's value after a choice: within the outcomes of executed actions, and
+    between their means."""
     repeated = means[:, previous : previous + 1]
     mean = chance.chosen * means + chance.uniform * means.mean(axis=1, keepdims=True) + chance.previous * repeated
     result = chance.chosen * (within + (means - mean) ** 2)
@@ -105,7 +105,7 @@ def _largest_variance(chance: Chance, means: np.ndarray, within: np.ndarray, pre
 
 @dataclass(frozen=True, eq=False)
 class ActionGapRegularity:
-    """How the action gap g(s) = V*(s) - max over actions that are not optimal of Q*(s, a) is distributed.
+    """Distribution of the action gap g(s) = V*(s) - max over actions that are not optimal of Q*(s, a).
 
     Attributes:
         constant: the smallest c with P(0 < g(s) <= t) <= c t^zeta for all t > 0; 0 where there are no gaps.

@@ -1,14 +1,14 @@
-"""Where policies go and how long that takes: occupancy, exploration, covering, mixing.
+"""Visits of policies and the time that they take: occupancy, exploration, covering, mixing.
 
-Occupancy measures: how often a policy is where, and what it does there. Source: Puterman (1994), section 6.9. Measures
-of representations look where `standard_occupancy` does: half the visits of uniform play, half those of optimal play.
+Occupancy measures: how often a policy is in a state and takes an action. Source: Puterman (1994), section 6.9. Measures
+of representations weigh states by `standard_occupancy`: half the visits of uniform play, half those of optimal play.
 
-Exploration time: how long uniform play takes to meet a large reward, what exploration alone costs, whatever is learnt.
+Exploration time: how long uniform play takes to find a large reward, the cost of exploration without any learning.
 Covering: how long random play takes to see everything. Source: Laidlaw, Russell and Dragan (2023), appendix. The bound
 on the covering length: Even-Dar and Mansour (2003).
 
 Mixing time: how many steps until a policy has forgotten where it began. The distribution mismatch coefficient: how much
-rarer an exploring policy is where the optimal policy goes.
+rarer an exploring policy visits the states of the optimal policy.
 """
 
 import math
@@ -47,7 +47,7 @@ _LEAST = 1e-280  # mass that is not worth a step: smaller numbers lose their dig
 
 @dataclass(frozen=True, eq=False)
 class Occupancy:
-    """How often a policy is in a state and takes an action.
+    """Occupancy measure of a policy: expected visits of pairs of a state and an action.
 
     Attributes:
         visits: (S, A) float64, the sum over t of gamma^t mu_t(s, a), t = 0, 1, ...
@@ -100,7 +100,7 @@ def occupancy(
 
         mu_t(s, a) = P(s_t = s, a_t = a),   visits(s, a) = sum over t of gamma^t mu_t(s, a),   t = 0, 1, ...
 
-    An episode that has ended is nowhere: terminal states have no visits. The expected return is the sum of
+    Terminal states have no visits, as episodes end there. The expected return is the sum of
     visits(s, a) r(s, a) over executed actions.
 
     Args:
@@ -246,11 +246,9 @@ class Propagation:
         self.width = mdp.width
 
     def after_the_start(self) -> tuple[np.ndarray, np.ndarray]:
-        """((S,), (S, W)): under sticky actions where play starts, and where it is a step later.
+        """((S,), (S, W)): under sticky actions the mass of the start, and that one step later; else 0, and the start.
 
-        Otherwise nothing, and where it starts.
-
-        That is where the rules of later steps hold. Without states where play ends.
+        The second is the first mass that moves by the rules of later steps. Without states where play ends.
         """
         start = next(self.distributions())[0]
         started, now = np.zeros(len(start)), np.zeros((len(start), self.width))
@@ -263,15 +261,15 @@ class Propagation:
         return started, now
 
     def executed(self, started: np.ndarray, visits: np.ndarray) -> np.ndarray:
-        """(S, A): how masses execute the actions: started (S,) under the rules of the first step, visits (S, W) of
-        later ones."""
+        """(S, A): the mass that executes each action: of started (S,) by the rules of the first step, of visits (S, W)
+        by those of later ones."""
         later = self.later.chance.executed(visits, chosen_mass(self.later.policy, visits))
         first = started[:, None]
         return later + self.first.chance.executed(first, chosen_mass(self.first.policy, first))
 
     def discounted(self, tolerance: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """((S,), (S, W), bound): discounted visits, under sticky actions those of the first step apart; what they may
-        lack."""
+        """((S,), (S, W), bound): discounted visits of the first step, under sticky actions alone; of the others; and a
+        bound on the visits that are missing."""
         started, waiting = self.after_the_start()
         gamma = self.mdp.gamma
         waiting *= gamma if self.mdp.is_sticky else 1.0
@@ -304,10 +302,10 @@ class Propagation:
     def record(
         self, mass: np.ndarray, first: bool, executed: bool, scale: float, total: np.ndarray, largest: np.ndarray
     ) -> None:
-        """Add the pairs (state, action) of one step."""
-        play = self.first if first else self.later
-        weights = (play.chance if executed else Chance()).triple
-        kernels.record(self.live, play.policy, weights, mass, scale, total, largest)
+        """Add the mass of pairs (state, action) of one step to `total`, times `scale`, and raise `largest` to it."""
+        step = self.first if first else self.later
+        weights = (step.chance if executed else Chance()).triple
+        kernels.record(self.live, step.policy, weights, mass, scale, total, largest)
 
     def _push(self, now: np.ndarray, first: bool, after: np.ndarray) -> float:
         return self.mdp.dynamics.step_distribution(self.first if first else self.later, now, after)
@@ -318,7 +316,7 @@ class Propagation:
 
 @dataclass(frozen=True, eq=False)
 class StandardOccupancy:
-    """Optimal values of the learner's discount, and where one is.
+    """Optimal values of the learner's discount, and weights of states.
 
     Attributes:
         states: (S,) weights that sum to 1; 0 for terminal states.
@@ -358,12 +356,12 @@ LARGE = 0.5  # of the largest reward
 
 @dataclass(frozen=True)
 class ExplorationTime:
-    """When uniform play first meets a large reward.
+    """Expected time until uniform play finds a large reward.
 
     Attributes:
         steps: expected, episodes after episodes; infinite where it never does.
         episodes: expected, the one in which it happens included: 1 / probability.
-        probability: that an episode meets one.
+        probability: that an episode has one.
         threshold: a reward above it is large.
         horizon: steps of an episode.
     """
@@ -404,23 +402,23 @@ def exploration_time(mdp: TabularMDP, *, horizon: int | None = None) -> Explorat
     is_large = rewards > threshold
     mass = np.zeros((mdp.num_states, 1))
     np.add.at(mass[:, 0], mdp.start_states, mdp.start_probabilities)
-    met = length = 0.0
+    probability = length = 0.0
     chance = mdp.chance.first
     for _ in range(steps):
         mass[~live] = 0.0
         total = mass.sum(axis=1, keepdims=True)
         length += float(total.sum())
         executed = chance.executed(mass, np.repeat(total / mdp.num_actions, mdp.num_actions, axis=1))
-        met += float(executed[is_large].sum())
+        probability += float(executed[is_large].sum())
         executed[is_large] = 0.0
         if not executed.any():
             break
         mass = mdp.dynamics.push_forward(executed, mdp.width)
         chance = mdp.chance
-    met = min(met, 1.0)
-    if met <= 0.0:
+    probability = min(probability, 1.0)
+    if probability <= 0.0:
         return ExplorationTime(math.inf, math.inf, 0.0, threshold, steps)
-    return ExplorationTime(length / met, 1 / met, met, threshold, steps)
+    return ExplorationTime(length / probability, 1 / probability, probability, threshold, steps)
 
 
 # Covering -------------------------------------------------------------------------------------------------------------
@@ -506,7 +504,7 @@ ROUNDING = 1e-12  # of a distance, that a tie with epsilon is one
 
 @dataclass(frozen=True)
 class MixingTime:
-    """How long a policy takes to forget where it began.
+    """Mixing time of a policy: steps until it has forgotten where it began.
 
     Attributes:
         value: t_mix in steps; infinite where the chain does not converge.
@@ -644,12 +642,12 @@ def _time(chain: np.ndarray, epsilon: float) -> tuple[int, float]:
         powers.append(powers[-1] @ powers[-1])
         if len(powers) > 60:
             raise UndefinedMeasure("mixing_time: the chain takes more than 2^60 steps")
-    steps, reached = 0, np.eye(size)  # the largest t that is not near enough
+    steps, power = 0, np.eye(size)  # the largest t that is not near enough, and P^t
     for i in range(len(powers) - 2, -1, -1):
-        further = reached @ powers[i]
+        further = power @ powers[i]
         if distance(further) > epsilon:
-            steps, reached = steps + 2**i, further
-    return steps + 1, distance(reached @ chain)
+            steps, power = steps + 2**i, further
+    return steps + 1, distance(power @ chain)
 
 
 # Mismatch -------------------------------------------------------------------------------------------------------------
