@@ -57,7 +57,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _is_table(entry: object, levels: int) -> bool:
-    """Whether names lead to names, so many levels deep; a default has one level, and what is empty none."""
+    """Whether an entry is a dictionary nested to this depth; a default has one level, and None stands for no entry."""
     if not isinstance(entry, dict) or not all(isinstance(name, str) for name in entry):
         return False
     below = entry.items() if levels > 1 else ()

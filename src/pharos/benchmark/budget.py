@@ -144,7 +144,7 @@ class Snapshots:
 
 
 def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, seed: int) -> Curve:
-    """Let a generator learn, and evaluate the policy that counts at each of the evaluation points, and before.
+    """Train with a generator, and evaluate the policy in force at each evaluation point, and uniform play before.
 
     Returns:
         A row before the first step, that of uniform play, and one for each point.

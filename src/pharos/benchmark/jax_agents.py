@@ -32,7 +32,7 @@ LearnCompiled = Callable[..., tuple[Callable[..., Any], Any]]
 def compiled_curves(
     learn: LearnCompiled, task: Task, *, steps: int, evaluations: int, seeds: Sequence[int]
 ) -> list[Curve]:
-    """Let a function of JAX learn with each seed, and evaluate the policy that counts at each of the evaluation points.
+    """Train with a function of JAX for each seed, and evaluate the policy in force at each evaluation point.
 
     Returns:
         A curve for each seed: a row before the first step, that of uniform play, and one for each point. There are no

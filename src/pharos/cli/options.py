@@ -146,8 +146,9 @@ def discount(gamma: float | None, horizon: int | None) -> float:
 
 
 def ranks_of(processes: str) -> int | str:
-    """1, or "mpi" in a process that a launcher has started with others; all but the first of them are silent from here
-    on. A number above 1 starts this command once more, by `mpiexec`.
+    """Return 1, or "mpi" in a process that a launcher has started with others; all but the first of them are silenced.
+
+    A number above 1 starts this command once more, by `mpiexec`.
     """
     from pharos.ranks import launched, mpi_rank, start_under_mpiexec
 

@@ -538,7 +538,7 @@ class Environment:
 
     @property
     def recorded(self) -> np.ndarray | None:
-        """(states, ...) what an import recorded of each state, for the observation "recorded"; here None: nothing."""
+        """(states, ...) recorded observation of each state, for the observation "recorded"; the base class has None."""
         return None
 
     # Derived ----------------------------------------------------------------------------------------------------------

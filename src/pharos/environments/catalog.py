@@ -98,8 +98,8 @@ def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:
 
 
 def instance_name(environment: str, parameters: Mapping[str, object]) -> str:
-    """`frozen_lake/8x8` where an instance of the class has these parameters, else the class and what differs from its
-    defaults; of a class that is not loaded, with all that say something.
+    """Name of an instance with these parameters, such as `frozen_lake/8x8`; else the class and parameters that differ
+    from its defaults (if the class is not loaded or has no defaults: all that are neither None nor empty).
     """
     cls, setting = class_called(environment), {name: as_tuples(value) for name, value in parameters.items()}
     usual: Mapping[str, object] = {name: value for name, value in setting.items() if value in (None, ())}

@@ -64,7 +64,7 @@ class DiscountedVisits:
         return self._known[policy]
 
     def losses(self, policy: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(S,) each: what is lost in states, visits, and the action chosen most.
+        """(S,) each: loss in each state, discounted visits, and the action chosen most often.
 
             loss(s) = sum over a of visits(s, a) gap(s, a), which sums to V* minus the value of the policy at the start
 
@@ -88,7 +88,7 @@ class DiscountedVisits:
         return lost, visits, pairs.argmax(axis=1)
 
     def _table(self, policy: str) -> np.ndarray | None:
-        """The policy as solvers take it; None for the uniform one. Where it was not asked, it does anything."""
+        """The policy as solvers take it; None for the uniform one. Uniform in states where it was not asked."""
         if policy == UNIFORM:
             return None
         table = np.asarray(self.exploration.solutions[policy].policy)

@@ -144,7 +144,7 @@ class Simulator:
 
 
 class Stream:
-    """The random numbers of one environment, as a vector environment draws them for each of its own.
+    """Random numbers of one environment, drawn as a vector environment draws them for each of its environments.
 
     Attributes:
         words: (1,) uint64, its state.

@@ -124,7 +124,7 @@ class Frames(Observation):
     """
 
     def _stack(self, frames: object, channels: int) -> None:
-        """Take `space` for that of one frame, whose axis `channels` is that of its channels, and stack k of them.
+        """Set `space` to k stacked frames, where it was the space of one; `channels` is the axis of its channels.
 
         Raises:
             ParameterError: k is no integer from 1 to MOST.

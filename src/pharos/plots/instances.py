@@ -233,7 +233,7 @@ def _lengths(solution: "Solution") -> np.ndarray:
 
 
 def _reward_on_entering(mdp: "TabularMDP", terminal: int) -> str:
-    """The reward of the transitions that lead into a terminal state; empty where they differ or there are none."""
+    """Reward of the transitions into a terminal state, as text; empty if they differ or there are none."""
     into = mdp.dynamics.leads_to(terminal) & ~np.asarray(mdp.terminal)[:, None]
     rewards = np.unique(mdp.rewards[into])
     return f"{rewards[0]:g}" if len(rewards) == 1 else ""

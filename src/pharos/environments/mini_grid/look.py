@@ -64,7 +64,7 @@ def goal(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
 
 
 def door(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
-    """An open door stands aside; a closed one has a handle, a locked one a keyhole in a darker leaf."""
+    """A door: open, at the side of the cell; closed, with a handle; locked, with a keyhole in a darker leaf."""
     if glyph == "_":
         return painted(cell, (box(0.84, 1, 0, 1), color), (box(0.9, 0.94, 0.06, 0.94), DARK))
     leaf = (box(0, 1, 0, 1), color), (box(0.08, 0.92, 0.08, 0.92), DARK), (box(0.13, 0.87, 0.13, 0.87), color * 0.8)

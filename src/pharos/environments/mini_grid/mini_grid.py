@@ -87,7 +87,7 @@ def level_of(layout: GridLayout) -> Level:
 
 
 def rows_of(text: object) -> tuple[str, ...]:
-    """The rows of a level as text, in capitals but for the player; ParameterError where they are of unequal length."""
+    """The rows of a level as text, in capitals except the player; ParameterError if their lengths differ."""
     rows = tuple(text.upper().replace("VV", "vv").replace("/", " ").split()) if isinstance(text, str) else ()
     if not rows or len(set(map(len, rows))) > 1 or len(rows[0]) % 2 or len(rows[0]) < 6 or len(rows) < 3:
         raise ParameterError(
@@ -98,7 +98,7 @@ def rows_of(text: object) -> tuple[str, ...]:
 
 
 def _target(target: str | None, doors: list[str], things: list[str]) -> tuple[int, int]:
-    """(door, thing) that is the target; -1: none."""
+    """(door, thing): number of the target; -1: none."""
     if target is None:
         return -1, -1
     matches = [(i, -1) for i, text in enumerate(doors) if text == target and text[0] != "O"]

@@ -87,12 +87,12 @@ class Blackjack(Environment):
 
     @cached_property
     def cards(self) -> np.ndarray:
-        """(10,) float64: how likely each card is."""
+        """(10,) float64: probability of each card."""
         return CARDS
 
     @cached_property
     def results(self) -> np.ndarray:
-        """(2, 22, 11, 4) float64: how likely each result of sticking is, by (natural, total, card of the dealer)."""
+        """(2, 22, 11, 4) float64: probability of each result of sticking, by (natural, total, card of the dealer)."""
         table = np.zeros((2, BUST, 11, 4))
         for card in range(1, 11):
             totals = dealer_totals(card, card == 1)
@@ -148,7 +148,7 @@ class Blackjack(Environment):
 
 @cache
 def dealer_totals(total: int, ace: bool) -> np.ndarray:
-    """(23,) float64: how likely each final total of the dealer is; BUST stands for all beyond 21.
+    """(23,) float64: probability of each final total of the dealer; BUST stands for all beyond 21.
 
     Args:
         total: of his cards, aces counting 1. ace: whether there is one among them.

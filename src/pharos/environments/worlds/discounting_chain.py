@@ -61,7 +61,7 @@ class DiscountingChain(Environment):
 
     @cached_property
     def prizes(self) -> np.ndarray:
-        """(chains,) float64: what each pays."""
+        """(chains,) float64: reward of each chain."""
         prizes = np.ones(len(self.delays))
         prizes[self.mapping_seed % len(prizes)] += self.bonus
         return prizes

@@ -163,7 +163,7 @@ class FrozenLake(Environment):
 
 
 def _checked_map(text: object) -> str:
-    """The map with its rows separated by "/"; ParameterError where it is none."""
+    """The map with its rows separated by "/"; ParameterError if the text is no map."""
     rows = str(text).upper().replace("/", " ").split() if isinstance(text, str) else []
     if not rows or len({len(row) for row in rows}) > 1 or set("".join(rows)) - set(LETTERS):
         raise ParameterError(f"FrozenLake: map={text!r}; expected rows of equal length of the letters S, F, H and G")

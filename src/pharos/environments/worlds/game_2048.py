@@ -96,7 +96,7 @@ class Game2048(Environment):
 
     @property
     def pays_score(self) -> bool:
-        """Whether moves pay the tiles that they make."""
+        """Whether the reward of a move is the sum of the tiles that it makes."""
         return self.objective == "score"
 
     @cached_property
@@ -126,12 +126,12 @@ class Game2048(Environment):
 
     @cached_property
     def sums(self) -> np.ndarray:
-        """(18,) int64: what an empty cell and each tile count."""
+        """(18,) int64: face value of an empty cell and of each tile, by exponent."""
         return np.array([0, *(2**e for e in range(1, len(GLYPHS) + 1))])
 
     @cached_property
     def scores(self) -> np.ndarray:
-        """(18,) int64: what making each of them from tiles of 2 pays."""
+        """(18,) int64: score of making each tile from tiles of 2, by exponent."""
         return np.array([0, *((e - 1) * 2**e for e in range(1, len(GLYPHS) + 1))])
 
     @property

@@ -91,7 +91,7 @@ class RiverSwim(Environment):
 
     @property
     def at_ends(self) -> float:
-        """`forward_at_ends`, or what it stands for."""
+        """`forward_at_ends`, or `forward` if it is None."""
         return self.forward if self.forward_at_ends is None else self.forward_at_ends
 
     @property

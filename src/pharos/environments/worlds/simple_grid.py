@@ -113,7 +113,7 @@ class SimpleGrid(Environment):
 
     @cached_property
     def cell_values(self) -> np.ndarray:
-        """(height, width) float64: what entering a cell pays."""
+        """(height, width) float64: reward of entering each cell."""
         values = np.zeros((self.height, self.width))
         for place, value in (*self.rewards, *self.penalties):
             values[place] = value
