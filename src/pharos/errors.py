@@ -104,8 +104,8 @@ class AllRunsFailed(PharosError):
     """Every run of a study, or of a batch, has failed.
 
     Attributes:
-        errors: of a run -> why it failed.
-        outcome: what would have been returned: the Status of a study, the FailedRuns of a batch.
+        errors: reason of each failure, by run.
+        outcome: the value that is not returned: the Status of a study, the FailedRuns of a batch.
     """
 
     def __init__(self, where: object, errors: Mapping[Any, Any], outcome: Any):
