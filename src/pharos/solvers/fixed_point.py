@@ -106,9 +106,8 @@ class Backup(Generic[M]):
         """(S + 1, W); mapped from a file where memory has little room for it."""
         return large_zeros((self.mdp.num_states + 1, self.mdp.width), self.dtype, share=SHARE_OF_VALUES)
 
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """T x, not in place."""
-        out = np.empty_like(x)
+    def __call__(self, x: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """T x, in another array, which is returned."""
         with np.errstate(over="ignore", invalid="ignore"):
             self.mdp.dynamics.backup(self.equation, x, out)
         return out
@@ -231,11 +230,11 @@ def backward_induction(
     """
     backup = Backup(mdp, select)
     x = backup.zeros()
-    before, bound = x, 0.0
+    before, bound = backup.zeros(), 0.0
     steps = np.zeros((horizon + 1, *x.shape)) if keep_all else None
     largest = 0.0
     for t in range(horizon):
-        before, x = x, backup(x)
+        before, x = x, backup(x, before)
         bound = backup.factor * bound + backup.rounding(largest)
         largest = largest_of(x)
         if steps is not None:

@@ -444,10 +444,10 @@ def evaluate_parts(
     if select.actions is None:
         sums = largest(select.probabilities.sum(axis=2)).tolist()
         factors = np.array([backup.factor_of(mass_of(each, mdp.num_actions)) for each in sums])
-    x = before = backup.zeros()
+    x, before = backup.zeros(), backup.zeros()
     bounds, sizes = np.zeros(len(begins)), np.zeros(len(begins))
     for _ in range(checked_horizon(mdp, None) or 0):
-        before, x = x, backup(x)
+        before, x = x, backup(x, before)
         bounds = factors * bounds + backup.rounding_of(rewards, sizes)
         sizes = largest(np.abs(x[:-1]))
     starts = mdp.start_states[np.argsort(part[mdp.start_states], kind="stable")].reshape(len(begins), -1)
