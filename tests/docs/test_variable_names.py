@@ -1,6 +1,8 @@
-"""Variables are named after what they hold: a noun of the field, not a participle."""
+"""Names: variables are nouns and not participles, a class name means one thing, docstrings say what is returned."""
 
 import ast
+import re
+from collections import Counter
 from pathlib import Path
 
 import pharos
@@ -39,3 +41,31 @@ def test_no_variable_is_named_by_a_participle():
         if names := variables(path) & PARTICIPLES:
             participles[file] = names
     assert participles == LICENSED
+
+
+def test_a_class_name_means_one_thing_in_the_whole_library():
+    names = Counter(
+        node.name
+        for path in SOURCE.rglob("*.py")
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    )
+    assert [name for name, count in names.items() if count > 1] == []
+
+
+# "What a checkpoint keeps." is a predicate without a subject, and says nothing in an IDE's list.
+RIDDLES = re.compile(r"(What|How|Where|When|Who|Whose|Which|Those|That of|Of|As|Until|Everything|It|They|Them)\b")
+
+
+def test_docstrings_begin_with_a_noun_or_a_verb():
+    riddles = []
+    for path in sorted(SOURCE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+                docstring = ast.get_docstring(node) or ""
+                if RIDDLES.match(docstring):
+                    riddles.append((path.relative_to(SOURCE).as_posix(), getattr(node, "name", "")))
+    assert riddles == [  # text of rules, which is part of the fingerprint of their state spaces
+        ("environments/worlds/game_2048.py", "room"),
+        ("environments/worlds/taxi.py", "parts_of"),
+    ]

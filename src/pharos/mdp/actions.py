@@ -172,10 +172,6 @@ class PolicyTable:
             return PolicyTable(self.num_actions, actions=np.ascontiguousarray(self.actions[states]))
         return PolicyTable(self.num_actions, np.ascontiguousarray(self.probabilities[states]))
 
-    def choice_mass(self, mass: np.ndarray) -> np.ndarray:
-        """(S, A) mass that chooses each action after the first step, of mass (S, W); the adjoint of `value`."""
-        return chosen_mass(self.later, mass)
-
     def policy(self, q: np.ndarray) -> "PolicyTable":
         return self
 

@@ -65,7 +65,7 @@ class DeepSea(Environment):
 
     @property
     def outcomes(self) -> int:  # type: ignore[override]
-        """As said; the other action; and each of them where going right fails."""
+        """Outcomes: the chosen action; the other one; and each of them where going right fails."""
         return (2 if self.p_rand > 0 else 1) * (2 if self.stochastic else 1)
 
     @property

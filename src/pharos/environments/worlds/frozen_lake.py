@@ -129,7 +129,7 @@ class FrozenLake(Environment):
 
     @property
     def outcomes(self) -> int:  # type: ignore[override]
-        """On slippery ice three: the action before the chosen one, the chosen one, the one after it."""
+        """Three on slippery ice: the action before the chosen one, the chosen one, the one after it; else one."""
         return 3 if self.slippery else 1
 
     def probability(self, state, action, outcome):
