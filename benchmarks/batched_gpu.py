@@ -93,7 +93,7 @@ def main() -> None:
             unit = options["n_envs"] * options["n_steps"] if agent == "ppo" else 100
             for number in arguments.runs:
                 batch = make_batch(agent, runs_of(task, options, number), device="cuda")
-                flop = work(agent, task, options, batch.lanes[0])
+                flop = work(agent, options, batch.lanes[0])
                 began = time.perf_counter()
                 warm = max(3 * unit, options.get("learning_starts", 0) + 200)
                 batch.learn([warm], lambda point: None)
