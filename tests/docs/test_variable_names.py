@@ -10,15 +10,32 @@ import pharos
 SOURCE = Path(pharos.__file__).parent
 
 PARTICIPLES = {"asked", "found", "given", "kept", "known", "seen", "taken", "told"}
+PARTICIPLES |= {
+    "alike",
+    "asking",
+    "chosen",
+    "following",
+    "likely",
+    "met",
+    "paid",
+    "reached",
+    "said",
+    "seeing",
+    "together",
+}
 
 # Keywords and fields that callers write, and rules, whose variables are part of the fingerprint of their state spaces.
 LICENSED = {
     "agents/hyperparameters.py": {"given"},
-    "environments/worlds/game_2048.py": {"found"},
-    "environments/mini_grid/mini_grid_empty.py": {"taken"},
+    "environments/base.py": {"likely"},
+    "environments/imported.py": {"likely", "paid"},
+    "environments/worlds/game_2048.py": {"found", "likely", "paid"},
+    "environments/mini_grid/mini_grid_empty.py": {"reached", "taken"},
     "errors.py": {"found", "known"},
+    "exporters.py": {"chosen"},
     "hardness/report.py": {"kept"},
     "leaderboard/verification.py": {"found"},
+    "mdp/actions.py": {"chosen"},
     "observations/context.py": {"seen"},
 }
 

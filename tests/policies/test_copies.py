@@ -87,16 +87,16 @@ def test_which_mdps_have_copies():
 @pytest.mark.long
 @pytest.mark.parametrize("agent", ["dqn", "ppo"])
 def test_the_runs_of_a_batch_have_the_values_that_each_has_alone(agent):
-    members = TaskCache()
+    tasks = TaskCache()
 
     def config(sticky, seed):
         chance = ChanceSetting(sticky=sticky)
         return RunConfig(environment="simple_grid", chance=chance, agent=agent, seed=seed, **SETTING)
 
     cells = [(sticky, seed) for sticky in (0.25, 0.1) for seed in range(3)]
-    group = [members.member(seed, config(sticky, seed), None) for sticky, seed in cells]
-    batch = make_batch(agent, [member.run for member in group])
+    group = [tasks.prepare(seed, config(sticky, seed), None) for sticky, seed in cells]
+    batch = make_batch(agent, [run.run for run in group])
     batch.learn([150], lambda point: None)
     values = joint_values(batch, group)
-    assert values == {i: evaluate_agent(batch.policy(i), member.task) for i, member in enumerate(group)}
+    assert values == {i: evaluate_agent(batch.policy(i), run.task) for i, run in enumerate(group)}
     assert len({each.value for each in values.values()}) > 1

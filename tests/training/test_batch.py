@@ -209,8 +209,8 @@ def test_a_device_that_is_not_there_is_named_before_anything_is_trained(engine):
 
 
 def test_members_know_the_device_and_nobody_contradicts_them(engine):
-    with pytest.raises(ParameterError, match="device is 'cuda', and the members are for 'cpu'; expected one device"):
-        train_configs([], members=TaskCache(), device="cuda")
+    with pytest.raises(ParameterError, match="device is 'cuda', and the tasks are for 'cpu'; expected one device"):
+        train_configs([], tasks=TaskCache(), device="cuda")
     assert engine.made == []
 
 

@@ -166,8 +166,8 @@ class TrainedForm(Form):
         if len(parts) > 1:
             train_parts(configs, folders, parts, checkpoints=checkpoints, device="cpu", progress=progress)
             return
-        members = TaskCache(trust=True)  # the user has named the code
-        train_configs(configs, folders, checkpoints=checkpoints, progress=progress, members=members)
+        tasks = TaskCache(trust=True)  # the user has named the code
+        train_configs(configs, folders, checkpoints=checkpoints, progress=progress, tasks=tasks)
 
     def _config(self, job: Job, protocol: Protocol) -> RunConfig:
         task = job.task.training_task(protocol)

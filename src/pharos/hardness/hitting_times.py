@@ -153,8 +153,8 @@ class HittingTimes:
         self.arrays = (*without_common(matrix, choices.num_actions), choices.is_restart)
         first, previous = choices.reversed
         self.back = (first.astype(np.int64), previous.astype(np.int64))
-        self.members = np.argsort(choices.underlying, kind="stable")
-        self.edges = np.searchsorted(choices.underlying[self.members], np.arange(choices.num_targets + 1))
+        self.node_order = np.argsort(choices.underlying, kind="stable")
+        self.edges = np.searchsorted(choices.underlying[self.node_order], np.arange(choices.num_targets + 1))
         self.initial_scale = 1.0
         self._allocate()
 
@@ -174,7 +174,7 @@ class HittingTimes:
 
     def nodes_of(self, target: int) -> np.ndarray:
         """The nodes of a target: one, or under sticky actions one for each previous action."""
-        return self.members[self.edges[target] : self.edges[target + 1]]
+        return self.node_order[self.edges[target] : self.edges[target + 1]]
 
     def scale_of(self, j: np.ndarray) -> float:
         """99th percentile of hitting time divided by distance, of the target last opened."""

@@ -595,8 +595,8 @@ def _merged(chain: "csr_matrix", underlying: np.ndarray, ended: np.ndarray) -> "
     """The chain in which an episode that has ended does not remember the previous action."""
     label = np.where(ended[underlying], underlying, len(ended) + np.arange(len(underlying)))
     _, first, place = np.unique(label, return_index=True, return_inverse=True)
-    members = scipy.sparse.csr_matrix((np.ones(len(place)), (np.arange(len(place)), place)))
-    return scipy.sparse.csr_matrix(chain[first] @ members)
+    membership = scipy.sparse.csr_matrix((np.ones(len(place)), (np.arange(len(place)), place)))
+    return scipy.sparse.csr_matrix(chain[first] @ membership)
 
 
 def _too_many(nodes: int) -> str:
@@ -615,10 +615,10 @@ def _period(chain: "csr_matrix") -> int:
     closed = np.flatnonzero(~leaves)
     if len(closed) != 1:
         return 0
-    members = np.flatnonzero(labels == closed[0])
-    inner = chain[members][:, members]
+    recurrent = np.flatnonzero(labels == closed[0])
+    inner = chain[recurrent][:, recurrent]
     order, before = scipy.sparse.csgraph.breadth_first_order(inner, 0)
-    level = np.zeros(len(members), np.int64)
+    level = np.zeros(len(recurrent), np.int64)
     for node in order[1:]:
         level[node] = level[before[node]] + 1
     rows, columns = inner.nonzero()

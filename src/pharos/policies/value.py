@@ -585,7 +585,7 @@ def walk_values(
         id(mdp): (as_array(mdp.dynamics.deterministic_table()), np.asarray(mdp.terminal), mdp.reward_table)
         for mdp in mdps
     }
-    members = {key: np.array([i for i, mdp in enumerate(mdps) if id(mdp) == key]) for key in worlds}
+    indices = {key: np.array([i for i, mdp in enumerate(mdps) if id(mdp) == key]) for key in worlds}
     ahead = [steps_that_matter(mdp) for mdp in mdps]
     state = np.array([mdp.start_states[0] for mdp in mdps], np.int64)
     history = np.repeat(state[:, None], frames, axis=1)
@@ -597,7 +597,7 @@ def walk_values(
         path.append(np.where(is_over[:, None], -1, history))
         actions = act(state if frames == 1 else history)
         for key, (table, terminal, rewards) in worlds.items():
-            i = members[key][~is_over[members[key]]]
+            i = indices[key][~is_over[indices[key]]]
             s, a = state[i], actions[i]
             next_states, entries = table[s, a], rewards.table[s, a]
             reward = discount[i] * (rewards.palette[entries] if len(rewards.palette) else entries)

@@ -103,8 +103,8 @@ def train_batch(
         stored = stored_values(config.to_dict())
         return None if stored is None else TaskValues.from_dict(stored)
 
-    members = TaskCache(values, trust=True, strict=True, device=device)
-    ends = train_configs(configs, folders, checkpoints=checkpoints, members=members)
+    tasks = TaskCache(values, trust=True, strict=True, device=device)
+    ends = train_configs(configs, folders, checkpoints=checkpoints, tasks=tasks)
     return [end.error if isinstance(end, FailedRun) else None for end in ends]
 
 

@@ -26,11 +26,11 @@ from pharos.system.storage import digest_of_json, lock, read_json, remove_leftov
 from pharos.system.wording import in_one_line, pluralize
 from pharos.training import results as _results
 from pharos.training.curve import joint_values
-from pharos.training.learners import FailedRun, Learner, Member, TaskCache, make_learner
+from pharos.training.learners import FailedRun, Learner, PreparedRun, TaskCache, make_learner
 from pharos.training.results import Checkpoint, Record, TrainingResult, clear_run, finished_result
 from pharos.training.task import RunConfig
 
-# Fields from which a member is made anew where its batch is halved.
+# Fields from which a run is prepared anew where its batch is halved.
 BEGINNING = ("place", "config", "folder", "task", "hyperparameters", "run", "key")
 
 
@@ -64,7 +64,7 @@ def train_configs(
     *,
     checkpoints: Path | None = None,
     progress: ProgressCallback | None = None,
-    members: TaskCache | None = None,
+    tasks: TaskCache | None = None,
     device: str | None = None,
     lane: int | None = None,
 ) -> list[TrainingResult | FailedRun]:
@@ -75,23 +75,23 @@ def train_configs(
         checkpoints: folder for those of whole batches; None: none are written. A batch that was killed goes on from
             there with the runs that it had.
         progress: called after each evaluation; what it raises ends the training and is raised here.
-        members: makes tasks, with values that are known already, and code of the user's own where it is trusted; None:
+        tasks: makes tasks, with values that are known already, and code of the user's own where it is trusted; None:
             from scratch, trusting none.
-        device: "cpu" or "cuda"; None: that of the members, and "cpu" where there are none.
+        device: "cpu" or "cuda"; None: that of the tasks, and "cpu" where there are none.
         lane: the most runs in a batch; None: all that fit together. Changes no result.
     Returns:
         The result of each run, or why it has none.
     Raises:
-        FileFormatError: not the configuration of a run. ParameterError: there is no such device, or the members are
+        FileFormatError: not the configuration of a run. ParameterError: there is no such device, or the tasks are
             for another one.
         MissingExtra: PyTorch is not installed.
     """
-    members = TaskCache(device=device or "cpu") if members is None else members
-    if device not in (None, members.device):
-        raise ParameterError(f"device is {device!r}, and the members are for {members.device!r}; expected one device")
-    _check_device(members.device)
+    tasks = TaskCache(device=device or "cpu") if tasks is None else tasks
+    if device not in (None, tasks.device):
+        raise ParameterError(f"device is {device!r}, and the tasks are for {tasks.device!r}; expected one device")
+    _check_device(tasks.device)
     run_configs = [config if isinstance(config, RunConfig) else RunConfig.from_dict(config) for config in configs]
-    return TrainingJobs(run_configs, folders, checkpoints, progress, members, lane).run()
+    return TrainingJobs(run_configs, folders, checkpoints, progress, tasks, lane).run()
 
 
 def _check_device(device: str) -> None:
@@ -124,13 +124,13 @@ class TrainingJobs:
         folders: Sequence[Path] | None,
         checkpoints: Path | None,
         progress: ProgressCallback | None,
-        members: TaskCache,
+        tasks: TaskCache,
         lane: int | None = None,
         *,
         raises: bool = False,
         tensorboard: bool = False,
     ):
-        self.configs, self.checkpoints, self.progress, self.members = configs, checkpoints, progress, members
+        self.configs, self.checkpoints, self.progress, self.tasks = configs, checkpoints, progress, tasks
         self.folders = [None] * len(configs) if folders is None else [Path(folder) for folder in folders]
         self.lane, self.raises, self.tensorboard = lane, raises, tensorboard
         self.results: dict[int, TrainingResult | FailedRun] = {}
@@ -170,7 +170,7 @@ class TrainingJobs:
 
     # Groups ----------------------------------------------------------------------------------------------------------
 
-    def _groups(self) -> Iterator[list[Member]]:
+    def _groups(self) -> Iterator[list[PreparedRun]]:
         """Yield runs that train alone; then batches restored from checkpoints, and the rest by what fits together."""
         alone, waiting = [], {}
         # Finished runs need no training; others train alone or wait for a batch
@@ -190,14 +190,14 @@ class TrainingJobs:
             else:
                 alone.append(place)
         for place in alone:
-            if (member := self._member(place, is_alone=True)) is not None:
-                yield [member]
+            if (run := self._prepared_run(place, is_alone=True)) is not None:
+                yield [run]
         yield from self._stored_groups(waiting)
         # Runs with equal keys, in lanes
-        groups: dict[Hashable, list[Member]] = defaultdict(list)
+        groups: dict[Hashable, list[PreparedRun]] = defaultdict(list)
         for place in waiting:
-            if (member := self._member(place)) is not None:
-                groups[member.key].append(member)
+            if (run := self._prepared_run(place)) is not None:
+                groups[run.key].append(run)
         for group in groups.values():
             width = self.lane or len(group)
             for first in range(0, len(group), width):
@@ -209,18 +209,18 @@ class TrainingJobs:
             return False
         folder = self.folders[place]
         try:
-            return is_small_table(self.members.task(config).mdp) and not (folder and (folder / "checkpoint").exists())
+            return is_small_table(self.tasks.task(config).mdp) and not (folder and (folder / "checkpoint").exists())
         except Exception:  # what is wrong with it, it is told alone
             return False
 
-    def _member(self, place: int, *, is_alone: bool = False) -> Member | None:
+    def _prepared_run(self, place: int, *, is_alone: bool = False) -> PreparedRun | None:
         try:
-            return self.members.member(place, self.configs[place], self.folders[place], is_alone=is_alone)
+            return self.tasks.prepare(place, self.configs[place], self.folders[place], is_alone=is_alone)
         except Exception as error:
             self.fail(place, error)
             return None
 
-    def _stored_groups(self, waiting: dict[int, RunConfig]) -> Iterator[list[Member]]:
+    def _stored_groups(self, waiting: dict[int, RunConfig]) -> Iterator[list[PreparedRun]]:
         """Batches of checkpoints, with the runs that they had, which are taken from `waiting`."""
         by_id = {config.id: place for place, config in waiting.items()}
         finished = {self.configs[place].id for place, end in self.results.items() if isinstance(end, TrainingResult)}
@@ -232,7 +232,7 @@ class TrainingJobs:
                 continue
             try:
                 group = [
-                    self.members.member(place, config, None if place is None else self.folders[place])
+                    self.tasks.prepare(place, config, None if place is None else self.folders[place])
                     for place, config in zip(places, configs, strict=True)
                 ]
             except Exception:  # what is wrong with a run is found later, where it fails alone
@@ -254,7 +254,7 @@ class TrainingGroup:
 
     learner: Learner  # from when the runs begin; gone where they failed
 
-    def __init__(self, jobs: TrainingJobs, group: list[Member]):
+    def __init__(self, jobs: TrainingJobs, group: list[PreparedRun]):
         self.jobs, self.group, self.config, self.is_alone = jobs, group, group[0].config, group[0].is_alone
         self.has_begun = self.holds = False  # whether runs are marked as running; whether checkpoints are this batch's
         self.held = contextlib.ExitStack()  # the folder of checkpoints, or that of a run alone
@@ -290,7 +290,7 @@ class TrainingGroup:
             )
         self.jobs.done = before
         for part in (self.group[:middle], self.group[middle:]):
-            fresh = [Member(*(getattr(each, name) for name in BEGINNING)) for each in part]
+            fresh = [PreparedRun(*(getattr(each, name) for name in BEGINNING)) for each in part]
             TrainingGroup(self.jobs, fresh).train()
 
     def _train(self) -> None:
@@ -299,21 +299,21 @@ class TrainingGroup:
         if self.is_alone and self._is_finished():
             return
         logs = first.folder / "tensorboard" if self.jobs.tensorboard and first.folder is not None else None
-        self.learner = make_learner(self.group, self.jobs.members.device, logs)
+        self.learner = make_learner(self.group, self.jobs.tasks.device, logs)
         checkpoint = self._checkpoint()
         if checkpoint is not None:
             entries, spent = checkpoint.restore(self.learner) or ([], 0.0)
             if self.is_alone:
                 first.curve.rows = entries
             else:
-                for member, entry in zip(self.group, entries, strict=False):
-                    member.curve.rows = entry["rows"]
-                    member.error = None if entry["error"] is None else PharosError(entry["error"])
+                for run, entry in zip(self.group, entries, strict=False):
+                    run.curve.rows = entry["rows"]
+                    run.error = None if entry["error"] is None else PharosError(entry["error"])
             began -= spent
-        for member in self.group:
-            if member.folder is not None:
-                member.folder.mkdir(parents=True, exist_ok=True)
-            member.record.write("running")
+        for run in self.group:
+            if run.folder is not None:
+                run.folder.mkdir(parents=True, exist_ok=True)
+            run.record.write("running")
         self.has_begun = True
         self._learn(checkpoint, began)
         self._publish(time.perf_counter() - began, compiling.seconds() - compiled)
@@ -325,7 +325,7 @@ class TrainingGroup:
         """The folder for checkpoints of a batch; None for a run alone, or where none are written."""
         if self.is_alone or self.jobs.checkpoints is None:
             return None
-        return self.jobs.checkpoints / digest_of_json([member.config.id for member in self.group])[:16]
+        return self.jobs.checkpoints / digest_of_json([run.config.id for run in self.group])[:16]
 
     def _is_finished(self) -> bool:
         """Lock the folder of a run alone; return whether another process has finished it meanwhile."""
@@ -355,7 +355,7 @@ class TrainingGroup:
             self.held.enter_context(lock(folder, FolderLocked, "training"))
         except FolderLocked:
             return None
-        configs = [member.config for member in self.group]
+        configs = [run.config for run in self.group]
         entry = {"ids": [each.id for each in configs], "configs": [each.to_dict() for each in configs]}
         replace_json(folder / "batch.json", entry)
         self.holds = True
@@ -371,19 +371,18 @@ class TrainingGroup:
     def _learn(self, checkpoint: Checkpoint | None, began: float) -> None:
         """Train from the last row of the curves on, with an evaluation at each point."""
         steps, interval = self.config.steps, self.config.evaluation_interval
-        count, before = sum(member.place is not None for member in self.group), self.jobs.done
-        if not any(member.curve.rows for member in self.group):
+        count, before = sum(run.place is not None for run in self.group), self.jobs.done
+        if not any(run.curve.rows for run in self.group):
             self._evaluate(0)
         # Steps of the evaluations to come, after those of a checkpoint
-        start = max(member.curve.rows[-1]["step"] for member in self.group if member.curve.rows)
+        start = max(run.curve.rows[-1]["step"] for run in self.group if run.curve.rows)
         points = [point for point in [*range(interval, steps, interval), steps] if point > start]
 
         def save(step: int) -> None:
             if checkpoint is None or step == steps:
                 return
             curves: list[Any] = [
-                {"rows": member.curve.rows, "error": member.error and in_one_line(member.error)}
-                for member in self.group
+                {"rows": run.curve.rows, "error": run.error and in_one_line(run.error)} for run in self.group
             ]
             entries = curves[0]["rows"] if self.is_alone else curves
             checkpoint.save(self.learner, entries, time.perf_counter() - began)
@@ -406,57 +405,55 @@ class TrainingGroup:
         """Evaluate the policies: a row for each run that has not failed, by its place in the group."""
         rows, values = {}, {} if self.is_alone else joint_values(self.learner, self.group)
         episodes, returns = self.learner.episodes, self.learner.returns
-        for i, member in enumerate(self.group):
-            if member.error is not None:
+        for i, run in enumerate(self.group):
+            if run.error is not None:
                 continue
             policy = self.learner.policy(i)
             try:
-                rows[i] = member.curve.add(step, int(episodes[i]), float(returns[i]), policy, values.get(i))
+                rows[i] = run.curve.add(step, int(episodes[i]), float(returns[i]), policy, values.get(i))
             except Exception as error:
-                member.fail(error)
-        if all(member.error is not None for member in self.group):
+                run.fail(error)
+        if all(run.error is not None for run in self.group):
             raise self.group[0].error or PharosError("no run is left")
         return rows
 
     def _publish(self, seconds: float, compiled: float) -> None:
         """Write and keep the result of each run; its seconds are its share of those of the batch."""
-        size = {"runs": len(self.group), "seconds": seconds, "device": self.jobs.members.device}
+        size = {"runs": len(self.group), "seconds": seconds, "device": self.jobs.tasks.device}
         share = seconds - compiled if self.is_alone else seconds / len(self.group)
         entries = {"compiling_seconds": compiled} if self.is_alone else {"batch": size}
-        for i, member in enumerate(self.group):
-            if member.place is None:
+        for i, run in enumerate(self.group):
+            if run.place is None:
                 continue
-            config, folder, curve = member.config.to_dict(), member.folder, member.curve.rows
-            if member.error is not None:
-                self.jobs.results[member.place] = FailedRun(config, folder, member.error)
+            config, folder, curve = run.config.to_dict(), run.folder, run.curve.rows
+            if run.error is not None:
+                self.jobs.results[run.place] = FailedRun(config, folder, run.error)
                 continue
-            result = member.curve.result()
+            result = run.curve.result()
             if folder is not None:
                 self.learner.publish(i, folder)
                 _results.write_curve(folder, curve)
-                member.record.write("finished", seconds=share, **entries, result=result)
+                run.record.write("finished", seconds=share, **entries, result=result)
             rows = [{name: row[name] for name in _results.COLUMNS} for row in curve]
-            self.jobs.results[member.place] = TrainingResult(
-                config, result, rows, self.learner.policy(i), folder, share
-            )
+            self.jobs.results[run.place] = TrainingResult(config, result, rows, self.learner.policy(i), folder, share)
         self._remove_checkpoint()
         if self.is_alone and (folder := self.group[0].folder) is not None:
             clear_run(folder)
 
     def _fail(self, error: Exception) -> None:
         """Record that the only run of the group has failed."""
-        (member,) = self.group
-        if member.place is None:
+        (run,) = self.group
+        if run.place is None:
             return
         if self.is_alone and not self.has_begun:
-            self.jobs.fail(member.place, error)
+            self.jobs.fail(run.place, error)
             return
-        if member.error is None:
-            member.fail(error)
+        if run.error is None:
+            run.fail(error)
         if self.jobs.raises:
             raise error
-        self.jobs.results[member.place] = FailedRun(member.config.to_dict(), member.folder, error)
-        self.jobs.done += member.config.steps
+        self.jobs.results[run.place] = FailedRun(run.config.to_dict(), run.folder, error)
+        self.jobs.done += run.config.steps
 
 
 def _is_memory(error: BaseException) -> bool:

@@ -28,7 +28,7 @@ from pharos.training import results as _results
 from pharos.training.task import Task
 
 if TYPE_CHECKING:
-    from pharos.training.learners import Member
+    from pharos.training.learners import PreparedRun
 
 
 BLOCK = 4096  # observations that policies are asked about at once
@@ -98,46 +98,46 @@ class BestActions(Protocol):
         ...
 
 
-def joint_values(batch: PolicyBatch, members: "Sequence[Member]") -> dict[int, Evaluation]:
+def joint_values(batch: PolicyBatch, runs: "Sequence[PreparedRun]") -> dict[int, Evaluation]:
     """Values of policies by place in the batch, where computing them at once costs less; others are left out.
 
     These are policies of DQN where nothing is random, and of runs that share a task of few states and see one frame.
     """
-    walks = [i for i, each in enumerate(members) if each.error is None and _walks(each)]
-    values = _values_of_walks(batch, members, walks)
+    walks = [i for i, each in enumerate(runs) if each.error is None and _walks(each)]
+    values = _values_of_walks(batch, runs, walks)
     tasks = defaultdict(list)
-    for i, member in enumerate(members):
-        if member.error is None and i not in values and is_small_table(member.task.mdp) and _frames(member) == 1:
-            tasks[id(member.task)].append(i)
+    for i, run in enumerate(runs):
+        if run.error is None and i not in values and is_small_table(run.task.mdp) and _frames(run) == 1:
+            tasks[id(run.task)].append(i)
     for places in tasks.values():
         if len(places) > 1:
-            values |= _values_of_tables(batch, members[places[0]].task, places)
+            values |= _values_of_tables(batch, runs[places[0]].task, places)
     return values
 
 
-def _walks(member: "Member") -> bool:
-    return member.config.agent == "dqn" and is_walk(member.task.mdp)
+def _walks(run: "PreparedRun") -> bool:
+    return run.config.agent == "dqn" and is_walk(run.task.mdp)
 
 
-def _frames(member: "Member") -> int:
+def _frames(run: "PreparedRun") -> int:
     """Number of states in one observation of the agent: more than 1 where frames are stacked."""
-    return 1 if member.config.is_tabular else member.task.observer.frames
+    return 1 if run.config.is_tabular else run.task.observer.frames
 
 
-def _values_of_walks(batch: PolicyBatch, members: "Sequence[Member]", places: Sequence[int]) -> dict[int, Evaluation]:
+def _values_of_walks(batch: PolicyBatch, runs: "Sequence[PreparedRun]", places: Sequence[int]) -> dict[int, Evaluation]:
     """Values by place: an episode of T steps costs T calls of the networks of all runs at once, not of each."""
     if not places:
         return {}
     assert isinstance(batch, BestActions)
     best_actions = batch.best_actions
-    frames = _frames(members[places[0]])
-    states = np.zeros((len(members), frames) if frames > 1 else len(members), np.int64)
+    frames = _frames(runs[places[0]])
+    states = np.zeros((len(runs), frames) if frames > 1 else len(runs), np.int64)
 
     def act(now: np.ndarray) -> np.ndarray:
         states[places] = now
         return best_actions(states)[places]
 
-    mdps = [members[i].task.mdp for i in places]
+    mdps = [runs[i].task.mdp for i in places]
     return dict(zip(places, walk_values(mdps, act, frames=frames), strict=True))
 
 

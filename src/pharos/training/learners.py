@@ -1,8 +1,8 @@
 """Runs with their tasks, and their learners: N >= 1 runs under one loop, each with the result that it has alone.
 
-A `Member` is a run before it is trained: with its task, what it sees, and its hyperparameters, checked. Learners are
-`Tables` of Q-learning, `Networks` of the batched engine, or one model of Stable-Baselines3 (`Deep`); all of each can be
-stored and resumed.
+A `PreparedRun` is a run before it is trained: with its task, what it sees, and its hyperparameters, checked. Learners
+are `Tables` of Q-learning, `Networks` of the batched engine, or one model of Stable-Baselines3 (`Deep`); all of each
+can be stored and resumed.
 """
 
 import contextlib
@@ -54,7 +54,7 @@ class FailedRun:
 
 
 @dataclass(eq=False)
-class Member:
+class PreparedRun:
     """A run before and while it is trained, with its task and hyperparameters.
 
     Attributes:
@@ -128,8 +128,10 @@ class TaskCache:
         """The states of a task, and their MDP without chance and horizon; the same for all tasks of a world."""
         return self._once("world", config, WORLD, lambda: (task.space, task.space.mdp(gamma=task.gamma)))
 
-    def member(self, place: int | None, config: RunConfig, folder: Path | None, *, is_alone: bool = False) -> Member:
-        """A run as a member of a batch, with its task and its key.
+    def prepare(
+        self, place: int | None, config: RunConfig, folder: Path | None, *, is_alone: bool = False
+    ) -> PreparedRun:
+        """A run prepared for a batch, with its task and its key.
 
         Raises:
             ParameterError: a hyperparameter is wrong, or the engine lacks it.
@@ -154,7 +156,7 @@ class TaskCache:
             if config.is_tabular and not is_alone:
                 table()  # an error is raised before others are concerned
             make = table if config.is_tabular else algorithm
-            return Member(place, config, folder, task, settings, make, key, is_alone)
+            return PreparedRun(place, config, folder, task, settings, make, key, is_alone)
         from pharos.agents.batched import OURS, BatchRun, ObservationSource, group_key, supports
 
         check_hyperparameters(config.agent, settings, OURS)
@@ -175,7 +177,7 @@ class TaskCache:
             chance=chance,
             staying=self._once("staying", config, WORLD, lambda: _staying(task)) if chance.lazy else None,
         )
-        return Member(place, config, folder, task, settings, run, (key, group_key(config.agent, run, self.device)))
+        return PreparedRun(place, config, folder, task, settings, run, (key, group_key(config.agent, run, self.device)))
 
     def _once(self, what: str, config: RunConfig, names: Sequence[str], make: Callable[[], T]) -> T:
         entry = config.to_dict()
@@ -238,23 +240,23 @@ class Learner(Protocol):
         """Write the policy of run i into its folder, as `load_agent` reads it."""
 
 
-def make_learner(members: Sequence[Member], device: str = "cpu", logs: Path | None = None) -> Learner:
+def make_learner(runs: Sequence[PreparedRun], device: str = "cpu", logs: Path | None = None) -> Learner:
     """The learner of runs that fit together.
 
     Args:
         device: of networks of the batched engine.
         logs: folder for those of TensorBoard, of Stable-Baselines3.
     """
-    config, task = members[0].config, members[0].task
+    config, task = runs[0].config, runs[0].task
     if config.is_tabular:
-        return Tables([member.run for member in members])
+        return Tables([each.run for each in runs])
     if config.engine == "batched":
         from pharos.agents.batched import make_batch
 
-        return Networks(make_batch(config.agent, [member.run for member in members], device=device))
-    (member,) = members
+        return Networks(make_batch(config.agent, [each.run for each in runs], device=device))
+    (prepared,) = runs
     where = None if logs is None else str(logs)
-    return Deep(member.run, task, member.hyperparameters, config.steps, config.seed, where)
+    return Deep(prepared.run, task, prepared.hyperparameters, config.steps, config.seed, where)
 
 
 class _Arrays:

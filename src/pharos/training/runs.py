@@ -62,9 +62,9 @@ def train(
         MissingExtra: Stable-Baselines3 is not installed.
     """
     task, (config,) = _runs(environment, {"agent": agent, **options}, [seed])
-    members = TaskCache()
-    members.adopt(config, task)
-    return _train(config, members, None if out is None else Path(out), progress, tensorboard)
+    tasks = TaskCache()
+    tasks.adopt(config, task)
+    return _train(config, tasks, None if out is None else Path(out), progress, tensorboard)
 
 
 @takes(TrainingOptions, engine="batched")
@@ -107,9 +107,9 @@ def train_many(
     if folders is not None and len(parts) > 1:
         results = train_parts(configs, folders, parts, checkpoints=checkpoints, device=device, progress=progress)
     else:
-        members = TaskCache(device=device)
-        members.adopt(configs[0], task)
-        results = train_configs(configs, folders, checkpoints=checkpoints, progress=progress, members=members)
+        tasks = TaskCache(device=device)
+        tasks.adopt(configs[0], task)
+        results = train_configs(configs, folders, checkpoints=checkpoints, progress=progress, tasks=tasks)
     failed = {
         f"seed {seed}": end.error for seed, end in zip(numbers, results, strict=True) if isinstance(end, FailedRun)
     }
@@ -139,13 +139,13 @@ def train_config(
     """
     if not isinstance(config, RunConfig):
         config = RunConfig.from_dict(config)
-    members = TaskCache(lambda _: values, trust=trust, strict=strict)
-    return _train(config, members, Path(folder), progress)
+    tasks = TaskCache(lambda _: values, trust=trust, strict=strict)
+    return _train(config, tasks, Path(folder), progress)
 
 
 def _train(
     config: RunConfig,
-    members: TaskCache,
+    tasks: TaskCache,
     folder: Path | None,
     progress: RunProgress | None,
     tensorboard: bool = False,
@@ -164,7 +164,7 @@ def _train(
             progress(now.rows[0]["step"], config.steps, now.rows[0])
 
     folders, checkpoints = (None, None) if folder is None else ([folder], folder / "checkpoints")
-    jobs = TrainingJobs([config], folders, checkpoints, tell, members, raises=True, tensorboard=tensorboard)
+    jobs = TrainingJobs([config], folders, checkpoints, tell, tasks, raises=True, tensorboard=tensorboard)
     (end,) = jobs.run()
     assert isinstance(end, TrainingResult)
     return end
@@ -246,8 +246,8 @@ def _train_part(
     up, and a repeated call needs its locks."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     configs, folders = zip(*entries, strict=True)
-    members = TaskCache(trust=True, device=device)  # of code that the process which started this one has imported
-    train_configs(configs, folders, checkpoints=checkpoints, progress=tell, members=members)
+    tasks = TaskCache(trust=True, device=device)  # of code that the process which started this one has imported
+    train_configs(configs, folders, checkpoints=checkpoints, progress=tell, tasks=tasks)
 
 
 def _end(config: RunConfig, folder: Path) -> TrainingResult | FailedRun:

@@ -231,7 +231,7 @@ class _Search:
     search_seed: int
     engine: str
     shortlist: int
-    members: TaskCache = field(default_factory=TaskCache)
+    task_cache: TaskCache = field(default_factory=TaskCache)
 
     @cached_property
     def observation_name(self) -> str:
@@ -302,7 +302,7 @@ class _Search:
                 hyperparameters=hyperparameters,
                 engine=self.engine,
             )
-            self.members.adopt(config, task)
+            self.task_cache.adopt(config, task)
             configs.append(config)
 
         def progress(now: TrainingProgress) -> None:
@@ -313,7 +313,7 @@ class _Search:
 
         # Train them, reporting means on the way
         for group in [configs] if self.engine == "batched" else [[config] for config in configs]:
-            for end in train_configs(group, progress=progress, members=self.members):
+            for end in train_configs(group, progress=progress, tasks=self.task_cache):
                 if isinstance(end, FailedRun):
                     raise end.exception
         return sum(regrets) / len(regrets)

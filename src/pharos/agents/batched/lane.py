@@ -127,9 +127,9 @@ class ObservationTable:
             kernels.look_up(self._table.numpy(), self._begins, states.array, target)
         else:
             for i, view in enumerate(self.views):
-                members = np.flatnonzero(self.which == i)
-                rows = states.array[members].reshape(-1, *states.array.shape[2:])
-                kernels.write_drawn(view.raw(view.source.at(rows)), view.places, members, target)
+                runs = np.flatnonzero(self.which == i)
+                rows = states.array[runs].reshape(-1, *states.array.shape[2:])
+                kernels.write_drawn(view.raw(view.source.at(rows)), view.places, runs, target)
         return out
 
     def encoded(self, observations: np.ndarray, i: int) -> torch.Tensor:
@@ -348,10 +348,10 @@ class Lane(Generic[Net]):
             return self.network.initial(partial(self._draws, self.keys))
         rows = np.zeros((self.width, self.network.parameters.length), np.float32)
         for i, network in enumerate(self._own_networks):
-            members = np.flatnonzero(self.seen.which == i)
-            keys = self.keys[members]
+            runs = np.flatnonzero(self.seen.which == i)
+            keys = self.keys[runs]
             drawn = network.initial(partial(self._draws, keys))
-            rows[members] = pad(network.parameters, drawn, self.network.parameters)
+            rows[runs] = pad(network.parameters, drawn, self.network.parameters)
         return rows
 
     @staticmethod
@@ -420,9 +420,9 @@ class RunPolicy:
 class World:
     """One MDP, and the runs on it."""
 
-    def __init__(self, run: BatchRun, members: Sequence[int]):
+    def __init__(self, run: BatchRun, runs: Sequence[int]):
         mdp, dynamics = run.mdp, run.mdp.dynamics
-        self.members = np.array(members, np.int64)
+        self.runs = np.array(runs, np.int64)
         table = dynamics.deterministic_table()
         self.transitions = dynamics.for_kernels if table is None else table
         self.rewards: tuple[Any, ...] = (mdp.reward_table.table, mdp.reward_table.palette)
@@ -452,7 +452,7 @@ class BatchedEpisodes:
         for i, run in enumerate(runs):
             parts = (run.mdp.dynamics, run.mdp.reward_table, run.mdp.terminal, run.mdp.start_states)
             by_table.setdefault((*map(id, parts), id(run.outcome_rewards), id(run.staying)), []).append(i)
-        self.worlds = [World(runs[members[0]], members) for members in by_table.values()]
+        self.worlds = [World(runs[places[0]], places) for places in by_table.values()]
         self.keys = keys
         self._chances = np.array([(*run.mdp.chance.triple, run.mdp.chance.first_chosen) for run in runs], np.float64)
         self._limits = np.array([run.time_limit for run in runs], np.int64)
@@ -468,7 +468,7 @@ class BatchedEpisodes:
         self.next_state = np.zeros((width, copies), np.int64)
         self.reward, self.flags = np.zeros((width, copies)), np.zeros((width, copies), np.uint8)
         for world in self.worlds:
-            kernels.start(keys, world.members, world.starts, world.cumulative, self.state)
+            kernels.start(keys, world.runs, world.starts, world.cumulative, self.state)
         self.depth = (frames,) if frames > 1 else ()
         self.history = np.repeat(self.state[..., None], frames, axis=2)
         self.next_history = self.history.copy()
@@ -491,7 +491,7 @@ class BatchedEpisodes:
         for world in self.worlds:
             kernels.advance(
                 world.transitions, world.rewards, world.staying, world.terminal, world.starts, world.cumulative,
-                world.members, setting, self._knobs, actions, episodes, self.pending, transition, counts,
+                world.runs, setting, self._knobs, actions, episodes, self.pending, transition, counts,
             )  # fmt: skip
         if self.depth:
             self.next_history[..., :-1], self.next_history[..., -1] = self.history[..., 1:], self.next_state
