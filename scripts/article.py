@@ -110,6 +110,9 @@ def size(row, done):
         used = used[used["environment"] == row["of"]]
     if row["finding"] == "the learner with more regret":
         used = used[used["observation"] != "simple_image"]
+    if row["finding"] == SAME_HARD:  # of cells that both agents have
+        cell = used.groupby(["instance", "chance", "observation"])
+        used = used[cell["agent"].transform("nunique") == 2]
     return {"runs": len(used), "tasks": used.groupby(["instance", "chance"]).ngroups}
 
 
