@@ -8,9 +8,9 @@ from pharos.kernels import batched
 RUN = 1  # the one of a lane that is looked at
 
 
-def runs_of(task, hyperparameters, number=3, steps=120, apart=2**40):
+def runs_of(task, hyperparameters, number=3, steps=120, first_key=2**40, apart=977):
     source = ObservationSource.of(task.space, task.observer.observe)
-    keys = [apart + 977 * i for i in range(number)]
+    keys = [first_key + apart * i for i in range(number)]
     return [BatchRun(task.mdp, source, task.time_limit, hyperparameters, steps, i, key) for i, key in enumerate(keys)]
 
 

@@ -5,8 +5,9 @@ import pytest
 import torch
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
 
+from batched_runs import runs_of
 from pharos.agents import make_model
-from pharos.agents.batched import BatchRun, ObservationSource, make_batch
+from pharos.agents.batched import make_batch
 from pharos.environments import make
 from pharos.interaction import make_sb3_vec
 from pharos.kernels import batched as rollouts
@@ -18,9 +19,7 @@ DQN = {"learning_rate": 0.001, "buffer_size": 200, "learning_starts": 40, "batch
 
 
 def batch_of(agent, task, hyperparameters):
-    source = ObservationSource.of(task.space, task.observer.observe)
-    runs = [BatchRun(task.mdp, source, task.time_limit, hyperparameters, 10_000, i, 31 * i) for i in range(2)]
-    return make_batch(agent, runs)
+    return make_batch(agent, runs_of(task, hyperparameters, 2, steps=10_000, first_key=0, apart=31))
 
 
 def model_of(agent, task, hyperparameters):

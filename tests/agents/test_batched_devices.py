@@ -30,7 +30,7 @@ def grids(agent, observation, sizes, number=2):
     return [
         run
         for task, size in zip(tasks, sizes, strict=True)
-        for run in runs_of(task, AGENTS[agent], number, apart=2**40 + size)
+        for run in runs_of(task, AGENTS[agent], number, first_key=2**40 + size)
     ]
 
 

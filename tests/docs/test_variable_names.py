@@ -5,24 +5,14 @@ import re
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 import pharos
 
 SOURCE = Path(pharos.__file__).parent
 
-PARTICIPLES = {"asked", "found", "given", "kept", "known", "seen", "taken", "told"}
-PARTICIPLES |= {
-    "alike",
-    "asking",
-    "chosen",
-    "following",
-    "likely",
-    "met",
-    "paid",
-    "reached",
-    "said",
-    "seeing",
-    "together",
-}
+PARTICIPLES = {"alike", "asked", "asking", "chosen", "following", "found", "given", "kept", "known", "likely", "met"}
+PARTICIPLES |= {"paid", "reached", "said", "seeing", "seen", "taken", "together", "told"}
 
 # Keywords and fields that callers write, and rules, whose variables are part of the fingerprint of their state spaces.
 LICENSED = {
@@ -40,10 +30,17 @@ LICENSED = {
 }
 
 
-def variables(path: Path) -> set[str]:
+@pytest.fixture(scope="module")
+def nodes_of():
+    """The nodes of the syntax tree of each file of the library."""
+    files = {path.relative_to(SOURCE).as_posix(): path for path in sorted(SOURCE.rglob("*.py"))}
+    return {file: list(ast.walk(ast.parse(path.read_text(encoding="utf-8")))) for file, path in files.items()}
+
+
+def variables(nodes: list[ast.AST]) -> set[str]:
     """Names that a file binds: by assignments, loops, comprehensions, fields and parameters."""
     names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes:
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
             names.add(node.id)
         elif isinstance(node, ast.arg):
@@ -51,22 +48,13 @@ def variables(path: Path) -> set[str]:
     return names
 
 
-def test_no_variable_is_named_by_a_participle():
-    participles = {}
-    for path in sorted(SOURCE.rglob("*.py")):
-        file = path.relative_to(SOURCE).as_posix()
-        if names := variables(path) & PARTICIPLES:
-            participles[file] = names
-    assert participles == LICENSED
+def test_no_variable_is_named_by_a_participle(nodes_of):
+    participles = {file: variables(nodes) & PARTICIPLES for file, nodes in nodes_of.items()}
+    assert {file: names for file, names in participles.items() if names} == LICENSED
 
 
-def test_a_class_name_means_one_thing_in_the_whole_library():
-    names = Counter(
-        node.name
-        for path in SOURCE.rglob("*.py")
-        for node in ast.parse(path.read_text(encoding="utf-8")).body
-        if isinstance(node, ast.ClassDef)
-    )
+def test_a_class_name_means_one_thing_in_the_whole_library(nodes_of):
+    names = Counter(node.name for nodes in nodes_of.values() for node in nodes if isinstance(node, ast.ClassDef))
     assert [name for name, count in names.items() if count > 1] == []
 
 
@@ -74,14 +62,14 @@ def test_a_class_name_means_one_thing_in_the_whole_library():
 RIDDLES = re.compile(r"(What|How|Where|When|Who|Whose|Which|Those|That of|Of|As|Until|Everything|It|They|Them)\b")
 
 
-def test_docstrings_begin_with_a_noun_or_a_verb():
-    riddles = []
-    for path in sorted(SOURCE.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
-                docstring = ast.get_docstring(node) or ""
-                if RIDDLES.match(docstring):
-                    riddles.append((path.relative_to(SOURCE).as_posix(), getattr(node, "name", "")))
+def test_docstrings_begin_with_a_noun_or_a_verb(nodes_of):
+    riddles = [
+        (file, getattr(node, "name", ""))
+        for file, nodes in nodes_of.items()
+        for node in nodes
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
+        and RIDDLES.match(ast.get_docstring(node) or "")
+    ]
     assert riddles == [  # text of rules, which is part of the fingerprint of their state spaces
         ("environments/worlds/game_2048.py", "room"),
         ("environments/worlds/taxi.py", "parts_of"),

@@ -12,7 +12,7 @@ import pharos
 from naive import hitting as naive_hitting
 from pharos import hardness
 from pharos.errors import UndefinedMeasure
-from pharos.hardness.hitting_times import HittingTimeBounds, HittingTimes
+from pharos.hardness.hitting_times import HittingBounds, HittingTimes
 from pharos.hardness.interval import Budget, BudgetClock
 from pharos.hardness.stochastic_diameter import HubBounds, _Diameter
 from pharos.kernels import hitting
@@ -479,4 +479,4 @@ def test_a_target_without_an_upper_bound_so_far_is_not_ruled_out():
 
 
 def test_where_no_upper_bound_is_known_there_is_none_of_times_of_0():
-    assert HittingTimeBounds(0.5, math.inf, 0.0).upper == math.inf
+    assert HittingBounds(0.5, math.inf, 0.0).upper == math.inf
