@@ -36,7 +36,7 @@ T = TypeVar("T")
 # Entries of a configuration that decide about rewards and states, about the task, about observations
 WORLD = ("environment", "parameters", "gamma", "sources")
 TASK = ("environment", "parameters", "chance", "observation", "observation_options", "gamma", "horizon", "sources")
-SIGHT = ("environment", "parameters", "observation", "observation_options", "sources")
+OBSERVATIONS = ("environment", "parameters", "observation", "observation_options", "sources")
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,9 @@ class TaskCache:
         task, chance = self.task(config), config.chance
         run = BatchRun(
             mdp=replace(chance, lazy=0.0).of(self._world(config, task)[1]) if chance.lazy else task.mdp,
-            observe=self._once("sight", config, SIGHT, lambda: ObservationSource.of(task.space, task.observer.observe)),
+            observe=self._once(
+                "observations", config, OBSERVATIONS, lambda: ObservationSource.of(task.space, task.observer.observe)
+            ),
             time_limit=task.time_limit,
             hyperparameters=settings,
             steps=config.steps,

@@ -74,8 +74,9 @@ def _summary(results: Results) -> Section:
         returns = results.comparison.returns
         matched = int(returns["ours"].notna().sum())
         lines.append(f"{matched} of the {len(returns)} returns that the paper prints have their counterpart here.")
-    missing = f"{pluralize(now.missing, 'run')} missing: every number below is of the runs that are there."
-    missing = missing if now.missing else ""
+    missing = ""
+    if now.missing:
+        missing = f"{pluralize(now.missing, 'run')} missing: every number below is of the runs that are there."
     errors = [f"{count} × {error}" for error, count in Counter(now.errors.values()).items()]
     damaged = list({**now.damaged, **results.damaged}.values())
     return Section("Summary", "summary", lines=lines, missing=missing, errors=errors, damaged=damaged)
