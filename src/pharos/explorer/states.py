@@ -14,7 +14,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp import Dynamics, TabularMDP
-from pharos.policies import PolicyAnswers, PolicyLike, StateObserver, TabularAgent, evaluate_policy
+from pharos.policies import Observer, PolicyAnswers, PolicyLike, TabularAgent, evaluate_policy
 from pharos.solvers import Solution
 from pharos.state_space import StateSpace
 
@@ -290,7 +290,7 @@ class Learnt:
             return evaluate_policy(mdp, policy)
         if space is None or space.environment is None:
             raise ParameterError("a policy of observations needs an environment that is known; give it as a table")
-        observer = StateObserver(
+        observer = Observer(
             space, space.environment, self.observation, dict(self.observation_options), self.previous_action
         )
         width = mdp.policy_width

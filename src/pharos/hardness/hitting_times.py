@@ -55,7 +55,7 @@ PRODUCT = 1 + 2.0**-50
 
 
 @dataclass(frozen=True)
-class HittingTimeBounds:
+class HittingBounds:
     """Bounds of all hitting times of a target: J* lies between J times `low` and J times `high`.
 
     largest: the largest J. limited: whether floats are too short for closer bounds, so that more time would not help.
@@ -90,15 +90,15 @@ class HittingTimeBounds:
         """Whether the bounds are within `tolerance` of each other."""
         return math.isfinite(self.high) and self.high - self.low <= tolerance * self.high
 
-    def but_limited(self) -> "HittingTimeBounds":
+    def but_limited(self) -> "HittingBounds":
         """The same bounds, as close as floats allow."""
-        return HittingTimeBounds(self.low, self.high, self.largest, True)
+        return HittingBounds(self.low, self.high, self.largest, True)
 
 
-def certified(above: float, below: float, largest: float) -> HittingTimeBounds:
+def certified(above: float, below: float, largest: float) -> HittingBounds:
     """The bounds that follow from T J - J <= above and J - T J <= below."""
     high = PRODUCT / (1 - above) if above < 1 - 1e-9 else math.inf
-    return HittingTimeBounds(1 / ((1 + below) * PRODUCT), high, largest)
+    return HittingBounds(1 / ((1 + below) * PRODUCT), high, largest)
 
 
 def added(high: np.ndarray, low: np.ndarray, more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -206,7 +206,7 @@ class HittingTimes:
         j[~sure] = TOP  # a choice that may lead there is never the best
         return j, nodes.size, ~sure
 
-    def bounds(self, j: np.ndarray, count: int) -> HittingTimeBounds:
+    def bounds(self, j: np.ndarray, count: int) -> HittingBounds:
         """Bounds by the residuals of J; the greedy policy stands in `policy` then. `least` is the best lower one."""
         arrays = (*self.arrays, self.goal, self.order, count, j, None, self.policy, None, None)
         above, below, largest = hitting.residuals(*arrays)
@@ -214,7 +214,7 @@ class HittingTimes:
         self.least = max(self.least, bounds.lower)
         return bounds
 
-    def sweep(self, j: np.ndarray, count: int, sweeps: int, enough: float, spending: BudgetClock) -> HittingTimeBounds:
+    def sweep(self, j: np.ndarray, count: int, sweeps: int, enough: float, spending: BudgetClock) -> HittingBounds:
         """Bounds after sweeps in place, fewer where the upper bound is at most `enough`, the budget ends, or J does not
         move."""
         for number in range(sweeps):
@@ -250,9 +250,7 @@ class HittingTimes:
                 self.raised = self.swept
         return float(change)
 
-    def solve(
-        self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: BudgetClock
-    ) -> HittingTimeBounds:
+    def solve(self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: BudgetClock) -> HittingBounds:
         """Bounds within `tolerance` of each other, or an upper bound of at most `enough`, or what budget and floats
         allow."""
         bounds, failures, stalls, apart = self._converged(j, count, tolerance, enough, spending), 0, 0, math.inf
@@ -286,7 +284,7 @@ class HittingTimes:
 
     def _converged(
         self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: BudgetClock
-    ) -> HittingTimeBounds:
+    ) -> HittingBounds:
         """Bounds after sweeps, as long as at their rate these meet sooner than a linear solve takes, or nearly so.
 
         The rate is that of three times `SWEEPS` / 2 sweeps: moves along the slow mode set single ones back.
@@ -339,8 +337,8 @@ class HittingTimes:
     # Two floats a node ------------------------------------------------------------------------------------------------
 
     def _refined(
-        self, j: np.ndarray, count: int, tolerance: float, plain: HittingTimeBounds, spending: BudgetClock
-    ) -> HittingTimeBounds:
+        self, j: np.ndarray, count: int, tolerance: float, plain: HittingBounds, spending: BudgetClock
+    ) -> HittingBounds:
         """Bounds of a J that is the sum of two floats; `plain`, those of one, where they are no better. j becomes J +
         W."""
         high, low = j.copy(), np.zeros_like(j)
@@ -370,7 +368,7 @@ class HittingTimes:
 
     def _moved(
         self, high: np.ndarray, low: np.ndarray, count: int, factored: tuple[np.ndarray, "Factors"]
-    ) -> tuple[HittingTimeBounds, np.ndarray]:
+    ) -> tuple[HittingBounds, np.ndarray]:
         """(bounds of J* relative to J + W, J + W rounded up); a policy that is greedy in J - W in place of that in J
         where ties need it."""
         inner, factors = factored
@@ -396,7 +394,7 @@ class HittingTimes:
             margin[inner] += np.maximum(more, 0.0)
         lower = certified(0.0, below, 1.0).low
         ratio = float(np.min(below_high[inner] / ceiling[inner], initial=1.0)) / PRODUCT
-        return HittingTimeBounds(max(ratio * lower, 0.0), upper, float(ceiling[inner].max(initial=0.0)), True), ceiling
+        return HittingBounds(max(ratio * lower, 0.0), upper, float(ceiling[inner].max(initial=0.0)), True), ceiling
 
     def _residuals(
         self, high: np.ndarray, low: np.ndarray, count: int

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 LONGEST_REASON = 400
 
-BoardProgressCallback = Callable[[int, int, str], None]
+BoardCallback = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Board(Generic[T]):
         self,
         files: Sequence[tuple[str, Path]],
         judged: Callable[[Path], tuple[T, str]],
-        progress: BoardProgressCallback | None,
+        progress: BoardCallback | None,
     ) -> None:
         """Verify files, by name and path.
 
@@ -115,7 +115,7 @@ def board(
     *,
     title: str = "Leaderboard",
     trust: bool = False,
-    progress: BoardProgressCallback | None = None,
+    progress: BoardCallback | None = None,
     **options: Any,
 ) -> Board[Verdict]:
     """Verify every entry in a folder, and write a page that ranks them; entries of one task share its solution.

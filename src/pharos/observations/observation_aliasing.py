@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 BLOCK = 4096
 MOST_HISTORIES = 1_000_000
 
-AliasingProgressCallback = Callable[[int, str], None]
+AliasingCallback = Callable[[int, str], None]
 """Called with how many states are done, and a text."""
 
 
@@ -42,9 +42,7 @@ class Aliasing:
         return self.num_sharing / self.num_states
 
 
-def aliasing(
-    space: "StateSpace", observation: Observation, *, progress: AliasingProgressCallback | None = None
-) -> Aliasing:
+def aliasing(space: "StateSpace", observation: Observation, *, progress: AliasingCallback | None = None) -> Aliasing:
     """Count the states of a state space that an observation does not tell apart.
 
     Of an observation of k frames the states that some histories do not tell apart, see `history_aliasing`.
@@ -57,7 +55,7 @@ def aliasing(
 
 
 def observation_classes(
-    space: "StateSpace", observation: Observation, *, progress: AliasingProgressCallback | None = None
+    space: "StateSpace", observation: Observation, *, progress: AliasingCallback | None = None
 ) -> np.ndarray:
     """Number the different observations of a state space.
 
@@ -87,7 +85,7 @@ def history_aliasing(
     observation: Observation,
     *,
     most: int = MOST_HISTORIES,
-    progress: AliasingProgressCallback | None = None,
+    progress: AliasingCallback | None = None,
 ) -> Aliasing:
     """Count the states that an observation of k frames does not tell apart, over all histories that play can have.
 
@@ -143,7 +141,7 @@ def _histories(space: "StateSpace", length: int, max_histories: int) -> np.ndarr
 
 
 def _numbered(
-    observations_of: Callable[[slice], np.ndarray], count: int, name: str, progress: AliasingProgressCallback | None
+    observations_of: Callable[[slice], np.ndarray], count: int, name: str, progress: AliasingCallback | None
 ) -> np.ndarray:
     """(count,) int64, the numbers of different observations, which `observations_of` gives for blocks of rows."""
     import xxhash

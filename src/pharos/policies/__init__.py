@@ -2,6 +2,7 @@
 
 from pharos.policies.policy import (
     DeepPolicy,
+    Observer,
     Policy,
     PolicyAnswers,
     PolicyLike,
@@ -9,7 +10,6 @@ from pharos.policies.policy import (
     ReachableRows,
     RecurrentPolicy,
     SB3Model,
-    StateObserver,
     TableAnswers,
     TabularAgent,
     deep_policy,

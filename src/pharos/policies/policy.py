@@ -222,7 +222,7 @@ BATCH = 4096
 
 
 @dataclass(frozen=True, eq=False)
-class StateObserver:
+class Observer:
     """Observations of the states of an environment, as a policy sees them.
 
     Attributes:
@@ -468,7 +468,7 @@ class PolicyAnswers(QueriedPolicy):
         ParameterError: it is no policy, or was trained on other observations.
     """
 
-    def __init__(self, policy: PolicyLike, mdp: TabularMDP, observer: StateObserver, *, deterministic: bool = False):
+    def __init__(self, policy: PolicyLike, mdp: TabularMDP, observer: Observer, *, deterministic: bool = False):
         super().__init__(mdp, sees_previous_action=observer.previous_action)
         self.policy, self.observer, self.deterministic = policy_function(policy), observer, deterministic
         check_observation(policy, observer.observe.space, observer.observation)

@@ -22,6 +22,7 @@ from pharos.errors import DivergenceError, ParameterError
 from pharos.mdp import PolicyTable, Rewards, Table, TabularMDP, require_mdp
 from pharos.policies.policy import (
     Arrays,
+    Observer,
     Policy,
     PolicyAnswers,
     PolicyLike,
@@ -29,7 +30,6 @@ from pharos.policies.policy import (
     ReachableRows,
     RecurrentPolicy,
     SB3Model,
-    StateObserver,
     TableAnswers,
     TabularAgent,
     check_observation,
@@ -50,7 +50,7 @@ class QueriedHistories(PolicyAnswers):
     without its first state and with the next state behind. So the value of the policy is exact where they are few.
     """
 
-    def __init__(self, policy: PolicyLike, mdp: TabularMDP, observer: StateObserver, *, deterministic: bool = False):
+    def __init__(self, policy: PolicyLike, mdp: TabularMDP, observer: Observer, *, deterministic: bool = False):
         if observer.previous_action:
             raise ParameterError("the policy sees several frames and the previous action; expected one or the other")
         super().__init__(policy, mdp, observer, deterministic=deterministic)
@@ -151,9 +151,7 @@ class QueriedMemories(QueriedHistories):
     Cost: what the policy keeps is stored for each row.
     """
 
-    def __init__(
-        self, policy: RecurrentPolicy, mdp: TabularMDP, observer: StateObserver, *, deterministic: bool = False
-    ):
+    def __init__(self, policy: RecurrentPolicy, mdp: TabularMDP, observer: Observer, *, deterministic: bool = False):
         observation = observer.observe.observation
         if observation.frames > 1 or observation.irrelevant:
             besides = "several frames" if observation.frames > 1 else "irrelevant entries"
@@ -254,7 +252,7 @@ def _packed(tree: Arrays, count: int) -> list[bytes]:
 
 
 def answers_of(
-    policy: PolicyLike, mdp: TabularMDP, observer: StateObserver, *, deterministic: bool = False
+    policy: PolicyLike, mdp: TabularMDP, observer: Observer, *, deterministic: bool = False
 ) -> PolicyAnswers:
     """Answers of a policy that sees observations: of the state alone, of the last frames, or with a memory."""
     if isinstance(policy, SB3Model) and not isinstance(policy, Policy):
@@ -299,7 +297,7 @@ class Evaluation:
 def policy_value(
     policy: PolicyLike,
     mdp: TabularMDP,
-    observer: Callable[[], StateObserver],
+    observer: Callable[[], Observer],
     return_range: Callable[[], tuple[float, float]],
     *,
     deterministic: bool = False,
@@ -447,7 +445,7 @@ def _solution_of_reached(
             f"{mdp}: is not of a state space whose environment is known, so there is nothing to observe; "
             f"give the policy as a table"
         )
-    observer = StateObserver(
+    observer = Observer(
         space, space.environment, observation, dict(observation_options or {}), previous_action, mdp.horizon
     )
     if observer.frames > 1:

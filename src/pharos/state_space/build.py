@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceLocked, StateSpaceMismatch
 from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, Plan, lock, read_manifest
-from pharos.state_space.progress import BuildProgressCallback, reporter
+from pharos.state_space.progress import BuildCallback, reporter
 from pharos.state_space.store import StateSpace, load
 from pharos.state_space.stored import SHARDS, check_files
 from pharos.system import memory as machine
@@ -40,7 +40,7 @@ def build(
     memory: int | None = None,
     workers: int | None = None,
     processes: int | str = 1,
-    progress: BuildProgressCallback | bool | None = None,
+    progress: BuildCallback | bool | None = None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     wait: bool | None = None,
 ) -> StateSpace:
@@ -104,7 +104,7 @@ def _build(
     path: Path,
     rank: "Rank | None",
     options: "Options",
-    progress: BuildProgressCallback | bool | None,
+    progress: BuildCallback | bool | None,
     hold: Hold,
 ) -> bool:
     """Complete the state space in the folder; returns whether it was complete before."""

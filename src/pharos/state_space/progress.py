@@ -28,11 +28,11 @@ class BuildProgress:
     on_disk: bool = False
 
 
-BuildProgressCallback = Callable[[BuildProgress], None]
+BuildCallback = Callable[[BuildProgress], None]
 
 
 @contextlib.contextmanager
-def reporter(progress: BuildProgressCallback | bool | None, env: Environment) -> Iterator[BuildProgressCallback]:
+def reporter(progress: BuildCallback | bool | None, env: Environment) -> Iterator[BuildCallback]:
     """The function that gets each BuildProgress: the caller's, a bar on a terminal, or nothing."""
     if callable(progress):
         yield progress
@@ -44,7 +44,7 @@ def reporter(progress: BuildProgressCallback | bool | None, env: Environment) ->
 
 
 @contextlib.contextmanager
-def _bar(env: Environment) -> Iterator[BuildProgressCallback]:
+def _bar(env: Environment) -> Iterator[BuildCallback]:
     from rich.console import Console
     from rich.progress import Progress as Bar
     from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn

@@ -32,7 +32,7 @@ from pharos.ranks import Rank, mpi_rank
 from pharos.rules import rules_of
 from pharos.state_space.journal import Journal, Position
 from pharos.state_space.manifest import Plan
-from pharos.state_space.progress import BuildProgressCallback
+from pharos.state_space.progress import BuildCallback
 from pharos.state_space.search import Options, Search
 from pharos.state_space.table import BranchBlock, MemoryTable
 from pharos.system.memory import huge_pages
@@ -270,13 +270,7 @@ class RankedSearch(Search):
     """The search of rank 0; the other ranks run `answer`."""
 
     def __init__(
-        self,
-        plan: Plan,
-        journal: Journal,
-        options: Options,
-        report: BuildProgressCallback,
-        rank: Rank,
-        wide: int = WIDE,
+        self, plan: Plan, journal: Journal, options: Options, report: BuildCallback, rank: Rank, wide: int = WIDE
     ):
         super().__init__(plan, journal, options, report)
         self.threads = 1

@@ -19,7 +19,7 @@ from pharos.errors import StateSpaceTooLarge
 from pharos.rules import rules_of
 from pharos.state_space.journal import Journal, OutcomeJournal, Position
 from pharos.state_space.manifest import Plan
-from pharos.state_space.progress import BuildProgress, BuildProgressCallback
+from pharos.state_space.progress import BuildCallback, BuildProgress
 from pharos.state_space.table import BranchBlock, MemoryTable, SpilledTable
 from pharos.system import compiling
 from pharos.system import memory as machine
@@ -70,7 +70,7 @@ class Piece:
 class Search:
     """One run of a build, from the start states or the last checkpoint to the end."""
 
-    def __init__(self, plan: Plan, journal: Journal, options: Options, report: BuildProgressCallback):
+    def __init__(self, plan: Plan, journal: Journal, options: Options, report: BuildCallback):
         self.plan, self.journal, self.options, self.report = plan, journal, options, report
         self.env: Environment = plan.env
         self.branches, self.num_words = plan.branches, plan.layout.num_words

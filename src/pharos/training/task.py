@@ -21,7 +21,7 @@ from pharos.environments import Environment, as_tuples, class_called, class_of, 
 from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
 from pharos.mdp import ChanceSetting, TabularMDP
 from pharos.observations import OwnObservation, observation_of, registered
-from pharos.policies import ReachableRows, StateObserver, reachable_rows
+from pharos.policies import Observer, ReachableRows, reachable_rows
 from pharos.solvers import ReferenceValues, Solution, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
 from pharos.system.records import flat, read
@@ -142,9 +142,9 @@ class Task:
         return build(self.env)
 
     @cached_property
-    def observer(self) -> StateObserver:
+    def observer(self) -> Observer:
         """Observations of the states, as a policy sees them."""
-        return StateObserver(
+        return Observer(
             self.space,
             self.env,
             self.observation,

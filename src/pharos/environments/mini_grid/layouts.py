@@ -397,7 +397,7 @@ def _fits(canvas: Canvas, room: Room, others: list[Room]) -> bool:
     )
 
 
-class ParameterRange(NamedTuple):
+class Range(NamedTuple):
     """Range of a parameter: default, lowest and highest value (a function of the size), and whether it must be odd."""
 
     default: int
@@ -416,36 +416,30 @@ class Recipe(NamedTuple):
     """
 
     draw: Callable[..., GridLayout]
-    parameters: dict[str, ParameterRange]
+    parameters: dict[str, Range]
     max_steps: Callable[[int, int], int]
 
 
-def _recipe(
-    draw: Callable[..., GridLayout], max_steps: Callable[[int, int], int], **parameters: ParameterRange
-) -> Recipe:
-    return Recipe(draw, {**parameters, "seed": ParameterRange(0, 0)}, max_steps)
+def _recipe(draw: Callable[..., GridLayout], max_steps: Callable[[int, int], int], **parameters: Range) -> Recipe:
+    return Recipe(draw, {**parameters, "seed": Range(0, 0)}, max_steps)
 
 
-_CROSSINGS = {"size": ParameterRange(9, 5, odd=True), "crossings": ParameterRange(1, 0, lambda size: size - 3)}
+_CROSSINGS = {"size": Range(9, 5, odd=True), "crossings": Range(1, 0, lambda size: size - 3)}
 KINDS = {
-    "empty": Recipe(empty, {"size": ParameterRange(8, 4)}, lambda size, _: 4 * size**2),
-    "empty_random": _recipe(empty_random, lambda size, _: 4 * size**2, size=ParameterRange(6, 4)),
-    "four_rooms": _recipe(four_rooms, lambda size, _: 100, size=ParameterRange(19, 5)),
-    "door_key": _recipe(door_key, lambda size, _: 10 * size**2, size=ParameterRange(8, 5)),
-    "unlock": _recipe(unlock, lambda size, _: 8 * size**2, size=ParameterRange(6, 4)),
-    "unlock_pickup": _recipe(unlock_pickup, lambda size, _: 8 * size**2, size=ParameterRange(6, 4)),
-    "key_corridor": _recipe(
-        key_corridor, lambda size, _: 30 * size**2, size=ParameterRange(6, 3), rows=ParameterRange(3, 1)
-    ),
-    "lava_gap": _recipe(lava_gap, lambda size, _: 4 * size**2, size=ParameterRange(7, 5)),
+    "empty": Recipe(empty, {"size": Range(8, 4)}, lambda size, _: 4 * size**2),
+    "empty_random": _recipe(empty_random, lambda size, _: 4 * size**2, size=Range(6, 4)),
+    "four_rooms": _recipe(four_rooms, lambda size, _: 100, size=Range(19, 5)),
+    "door_key": _recipe(door_key, lambda size, _: 10 * size**2, size=Range(8, 5)),
+    "unlock": _recipe(unlock, lambda size, _: 8 * size**2, size=Range(6, 4)),
+    "unlock_pickup": _recipe(unlock_pickup, lambda size, _: 8 * size**2, size=Range(6, 4)),
+    "key_corridor": _recipe(key_corridor, lambda size, _: 30 * size**2, size=Range(6, 3), rows=Range(3, 1)),
+    "lava_gap": _recipe(lava_gap, lambda size, _: 4 * size**2, size=Range(7, 5)),
     "lava_crossing": _recipe(lava_crossing, lambda size, _: 4 * size**2, **_CROSSINGS),
     "simple_crossing": _recipe(simple_crossing, lambda size, _: 4 * size**2, **_CROSSINGS),
-    "multi_room": _recipe(
-        multi_room, lambda _, rooms: 20 * rooms, size=ParameterRange(10, 4), rooms=ParameterRange(6, 1)
-    ),
+    "multi_room": _recipe(multi_room, lambda _, rooms: 20 * rooms, size=Range(10, 4), rooms=Range(6, 1)),
     "dist_shift": Recipe(
         dist_shift,
-        {"size": ParameterRange(9, 7), "strip": ParameterRange(2, 2, lambda size: size - 4)},
+        {"size": Range(9, 7), "strip": Range(2, 2, lambda size: size - 4)},
         lambda size, _: 4 * size * (size - 2),
     ),
 }
