@@ -65,7 +65,7 @@ def test_a_run_is_the_same_in_lanes_of_every_width(grid, agent):
 def test_a_lane_has_at_most_three_idle_runs():
     assert [lane_widths(number, False) for number in (1, 5, 10, 32, 37)] == [[4], [6], [10], [32], [32, 6]]
     assert lane_widths(9, True) == [8, 4]
-    assert [lane_widths(number, False, "cuda") for number in (9, 33, 300)] == [[32], [64], [256, 64]]
+    assert [lane_widths(number, False, "cuda") for number in (9, 33, 300)] == [[10], [34], [256, 44]]
     assert lane_width(True, "cuda") == 256
 
 

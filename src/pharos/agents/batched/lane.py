@@ -134,8 +134,7 @@ class ObservationTable:
 
     def encoded(self, observations: np.ndarray, i: int) -> torch.Tensor:
         """(N, size) float32 of observations (N, ...) as the environment of run i gives them."""
-        rows = torch.from_numpy(self.views[self.which[i]].encoded(observations)).float()
-        return torch.nn.functional.pad(rows, (0, self.size - rows.shape[1])).to(self.device)
+        return torch.from_numpy(self.views[self.which[i]].encoded(observations)).float()
 
 
 class DeviceObservationTable(ObservationTable):
@@ -181,6 +180,7 @@ class DeviceObservationTable(ObservationTable):
         offsets = self._begins[:, None] if self.frames == 1 else self._begins[:, None, None]
         self._offsets = torch.from_numpy(offsets).to(self.device)
         self._places = torch.from_numpy(places[self.which][:, None]).to(self.device)
+        self._in_an_observation = [torch.from_numpy(view.places).to(self.device) for view in self.views]
 
     def at(self, states: PinnedBuffer, out: torch.Tensor) -> torch.Tensor:
         """See `ObservationTable`; a GPU can record it."""
@@ -188,6 +188,13 @@ class DeviceObservationTable(ObservationTable):
         rows = (states.tensor + self._offsets).view(-1)
         raw = self._table.index_select(0, rows).view(*states.tensor.shape[:2], -1)
         return out.copy_(raw.gather(2, self._places.expand(-1, raw.shape[1], -1)))
+
+    def encoded(self, observations: np.ndarray, i: int) -> torch.Tensor:
+        """See `ObservationTable`; what travels is raw, a 36th of the neighbours of pixels as float32."""
+        which = self.which[i]
+        raw = torch.from_numpy(self.views[which].raw(observations)).to(self.device)
+        rows = raw.index_select(1, self._in_an_observation[which]).float()
+        return torch.nn.functional.pad(rows, (0, self.size - rows.shape[1]))
 
 
 # Lane -----------------------------------------------------------------------------------------------------------------

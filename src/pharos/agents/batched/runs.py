@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 WIDTH_OF_VECTORS, WIDTH_OF_IMAGES = 32, 8  # most runs of a lane
 NARROWEST = 4
-WIDTHS_ELSEWHERE = (32, 64, 128, 256)  # of lanes on other devices than the processor
+WIDTH_ELSEWHERE = 256  # on other devices than the processor
 
 # What Stable-Baselines3 takes where nothing is given. The first part may differ among the runs of a batch.
 OF_A_RUN: dict[str, dict[str, Any]] = {
@@ -272,19 +272,15 @@ def _is_in_steps(value: Any) -> bool:
 def lane_width(is_image: bool, device: str = "cpu") -> int:
     """Maximum runs of a lane, chosen by measurement on the processor (docs/decisions/0013-batched-training.md)."""
     if device != "cpu":
-        return WIDTHS_ELSEWHERE[-1]
+        return WIDTH_ELSEWHERE
     return WIDTH_OF_IMAGES if is_image else WIDTH_OF_VECTORS
 
 
 def lane_widths(number: int, is_image: bool, device: str = "cpu") -> list[int]:
-    """The widths of the lanes of a batch: the last one has few idle runs.
+    """The widths of the lanes of a batch: the last one has at most one idle run, or NARROWEST rows.
 
-    On the processor a width is even and at least NARROWEST, as products of single runs add up in another order;
-    elsewhere it is one of a few.
+    A width is even and at least NARROWEST, as the processor adds up products of single runs in another order.
     """
     widest = lane_width(is_image, device)
     full, rest = divmod(number, widest)
-    last = max(rest + rest % 2, NARROWEST)
-    if device != "cpu":
-        last = next(width for width in WIDTHS_ELSEWHERE if width >= rest)
-    return [widest] * full + ([last] if rest else [])
+    return [widest] * full + ([max(rest + rest % 2, NARROWEST)] if rest else [])
