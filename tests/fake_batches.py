@@ -1,8 +1,8 @@
 """A runner of batches that learns nothing: what `fake_training` writes for each run, and a line for each batch.
 
-The file PHAROS_FAKE_BATCHES gets the size of each batch. PHAROS_FAKE_MOST runs fit into memory: more, and the process
-is killed. PHAROS_FAKE_SECONDS is how long a run takes, PHAROS_FAKE_FAIL a seed that fails; the batch has a checkpoint
-while it is trained.
+The file PHAROS_FAKE_BATCHES gets the size of each batch; PHAROS_FAKE_PARENTS, if given, the process that started this
+one. PHAROS_FAKE_MOST runs fit into memory: more, and the process is killed. PHAROS_FAKE_SECONDS is how long a run takes,
+PHAROS_FAKE_FAIL a seed that fails; the batch has a checkpoint while it is trained.
 """
 
 import json
@@ -15,6 +15,9 @@ import fake_training
 def train(configs, folders, checkpoints):
     with open(os.environ["PHAROS_FAKE_BATCHES"], "a") as file:
         file.write(f"{len(configs)}\n")
+    if "PHAROS_FAKE_PARENTS" in os.environ:
+        with open(os.environ["PHAROS_FAKE_PARENTS"], "a") as file:
+            file.write(f"{os.getppid()}\n")
     place = checkpoints / "batch"
     place.mkdir(parents=True, exist_ok=True)
     ids = [fake_training.run_id(config) for config in configs]

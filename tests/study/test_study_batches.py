@@ -1,6 +1,7 @@
 """Studies with `engine: batched`: what fits together is trained together, and nothing else changes."""
 
 import json
+import multiprocessing
 import os
 import shutil
 import signal
@@ -67,6 +68,16 @@ def test_more_runs_than_a_lane_are_several_batches(tmp_path, sizes):
 def test_batches_are_larger_where_networks_are_not_on_the_processor(tmp_path):
     run = specification(seeds=1).runs[0]
     assert (Batches(tmp_path).width(run), Batches(tmp_path, "cuda").width(run)) == (lane_width(is_image=False), 256)
+
+
+@pytest.mark.skipif("forkserver" not in multiprocessing.get_all_start_methods(), reason="nothing is forked here")
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_what_trains_on_a_gpu_is_not_forked(tmp_path, sizes, monkeypatch, device):
+    """CUDA refuses in a fork of a process that has asked whether there is a GPU, as Stable-Baselines3 does."""
+    parents = tmp_path / "parents"
+    monkeypatch.setenv("PHAROS_FAKE_PARENTS", str(parents))
+    assert run(specification(seeds=2), tmp_path / "out", device=device).finished == 2 and sizes() == [2]
+    assert (parents.read_text() == f"{os.getpid()}\n") == (device == "cuda")
 
 
 def test_the_engine_is_said_for_the_study_for_a_block_and_for_an_agent():

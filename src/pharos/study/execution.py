@@ -139,7 +139,9 @@ class Execution:
         self.repeated: set[str] = set()
         self.pending: deque[tuple[float, Run]] = deque()
         self.running: dict[str, tuple[tuple[Run, ...], float]] = {}
-        self.workers = Workers("pharos.study.warm" if runner is train else "pharos.study.worker")
+        # Stable-Baselines3 asks whether there is a GPU, and CUDA refuses in what is forked after that
+        preload = "pharos.study.warm" if runner is train else "pharos.study.worker"
+        self.workers = Workers(preload if options.device == "cpu" else None)
         self.batches = _batches.Batches(folder, options.device)
         self.kills: dict[str, int] = defaultdict(int)
         self.lost_servers = 0
