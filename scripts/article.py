@@ -298,7 +298,7 @@ def facts_of_findings():
         p = np.array([row["p"] for row in found(name).values() if row["p"] == row["p"]])
         said.append(f"{(holm(p) < 0.05).sum()} of {(p < 0.05).sum()} in {title}")
         done = runs(name)
-        said.append(f"{(~done['exact']).sum()} of {len(done)} runs")
+        said.append(f"{(~done['exact']).sum()} of {len(done):,} runs")
     measures = pd.read_csv(STUDIES / "classes" / "hardness.csv")
     said.append(f"{measures['num_states'].min():,} to {measures['num_states'].max():,} states")
     power = [found("classes")[finding, "frozen_lake"]["power"] for _, finding, of in ROWS if of == "frozen_lake"]
