@@ -1,6 +1,6 @@
 """How fast is the batched engine on a GPU? Agent-steps a second, and the share of the GPU's peak.
 
-    python benchmarks/batched_gpu.py [--instance NAME] [--runs 256 1024 4096] [--seconds S] [--agents dqn ppo]
+    python benchmarks/batched_gpu.py [--instances NAME ...] [--runs 256 1024 4096] [--seconds S] [--agents dqn ppo]
 
 With the hyperparameters of pharos' table, after `learning_starts` and some updates. First it is checked, on the
 device, that runs learn what they learn on the processor, that the same batch has the same bits twice, and whether a
@@ -35,9 +35,11 @@ def peak() -> float:
     return best
 
 
-def runs_of(task: Task, options: dict, number: int, steps: int = STEPS) -> list[BatchRun]:
-    source = ObservationSource.of(task.space, task.observer.observe)
-    return [BatchRun(task.mdp, source, task.time_limit, options, steps, i, i) for i in range(number)]
+def runs_of(tasks: list[Task], options: dict, number: int, steps: int = STEPS) -> list[BatchRun]:
+    """`number` runs, dealt out over the tasks in turn."""
+    sources = [ObservationSource.of(task.space, task.observer.observe) for task in tasks]
+    pairs = [(tasks[i % len(tasks)], sources[i % len(tasks)]) for i in range(number)]
+    return [BatchRun(task.mdp, source, task.time_limit, options, steps, i, i) for i, (task, source) in enumerate(pairs)]
 
 
 def options_of(agent: str, task: Task, observation: str) -> dict:
@@ -51,7 +53,7 @@ def outcome(batch, i: int) -> list[np.ndarray]:
     return [*batch.parameters(i).values(), batch.returns[i]]
 
 
-def check(agent: str, task: Task, options: dict) -> None:
+def check(agent: str, tasks: list[Task], options: dict) -> None:
     """The device beside the processor, itself, and other numbers of runs."""
     unit = options["n_envs"] * options["n_steps"] if agent == "ppo" else 4
     few = options | ({"learning_starts": 40} if agent == "dqn" else {})
@@ -59,7 +61,7 @@ def check(agent: str, task: Task, options: dict) -> None:
     batches = {}
     for name, number, device in (("cpu", 8, "cpu"), ("8", 8, "cuda"), ("again", 8, "cuda"), ("40", 40, "cuda"),
                                  ("100", 100, "cuda"), ("200", 200, "cuda")):  # fmt: skip
-        batches[name] = make_batch(agent, runs_of(task, few, number, steps), device=device)
+        batches[name] = make_batch(agent, runs_of(tasks, few, number, steps), device=device)
         batches[name].learn([steps], lambda point: None)
     for name in ("cpu", "again", "40", "100", "200"):
         pairs = [
@@ -72,7 +74,7 @@ def check(agent: str, task: Task, options: dict) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--instance", default="frozen_lake/8x8")
+    parser.add_argument("--instances", nargs="+", default=["frozen_lake/8x8"], help="with as many actions each")
     parser.add_argument("--runs", type=int, nargs="+", default=[256, 1024, 4096])
     parser.add_argument("--seconds", type=float, default=4.0)
     parser.add_argument("--agents", nargs="+", default=["dqn", "ppo"])
@@ -83,16 +85,18 @@ def main() -> None:
     torch.set_num_threads(1)
     most = peak()
     device = f"torch {torch.__version__}, {torch.cuda.get_device_name()}"
-    print(f"{arguments.instance}, {device}, a product: {most / 1e12:.1f} TFLOP/s", flush=True)
+    print(f"{', '.join(arguments.instances)}, {device}, a product: {most / 1e12:.1f} TFLOP/s", flush=True)
     for agent in arguments.agents:
         for observation in arguments.observations:
-            task = Task.of(arguments.instance, observation=observation)
-            options = options_of(agent, task, observation)
+            tasks = [Task.of(name, observation=observation) for name in arguments.instances]
+            options = options_of(agent, tasks[0], observation)
             if arguments.check:
-                check(agent, task, options)
+                check(agent, tasks, options)
             unit = options["n_envs"] * options["n_steps"] if agent == "ppo" else 100
             for number in arguments.runs:
-                batch = make_batch(agent, runs_of(task, options, number), device="cuda")
+                began = time.perf_counter()
+                batch = make_batch(agent, runs_of(tasks, options, number), device="cuda")
+                made = time.perf_counter() - began
                 flop = work(agent, options, batch.lanes[0])
                 began = time.perf_counter()
                 warm = max(3 * unit, options.get("learning_starts", 0) + 200)
@@ -106,8 +110,8 @@ def main() -> None:
                 speed = done * number / (time.perf_counter() - began)
                 print(
                     f"{agent} {observation:14}{number:6} runs: {speed:12,.0f} agent-steps/s, "
-                    f"{speed * flop / 1e12:6.2f} TFLOP/s, {speed * flop / most:5.1%} of peak (warm-up {warmed:.1f} s, "
-                    f"{torch.cuda.max_memory_allocated() / 2**30:.1f} GiB)",
+                    f"{speed * flop / 1e12:6.2f} TFLOP/s, {speed * flop / most:5.1%} of peak (batch {made:.1f} s, "
+                    f"warm-up {warmed:.1f} s, {torch.cuda.max_memory_allocated() / 2**30:.1f} GiB)",
                     flush=True,
                 )
                 if arguments.profile:

@@ -1,8 +1,8 @@
 """A runner of batches that learns nothing: what `fake_training` writes for each run, and a line for each batch.
 
 The file PHAROS_FAKE_BATCHES gets the size of each batch; PHAROS_FAKE_PARENTS, if given, the process that started this
-one. PHAROS_FAKE_MOST runs fit into memory: more, and the process is killed. PHAROS_FAKE_SECONDS is how long a run takes,
-PHAROS_FAKE_FAIL a seed that fails; the batch has a checkpoint while it is trained.
+one. PHAROS_FAKE_MOST runs fit into memory: more, and the process is killed. PHAROS_FAKE_SECONDS is how long a run
+takes, PHAROS_FAKE_FAIL a seed that fails; the batch has a checkpoint while it is trained.
 """
 
 import json
