@@ -23,7 +23,7 @@ from pharos.study import batches as _batches
 from pharos.study import execution as _execution
 from pharos.study.batches import Batches
 from pharos.system.storage import cache_directory, sealed
-from pharos.training import read_record, train_config
+from pharos.training import ExecutionOptions, read_record, train_config
 
 TESTS = Path(__file__).parents[1]
 
@@ -78,6 +78,16 @@ def test_what_trains_on_a_gpu_is_not_forked(tmp_path, sizes, monkeypatch, device
     monkeypatch.setenv("PHAROS_FAKE_PARENTS", str(parents))
     assert run(specification(seeds=2), tmp_path / "out", device=device).finished == 2 and sizes() == [2]
     assert (parents.read_text() == f"{os.getpid()}\n") == (device == "cuda")
+
+
+def test_a_gpu_has_one_process_unless_more_are_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(_execution, "usable_workers", lambda workers: 7 if workers is None else workers)
+
+    def processes(**options):
+        return _execution.Execution(specification(), tmp_path, ExecutionOptions(**options)).num_workers
+
+    assert [processes(device=device) for device in ("cpu", "cuda")] == [7, 1]
+    assert [processes(device=device, workers=3) for device in ("cpu", "cuda")] == [3, 3]
 
 
 def test_the_engine_is_said_for_the_study_for_a_block_and_for_an_agent():

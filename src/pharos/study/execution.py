@@ -126,7 +126,9 @@ class Execution:
         progress: Callable[[Status], None] | None = None,
     ):
         self.study, self.folder, self.options, self.progress = study, folder, options, progress
-        self.runs, self.num_workers = shard_of(study.runs, options.shard), usable_workers(options.workers)
+        self.runs = shard_of(study.runs, options.shard)
+        alone = options.workers is None and options.device != "cpu"  # several processes would share a GPU's memory
+        self.num_workers = usable_workers(1 if alone else options.workers)
         claim(study, folder)
         if batch_runner is None and runner is train:
             batch_runner = partial(_batches.train_batch, device=options.device)

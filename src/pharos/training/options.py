@@ -94,7 +94,7 @@ class ExecutionOptions:
             machines that come and go: a deep agent then ends elsewhere than without the interruption. Else killed runs
             start anew, and results never depend on it.
         timeout: seconds after which a run is ended, and failed. A batch gets as many for each of its runs.
-        workers: processes; as many as processors when not given.
+        workers: processes; as many as processors when not given, one on a GPU, whose memory they would share.
         device: of batches: cpu or cuda. As torch names it.
     """
 
