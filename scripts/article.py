@@ -283,7 +283,7 @@ def without_one_class(agent):
 
 def facts():
     """Phrases of the text that hold numbers, each as the text has it."""
-    return [*facts_of_findings(), *facts_of_the_sealed_test()]
+    return [*facts_of_findings(), *facts_of_the_sealed_test(), *facts_of_the_new_block()]
 
 
 def facts_of_findings():
@@ -337,6 +337,14 @@ def facts_of_the_sealed_test():
     said.append(f"by its image, {image['greedy']:.2f} for a predicted {image['kernel_regret']:.2f}")
     said.append(f"without this cell R² is {r_squared(*left_out(dqn[~is_hanoi], 'kernel_regret')):.2f}")
     return said
+
+
+def facts_of_the_new_block():
+    table = pd.read_csv(STUDIES / "hardness-dev" / "long-random-dqn-unseen-classes.csv")
+    row = table.set_index(["outcome", "predictor"]).loc["greedy", "sampled_regret"]
+    correlations = f"rank correlation {row['rho']:.2f}, {row['agreement']:.2f} of pairs in order"
+    fit = interval(row["r_squared"], row["r_squared_lower"], row["r_squared_upper"])
+    return [f"On {row['cells']} new cells", f"R² {fit}, {correlations}"]
 
 
 # Figures -------------------------------------------------------------------------------------------------------------
