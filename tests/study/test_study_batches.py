@@ -80,6 +80,12 @@ def test_what_trains_on_a_gpu_is_not_forked(tmp_path, sizes, monkeypatch, device
     assert (parents.read_text() == f"{os.getpid()}\n") == (device == "cuda")
 
 
+def test_a_device_that_is_not_there_is_refused_before_any_run(tmp_path):
+    with pytest.raises(ParameterError, match=r"device is 'tpu', which torch does not have here: .*; try cpu"):
+        study.run(specification(seeds=1), tmp_path, device="tpu")
+    assert not (tmp_path / "runs").exists()
+
+
 def test_a_gpu_has_one_process_unless_more_are_asked_for(tmp_path, monkeypatch):
     monkeypatch.setattr(_execution, "usable_workers", lambda workers: 7 if workers is None else workers)
 

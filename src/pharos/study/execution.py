@@ -97,10 +97,12 @@ def run(
     Returns:
         The Status at the end. Failed runs do not stop the others.
     Raises:
-        ParameterError: the specification or an option is wrong, or the folder holds another study.
+        ParameterError: the specification or an option is wrong, or the folder holds another study, or torch has no such device here.
         AllRunsFailed: every run has failed; its `outcome` is the Status.
     """
     execution = Execution(*opened(source, folder), ExecutionOptions(**options), runner, batch_runner, progress)
+    if execution.pending and runner is train:
+        refuse_missing(execution.options.device)
     if foretold is not None and execution.pending:
         foretold(execution.forecast())
     if prepare is None and runner is train:
@@ -398,6 +400,30 @@ def prepare_instances(
                 waits_for = f"; {message}" if isinstance(message, str) and message else ""
                 if not waits_for and todo:  # one is prepared, or its process has died
                     todo.popleft()
+
+
+def refuse_missing(device: str) -> None:
+    """Raise ParameterError for a device that torch does not have here, before each run fails for it.
+
+    A process of its own asks torch: it would keep some of a GPU's memory.
+    """
+    if device == "cpu":
+        return
+    with Workers() as workers:
+        workers.start("", _ask_for_device, (device,))
+        while workers:
+            for _, message in workers.events():
+                if isinstance(message, ParameterError):
+                    raise message
+
+
+def _ask_for_device(device: str, send: Callable[[ParameterError], None]) -> None:
+    from pharos.training.batch import check_device
+
+    try:
+        check_device(device)
+    except ParameterError as error:
+        send(error)
 
 
 def _prepare_all(

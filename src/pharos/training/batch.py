@@ -89,12 +89,13 @@ def train_configs(
     tasks = TaskCache(device=device or "cpu") if tasks is None else tasks
     if device not in (None, tasks.device):
         raise ParameterError(f"device is {device!r}, and the tasks are for {tasks.device!r}; expected one device")
-    _check_device(tasks.device)
+    check_device(tasks.device)
     run_configs = [config if isinstance(config, RunConfig) else RunConfig.from_dict(config) for config in configs]
     return TrainingJobs(run_configs, folders, checkpoints, progress, tasks, lane).run()
 
 
-def _check_device(device: str) -> None:
+def check_device(device: str) -> None:
+    """Raise ParameterError for a device that torch does not have here."""
     if device == "cpu":
         return
     import torch
