@@ -97,7 +97,8 @@ def run(
     Returns:
         The Status at the end. Failed runs do not stop the others.
     Raises:
-        ParameterError: the specification or an option is wrong, or the folder holds another study, or torch has no such device here.
+        ParameterError: the specification or an option is wrong, the folder holds another study, or torch has no such
+            device here.
         AllRunsFailed: every run has failed; its `outcome` is the Status.
     """
     execution = Execution(*opened(source, folder), ExecutionOptions(**options), runner, batch_runner, progress)
