@@ -419,7 +419,7 @@ def refuse_missing(device: str) -> None:
 
 
 def _ask_for_device(device: str, send: Callable[[ParameterError], None]) -> None:
-    from pharos.training.batch import check_device
+    from pharos.training import check_device
 
     try:
         check_device(device)
