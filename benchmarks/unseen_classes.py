@@ -4,20 +4,23 @@ python benchmarks/unseen_classes.py STUDY.yaml RUNS.parquet PREDICTIONS.parquet 
     [--permutations N] [--hardness FOLDER] [--and STUDY.yaml RUNS.parquet PREDICTIONS.parquet]
 
 RUNS.parquet is a packed study (`pharos study pack`); --and adds another one, with predictions of its own. Writes all
-columns of `study.validation`, prints the primary outcome and the regret of training episodes, and draws predicted
-against observed regret and the learners' curves.
+columns of `study.validation`, prints the primary outcome and the regret of training episodes, and how far today's
+predictor is off without a line, and draws predicted against observed regret and the learners' curves.
 """
 
 import argparse
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from pharos import study
 from pharos.plots import save_for_page, unseen_figures
 from pharos.validation import PredictedCells
+from pharos.validation.learners import PRIMARY
 from pharos.validation.leave_one_class_out import PERMUTATIONS
+from pharos.validation.prediction import published
 
 OUTCOMES = ("greedy", "played")
 
@@ -59,6 +62,8 @@ def main():
             words += [f"{row['p_rho_holm']:.2g}", _interval(row, "given_tabular_regret"), _interval(row, "agreement")]
             image = f"{row['image_agreement'] * row['image_pairs']:g} of {row['image_pairs']}"
             print(f"| `{row['predictor']}` | {' | '.join(words)} of {row['pairs']} | {image} |")
+        if outcome == "greedy":
+            _print_misses(predictions, cells, agent)
     if given.figures:
         folder = Path(given.figures)
         folder.mkdir(parents=True, exist_ok=True)
@@ -77,6 +82,25 @@ def _finished(spec, packed, hardness):
             study.curves(place),
             study.hardness_table(study.specification(spec), hardness or place, tasks=tasks),
         )
+
+
+def _print_misses(predictions, cells, agent):
+    """Print how today's predictor does as it is, and how many cells are within the interval of `pharos predict`."""
+    kind = agent.split()[0]  # without the name of its setting
+    keys = ["environment", "instance", "chance", "agent", "observation"]
+    both = predictions.merge(cells[[*keys, "greedy"]], on=keys)
+    both = both[both["agent"] == agent]
+    if PRIMARY.get(kind) not in both:
+        return
+    miss, classes = both["greedy"] - both[PRIMARY[kind]], both["environment"]
+    weights = 1 / classes.groupby(classes).transform("size")  # classes weigh alike
+    middle = np.average(both["greedy"], weights=weights)
+    unfitted = 1 - (weights * miss**2).sum() / (weights * (both["greedy"] - middle) ** 2).sum()
+    width = published(kind).half_width()
+    held = miss.abs() <= width
+    least = held.groupby(classes).mean()
+    within = f"{held.mean():.2f} of {len(held)} cells within {width:.2f}, of {least.idxmin()} {least.min():.2f}"
+    print(f"`{PRIMARY[kind]}` without a line: R2 {unfitted:.2f}; {within}")
 
 
 def _interval(row, name):
