@@ -110,10 +110,16 @@ def size(row, done):
         used = used[used["environment"] == row["of"]]
     if row["finding"] == "the learner with more regret":
         used = used[used["observation"] != "simple_image"]
-    if row["finding"] == SAME_HARD:  # of cells that both agents have
-        cell = used.groupby(["instance", "chance", "observation"])
-        used = used[cell["agent"].transform("nunique") == 2]
-    return {"runs": len(used), "tasks": used.groupby(["instance", "chance"]).ngroups}
+    task = ["instance", "chance"]
+    pairs = {  # cells that both agents have; tasks that have both agents, or both observations
+        SAME_HARD: ([*task, "observation"], "agent"),
+        "the learner with more regret": (task, "agent"),
+        "the harder observation of DQN": (task, "observation"),
+    }
+    if row["finding"] in pairs:
+        keys, differs = pairs[row["finding"]]
+        used = used[used.groupby(keys)[differs].transform("nunique") == 2]
+    return {"runs": len(used), "tasks": used.groupby(task).ngroups}
 
 
 def number(value, digits=2):
