@@ -13,8 +13,8 @@ regret of runs. For each cell:
 
 How many runs: if the means are equal and runs deviate by s, n of Stable-Baselines3 and 2 n of the batched engine show
 it with the chance POWER where n = (z(0.95) + z((1 + POWER) / 2))^2 * 1.5 * s^2 / MARGIN^2. The pilot trains 32 runs of
-the batched engine alone for each candidate, so that a setting is chosen before any difference is seen; RESERVE is for
-the error of its deviations. Runs of the comparison have other seeds than those of the pilot.
+the batched engine alone for each candidate (more where 32 had missed rare runs), so that a setting is chosen before any
+difference is seen; RESERVE is for the error of its deviations. Runs of the comparison have other seeds than the pilot.
 
 Writes docs/agreement.csv, and prints the table.
 
@@ -56,7 +56,7 @@ CELLS = (
     ("dqn", GRID, "plain", "simple_image", 2500, 109),
     ("dqn", BREAKOUT, "plain", "vector", 2500, 30),
     ("dqn", BREAKOUT, "plain", "simple_image", 2500, 30),
-    ("dqn", freeway(1, 3), STICKY, "vector", 2500, 208),
+    ("dqn", freeway(3, 5), STICKY, "vector", 4500, 119),
     ("dqn", freeway(3, 5), "plain", "simple_image", 2500, 156),
     ("ppo", "frozen_lake/4x4", "plain", "vector", 2500, 30),
     ("ppo", "frozen_lake/4x4", RANDOM, "vector", 2500, 30),
@@ -78,6 +78,11 @@ CANDIDATES = (
     ("ppo", GRIDS, "plain", "simple_image", (2500, 5000)),
     ("ppo", FREEWAYS, STICKY, "vector", (2500, 5000, 10_000)),
     ("ppo", FREEWAYS, "plain", "simple_image", (2500, 5000, 10_000)),
+)
+# The same with numbers of runs, and seeds from 10,000: 32 runs had missed the rare ones that lose most
+SECOND_CANDIDATES = (
+    ("dqn", [freeway(2, 3), freeway(3, 5), freeway(3, 8)], STICKY, "vector", (2500, 5000), 96),
+    ("dqn", [freeway(3, 5)], STICKY, "vector", (4000, 4500), 192),
 )
 SMALL = {
     "dqn": {"learning_starts": 500, "buffer_size": 10_000, "target_update_interval": 250, "exploration_fraction": 0.4},
@@ -124,6 +129,8 @@ def runs_needed(deviation):
 def pilot(folder, workers):
     """Print mean and deviation of each candidate, and how many runs and steps of Stable-Baselines3 it needs."""
     cells = [(*rest, steps, PILOT) for *rest, lengths in CANDIDATES for steps in lengths]
+    for *rest, lengths, number in SECOND_CANDIDATES:
+        cells += [(*rest, steps, list(range(10_000, 10_000 + number))) for steps in lengths]
     spec = specification("batched", cells)
     print(study.run(spec, folder, workers=workers))
     runs = study.table(spec, folder)
