@@ -38,10 +38,11 @@ GRID = {"name": "simple_grid", "parameters": {"height": 3, "width": 3, "rewards"
 BREAKOUT = {"name": "breakout", "parameters": {"height": 7, "columns": 5, "brick_rows": 1}}
 
 
-def freeway(cars, length):
+def freeway(cars, length, **more):
     """A small Freeway."""
     speeds, directions = [1, 2, 3][:cars], [1, -1, 1][:cars]
     parameters = {"num_cars": cars, "lane_length": length, "car_speeds": speeds, "directions": directions}
+    parameters |= more
     return {"name": "freeway", "parameters": parameters}
 
 
@@ -81,6 +82,8 @@ CANDIDATES = (
 )
 # The same with numbers of runs, and seeds from 10,000: 32 runs had missed the rare ones that lose most
 SECOND_CANDIDATES = (
+    ("dqn", [freeway(1, 3, hit_penalty=loss) for loss in (0.1, 0.5)], STICKY, "vector", (2500, 5000), 256),
+    ("dqn", [freeway(1, 3)], STICKY, "vector", (5000,), 256),
     ("dqn", [freeway(2, 3), freeway(3, 5), freeway(3, 8)], STICKY, "vector", (2500, 5000), 96),
     ("dqn", [freeway(3, 5)], STICKY, "vector", (4000, 4500), 192),
 )
