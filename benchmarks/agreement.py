@@ -18,7 +18,7 @@ difference is seen; RESERVE is for the error of its deviations. Runs of the comp
 
 Writes docs/agreement.csv, and prints the table.
 
-Cost, one worker on a busy machine: the pilot 12 minutes, the batched runs 15, those of Stable-Baselines3 1.7 hours.
+Cost, one worker on a busy machine: the pilots half an hour, the batched runs 15, those of Stable-Baselines3 1.7 hours.
 """
 
 import argparse
@@ -42,8 +42,7 @@ def freeway(cars, length, **more):
     """A small Freeway."""
     speeds, directions = [1, 2, 3][:cars], [1, -1, 1][:cars]
     parameters = {"num_cars": cars, "lane_length": length, "car_speeds": speeds, "directions": directions}
-    parameters |= more
-    return {"name": "freeway", "parameters": parameters}
+    return {"name": "freeway", "parameters": {**parameters, **more}}
 
 
 RANDOM, STICKY = {"random": 0.1}, {"sticky": 0.25}

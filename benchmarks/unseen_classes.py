@@ -17,6 +17,7 @@ import pandas as pd
 
 from pharos import study
 from pharos.plots import save_for_page, unseen_figures
+from pharos.training import CELL
 from pharos.validation import PredictedCells
 from pharos.validation.learners import PRIMARY
 from pharos.validation.leave_one_class_out import PERMUTATIONS
@@ -87,8 +88,7 @@ def _finished(spec, packed, hardness):
 def _print_misses(predictions, cells, agent):
     """Print how today's predictor does as it is, and how many cells are within the interval of `pharos predict`."""
     kind = agent.split()[0]  # without the name of its setting
-    keys = ["environment", "instance", "chance", "agent", "observation"]
-    both = predictions.merge(cells[[*keys, "greedy"]], on=keys)
+    both = predictions.merge(cells[[*CELL, "greedy"]], on=CELL)
     both = both[both["agent"] == agent]
     if PRIMARY.get(kind) not in both:
         return
