@@ -1,6 +1,6 @@
 """How fast are the same calls in two checkouts? Each in fresh processes in turn, with everything compiled on disk.
 
-    python benchmarks/checkouts.py OTHER [--rounds 4] [--only startup build solve train batched]
+    python benchmarks/checkouts.py OTHER [--rounds 4] [--only startup build solve evaluate train batched]
 
 OTHER is the folder of another checkout, such as `git worktree add ../before 55ae4af`. Prints for each call the seconds
 of the processor here, and the ratio to those of OTHER, as medians of pairs; the first round compiles and is left out.
@@ -63,6 +63,38 @@ def solve(results):
         timed(results, f"solve {name}, sticky", lambda mdp=sticky: pharos.value_iteration(mdp))
 
 
+def evaluate(results):
+    """Exact values of drawn networks that see vectors: ten evaluations of one task."""
+    import numpy as np
+
+    from pharos.training import Task, evaluate_agent
+
+    def network(seed, size, actions, is_greedy):
+        rng = np.random.default_rng(seed)
+        first, last = rng.normal(size=(size, 64)) / size**0.5, rng.normal(size=(64, actions))
+
+        def policy(observations):
+            scores = np.tanh(np.asarray(observations, float) @ first) @ last
+            if is_greedy:
+                return scores.argmax(axis=1)
+            grown = np.exp(scores - scores.max(axis=1, keepdims=True))
+            return grown / grown.sum(axis=1, keepdims=True)
+
+        return policy
+
+    for name, chance in (("freeway/20x5-speed1", {"random": 0.1}), ("freeway/16x7-speed1", {"sticky": 0.25})):
+        task = Task.of(name, observation="vector", **chance)
+        size, actions = task.observer.observe.space.shape[0], task.mdp.num_actions
+        for kind, is_greedy in (("greedy", True), ("random", False)):
+            policies = [network(seed, size, actions, is_greedy) for seed in range(11)]
+            evaluate_agent(policies.pop(), task, again=True)
+            timed(
+                results,
+                f"values of {kind} policies, {name}, {chance}",
+                lambda policies=policies, task=task: [evaluate_agent(policy, task, again=True) for policy in policies],
+            )
+
+
 def train(results):
     """Two million steps of Q-learning."""
     import pharos
@@ -97,7 +129,7 @@ def batched(results):
         )
 
 
-KINDS = {each.__name__: each for each in (startup, build, solve, train, batched)}
+KINDS = {each.__name__: each for each in (startup, build, solve, evaluate, train, batched)}
 
 
 def measured(checkout, kind, caches):

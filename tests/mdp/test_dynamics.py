@@ -21,6 +21,7 @@ from pharos.mdp import (
     TabularMDP,
     chosen_mass,
     random_actions,
+    runs_of,
     sticky_actions,
 )
 from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
@@ -161,7 +162,12 @@ def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
         equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, select)
         fast = np.empty_like(x)
         mdp.dynamics.backup(equation, x, fast)
-        np.testing.assert_allclose(fast, backed_up(Listed.of(mdp), equation, x), atol=1e-12)
+        slow = backed_up(Listed.of(mdp), equation, x)
+        np.testing.assert_allclose(fast, slow, atol=1e-12)
+        some = np.append(rng.random(mdp.num_states) < 0.5, True)
+        part = np.full_like(x, 7.0)
+        mdp.dynamics.backup(equation, x, part, runs_of(some[:-1]))
+        assert (part == np.where(some[:, None], fast, 7.0)).all()
     live = ~np.asarray(mdp.terminal)
     for play, width in (
         (PolicyStep(live, policy.later, mdp.chance), mdp.width),

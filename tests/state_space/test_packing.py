@@ -11,7 +11,7 @@ from numba import njit
 from pharos.environments import Components
 from pharos.errors import ParameterError
 from pharos.kernels.hash_table import fill, fill_more, fill_range, find, mixed, slot_of
-from pharos.rules.layout import layout_of, pack, unpack
+from pharos.rules.layout import AT_ONCE, layout_of, pack, unpack
 from pharos.rules.packed_view import clear_fault, fault, get_word, packed_view, set_word
 from strategies import examples
 
@@ -56,6 +56,8 @@ def test_unpacking_gives_back_what_was_packed(ranges, seed):
     components = components_of(ranges)
     layout, states = layout_of(components), states_of(components, seed)
     assert (unpack(layout, pack(layout, states)) == states).all()
+    many = np.tile(states, (AT_ONCE * len(ranges) // len(states) + 1, 1))  # component by component
+    assert (unpack(layout, pack(layout, many)) == many).all()
 
 
 def test_a_component_never_straddles_two_words():

@@ -270,19 +270,25 @@ def sticky_backup(transitions, table, palette, gamma, weights, choice, v, out, a
                 out[uint64(s), b] = shared + previous_weight * q[b]
 
 
+@njit(forceinline=True)
+def _policy_value(transitions, table, palette, gamma, weights, policy, v, actions, s):
+    """sum_a (chosen policy[s, a] + uniform / A) q(s, a): the backup of v at s."""
+    chosen_weight, uniform_share = weights[0], weights[2] / len(actions)
+    value = 0.0
+    for a in range(len(actions)):
+        q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
+        value += (chosen_weight * policy[s, a] + uniform_share) * q
+    return value
+
+
 @interpreted_first()
 @njit(cache=True, nogil=True)
-def policy_sweep(transitions, table, palette, gamma, chosen_weight, uniform_weight, policy, v, order, start, stop):
+def policy_sweep(transitions, table, palette, gamma, weights, policy, v, actions, order, start, stop):
     """v[s] = sum_a (chosen policy[s, a] + uniform / A) q(s, a), in place; policy (S, A): probabilities of choosing."""
-    _, num_actions = size_of(transitions)
-    uniform_share = uniform_weight / num_actions
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
         s = state_at(order, i)
-        value = 0.0
-        for a in range(num_actions):
-            q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
-            value += (chosen_weight * policy[s, a] + uniform_share) * q
+        value = _policy_value(transitions, table, palette, gamma, weights, policy, v, actions, s)
         change = max(change, abs(value - v[s]))
         v[s] = value
     return change
@@ -290,31 +296,56 @@ def policy_sweep(transitions, table, palette, gamma, chosen_weight, uniform_weig
 
 @interpreted_first()
 @njit(cache=True, nogil=True)
-def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, q, order, start, stop):
+def policy_backup(transitions, table, palette, gamma, weights, policy, v, out, actions, runs):
+    """out[s] = the backup of v for s of some runs (R, 2), not in place; terms as in `policy_sweep`."""
+    for i in range(len(runs)):
+        for s in range(runs[i, 0], runs[i, 1]):
+            out[s] = _policy_value(transitions, table, palette, gamma, weights, policy, v, actions, s)
+
+
+@njit(forceinline=True)
+def _sticky_policy_values(transitions, table, palette, gamma, weights, policy, v, actions, q, values, s):
+    """values[b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b); q (A,) scratch."""
+    chosen_weight, previous_weight, uniform_weight = weights
+    uniform_share = uniform_weight / len(actions)
+    looks_back = policy.shape[1] > 1
+    for a in range(len(actions)):
+        q[a] = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
+    # the mean under the policy, once where it does not depend on the previous action b
+    shared = 0.0
+    for b in range(len(actions)):
+        if b == 0 or looks_back:
+            shared = 0.0
+            for a in range(len(actions)):
+                shared += (chosen_weight * policy[s, b, a] + uniform_share) * q[a]
+        values[b] = shared + previous_weight * q[b]
+
+
+@interpreted_first()
+@njit(cache=True, nogil=True)
+def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, actions, q, order, start, stop):
     """v[s, b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b), in place.
 
     v (S + 1, A). policy (S, B, A): B is A, or 1 where the previous action does not matter. q (A,) scratch.
     """
-    _, num_actions = size_of(transitions)
-    chosen_weight, previous_weight, uniform_weight = weights
-    uniform_share = uniform_weight / num_actions
-    looks_back = policy.shape[1] > 1
-    change = 0.0
+    change, values = 0.0, np.empty(len(q))
     for i in range(stop - 1, start - 1, -1):
         s = state_at(order, i)
-        for a in range(num_actions):
-            q[a] = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
-        # the mean under the policy, once where it does not depend on the previous action b
-        shared = 0.0
-        for b in range(num_actions):
-            if b == 0 or looks_back:
-                shared = 0.0
-                for a in range(num_actions):
-                    shared += (chosen_weight * policy[s, b, a] + uniform_share) * q[a]
-            value = shared + previous_weight * q[b]
-            change = max(change, abs(value - v[s, b]))
-            v[s, b] = value
+        _sticky_policy_values(transitions, table, palette, gamma, weights, policy, v, actions, q, values, s)
+        for b in range(len(q)):
+            change = max(change, abs(values[b] - v[s, b]))
+            v[s, b] = values[b]
     return change
+
+
+@interpreted_first()
+@njit(cache=True, nogil=True)
+def sticky_policy_backup(transitions, table, palette, gamma, weights, policy, v, out, actions, runs):
+    """out[s, b] = the backup of v for s of some runs (R, 2), not in place; terms as in `sticky_policy_sweep`."""
+    q = np.empty(v.shape[1])
+    for i in range(len(runs)):
+        for s in range(runs[i, 0], runs[i, 1]):
+            _sticky_policy_values(transitions, table, palette, gamma, weights, policy, v, actions, q, out[s], s)
 
 
 @interpreted_first()

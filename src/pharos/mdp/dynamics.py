@@ -188,19 +188,18 @@ class Dynamics(ABC):
         """
         rewards, gamma, chance, select = equation
         choice = _choice(select)
+        arrays: tuple[object, ...] = (self.for_sweeps, rewards.table, rewards.palette, gamma)
+        x_, out_ = (x, out) if chance.is_sticky else (x[:, 0], out[:, 0])
         out[-1] = 0.0
         if choice is None:
-            states = slice(None) if runs is None else slice(*runs[0]) if len(runs) == 1 else rows_of(runs)
-            q = rewards.rows(states) + gamma * self.expected(x, states)
-            out[: self.num_states][states] = equation.value(q, states)
-            return
-        kernel, weights, x_, out_ = (
-            (bellman.sticky_backup, chance.triple, x, out)
-            if chance.is_sticky
-            else (bellman.optimal_backup, chance.uniform, x[:, 0], out[:, 0])
-        )
-        tables = (self.for_sweeps, rewards.table, rewards.palette, gamma)
-        arrays = (*tables, weights, choice, x_, out_, bellman.actions_of(self.num_actions))
+            assert isinstance(select, PolicyTable)
+            kernel = bellman.sticky_policy_backup if chance.is_sticky else bellman.policy_backup
+            arrays += chance.triple, select.later if chance.is_sticky else select.later[:, 0]
+        else:
+            kernel = bellman.sticky_backup if chance.is_sticky else bellman.optimal_backup
+            weights = chance.triple if chance.is_sticky else chance.uniform
+            arrays += weights, choice
+        arrays += x_, out_, bellman.actions_of(self.num_actions)
         whole = np.array([[0, self.num_states]])
         _shared(lambda part: kernel(*arrays, part), self, whole if runs is None else runs)
 
@@ -431,9 +430,10 @@ def swept(
     if choice is None:
         assert isinstance(select, PolicyTable)
         if chance.is_sticky:
-            return bellman.sticky_policy_sweep(*tables, chance.triple, select.later, x, scratch, order, *places)
-        weights = (float(chance.chosen), float(chance.uniform))
-        return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0], order, *places)
+            return bellman.sticky_policy_sweep(
+                *tables, chance.triple, select.later, x, actions, scratch, order, *places
+            )
+        return bellman.policy_sweep(*tables, chance.triple, select.later[:, 0], x[:, 0], actions, order, *places)
     if chance.is_sticky:
         return bellman.sticky_sweep(*tables, chance.triple, choice, x, actions, scratch, order, *places)
     v, border = x[:, 0], rows_with_room(transitions, *places)
@@ -523,11 +523,6 @@ def runs_between(runs: np.ndarray, num_rows: int) -> np.ndarray:
 def count_of(runs: np.ndarray) -> int:
     """Number of rows in runs (R, 2)."""
     return int((runs[:, 1] - runs[:, 0]).sum())
-
-
-def rows_of(runs: np.ndarray) -> np.ndarray:
-    """(N,) int64: the rows of runs (R, 2), ascending."""
-    return np.concatenate([np.zeros(0, np.int64), *(np.arange(start, stop) for start, stop in runs.tolist())])
 
 
 def shares_of(runs: np.ndarray, shares: int) -> list[np.ndarray]:

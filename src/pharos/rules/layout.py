@@ -14,6 +14,12 @@ import numpy as np
 from pharos.environments import Components
 from pharos.errors import ParameterError
 
+AT_ONCE = 64
+"""States for each component up to which all components are unpacked at once; of more, one after another."""
+
+AT_ONCE = 64
+"""States for each component up to which all components are unpacked at once; of more, one after another."""
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -70,6 +76,12 @@ def pack(layout: Layout, states: np.ndarray) -> np.ndarray:
 
 def unpack(layout: Layout, packed: np.ndarray) -> np.ndarray:
     """Integers (N, D) int64 of packed states (N, W) uint64."""
+    packed = np.asarray(packed)
+    if len(packed) <= AT_ONCE * len(layout.word):
+        fields = packed.take(layout.word.astype(np.intp), axis=1, mode="clip")  # nothing to clip; it is faster
+        fields >>= layout.shift
+        fields &= layout.mask
+        return fields.view(np.int64) + layout.low
     states = np.empty((len(packed), len(layout.word)), np.int64)
     for i in range(len(layout.word)):
         field = (packed[:, int(layout.word[i])] >> layout.shift[i]) & layout.mask[i]
