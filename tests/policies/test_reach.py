@@ -71,3 +71,29 @@ def test_an_agent_is_worth_the_same_again(most):
     assert whole.exact == (most > 3)
     with pytest.raises(ParameterError):
         evaluate_agent(lambda observations: np.full((len(observations), 4), np.nan), task, again=True)
+
+
+@pytest.mark.parametrize(
+    "slippery, chance", [(False, {"sticky": 0.2}), (False, {"sticky": 0.2, "random": 0.1}), (True, {})]
+)
+def test_a_greedy_policy_under_chance_is_asked_in_blocks_and_once_about_each_state(slippery, chance):
+    lake, asked = {"size": 8, "slippery": slippery}, []
+    task = Task.of("frozen_lake", lake, **chance)
+
+    def policy(observations):
+        asked.append(observations)
+        return 1 + (observations[:, :2].sum(axis=1) * 97).astype(int) % 2  # down or right
+
+    level_by_level = evaluate_agent(policy, task)
+    levels, states = len(asked), sum(map(len, asked))
+    assert len(np.unique(np.concatenate(asked), axis=0)) == states > levels > 3
+    asked.clear()
+    assert evaluate_agent(policy, task, again=True) == level_by_level
+    assert len(asked) <= 2  # where episodes start, and the rest
+    assert len(np.unique(np.concatenate(asked), axis=0)) == sum(map(len, asked))
+    # a policy that sees the previous action has an answer for each
+    asked.clear()
+    seeing = Task.of("frozen_lake", lake, previous_action=True, **chance)
+    evaluate_agent(policy, seeing)
+    rows = sum(map(len, asked))
+    assert len(np.unique(np.concatenate(asked), axis=0)) == rows > states

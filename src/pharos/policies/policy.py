@@ -274,9 +274,9 @@ class QueriedPolicy:
         width: rows of a state, A + 1 or 1.
     """
 
-    def __init__(self, mdp: TabularMDP, *, sees_previous_action: bool = False):
+    def __init__(self, mdp: TabularMDP, *, sees_previous_action: bool = False, by_state: bool = False):
         self.mdp, self.num_actions = mdp, mdp.num_actions
-        self.width = mdp.num_actions + 1 if sees_previous_action else mdp.policy_width
+        self.width = 1 if by_state else mdp.num_actions + 1 if sees_previous_action else mdp.policy_width
         self.by_pairs = self.width > 1
         # index + 1 of each row, 0: not queried; pages of zeros take no memory until they are written
         self._place = np.zeros(mdp.num_states * self.width, np.int32)
@@ -473,7 +473,26 @@ class PolicyAnswers(QueriedPolicy):
         self.policy, self.observer, self.deterministic = policy_function(policy), observer, deterministic
         check_observation(policy, observer.observe.space, observer.observation)
 
+    @cached_property
+    def by_state(self) -> "AnswersByState":
+        """Answers to observations of states alone, whatever the previous action was."""
+        return AnswersByState(self)
+
     def _query(self, rows: np.ndarray) -> np.ndarray:
+        return self.ask(rows) if self.observer.previous_action else self.by_state.query(rows // self.width)
+
+    def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
+        """As that of `QueriedPolicy`. Where it is None, a policy of vectors under chance has answered in all states of
+        `reach` nevertheless, in blocks: level by level it would be asked about few at a time."""
+        is_whole = super().query_all(reach)
+        has_chance = self.by_pairs or self.mdp.dynamics.has_chance
+        is_vector = len(getattr(self.observer.observe.space, "shape", None) or ()) == 1
+        if is_whole is None and has_chance and is_vector and not self.observer.previous_action and reach().is_whole:
+            self.by_state.query(reach().rows // self.width)
+        return is_whole
+
+    def ask(self, rows: np.ndarray) -> np.ndarray:
+        """(N, A) probabilities in rows, asked now."""
         states, previous = np.divmod(rows, self.width)
         previous = np.where(previous == self.num_actions, -1, previous) if self.by_pairs else np.full(len(rows), -1)
         context = self.observer.space.states(states), previous, np.zeros(len(rows), np.int64)
@@ -515,6 +534,17 @@ class PolicyAnswers(QueriedPolicy):
         if self.deterministic:
             return np.eye(self.num_actions)[answer.argmax(axis=1)]
         return answer / total
+
+
+class AnswersByState(QueriedPolicy):
+    """Answers of a policy that does not see the previous action: it is asked once about each state."""
+
+    def __init__(self, answers: PolicyAnswers):
+        super().__init__(answers.mdp, by_state=True)
+        self.answers = answers
+
+    def _query(self, rows: np.ndarray) -> np.ndarray:
+        return self.answers.ask(rows * self.answers.width)
 
 
 class TableAnswers(QueriedPolicy):

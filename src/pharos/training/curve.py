@@ -58,6 +58,8 @@ def evaluate_agent(
             reach for an exact value.
         episodes, seed: of the estimate beyond that.
         again: whether more policies of the task will be evaluated: what they share is remembered. Changes no value.
+            Policies of vectors under chance are then asked in blocks about all states that any policy reaches, where
+            these are few enough, else about those that they reach, step by step.
     Raises:
         ParameterError: the agent is none of these, or its answers are no probabilities.
     Cost: one answer of the policy for each state reached, then horizon x states reached.
