@@ -219,6 +219,7 @@ def _channel_first(observations: np.ndarray, space: "Space") -> np.ndarray:
 
 # Observations in one query of a policy.
 BATCH = 4096
+SOME = 1024  # rows that stand for all where these are too many for an exact value
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,22 +365,26 @@ class QueriedPolicy:
         return rows[self.index(rows) < 0]
 
     def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
-        """Query the policy in all rows of `reach` at once; return whether these are all.
+        """Query the policy in all rows of `reach` at once; True.
 
-        None, and nothing is stored, where an action has probability 0, so that the policy may reach less.
+        False where there are more rows, and the policy reaches all of these (every action has a positive probability,
+        as seen in SOME of them). None where an action has probability 0, so that it may reach less. Then nothing is
+        stored.
         """
         chance = self.mdp.chance
         always = chance.uniform > 0 and chance.first_uniform > 0
         if not always and not (self._query(self.start_rows()) > 0).all():
             return None
         rows, is_whole = reach()
+        if not is_whole:
+            return False if always or (self._query(rows[:: len(rows) // SOME + 1]) > 0).all() else None
         blocks = [self._query(rows[start : start + BATCH]) for start in range(0, len(rows), BATCH)]
         probabilities = np.concatenate(blocks)
         if not always and not (probabilities > 0).all():
             return None
         self._rows, self._answers, self._count = rows.copy(), probabilities, len(rows)
         self._place[rows] = np.arange(1, self._count + 1)
-        return is_whole
+        return True
 
     def _arrivals(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """(N,) the rows of states that were reached by executing these actions."""
