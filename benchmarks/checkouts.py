@@ -64,7 +64,7 @@ def solve(results):
 
 
 def evaluate(results):
-    """Exact values of drawn networks that see vectors: ten evaluations of one task."""
+    """Values of drawn networks that see vectors, exact on Freeway, estimated on Breakout: ten of one task."""
     import numpy as np
 
     from pharos.training import Task, evaluate_agent
@@ -82,7 +82,11 @@ def evaluate(results):
 
         return policy
 
-    for name, chance in (("freeway/20x5-speed1", {"random": 0.1}), ("freeway/16x7-speed1", {"sticky": 0.25})):
+    for name, chance in (
+        ("freeway/20x5-speed1", {"random": 0.1}),
+        ("freeway/16x7-speed1", {"sticky": 0.25}),
+        ("breakout/12x8x3", {"random": 0.1}),
+    ):
         task = Task.of(name, observation="vector", **chance)
         size, actions = task.observer.observe.space.shape[0], task.mdp.num_actions
         for kind, is_greedy in (("greedy", True), ("random", False)):
@@ -127,6 +131,14 @@ def batched(results):
                 agent, "frozen_lake/8x8", hyperparameters=given, **setting
             ),
         )
+    name, each = "freeway/16x7-speed1", 6_000
+    setting = {"sticky": 0.25, "steps": 2 * each, "evaluation_interval": each, "seeds": range(8)}
+    pharos.train_many("dqn", name, **setting | {"steps": 500, "evaluation_interval": 500, "seeds": range(2)})
+    timed(
+        results,
+        f"batched dqn, vector, {name}, sticky, evaluated every {each} steps",
+        lambda: pharos.train_many("dqn", name, **setting),
+    )
 
 
 KINDS = {each.__name__: each for each in (startup, build, solve, evaluate, train, batched)}
