@@ -487,8 +487,8 @@ class PolicyAnswers(QueriedPolicy):
         return self.ask(rows) if self.observer.previous_action else self.by_state.query(rows // self.width)
 
     def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
-        """As that of `QueriedPolicy`. Where it is None, a policy of vectors under chance has answered in all states of
-        `reach` nevertheless, in blocks: level by level it would be asked about few at a time."""
+        """Query the policy as `QueriedPolicy` does. Where that is None, one of vectors under chance has answered in all
+        states of `reach` nevertheless, in blocks: level by level it would be asked about few at a time."""
         is_whole = super().query_all(reach)
         has_chance = self.by_pairs or self.mdp.dynamics.has_chance
         is_vector = len(getattr(self.observer.observe.space, "shape", None) or ()) == 1
