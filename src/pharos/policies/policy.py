@@ -492,8 +492,10 @@ class PolicyAnswers(QueriedPolicy):
         is_whole = super().query_all(reach)
         has_chance = self.by_pairs or self.mdp.dynamics.has_chance
         is_vector = len(getattr(self.observer.observe.space, "shape", None) or ()) == 1
-        if is_whole is None and has_chance and is_vector and not self.observer.previous_action and reach().is_whole:
-            self.by_state.query(reach().rows // self.width)
+        if is_whole is None and has_chance and is_vector and not self.observer.previous_action:
+            reachable = reach()
+            if reachable.is_whole:
+                self.by_state.query(reachable.rows // self.width)
         return is_whole
 
     def ask(self, rows: np.ndarray) -> np.ndarray:

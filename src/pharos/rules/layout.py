@@ -17,9 +17,6 @@ from pharos.errors import ParameterError
 AT_ONCE = 64
 """States for each component up to which all components are unpacked at once; of more, one after another."""
 
-AT_ONCE = 64
-"""States for each component up to which all components are unpacked at once; of more, one after another."""
-
 
 @dataclass(frozen=True)
 class Layout:
