@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from naive import mdp as naive_mdp
+from pharos.kernels.stepping import execute_choices
 from pharos.mdp import (
     BEST,
     WORST,
@@ -257,7 +258,7 @@ def test_pairs_within_some_steps_end_with_those_of_the_last_step(sticky, steps, 
 
 
 @examples(80, probabilities, probabilities, st.integers(0, 2**32))
-def test_weights_draws_and_adjoints_of_chance_agree(sticky, random, seed):
+def test_weights_executed_choices_and_adjoints_of_chance_agree(sticky, random, seed):
     rng = np.random.default_rng(seed)
     chance, num_actions = Chance.of(sticky, random), 3
     mdp = random_actions(sticky_actions(TabularMDP.from_arrays([[0, 0, 0]], np.zeros((1, 3))), sticky), random)
@@ -269,9 +270,18 @@ def test_weights_draws_and_adjoints_of_chance_agree(sticky, random, seed):
     q = rng.normal(size=(4, num_actions))
     np.testing.assert_allclose((chance.chosen_values(q, previous) * chosen).sum(axis=1), (weights * q).sum(axis=1))
     for b in range(4):
-        actions = rng.choice(num_actions, 3000, p=chosen[b])
-        drawn = chance.draw(actions, np.full(3000, previous[b]), num_actions, rng)
-        np.testing.assert_allclose(np.bincount(drawn, minlength=3) / 3000, weights[b], atol=0.06)
+        executed, returns, alive = np.full(3000, previous[b]), np.zeros(3000), np.arange(3000)
+        numbers = rng.random(3000), rng.random(3000), rng.integers(num_actions, size=3000)
+        rewards, setting = np.array([[1.0, 20.0, 300.0]]), (*chance.triple, float(chance.first_chosen))
+        where = np.full(3000, b), numbers, setting, rewards, np.empty(0), np.zeros(3000, np.int64)
+        execute_choices(chosen, *where, 0.5, alive[::2], executed, returns)
+        np.testing.assert_allclose(np.bincount(executed[::2], minlength=3) / 1500, weights[b], atol=0.08)
+        assert (returns[::2] == 0.5 * rewards[0, executed[::2]]).all()
+        assert (executed[1::2] == previous[b]).all() and not returns[1::2].any()  # not among the episodes alive
+        always = where[0], numbers, (1.0, 0.0, 0.0, 1.0), *where[3:]
+        execute_choices(chosen, *always, 0.5, alive, executed, returns)
+        choices = np.searchsorted(chosen[b].cumsum(), numbers[0])
+        assert (executed == choices.clip(max=num_actions - 1)).all()
     if chance.is_sticky:
         mass, later = rng.random((2, num_actions)), rng.dirichlet(np.ones(num_actions), 2)
         values = rng.normal(size=(2, num_actions))

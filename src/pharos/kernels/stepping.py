@@ -229,6 +229,30 @@ def first_outside(actions, num_actions):
     return -1
 
 
+@njit(cache=True, nogil=True)
+def execute_choices(policy, places, numbers, chance, table, palette, states, discount, alive, previous, returns):
+    """One step of the episodes `alive` (N,): the executed actions become their `previous`, what these pay is added up.
+
+    policy: (M, A), probabilities; places: (N,), rows of the episodes there; numbers: (u, v, w), (N,) each: u chooses,
+    v decides between the choice, the previous action and w, a uniform one; chance: (chosen, previous, uniform,
+    first_chosen); table, palette: of rewards; states, previous (A where there is none), returns: of all episodes.
+    """
+    u, v, w = numbers
+    num_actions = policy.shape[1]
+    for k in range(len(alive)):
+        i, choice, sum_of = alive[k], 0, policy[places[k], 0]
+        while sum_of < u[k] and choice < num_actions - 1:
+            choice += 1
+            sum_of += policy[places[k], choice]
+        b = previous[i]
+        if v[k] < (chance[3] if b == num_actions else chance[0]):
+            action = choice
+        else:
+            action = b if b < num_actions and v[k] < chance[0] + chance[1] else w[k]
+        returns[i] += discount * reward_at(table, palette, states[i], action)
+        previous[i] = action
+
+
 def outcome_on_table(transitions, rewards, s, a, rng, i):
     """(next state, reward, probability) of the outcome of (s, a) that stream i draws; nothing is drawn where there is
     one.

@@ -363,17 +363,6 @@ class Chance:
         is_first = (np.asarray(previous) == num_actions)[:, None]
         return np.where(is_first, self.first_chosen * policy + self.first_uniform / num_actions, later)
 
-    def draw(self, actions: np.ndarray, previous: np.ndarray, num_actions: int, rng: np.random.Generator) -> np.ndarray:
-        """(N,): executed actions at random, of chosen `actions` (N,) and previous ones (N,), A where there is none.
-
-        Draws 2 N numbers of `rng`.
-        """
-        u, is_first = rng.random(len(actions)), previous == num_actions
-        uniform = np.where(is_first, u >= self.first_chosen, u >= self.chosen + self.previous)
-        sticks = ~is_first & ~uniform & (u >= self.chosen)
-        uniform_actions = rng.integers(num_actions, size=len(actions))
-        return np.where(sticks, previous, np.where(uniform, uniform_actions, actions))
-
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
         return dict(vars(self))

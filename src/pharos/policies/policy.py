@@ -301,8 +301,14 @@ class QueriedPolicy:
 
     def query(self, rows: np.ndarray) -> np.ndarray:
         """(N, A) probabilities of distinct or repeated rows; only new ones are queried."""
-        unknown = np.unique(rows[self._place[rows] == 0])
-        if unknown.size:
+        places = self.places(rows)  # before `probabilities`, which it appends to
+        return self.probabilities[places]
+
+    def places(self, rows: np.ndarray) -> np.ndarray:
+        """(N,) place of each row in `rows` and `probabilities`; new ones are queried."""
+        places = self.index(rows)
+        if (is_new := places < 0).any():
+            unknown = np.unique(rows[is_new])
             count = self._count + unknown.size
             if count > len(self._rows):
                 more = max(count, 2 * len(self._rows)) - len(self._rows)
@@ -314,7 +320,8 @@ class QueriedPolicy:
                 self._rows[place], self._answers[place] = block, self._query(block)
             self._place[unknown] = np.arange(self._count, count) + 1
             self._count = count
-        return self.probabilities[self.index(rows)]
+            places = self.index(rows)
+        return places
 
     def _query(self, rows: np.ndarray) -> np.ndarray:
         """(N, A) probabilities in rows that are new."""
@@ -536,7 +543,7 @@ class PolicyAnswers(QueriedPolicy):
                 f"({count}, {self.num_actions}) probabilities, or ({count},) actions"
             )
         total = answer.sum(axis=1, keepdims=True)
-        if not np.allclose(total, 1, atol=1e-4):
+        if not (np.abs(total - 1) <= 1.1e-4).all():
             raise ParameterError(f"the policy's probabilities sum to {total.min():g}; expected 1")
         if self.deterministic:
             return np.eye(self.num_actions)[answer.argmax(axis=1)]

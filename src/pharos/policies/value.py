@@ -19,6 +19,7 @@ import numpy as np
 
 from pharos import solvers
 from pharos.errors import DivergenceError, ParameterError
+from pharos.kernels.stepping import execute_choices
 from pharos.mdp import PolicyTable, Rewards, Table, TabularMDP, require_mdp
 from pharos.policies.policy import (
     Arrays,
@@ -108,10 +109,6 @@ class QueriedHistories(PolicyAnswers):
     def index(self, rows: np.ndarray) -> np.ndarray:
         self._make_room()
         return super().index(rows)
-
-    def query(self, rows: np.ndarray) -> np.ndarray:
-        self._make_room()
-        return super().query(rows)
 
     def _make_room(self) -> None:
         """Grow `_place` to an entry for each numbered history."""
@@ -630,22 +627,24 @@ def estimate(
         return_range: the lowest and the highest return that an episode can have.
     Source: Maurer and Pontil (2009), theorem 4.
     """
-    mdp, chance = answers.mdp, answers.mdp.chance
+    mdp, chance = answers.mdp, (*answers.mdp.chance.triple, float(answers.mdp.chance.first_chosen))
     steps = mdp.horizon or math.ceil(math.log(1e-9) / math.log(mdp.gamma)) if mdp.gamma > 0 else 1
+    rewards, terminal = mdp.reward_table, np.asarray(mdp.terminal)
     states = rng.choice(mdp.start_states, episodes, p=mdp.start_probabilities)
     previous, rows = np.full(episodes, mdp.num_actions), answers.first_rows(states)
     returns, alive = np.zeros(episodes), np.arange(episodes)
     for step in range(steps):
-        s, b = states[alive], previous[alive]
-        probabilities = answers.query(rows[alive])
-        actions = (probabilities.cumsum(axis=1) < rng.random((alive.size, 1))).sum(axis=1).clip(max=mdp.num_actions - 1)
-        executed = chance.draw(actions, b, mdp.num_actions, rng)
-        returns[alive] += mdp.gamma**step * mdp.reward_table.rows(s)[np.arange(alive.size), executed]
-        next_states = mdp.dynamics.sample(s, executed, rng)
-        states[alive], previous[alive] = next_states, executed
-        goes_on = (next_states >= 0) & ~np.asarray(mdp.terminal)[next_states]
-        before, alive = rows[alive][goes_on], alive[goes_on]
-        rows[alive] = answers.next_rows(before, executed[goes_on], next_states[goes_on])
+        places = answers.places(rows)
+        numbers = rng.random(alive.size), rng.random(alive.size), rng.integers(mdp.num_actions, size=alive.size)
+        execute_choices(
+            answers.probabilities, places, numbers, chance, rewards.table, rewards.palette, states, mdp.gamma**step,
+            alive, previous, returns,
+        )  # fmt: skip
+        executed = previous[alive]
+        next_states = mdp.dynamics.sample(states[alive], executed, rng)
+        goes_on = (next_states >= 0) & ~terminal[next_states]
+        alive, executed, next_states = alive[goes_on], executed[goes_on], next_states[goes_on]
+        states[alive], rows = next_states, answers.next_rows(rows[goes_on], executed, next_states)
         if not alive.size:
             break
     return float(returns.mean()), _half_width(returns, *return_range)

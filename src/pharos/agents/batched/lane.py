@@ -404,19 +404,19 @@ class RunPolicy:
 
     def __init__(self, lane: Lane, i: int):
         self.lane, self.i = lane, i
+        self.values = {name: view[i : i + 1] for name, view in lane.values.items()}  # which change as it learns
 
     def action_probabilities(self, observations: np.ndarray) -> np.ndarray:
         """(M, A) float64 for observations (M, ...) as the environment gives them."""
         lane = self.lane
         wait(lane.device)
-        values = {name: view[self.i : self.i + 1] for name, view in lane.values.items()}
         answers, first = [], 0
         while first < len(observations):
             size = next((size for size in ASKED if size >= len(observations) - first), ASKED[-1])
             rows = lane.seen.encoded(observations[first : first + size], self.i)
             block = torch.zeros((1, size, lane.seen.size), device=lane.device)
             block[0, : len(rows)] = rows  # of one of two sizes, as layers keep room for each size
-            answers.append(lane.probabilities(lane.network.scores(values, block)[0, : len(rows)].cpu().numpy()))
+            answers.append(lane.probabilities(lane.network.scores(self.values, block)[0, : len(rows)].cpu().numpy()))
             first += size
         return np.concatenate(answers)
 
