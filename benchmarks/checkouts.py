@@ -64,9 +64,11 @@ def solve(results):
 
 
 def evaluate(results):
-    """Values of drawn networks that see vectors, exact on Freeway, estimated on Breakout: ten of one task."""
+    """Values of drawn networks that see vectors, exact on Freeway, estimated on Breakout: ten of one task; there
+    also of the table of discounted optimal actions, ten times."""
     import numpy as np
 
+    import pharos
     from pharos.training import Task, evaluate_agent
 
     def network(seed, size, actions, is_greedy):
@@ -97,6 +99,13 @@ def evaluate(results):
                 f"values of {kind} policies, {name}, {chance}",
                 lambda policies=policies, task=task: [evaluate_agent(policy, task, again=True) for policy in policies],
             )
+    table = pharos.value_iteration(task.space.mdp(gamma=0.99)).policy
+    evaluate_agent(table, task, again=True)
+    timed(
+        results,
+        f"values of a table, {name}, {chance}",
+        lambda: [evaluate_agent(table, task, again=True) for _ in range(10)],
+    )
 
 
 def train(results):

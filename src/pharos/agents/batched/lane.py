@@ -5,6 +5,7 @@ Observations of W runs are tensors: gathered from one table where it fits, else 
 The episodes of W runs: each walks the table of its own MDP; runs of one MDP are advanced by one compiled call.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, Generic, TypeVar
@@ -49,7 +50,9 @@ class NetworkView:
     def raw(self, observations: np.ndarray) -> np.ndarray:
         """(N, M + 1) observations, or single frames, channels first, followed by a 0."""
         turned = np.moveaxis(observations, -1, 1) if self._turns else observations
-        return np.pad(turned.reshape(len(turned), -1), ((0, 0), (0, 1)))
+        rows = np.zeros((len(turned), math.prod(turned.shape[1:]) + 1), turned.dtype)
+        rows[:, :-1] = turned.reshape(len(turned), -1)
+        return rows
 
     def encoded(self, observations: np.ndarray) -> np.ndarray:
         """(N, size) of observations as the environment gives them."""
