@@ -270,12 +270,12 @@ def test_weights_executed_choices_and_adjoints_of_chance_agree(sticky, random, s
     q = rng.normal(size=(4, num_actions))
     np.testing.assert_allclose((chance.chosen_values(q, previous) * chosen).sum(axis=1), (weights * q).sum(axis=1))
     for b in range(4):
-        executed, returns, alive = np.full(3000, previous[b]), np.zeros(3000), np.arange(3000)
-        numbers = rng.random(3000), rng.random(3000), rng.integers(num_actions, size=3000)
+        executed, returns, alive = np.full(6000, previous[b]), np.zeros(6000), np.arange(6000)
+        numbers = rng.random(6000), rng.random(6000), rng.integers(num_actions, size=6000)
         rewards, setting = np.array([[1.0, 20.0, 300.0]]), (*chance.triple, float(chance.first_chosen))
-        where = np.full(3000, b), numbers, setting, rewards, np.empty(0), np.zeros(3000, np.int64)
+        where = np.full(6000, b), numbers, setting, rewards, np.empty(0), np.zeros(6000, np.int64)
         execute_choices(chosen, *where, 0.5, alive[::2], executed, returns)
-        np.testing.assert_allclose(np.bincount(executed[::2], minlength=3) / 1500, weights[b], atol=0.08)
+        np.testing.assert_allclose(np.bincount(executed[::2], minlength=3) / 3000, weights[b], atol=0.06)
         assert (returns[::2] == 0.5 * rewards[0, executed[::2]]).all()
         assert (executed[1::2] == previous[b]).all() and not returns[1::2].any()  # not among the episodes alive
         always = where[0], numbers, (1.0, 0.0, 0.0, 1.0), *where[3:]
