@@ -73,7 +73,10 @@ def speed(contestant, seconds: float, unit: int) -> float:
 
 
 def work(agent: str, options: dict, lane) -> float:
-    """FLOP of an agent-step by the networks: 2 a weight and sample forwards, 4 backwards (2 in the first layer)."""
+    """FLOP of an agent-step by the networks: 2 a weight and sample forwards, 4 backwards (2 in the first layer).
+
+    Of small images, too, whose equal patches the engine computes once.
+    """
     forward = first = 0.0
     for each in lane.network.parameters.shapes:
         if each.name.endswith("weight"):

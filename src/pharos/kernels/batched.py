@@ -110,40 +110,6 @@ def look_up(table, begins, states, out):
 
 
 @njit(cache=True, nogil=True)
-def look_up_frames(table, begins, histories, piece, out):
-    """out (W, pitch): `piece` entries of each frame in turn, the oldest first, of the histories (W, B, k) of each run.
-
-    table (R, length): a row for each frame, of which `piece` is a part; begins (W,): the row of each run's first state.
-    """
-    length, frames, piece = uint64(table.shape[1]), uint64(histories.shape[2]), uint64(piece)
-    for i in range(histories.shape[0]):
-        target = out[i]
-        for b in range(histories.shape[1]):
-            for f in range(frames):
-                row = table[begins[i] + histories[i, b, f]]
-                at, first = uint64(b) * length * frames + f * piece, uint64(0)
-                while first < length:
-                    for j in range(piece):
-                        target[at + j] = row[first + j]
-                    first += piece
-                    at += frames * piece
-
-
-@njit(cache=True, nogil=True)
-def write_drawn(raw, places, runs, out):
-    """out (W, pitch): the entries `places` (size,) of observations, B of each of `runs`, one after another.
-
-    raw (len(runs) B, M): the observations of one run after another.
-    """
-    size, number = len(places), len(raw) // len(runs)
-    for k in range(len(runs)):
-        for b in range(number):
-            row, target = raw[k * number + b], out[runs[k], b * size : (b + 1) * size]
-            for j in range(size):
-                target[j] = row[places[j]]
-
-
-@njit(cache=True, nogil=True)
 def choose(keys, step, explores, q, actions):
     """Epsilon-greedy actions (W, E): random ones where a run explores, else the first of the best of q (W, E, A)."""
     for i in range(actions.shape[0]):

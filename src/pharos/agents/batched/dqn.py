@@ -116,7 +116,7 @@ class DQNLane(Lane[QNetworks]):
 
     def network_for(self, shape: tuple[int, ...]) -> QNetworks:
         """See `Lane`."""
-        return QNetworks(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions)
+        return QNetworks(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions, self.device)
 
     def probabilities(self, scores: np.ndarray) -> np.ndarray:
         """One-hot probabilities of the greedy action."""

@@ -14,7 +14,16 @@ import numpy as np
 import torch
 
 from pharos.agents.batched.arithmetic import CompiledArithmetic, CudaGraph, PinnedBuffer, TensorArithmetic, is_gpu, wait
-from pharos.agents.batched.networks import KERNEL, MASK, BatchedNetwork, Values, aligned_zeros, flat_view, names_of, pad
+from pharos.agents.batched.networks import (
+    MASK,
+    BatchedNetwork,
+    Values,
+    aligned_zeros,
+    flat_view,
+    names_of,
+    pad,
+    places_of,
+)
 from pharos.agents.batched.runs import BLOCK, BatchRun, ObservationSource, as_networks_see, is_small, resolved
 from pharos.kernels import batched as kernels
 
@@ -30,33 +39,18 @@ class NetworkView:
     Attributes:
         frames: k.
         shape: of an observation as Stable-Baselines3's networks take it, images with their channels first.
-        size: numbers that the first layer takes.
-        places: (size,) where each of them is in a `raw` observation; beyond the border of an image in its 0.
-        of_a_frame: (size // k,) the same for an observation of one frame.
-        piece: how many numbers of one frame stand beside each other: the neighbours of a pixel, or all of them.
+        length: numbers of one frame.
     """
 
     def __init__(self, source: ObservationSource):
         self.source, self.frames = source, source.frames
         self.shape, self._turns = as_networks_see(tuple(source.shape), source.is_image)
-        self.is_small = is_small(self.shape, source.is_image)
-        self.places = places_of(self.shape, self.is_small)
-        self.of_a_frame, self.size = self.places, len(self.places)
-        if self.frames > 1:
-            self.of_a_frame = places_of((self.shape[0] // self.frames, *self.shape[1:]), self.is_small)
-        self.length = int(np.prod(self.shape)) // self.frames
-        self.piece = self.shape[0] // self.frames * KERNEL**2 if self.is_small else self.length
+        self.length = math.prod(self.shape) // self.frames
 
-    def raw(self, observations: np.ndarray) -> np.ndarray:
-        """(N, M + 1) observations, or single frames, channels first, followed by a 0."""
+    def rows(self, observations: np.ndarray) -> np.ndarray:
+        """(N, M) of observations as the environment gives them, or of single frames: channels first."""
         turned = np.moveaxis(observations, -1, 1) if self._turns else observations
-        rows = np.zeros((len(turned), math.prod(turned.shape[1:]) + 1), turned.dtype)
-        rows[:, :-1] = turned.reshape(len(turned), -1)
-        return rows
-
-    def encoded(self, observations: np.ndarray) -> np.ndarray:
-        """(N, size) of observations as the environment gives them."""
-        return self.raw(observations)[:, self.places]
+        return turned.reshape(len(turned), -1)
 
     def in_blocks(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yield (first state, single frames) of all states in blocks."""
@@ -65,24 +59,11 @@ class NetworkView:
             yield first, look(np.arange(first, min(first + BLOCK, self.source.num_states)))
 
 
-def places_of(shape: tuple[int, ...], is_small: bool) -> np.ndarray:
-    """Places of the first layer's input in an observation of a shape with a 0 behind it."""
-    places = np.arange(int(np.prod(shape)))
-    if not is_small:
-        return places
-    inside = places.reshape(shape)  # the small convolution takes the 9 C neighbours of each pixel
-    padded = np.pad(inside, ((0, 0), (1, 1), (1, 1)), constant_values=inside.size)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (KERNEL, KERNEL), axis=(1, 2))  # type: ignore[call-overload]
-    return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).ravel()
-
-
 class ObservationTable:
     """Observations of runs whose observations have the same shape.
 
-    Images are kept as bytes, those of the small convolution with the 9 C neighbours of each pixel, so that nothing is
-    unfolded while runs learn. Where they do not fit, minibatches are drawn: 0.3 us an image of a small Breakout, and
-    as much again for each ten pixels to copy their neighbours. Where several frames are seen single ones are kept, and
-    put together for those who ask.
+    Images are kept as bytes. Where they do not fit, minibatches are drawn: 0.3 us an image of a small Breakout. Where
+    several frames are seen single ones are kept, and put together for those who ask.
 
     Attributes:
         views: of the distinct sources; which: (W,) the place in `views` of each run's.
@@ -103,7 +84,8 @@ class ObservationTable:
         self.which = np.array([place[id(run.observe)] for run in runs])
         self._ends = np.cumsum([0, *(source.num_states for source in sources)])
         self._begins = self._ends[self.which]
-        self.shape, self.size, self.frames = self.views[0].shape, self.views[0].size, self.views[0].frames
+        self.shape, self.frames = self.views[0].shape, self.views[0].frames
+        self.size = math.prod(self.shape)
         self._allocate_table()
 
     def _allocate_table(self) -> None:
@@ -115,7 +97,7 @@ class ObservationTable:
         self._table = torch.empty((int(self._ends[-1]), length), dtype=kind)
         for view, begin in zip(self.views, self._ends, strict=False):
             for first, block in view.in_blocks():
-                rows = view.raw(block)[:, view.of_a_frame]
+                rows = np.ascontiguousarray(view.rows(block))
                 self._table[begin + first : begin + first + len(block)] = torch.from_numpy(rows)
 
     def at(self, states: PinnedBuffer, out: torch.Tensor) -> torch.Tensor:
@@ -124,20 +106,19 @@ class ObservationTable:
         Where k frames are seen states are (W, B, k), the last ones of the episode, the oldest first.
         """
         target = flat_view(out).numpy()
-        if self._table is not None and self.frames > 1:
-            kernels.look_up_frames(self._table.numpy(), self._begins, states.array, self.views[0].piece, target)
-        elif self._table is not None:
-            kernels.look_up(self._table.numpy(), self._begins, states.array, target)
+        if self._table is not None:
+            kernels.look_up(self._table.numpy(), self._begins, states.array.reshape(len(target), -1), target)
         else:
             for i, view in enumerate(self.views):
                 runs = np.flatnonzero(self.which == i)
-                rows = states.array[runs].reshape(-1, *states.array.shape[2:])
-                kernels.write_drawn(view.raw(view.source.at(rows)), view.places, runs, target)
+                drawn = view.rows(view.source.at(states.array[runs].reshape(-1, *states.array.shape[2:])))
+                target[runs, : states.array.shape[1] * self.size] = drawn.reshape(len(runs), -1)
         return out
 
     def encoded(self, observations: np.ndarray, i: int) -> torch.Tensor:
         """(N, size) float32 of observations (N, ...) as the environment of run i gives them."""
-        return torch.from_numpy(self.views[self.which[i]].encoded(observations)).float()
+        rows = self.views[self.which[i]].rows(observations)
+        return torch.from_numpy(np.ascontiguousarray(rows, np.float32))
 
 
 class DeviceObservationTable(ObservationTable):
@@ -154,12 +135,10 @@ class DeviceObservationTable(ObservationTable):
         super().__init__(runs, device)
         if len({view.shape for view in self.views}) == 1:
             return
-        self.size = max(view.size for view in self.views)
-        channels = self.shape[0] * KERNEL**2
-        self.shape = (self.shape[0], 1, self.size // channels) if self.is_image else (self.size,)
+        pixels = np.array([math.prod(view.shape[1:]) for view in self.views])[self.which]
+        self.shape = (self.shape[0], 1, int(pixels.max())) if self.is_image else (self.size,)
         if self.is_image:
-            pixels = np.array([view.size // channels for view in self.views])[self.which]
-            is_there = np.arange(self.size // channels) < pixels[:, None]
+            is_there = np.arange(pixels.max()) < pixels[:, None]
             self.mask = torch.from_numpy(is_there.astype(np.float32)).to(device)
 
     def _allocate_table(self) -> None:
@@ -172,18 +151,20 @@ class DeviceObservationTable(ObservationTable):
                 f"more than {SHARE_OF_DEVICE:.0%} of what is free; a run alone that is too large trains on cpu"
             )
         table = torch.zeros((total, length), dtype=kind)
-        places = np.full((len(self.views), max(view.size for view in self.views)), length - 1)
-        for view, row, begin in zip(self.views, places, self._ends, strict=False):
-            frame, inside = np.divmod(view.places, view.length)
-            row[: view.size] = np.where(frame < view.frames, frame * length + inside, length - 1)
+        of_views = [places_of(view.shape, is_small(view.shape, self.is_image)) for view in self.views]
+        self.size = max(map(len, of_views))
+        places = np.full((len(self.views), self.size), length - 1)
+        for view, own, row, begin in zip(self.views, of_views, places, self._ends, strict=False):
+            frame, inside = np.divmod(own, view.length)
+            row[: len(own)] = np.where(frame < view.frames, frame * length + inside, length - 1)
             for first, block in view.in_blocks():
-                raw = view.raw(block)[:, :-1]
-                table[begin + first : begin + first + len(raw), : raw.shape[1]] = torch.from_numpy(raw)
+                rows = np.ascontiguousarray(view.rows(block))
+                table[begin + first : begin + first + len(rows), : rows.shape[1]] = torch.from_numpy(rows)
         self._table = table.to(self.device)
         offsets = self._begins[:, None] if self.frames == 1 else self._begins[:, None, None]
         self._offsets = torch.from_numpy(offsets).to(self.device)
         self._places = torch.from_numpy(places[self.which][:, None]).to(self.device)
-        self._in_an_observation = [torch.from_numpy(view.places).to(self.device) for view in self.views]
+        self._in_an_observation = [torch.from_numpy(own).to(self.device) for own in of_views]
 
     def at(self, states: PinnedBuffer, out: torch.Tensor) -> torch.Tensor:
         """See `ObservationTable`; a GPU can record it."""
@@ -193,10 +174,10 @@ class DeviceObservationTable(ObservationTable):
         return out.copy_(raw.gather(2, self._places.expand(-1, raw.shape[1], -1)))
 
     def encoded(self, observations: np.ndarray, i: int) -> torch.Tensor:
-        """See `ObservationTable`; what travels is raw, a 36th of the neighbours of pixels as float32."""
+        """See `ObservationTable`; what travels is a 36th of the neighbours of pixels as float32."""
         which = self.which[i]
-        raw = torch.from_numpy(self.views[which].raw(observations)).to(self.device)
-        rows = raw.index_select(1, self._in_an_observation[which]).float()
+        raw = torch.from_numpy(np.ascontiguousarray(self.views[which].rows(observations))).to(self.device)
+        rows = torch.nn.functional.pad(raw, (0, 1)).index_select(1, self._in_an_observation[which]).float()
         return torch.nn.functional.pad(rows, (0, self.size - rows.shape[1]))
 
 

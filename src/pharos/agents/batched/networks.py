@@ -16,13 +16,15 @@ import torch
 from torch import Tensor
 
 from pharos.agents.batched.runs import is_small
+from pharos.kernels import patches
 from pharos.kernels.batched import linear_row
+from pharos.kernels.patches import FILTERS
 
 ALIGNED = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
 RELU, TANH, NONE = "relu", "tanh", "none"
 ROWS = "all parameters"
 MASK = "which pixels there are"
-KERNEL, FILTERS = 3, 16  # of the small convolution
+KERNEL = 3  # of the small convolution, which has FILTERS
 FEATURES = 128
 
 Values = dict[str, Tensor]
@@ -311,6 +313,54 @@ class ConvolutionLayer(NetworkLayer):
         return x.reshape(like.shape[1], like.shape[0], -1).transpose(0, 1)
 
 
+class PictureLayers(NetworkLayer):
+    """The small convolution and the linear layer after it, on the processor: each different patch once.
+
+    x (W, B, C pixels), from 0 to 255. The parameters are those of the two layers; see kernels/patches.py.
+    """
+
+    def __init__(self, parameters: Parameters, name: str, shape: tuple[int, ...]):
+        self.shape, self.places = shape, places_of(shape, True).reshape(math.prod(shape[1:]), -1)
+        super().__init__(name, math.prod(shape), FEATURES, RELU)
+        picture_layers(parameters, name, shape)
+        self._offsets = tuple(each.offset for each in parameters.shapes[-4:])
+        self._memories: dict[tuple[int, int], tuple[np.ndarray, ...]] = {}
+
+    def forward(self, values: Values, x: Tensor) -> Tensor:
+        """The outputs."""
+        y, _ = self._buffers(x)
+        width, number, pixels = *x.shape[:2], len(self.places)
+        if (width, number) not in self._memories:
+            groups = (width, number * pixels)  # at most
+            self._memories[width, number] = (
+                np.zeros((width, pixels + 1), np.int64),
+                *(np.empty(groups, np.int32) for _ in range(2)),
+                np.empty((*groups, FILTERS), np.float32),
+                np.empty((width, pixels, number), np.int32),
+            )
+        memory, pictures = self._memories[width, number], flat_view(x).numpy()
+        patches.forward(values[ROWS].numpy(), self._offsets, self.shape, self.places, pictures, y.numpy(), memory)
+        return y
+
+    def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
+        """See `NetworkLayer`; there is no gradient of the input."""
+        dy = self._before_activation(dy, self._buffers(x)[0])
+        rows, written = values[ROWS].numpy(), gradients[ROWS].numpy()
+        memory, pictures = self._memories[x.shape[0], x.shape[1]], flat_view(x).numpy()
+        patches.backward(rows, written, self._offsets, self.shape, self.places, pictures, dy.numpy(), memory)
+
+
+def places_of(shape: tuple[int, ...], is_small: bool) -> np.ndarray:
+    """Places of the first layer's input in an observation of a shape with a 0 behind it."""
+    places = np.arange(math.prod(shape))
+    if not is_small:
+        return places
+    inside = places.reshape(shape)  # the small convolution takes the 9 C neighbours of each pixel
+    padded = np.pad(inside, ((0, 0), (1, 1), (1, 1)), constant_values=inside.size)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (KERNEL, KERNEL), axis=(1, 2))  # type: ignore[call-overload]
+    return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).ravel()
+
+
 def is_one_by_one(x: Tensor) -> bool:
     """Whether convolutions go run by run, which is faster on the processor."""
     return x.device.type == "cpu"
@@ -342,13 +392,20 @@ class Stack:
 # Networks -------------------------------------------------------------------------------------------------------------
 
 
-def extractor(parameters: Parameters, name: str, shape: tuple[int, ...], is_image: bool) -> list[NetworkLayer]:
+def picture_layers(parameters: Parameters, name: str, shape: tuple[int, ...]) -> list[NetworkLayer]:
+    """The small convolution and the linear layer after it, for observations with the neighbours of each pixel."""
+    small = PatchConvolutionLayer(parameters, f"{name}.layers.0.0", shape, FILTERS)
+    return [small, LinearLayer(parameters, f"{name}.layers.1", small.outputs, FEATURES, RELU, pixels=small.pixels)]
+
+
+def extractor(
+    parameters: Parameters, name: str, shape: tuple[int, ...], is_image: bool, device: str
+) -> list[NetworkLayer]:
     """The layers from an observation to 128 features: SmallMLP, or SmallCNN with one or three convolutions."""
     if not is_image:
         return [LinearLayer(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
     if is_small(shape, is_image):
-        small = PatchConvolutionLayer(parameters, f"{name}.layers.0.0", shape, FILTERS)
-        return [small, LinearLayer(parameters, f"{name}.layers.1", small.outputs, FEATURES, RELU, pixels=small.pixels)]
+        return [PictureLayers(parameters, name, shape)] if device == "cpu" else picture_layers(parameters, name, shape)
     convolutions: list[NetworkLayer] = []
     for i, (filters, kernel, stride) in enumerate(((32, 8, 4), (64, 4, 2), (64, 3, 1))):
         scale = 1 / 255 if i == 0 else 1.0
@@ -417,10 +474,12 @@ class QNetworks:
 
     eps = 1e-8  # of Adam
 
-    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: NetArch, num_actions: int):
+    def __init__(
+        self, shape: tuple[int, ...], is_image: bool, net_arch: NetArch, num_actions: int, device: str = "cpu"
+    ):
         self.parameters = parameters = Parameters()
         sizes = sizes_of(net_arch)
-        layers = extractor(parameters, "q_net.features_extractor", shape, is_image)
+        layers = extractor(parameters, "q_net.features_extractor", shape, is_image, device)
         layers += hidden(parameters, "q_net.q_net", sizes, RELU)
         last = LinearLayer(parameters, f"q_net.q_net.{2 * len(sizes)}", [FEATURES, *sizes][-1], num_actions, NONE)
         self.stack = Stack([*layers, last])
@@ -447,9 +506,11 @@ class ActorCritics:
 
     eps = 1e-5
 
-    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: NetArch, num_actions: int):
+    def __init__(
+        self, shape: tuple[int, ...], is_image: bool, net_arch: NetArch, num_actions: int, device: str = "cpu"
+    ):
         self.parameters = parameters = Parameters()
-        self.trunk = Stack(extractor(parameters, "features_extractor", shape, is_image))
+        self.trunk = Stack(extractor(parameters, "features_extractor", shape, is_image, device))
         actor, critic = sizes_of(net_arch, "pi"), sizes_of(net_arch, "vf")
         actor_layers = hidden(parameters, "mlp_extractor.policy_net", actor, TANH)
         critic_layers = hidden(parameters, "mlp_extractor.value_net", critic, TANH)

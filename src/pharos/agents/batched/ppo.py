@@ -51,7 +51,7 @@ class PPOLane(Lane[ActorCritics]):
 
     def network_for(self, shape: tuple[int, ...]) -> ActorCritics:
         """See `Lane`."""
-        return ActorCritics(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions)
+        return ActorCritics(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions, self.device)
 
     def evaluate(self, x: torch.Tensor) -> torch.Tensor:
         """See `Lane`; writes the values of the states, too."""
