@@ -346,11 +346,17 @@ def facts_of_the_sealed_test():
 
 
 def facts_of_the_new_block():
-    table = pd.read_csv(STUDIES / "hardness-dev" / "long-random-dqn-unseen-classes.csv")
-    row = table.set_index(["outcome", "predictor"]).loc["greedy", "sampled_regret"]
-    correlations = f"rank correlation {row['rho']:.2f}, {row['agreement']:.2f} of pairs in order"
-    fit = interval(row["r_squared"], row["r_squared_lower"], row["r_squared_upper"])
-    return [f"On {row['cells']} new cells", f"R² {fit}, {correlations}"]
+    said = []
+    for agent, predictor, words in (
+        ("dqn", "sampled_regret", "On {} new cells"),
+        ("ppo", "clipped_regret_evaluated", "met three on {}:"),
+    ):
+        table = pd.read_csv(STUDIES / "hardness-dev" / f"long-random-{agent}-unseen-classes.csv")
+        row = table.set_index(["outcome", "predictor"]).loc["greedy", predictor]
+        correlations = f"rank correlation {row['rho']:.2f}, {row['agreement']:.2f} of pairs in order"
+        fit = interval(row["r_squared"], row["r_squared_lower"], row["r_squared_upper"])
+        said += [words.format(row["cells"]), f"R² {fit}, {correlations}"]
+    return said
 
 
 # Figures -------------------------------------------------------------------------------------------------------------
