@@ -18,9 +18,9 @@ def train(configs, folders, checkpoints):
     if "PHAROS_FAKE_PARENTS" in os.environ:
         with open(os.environ["PHAROS_FAKE_PARENTS"], "a") as file:
             file.write(f"{os.getppid()}\n")
-    place = checkpoints / "batch"
-    place.mkdir(parents=True, exist_ok=True)
     ids = [fake_training.run_id(config) for config in configs]
+    place = checkpoints / ids[0]  # batches that go on at the same time have folders of their own
+    place.mkdir(parents=True, exist_ok=True)
     (place / "batch.json").write_text(json.dumps({"ids": ids}))
     if len(configs) > int(os.environ.get("PHAROS_FAKE_MOST", 1000)):
         os.kill(os.getpid(), signal.SIGKILL)

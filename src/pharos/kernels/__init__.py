@@ -13,5 +13,5 @@ from pharos.kernels import outcomes  # noqa: E402  (it loads Numba, which reads 
 
 _shared = """
     batched bellman gaps graph hash_table hitting horizon linear_algebra many_searches observation_kernels
-    occupancy outcomes partition stepping
+    occupancy outcomes partition patches stepping
 """

@@ -38,7 +38,7 @@ def patch_keys(pictures, shape, keys):
     """
     channels, height, width = shape
     pixels, count = height * width, 0
-    known = np.empty((COLOURS + 1, 2), np.int64)  # (picture, pixel) of each colour, by its number
+    places = np.empty((COLOURS + 1, 2), np.int64)  # (picture, pixel) of each colour, by its number
     codes, rows = np.zeros((height + 2, width + 2), np.int64), np.empty((height + 2, width), np.int64)
     for b in range(len(pictures)):
         picture, code = pictures[b], 0
@@ -48,14 +48,14 @@ def patch_keys(pictures, shape, keys):
                 if code == 0 or not _is_alike(picture, pixel, picture, pixel - 1, channels, pixels):
                     code = 1
                     while code <= count and not _is_alike(
-                        picture, pixel, pictures[known[code, 0]], known[code, 1], channels, pixels
+                        picture, pixel, pictures[places[code, 0]], places[code, 1], channels, pixels
                     ):
                         code += 1
                     if code > COLOURS:
                         keys[:] = np.arange(keys.size).reshape(keys.shape)
                         return
                     if code > count:
-                        count, known[code, 0], known[code, 1] = code, b, pixel
+                        count, places[code, 0], places[code, 1] = code, b, pixel
                 codes[y + 1, x + 1] = code
         for y in range(height + 2):
             for x in range(width):

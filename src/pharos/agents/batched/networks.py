@@ -18,13 +18,12 @@ from torch import Tensor
 from pharos.agents.batched.runs import is_small
 from pharos.kernels import patches
 from pharos.kernels.batched import linear_row
-from pharos.kernels.patches import FILTERS
 
 ALIGNED = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
 RELU, TANH, NONE = "relu", "tanh", "none"
 ROWS = "all parameters"
 MASK = "which pixels there are"
-KERNEL = 3  # of the small convolution, which has FILTERS
+KERNEL, FILTERS = 3, patches.FILTERS  # of the small convolution
 FEATURES = 128
 
 Values = dict[str, Tensor]
