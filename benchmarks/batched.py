@@ -5,7 +5,8 @@
 
 Both with the hyperparameters of pharos' table, after `learning_starts` and some updates. Rounds go through all
 contestants in turn, so that a busy machine slows all alike; the ratio is the median over rounds. The last columns:
-arithmetic of the networks in GFLOP/s, and its share of what a plain product of matrices reached in the same round.
+arithmetic of the networks in GFLOP/s (of images as if each were computed by itself), and its share of what a plain
+product of matrices reached in the same round.
 With several numbers of frames, of images, all of them are contestants of the same rounds; the ratio is each one's own.
 """
 
