@@ -309,6 +309,11 @@ def facts_of_findings():
     said.append(f"{measures['num_states'].min():,} to {measures['num_states'].max():,} states")
     power = [found("classes")[finding, "frozen_lake"]["power"] for _, finding, of in ROWS if of == "frozen_lake"]
     said.append(f"a power of {power[0]:.2f} and {power[1]:.2f}")
+    done = runs("paper")
+    ppo = done[(done["agent"] == "ppo") & (done["environment"] == "breakout")]
+    regrets = ppo.groupby(["instance", "chance", "observation"])["normalized_regret"].mean().unstack().dropna()
+    is_less = regrets["simple_image"] < regrets["vector"]
+    said.append(f"PPO has less regret with images on {is_less.sum()} of {len(regrets)}")
     return said
 
 
