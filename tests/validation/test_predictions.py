@@ -18,6 +18,7 @@ from pharos.study.report.model_sections import winners
 from pharos.validation import (
     POLICY_PREDICTORS,
     PREDICTORS,
+    SAMPLED_PREDICTORS,
     learners,
     prediction,
     read_predictions,
@@ -59,6 +60,25 @@ def test_every_cell_that_sees_observations_is_predicted(predicted):
     assert plain["aliasing_floor"] == 0 < hidden["aliasing_floor"]
     assert plain["kernel_regret"] <= hidden["kernel_regret"]
     assert plain["tabular_regret"] == hidden["tabular_regret"]
+
+
+def test_the_primary_predictor_alone_is_what_it_is_beside_the_others(predicted, tmp_path):
+    alone = study.predict(SPEC, tmp_path, primary=True)
+    is_ppo = predicted["agent"] == "ppo"
+    of_ppo = ["clipped_regret", "clipped_regret_evaluated", "clipped_tabular_regret", "clipped_curve"]
+    for rows, names in ((is_ppo, of_ppo), (~is_ppo, [*SAMPLED_PREDICTORS])):
+        both = ["instance", "agent", "observation", "network", "num_states", *names]
+        pd.testing.assert_frame_equal(alone.loc[rows, both], predicted.loc[rows, both])
+        assert alone.loc[rows, names].notna().all().all()
+    assert alone[[*PREDICTORS[:-1], "policy_regret"]].isna().all().all()
+    assert alone["estimated_error"].tolist() == [0.0] * 4  # small kernels are exact
+    assert alone["notes"].str.contains("sampled_regret: a mean over 3 walks").tolist() == [True, True, False, False]
+
+
+def test_the_primary_predictor_of_an_agent_that_has_none_is_a_note(tmp_path):
+    block = {**SPEC["blocks"][0], "agents": ["a2c"]}
+    told = study.predict({**SPEC, "blocks": [block]}, tmp_path, primary=True)
+    assert told["notes"].str.contains("agent a2c has no primary predictor; expected one of dqn, ppo").all()
 
 
 def test_only_the_blocks_that_are_asked_for_are_predicted(tmp_path, monkeypatch):

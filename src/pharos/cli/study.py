@@ -223,6 +223,7 @@ def predict(
     block: list[int] | None = None,
     agent: list[str] | None = None,
     observation: list[str] | None = None,
+    primary: bool = False,
 ) -> Answer:
     """Predict the regret of each cell from what its network makes of its states, before any run; hashed and dated.
 
@@ -231,16 +232,25 @@ def predict(
         block: Of these blocks alone, from 1; again for another one.
         agent: Of this agent alone; again for another.
         observation: Of this observation alone; again for another one.
+        primary: Only the predictor that stands for each agent, in a small part of the time.
     """
     from pharos import study
+    from pharos.validation import PRIMARY
 
     opened, place = source.opened()
     with progress_line("predicting", logged=True) as tell:
+        blocks, agents, observations = block or None, agent or None, observation or None
         predictions = study.predict(
-            opened, place, blocks=block or None, agents=agent or None, observations=observation or None, progress=tell
+            *(opened, place),
+            blocks=blocks,
+            agents=agents,
+            observations=observations,
+            primary=primary,
+            progress=tell,
         )
     record = study.write_predictions(opened, predictions, out)
-    absent = predictions["kernel_regret"].isna()
+    told = predictions.columns.intersection(["kernel_regret", *PRIMARY.values()])
+    absent = predictions[told].isna().all(axis=1)
     missing = int(absent.sum())
 
     def text() -> None:

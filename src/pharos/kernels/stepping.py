@@ -428,15 +428,21 @@ def q_learning(
             place[0] = -1
 
 
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _product(x, y):
+    """x . y, summed in the order of the machine's vectors."""
+    total = 0.0
+    for i in range(len(x)):
+        total += x[i] * y[i]
+    return total
+
+
 @njit(forceinline=True)
 def _value(kernel, learned, c, a):
     """Q(c, a), of the tabular part and the features."""
     _, features, _ = kernel
     q, weights = learned
-    total = q[a, c]
-    for i in range(features.shape[1]):
-        total += features[c, i] * weights[a, i]
-    return total
+    return q[a, c] + _product(features[c], weights[a]) if features.shape[1] > 0 else q[a, c]
 
 
 @njit(forceinline=True)
@@ -445,10 +451,8 @@ def _likeness(kernel, c, d):
     matrix, features, diagonal = kernel
     if len(matrix) > 0:
         return np.float64(matrix[c, d])
-    total = np.float64(diagonal[c]) if c == d else 0.0
-    for i in range(features.shape[1]):
-        total += features[c, i] * features[d, i]
-    return total
+    own = np.float64(diagonal[c]) if c == d else 0.0
+    return own + _product(features[c], features[d])
 
 
 @njit(forceinline=True)

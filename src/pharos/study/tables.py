@@ -400,6 +400,7 @@ def predict(
     blocks: Sequence[int] | None = None,
     agents: Sequence[str] | None = None,
     observations: Sequence[str] | None = None,
+    primary: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> "pd.DataFrame":
     """Return predictions for each cell of a study whose agent learns from observations: a row each.
@@ -408,6 +409,8 @@ def predict(
         source, folder: as for `run`; no run is looked at.
         blocks, agents, observations: a part of the study: numbers of blocks from 1, names of agents, and of
             observations without their options; None: all.
+        primary: only the predictor that stands for each agent (`pharos.validation.PRIMARY`) with its table; other
+            columns are NaN, and `estimated_error` is that of this predictor. A small part of the time.
         progress: called with what is being done.
     Returns:
         Columns `environment`, `instance`, `chance`, `agent`, `observation`; PREDICTORS; `network`; `estimated_error`,
@@ -434,7 +437,7 @@ def predict(
             continue
         if progress is not None:
             progress(f"cell {len(rows) + 1}: {', '.join(key[1:])}")
-        rows[key] = run.cell | predicted(run.config)
+        rows[key] = run.cell | (predicted(run.config, primary=True) if primary else predicted(run.config))
     if not rows:
         raise ParameterError(f"study {study.name!r}: no agent learns from observations, so there is nothing to predict")
     frame = pd.DataFrame(list(rows.values()))

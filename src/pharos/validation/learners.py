@@ -27,15 +27,16 @@ PREDICTORS = (
 """Columns of predictions, numbers; the larger, the harder. `adam_regret` is kernel regret with `optimizer="adam"`."""
 POLICY_PREDICTORS = (
     *("policy_regret", "policy_regret_played", "policy_tabular_regret"),
-    *("policy_regret_evaluated", "clipped_regret", "clipped_regret_evaluated"),
+    *("policy_regret_evaluated", "clipped_regret", "clipped_regret_evaluated", "clipped_tabular_regret"),
 )
 """Columns beside them where an agent is an actor-critic: `kernel_policy_regret`, as played, of a table, as evaluated;
-and of PPO with its clipping, of the most probable actions and as evaluated."""
+and of PPO with its clipping, of the most probable actions, as evaluated, and of a table."""
 SAMPLED_PREDICTORS = ("sampled_regret", "sampled_deviation", "sampled_descent", "sampled_adam", "sampled_tabular")
 """Columns beside them of a DQN: the sampled learner, one walk's deviation, its two kernels, and a table's."""
 PRIMARY: Mapping[str, str] = {"dqn": "sampled_regret", "ppo": "clipped_regret_evaluated"}
 """The predictor that stands for each agent, named on twelve development classes and fourteen sealed ones together."""
 POLICY_CURVES = ("policy_curve", "clipped_curve")
+_NO_POLICY: Mapping[str, Any] = {**dict.fromkeys(POLICY_PREDICTORS, math.nan), **dict.fromkeys(POLICY_CURVES, "")}
 ACTOR_CRITICS: Mapping[str, Mapping[str, Any]] = {
     "ppo": {"gae_lambda": 0.95, "clip_range": 0.2},
     "a2c": {"gae_lambda": 1.0, "clip_range": None},
@@ -44,12 +45,13 @@ ACTOR_CRITICS: Mapping[str, Mapping[str, Any]] = {
 CURVE_POINTS = 40
 
 
-def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
+def predicted(config: Mapping[str, Any], *, primary: bool = False) -> dict[str, Any]:
     """Return PREDICTORS of a run, SAMPLED_PREDICTORS of a DQN, POLICY_PREDICTORS of an actor-critic, and their curves;
     and the measures that a user has registered, under their names.
 
     Args:
         config: of a run of a study that was read already, so that code which it names is trusted.
+        primary: the learner of PRIMARY alone, with its table; `estimated_error` is then its own.
     Returns:
         Numbers, NaN where there is none and `notes` says why; `network`, `estimated_error`, `curve`, `adam_curve`.
     """
@@ -62,6 +64,9 @@ def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
         task = RunConfig.from_dict(config).task(trust=True, strict=True)
         name, initialisation = network_of(config, task)
         options = _options(task, name, initialisation)
+        row |= {"num_states": float(task.mdp.num_states), "network": f"{name}, {initialisation}"}
+        if primary:
+            return row | _of_primary(config, task.mdp, options)
         schedule = schedule_of(config)
         user_measures = own_measures()
         measures = report(task.mdp, (*MEASURES, *user_measures), schedule=schedule, **options)
@@ -73,7 +78,6 @@ def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
     except PharosError as error:
         return {**row, "notes": str(error)}
     # Their values as columns
-    row |= {"num_states": float(task.mdp.num_states), "network": f"{name}, {initialisation}"}
     regret = measures["kernel_regret"].value
     if regret is not None:
         row |= {"kernel_regret": regret["value"], "kernel_regret_played": regret["played"]}
@@ -88,6 +92,24 @@ def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
             row[measure] = float(value["value"] if isinstance(value, Mapping) else value)
     notes = (result.undefined or result.certificate.note for result in measures.results.values())
     return {**row, "notes": "; ".join(note for note in notes if note)}
+
+
+def _of_primary(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
+    """Columns of the learner of PRIMARY: its numbers, the error that its landmarks are estimated to cause, notes.
+
+    Raises:
+        ParameterError: the agent has none.
+    """
+    if config["agent"] not in PRIMARY:
+        raise ParameterError(f"agent {config['agent']} has no primary predictor; expected one of {', '.join(PRIMARY)}")
+    if config["agent"] == "dqn":
+        result = _sampled(config, mdp, options)
+        row = _of_walks(result.value)
+    else:
+        result = _actor_critic(config, mdp, rollouts_of(config), options)
+        row = {**_NO_POLICY, **_of_clipped(result.value)}
+    error = math.nan if result.value is None else result.value["estimated_error"]
+    return {**row, "estimated_error": error, "notes": result.undefined or result.certificate.note or ""}
 
 
 def own_measures() -> list[str]:
@@ -214,14 +236,19 @@ def _of_policy(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[st
     rollouts = rollouts_of(config)
     regret = _actor_critic(config, mdp, replace(rollouts, clip_range=None), options).value
     clipped = None if rollouts.clip_range is None else _actor_critic(config, mdp, rollouts, options).value
-    row = {**dict.fromkeys(POLICY_PREDICTORS, math.nan), **dict.fromkeys(POLICY_CURVES, "")}
+    row = dict(_NO_POLICY)
     if regret is not None:
         numbers = (regret["value"], regret["played"], regret["tabular"], _evaluated(regret))
         row |= {**dict(zip(POLICY_PREDICTORS, numbers, strict=False)), "policy_curve": _curve(regret)}
-    if clipped is not None:
-        row |= {"clipped_regret": clipped["value"], "clipped_regret_evaluated": _evaluated(clipped)}
-        row["clipped_curve"] = _curve(clipped, "played")
-    return row
+    return row | _of_clipped(clipped)
+
+
+def _of_clipped(regret: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Columns of the idealised PPO with its clipping; none of them where there is no regret."""
+    if regret is None:
+        return {}
+    numbers = {"clipped_regret": regret["value"], "clipped_regret_evaluated": _evaluated(regret)}
+    return {**numbers, "clipped_tabular_regret": regret["tabular"], "clipped_curve": _curve(regret, "played")}
 
 
 def rollouts_of(config: Mapping[str, Any]) -> "Rollouts":

@@ -43,7 +43,8 @@ PERMUTATIONS = 4999
 CONTROL = "tabular_regret"
 IMAGES, VECTOR = ("simple_image", "complex_image", "recorded"), "vector"
 TABULAR, SCALE, CLASSES = "tabular measures", "random play", "class alone"
-TABLES = ("tabular_regret", "tabular_regret_played", "policy_tabular_regret")  # the learners without a kernel
+TABLES = ("tabular_regret", "tabular_regret_played", "policy_tabular_regret", "clipped_tabular_regret")
+"""Learners without a kernel."""
 BASELINES = (CLASSES, SCALE, TABULAR, "exploration_time", "num_states", *TABLES)
 P_VALUES = ("p_rho", "p_agreement", "p_slope")
 
