@@ -13,10 +13,11 @@ from naive.mdp import executed, matrix_of
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness import Representation, Schedule, kernel_regret
+from pharos.hardness.representation import return_on_graph
 from pharos.mdp import TabularMDP, lazy_actions
 from pharos.observations import Network, representation, tangent_kernel
 from refusals import failing, refusal
-from strategies import FEW, examples, outcome_mdps, with_chance
+from strategies import FEW, deterministic_mdps, examples, outcome_mdps, with_chance
 
 SHORT = Schedule(steps=3000, learning_starts=500)
 RNG = np.random.default_rng(1)
@@ -171,6 +172,16 @@ def test_learners_on_any_mdp_begin_as_uniform_play_and_know_no_scale(mdp, horizo
     assert min(found.curve.greedy.min(), found.curve.played.min()) > -2e-5
     np.testing.assert_array_equal(found.curve.greedy, scaled.curve.greedy)
     np.testing.assert_allclose(table.curve.greedy, table.tabular.greedy, atol=2e-5)
+
+
+@examples(50, deterministic_mdps(), st.integers(1, 40), st.integers(0, 3))
+def test_a_walk_in_doubled_strides_is_the_walk_step_by_step(mdp, steps, seed):
+    mdp = mdp.with_gamma(1.0).with_horizon(steps)
+    actions = np.random.default_rng(seed).integers(0, mdp.num_actions, mdp.num_states)
+    by_walking = walk(mdp, np.eye(mdp.num_actions)[actions])[1]
+    value = return_on_graph(mdp, actions, steps)
+    assert value == pytest.approx(by_walking, rel=1e-12, abs=1e-12 * steps * np.abs(mdp.rewards).max())
+    assert value == pytest.approx(pharos.evaluate_policy(mdp, actions, 1e-9).value_at_start, rel=1e-12, abs=1e-9)
 
 
 def test_an_identity_kernel_of_any_scale_is_the_table():

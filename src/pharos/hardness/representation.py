@@ -18,6 +18,7 @@ from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.visitation import Propagation, drawn, standard_occupancy
 from pharos.mdp import TabularMDP, whole_number
 from pharos.solvers import Solution, evaluate_policy, regret_scale, uniform_value, value_iteration
+from pharos.solvers.policy_iteration import chain
 
 MOST_EXACT = 4096
 """Different observations up to which a kernel is used as it is; beyond, by landmarks."""
@@ -525,19 +526,39 @@ class IdealisedLearner:
 
     def _value(self, policy: np.ndarray) -> float:
         """Start value of a policy (N, A)."""
+        is_pure = policy.max(axis=1).min() == 1.0
+        actions = np.zeros(self.mdp.num_states, np.int64)
+        actions[self.states] = policy.argmax(axis=1)
+        if self.is_return and is_pure and self.mdp.is_deterministic:
+            return return_on_graph(self.mdp, actions, self.episode)
         if self.is_return:
             return float((self.visits(policy).executed * self.mdp.rewards).sum())
-        if policy.max(axis=1).min() == 1.0:
-            actions = np.zeros(self.mdp.num_states, np.int64)
-            actions[self.states] = policy.argmax(axis=1)
-            return evaluate_policy(self.mdp, actions, ACCURACY * self.spread).value_at_start
-        return evaluate_policy(self.mdp, self.everywhere(policy), ACCURACY * self.spread).value_at_start
+        table = actions if is_pure else self.everywhere(policy)
+        return evaluate_policy(self.mdp, table, ACCURACY * self.spread).value_at_start
 
     def everywhere(self, policy: np.ndarray) -> np.ndarray:
         """(S, A) probabilities of a policy (N, A), uniform in states outside `states`."""
         table = np.full((self.mdp.num_states, self.mdp.num_actions), 1 / self.mdp.num_actions)
         table[self.states] = policy
         return table
+
+
+def return_on_graph(mdp: TabularMDP, actions: np.ndarray, steps: int) -> float:
+    """The expected return of an episode of `steps` steps of actions (S,) on a deterministic MDP: S log2(steps) time.
+
+    Doubling: the return and the end of 2 k steps from each state are those of k steps, twice.
+    """
+    successor, reward = chain(mdp, actions)
+    is_last = np.asarray(mdp.terminal)
+    jump = np.append(np.where(is_last | (successor < 0), mdp.num_states, successor), mdp.num_states)
+    earned = np.append(np.where(is_last, 0.0, reward), 0.0)
+    place, total = mdp.start_states.astype(np.int64), np.zeros(len(mdp.start_states))
+    while steps:
+        if steps % 2:
+            total += earned[place]
+            place = jump[place]
+        earned, jump, steps = earned + earned[jump], jump[jump], steps // 2
+    return float(mdp.start_probabilities @ total)
 
 
 def descent(
