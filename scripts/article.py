@@ -47,7 +47,7 @@ ROWS = (  # of the table of findings: in words, the finding and its class as in 
     ("one model explains nothing (0.09)", "one model explains next to nothing", "all"),
     ("models by observation: better (0.48)", "models by representation explain more than one", "all"),
     ("models by class: better (0.65)", "models by class explain more than one", "all"),
-    ("vectors better than images (0.6, 0.3)", "hardness explains vectors better than images", "all"),
+    ("models of vectors: better (0.6, 0.3)", "hardness explains vectors better than images", "all"),
     ("DQN and PPO correlate (r = 0.81)", SAME_HARD, "all"),
 )
 
@@ -299,8 +299,11 @@ def facts_of_findings():
     for title, name in STUDY_NAMES.items():
         verdicts = [row["verdict"].split(",")[0] for row in found(name).values()]
         counts = [verdicts.count(each) for each in ("agrees", "disagrees", "undecided")]
-        count = "of {} findings our {} study".format(sum(counts), {"A": "first", "B": "second"}[title])
-        said.append("{} agrees with {}, disagrees with {} and leaves {} undecided".format(count, *counts))
+        if title == "A":
+            words = "of {} findings our first study agrees with {}, disagrees with {} and leaves {} undecided"
+            said.append(words.format(sum(counts), *counts))
+        else:
+            said.append("our second {}, {} and {}".format(*counts))
         p = np.array([row["p"] for row in found(name).values() if row["p"] == row["p"]])
         said.append(f"{(holm(p) < 0.05).sum()} of {(p < 0.05).sum()} in {title}")
         done = runs(name)
@@ -308,7 +311,11 @@ def facts_of_findings():
     measures = pd.read_csv(STUDIES / "classes" / "hardness.csv")
     said.append(f"{measures['num_states'].min():,} to {measures['num_states'].max():,} states")
     power = [found("classes")[finding, "frozen_lake"]["power"] for _, finding, of in ROWS if of == "frozen_lake"]
-    said.append(f"a power of {power[0]:.2f} and {power[1]:.2f}")
+    of_freeway = found("classes")["the harder observation of DQN", "freeway"]["power"]
+    said.append(
+        f"a power of {power[0]:.2f} and {power[1]:.2f} (images, table) for a difference of 0.05, on Freeway "
+        f"{of_freeway:.2f} (images)"
+    )
     done = runs("paper")
     ppo = done[(done["agent"] == "ppo") & (done["environment"] == "breakout")]
     regrets = ppo.groupby(["instance", "chance", "observation"])["normalized_regret"].mean().unstack().dropna()
@@ -346,7 +353,7 @@ def facts_of_the_sealed_test():
     is_hanoi = (dqn["instance"] == "games.py:Hanoi(discs=3)") & (dqn["observation"].map(kind) == "simple_image")
     image = dqn[is_hanoi].iloc[0]
     said.append(f"by its image, {image['greedy']:.2f} for a predicted {image['kernel_regret']:.2f}")
-    said.append(f"without this cell R² is {r_squared(*left_out(dqn[~is_hanoi], 'kernel_regret')):.2f}")
+    said.append(f"without this cell R² is {r_squared(*left_out(dqn[~is_hanoi], 'kernel_regret')):.2f} with a line")
     return said
 
 
@@ -484,7 +491,7 @@ def misses_figure():
         axis.scatter(values, places, 18, color, marker=mark, label=label, zorder=2)
     axis.axvline(0, color="#23262d", linewidth=0.9)
     axis.set(yticks=places, yticklabels=[name.replace("_", " ") for name in before.index])
-    axis.set(xlabel="observed less predicted regret of DQN")
+    axis.set(xlabel="observed minus predicted regret of DQN")
     drawn.legend(loc="outside lower center", handletextpad=0.2)
     return drawn
 
