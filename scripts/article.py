@@ -289,7 +289,8 @@ def without_one_class(agent):
 
 def facts():
     """Phrases of the text that hold numbers, each as the text has it."""
-    return [*facts_of_findings(), *facts_of_the_sealed_test(), *facts_of_the_new_block()]
+    parts = (facts_of_findings, facts_of_the_sealed_test, facts_of_the_new_block)
+    return [phrase for part in parts for phrase in part()]
 
 
 def facts_of_findings():
@@ -317,10 +318,14 @@ def facts_of_findings():
         f"{of_freeway:.2f} (images)"
     )
     done = runs("paper")
-    ppo = done[(done["agent"] == "ppo") & (done["environment"] == "breakout")]
-    regrets = ppo.groupby(["instance", "chance", "observation"])["normalized_regret"].mean().unstack().dropna()
-    is_less = regrets["simple_image"] < regrets["vector"]
-    said.append(f"PPO has less regret with images on {is_less.sum()} of {len(regrets)}")
+    ppo = done[(done["agent"] == "ppo") & (done["chance"] == "plain")]
+    regrets = ppo.groupby(["environment", "instance", "observation"])["normalized_regret"].mean().unstack().dropna()
+    is_less = (regrets["simple_image"] < regrets["vector"]).groupby("environment")
+    of, less = is_less.size(), is_less.sum()
+    said.append(
+        f"PPO has less regret with images on {less['breakout']} of {of['breakout']} Breakouts, more on "
+        f"{of['freeway'] - less['freeway']} of {of['freeway']} Freeways"
+    )
     return said
 
 
@@ -351,8 +356,8 @@ def facts_of_the_sealed_test():
     said.append(f"by more than 0.2 on {(spread > 0.2).sum()} of {len(spread)} MDPs")
     dqn = joined("dqn")
     is_hanoi = (dqn["instance"] == "games.py:Hanoi(discs=3)") & (dqn["observation"].map(kind) == "simple_image")
-    image = dqn[is_hanoi].iloc[0]
-    said.append(f"by its image, {image['greedy']:.2f} for a predicted {image['kernel_regret']:.2f}")
+    if dqn["greedy"].idxmax() != dqn.index[is_hanoi][0]:
+        raise ValueError("another cell than Hanoi's image has the largest regret")
     said.append(f"without this cell R² is {r_squared(*left_out(dqn[~is_hanoi], 'kernel_regret')):.2f} with a line")
     return said
 
@@ -368,6 +373,29 @@ def facts_of_the_new_block():
         correlations = f"rank correlation {row['rho']:.2f}, {row['agreement']:.2f} of pairs in order"
         fit = interval(row["r_squared"], row["r_squared_lower"], row["r_squared_upper"])
         said += [words.format(row["cells"]), f"R² {fit}, {correlations}"]
+    return said
+
+
+@cache
+def large(agent):
+    """Cells of the six large instances with what was predicted of them before their runs."""
+    folder = STUDIES / "hardness-dev"
+    predictions, about = study.read_predictions(folder / f"large-{agent}-predictions.parquet")
+    done, points = packed("hardness-dev/large-runs.parquet")
+    if (done.merge(predictions, on=CELL)["began"] <= about["date"]).any():
+        raise ValueError("a run had begun before its prediction was written")
+    return predictions.merge(study.outcomes(done, points), on=CELL)
+
+
+def facts_of_large_instances():
+    states = large("dqn")["num_states"]
+    said = [f"{states.nunique()} instances of {states.min():,.0f} to {states.max():,.0f} states"]
+    for agent, predictor in (("dqn", "sampled_regret"), ("ppo", "clipped_regret_evaluated")):
+        cells = large(agent)
+        classes = np.unique(cells["environment"], return_inverse=True)[1]
+        fit = r_squared(cells["greedy"].to_numpy(float), cells[predictor].to_numpy(float), classes)
+        rank = stats.spearmanr(cells["greedy"].round(9), cells[predictor].round(9)).statistic
+        said.append(f"{number(fit)} and {number(rank)}")
     return said
 
 
