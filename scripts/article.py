@@ -23,6 +23,7 @@ from pharos.study.specification import parse
 from pharos.study.tables import row_of
 from pharos.training import CELL, RunConfig
 from pharos.validation.cross_validation import class_predictions, holm, r_squared, resampled_classes
+from pharos.validation.leave_one_class_out import Pairs
 from pharos.validation.prediction import FILE
 
 ROOT = Path(__file__).parents[1]
@@ -289,7 +290,7 @@ def without_one_class(agent):
 
 def facts():
     """Phrases of the text that hold numbers, each as the text has it."""
-    parts = (facts_of_findings, facts_of_the_sealed_test, facts_of_the_new_block)
+    parts = (facts_of_findings, facts_of_the_sealed_test, facts_of_the_new_block, facts_of_large_instances)
     return [phrase for part in parts for phrase in part()]
 
 
@@ -388,15 +389,17 @@ def large(agent):
 
 
 def facts_of_large_instances():
-    states = large("dqn")["num_states"]
+    states, pairs_in_order = large("dqn")["num_states"], []
     said = [f"{states.nunique()} instances of {states.min():,.0f} to {states.max():,.0f} states"]
     for agent, predictor in (("dqn", "sampled_regret"), ("ppo", "clipped_regret_evaluated")):
         cells = large(agent)
-        classes = np.unique(cells["environment"], return_inverse=True)[1]
-        fit = r_squared(cells["greedy"].to_numpy(float), cells[predictor].to_numpy(float), classes)
-        rank = stats.spearmanr(cells["greedy"].round(9), cells[predictor].round(9)).statistic
-        said.append(f"{number(fit)} and {number(rank)}")
-    return said
+        regret, predicted = cells["greedy"].to_numpy(float), cells[predictor].to_numpy(float).round(9)
+        classes, instances = (np.unique(cells[name], return_inverse=True)[1] for name in ("environment", "instance"))
+        rank = stats.spearmanr(regret.round(9), predicted).statistic
+        said.append(f"{number(r_squared(regret, predicted, classes))} and {number(rank)} for {agent.upper()}")
+        pairs = Pairs.of(regret, instances)
+        pairs_in_order.append(f"{pairs.right(predicted).sum():g} of {len(pairs.first)}")
+    return [*said, f"{' and '.join(pairs_in_order)} pairs are in order"]
 
 
 # Figures -------------------------------------------------------------------------------------------------------------

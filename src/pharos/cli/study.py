@@ -249,8 +249,8 @@ def predict(
             progress=tell,
         )
     record = study.write_predictions(opened, predictions, out)
-    told = predictions.columns.intersection(["kernel_regret", *PRIMARY.values()])
-    absent = predictions[told].isna().all(axis=1)
+    columns = predictions.columns.intersection(["kernel_regret", *PRIMARY.values()])
+    absent = predictions[columns].isna().all(axis=1)
     missing = int(absent.sum())
 
     def text() -> None:
