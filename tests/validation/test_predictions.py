@@ -82,7 +82,7 @@ def test_the_primary_predictor_of_an_agent_that_has_none_is_a_note(tmp_path):
 
 
 def test_only_the_blocks_that_are_asked_for_are_predicted(tmp_path, monkeypatch):
-    monkeypatch.setattr("pharos.validation.predicted", lambda _: {})
+    monkeypatch.setattr("pharos.validation.predicted", lambda _, primary: {})
     block = {"environments": ["frozen_lake/4x4"], "agents": ["dqn"]}
     two = study.specification({"name": "two", "blocks": [block, {**block, "environments": ["frozen_lake/8x8"]}]})
     assert study.predict(two, tmp_path, blocks=[2])["instance"].tolist() == ["frozen_lake/8x8"]

@@ -239,12 +239,12 @@ def predict(
 
     opened, place = source.opened()
     with progress_line("predicting", logged=True) as tell:
-        blocks, agents, observations = block or None, agent or None, observation or None
         predictions = study.predict(
-            *(opened, place),
-            blocks=blocks,
-            agents=agents,
-            observations=observations,
+            opened,
+            place,
+            blocks=block or None,
+            agents=agent or None,
+            observations=observation or None,
             primary=primary,
             progress=tell,
         )

@@ -437,7 +437,7 @@ def predict(
             continue
         if progress is not None:
             progress(f"cell {len(rows) + 1}: {', '.join(key[1:])}")
-        rows[key] = run.cell | (predicted(run.config, primary=True) if primary else predicted(run.config))
+        rows[key] = run.cell | predicted(run.config, primary=primary)
     if not rows:
         raise ParameterError(f"study {study.name!r}: no agent learns from observations, so there is nothing to predict")
     frame = pd.DataFrame(list(rows.values()))

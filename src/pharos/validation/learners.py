@@ -102,12 +102,8 @@ def _of_primary(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[s
     """
     if config["agent"] not in PRIMARY:
         raise ParameterError(f"agent {config['agent']} has no primary predictor; expected one of {', '.join(PRIMARY)}")
-    if config["agent"] == "dqn":
-        result = _sampled(config, mdp, options)
-        row = _of_walks(result.value)
-    else:
-        result = _actor_critic(config, mdp, rollouts_of(config), options)
-        row = {**_NO_POLICY, **_of_clipped(result.value)}
+    result = _primary(config, mdp, options)
+    row = _of_walks(result.value) if config["agent"] == "dqn" else {**_NO_POLICY, **_of_clipped(result.value)}
     error = math.nan if result.value is None else result.value["estimated_error"]
     return {**row, "estimated_error": error, "notes": result.undefined or result.certificate.note or ""}
 
@@ -147,6 +143,13 @@ def _actor_critic(
     name = "kernel_policy_regret"
     schedule = Schedule(steps=config["steps"], gamma=config["hyperparameters"].get("gamma", Schedule.gamma))
     return report(mdp, [name], schedule=schedule, rollouts=rollouts, **options)[name]
+
+
+def _primary(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
+    """Result of the learner that stands for the agent."""
+    if config["agent"] == "dqn":
+        return _sampled(config, mdp, options)
+    return _actor_critic(config, mdp, rollouts_of(config), options)
 
 
 def _of_walks(value: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -208,10 +211,7 @@ def primary_regret(
     if network is not None:
         name = f"{network}+tanh" if isinstance(network, str) and agent != "dqn" and _is_named(network) else network
     options = _options(task, name, initialisation, landmarks)
-    if agent == "dqn":
-        result = _sampled(config, task.mdp, options)
-    else:
-        result = _actor_critic(config, task.mdp, rollouts_of(config), options)
+    result = _primary(config, task.mdp, options)
     value = result.value
     if value is None:
         raise UndefinedMeasure(result.undefined or f"{result.name} is undefined")
