@@ -22,7 +22,7 @@ from pharos.study.blocks import Run
 from pharos.study.specification import parse
 from pharos.study.tables import row_of
 from pharos.training import CELL, RunConfig
-from pharos.validation.cross_validation import class_predictions, holm, r_squared, resampled_classes
+from pharos.validation.cross_validation import class_predictions, holm, r_squared, resampled_classes, spearman
 from pharos.validation.leave_one_class_out import Pairs
 from pharos.validation.prediction import FILE
 
@@ -388,17 +388,26 @@ def large(agent):
     return predictions.merge(study.outcomes(done, points), on=CELL)
 
 
+ON_A_TABLE = {"dqn": "sampled_tabular", "ppo": "clipped_tabular_regret"}  # the same learners without a kernel
+
+
+def judged_large(agent, predictor):
+    """(R² without a line, rank correlation, pairs in order, pairs) of the six large instances."""
+    cells = large(agent)
+    regret, predicted = cells["greedy"].to_numpy(float), cells[predictor].to_numpy(float)
+    classes, instances = (np.unique(cells[name], return_inverse=True)[1] for name in ("environment", "instance"))
+    pairs = Pairs.of(regret, instances)
+    in_order = pairs.right(predicted).sum()
+    return r_squared(regret, predicted, classes), spearman(predicted, regret), in_order, len(pairs.first)
+
+
 def facts_of_large_instances():
     states, pairs_in_order = large("dqn")["num_states"], []
     said = [f"{states.nunique()} instances of {states.min():,.0f} to {states.max():,.0f} states"]
     for agent, predictor in (("dqn", "sampled_regret"), ("ppo", "clipped_regret_evaluated")):
-        cells = large(agent)
-        regret, predicted = cells["greedy"].to_numpy(float), cells[predictor].to_numpy(float).round(9)
-        classes, instances = (np.unique(cells[name], return_inverse=True)[1] for name in ("environment", "instance"))
-        rank = stats.spearmanr(regret.round(9), predicted).statistic
-        said.append(f"{number(r_squared(regret, predicted, classes))} and {number(rank)} for {agent.upper()}")
-        pairs = Pairs.of(regret, instances)
-        pairs_in_order.append(f"{pairs.right(predicted).sum():g} of {len(pairs.first)}")
+        fit, rank, in_order, pairs = judged_large(agent, predictor)
+        said.append(f"{number(fit)} and {number(rank)} for {agent.upper()}")
+        pairs_in_order.append(f"{in_order:g} of {pairs}")
     return [*said, f"{' and '.join(pairs_in_order)} pairs are in order"]
 
 
@@ -542,6 +551,9 @@ def main():
     for agent, predictor in PRIMARY.items():
         told = ", ".join(f"{name} {value:.2f}" for name, value in without_one_class(agent).items())
         print(f"\nR² of {agent.upper()} by {predictor}, without one class: {told}")
+    for agent, predictor in ON_A_TABLE.items():
+        fit, rank, *_ = judged_large(agent, predictor)
+        print(f"\n{agent.upper()} on the six large instances by {predictor}: R² {number(fit)}, rank {number(rank)}")
 
 
 if __name__ == "__main__":

@@ -152,6 +152,19 @@ def test_pairs_of_observations_of_one_mdp_are_compared():
     assert pairs.agreement(np.zeros(24)) == 0.5
 
 
+def test_predictions_that_differ_by_rounding_are_alike():
+    """As for ranks: a difference within a billionth of the spread counts one half, one that is larger orders a pair."""
+    y, mdps = np.array([0.0, 1.0, 0.0, 1.0]), np.array([0, 0, 1, 1])
+    pairs = leave_one_class_out.Pairs.of(y, mdps)
+    for scale in (1e-6, 1.0, 1e12):
+        x = scale * np.array([0.7, 0.7 + 5e-10, 0.2, 1.2])
+        assert pairs.right(x).tolist() == [0.5, 1.0]
+        assert pairs.right(x + scale * np.array([5e-9, 0, 0, 0])).tolist() == [0.0, 1.0]
+        shuffled = pairs.permuted(x, np.array([0, 0, 1, 1]), mdps, ["a", "b", "a", "b"], 50, 0)
+        assert set(shuffled) == {0.25, 0.75}
+    assert np.isnan(pairs.only(np.zeros(2, bool)).agreement(np.zeros(0)))
+
+
 def test_the_ceiling_of_agreement_is_that_of_a_predictor_that_knows_expectations():
     """4,000 pairs of cells; means of seeds are their expectations with normal noise."""
     rng = np.random.default_rng(0)

@@ -330,7 +330,7 @@ def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[st
     of_both = pairs.only((is_image[first] & is_vector[second]) | (is_vector[first] & is_image[second]))
     row |= {"image_pairs": len(of_both.first), "image_agreement": of_both.agreement(x)}
     # Interval and p-value, where the predictor tells observations apart
-    if (x[pairs.first] == x[pairs.second]).all():
+    if (pairs.right(x) == 0.5).all():
         return row
     drawn = cross_validation.resampled_classes(classes.max() + 1, RESAMPLES, seed)
     row["agreement_lower"], row["agreement_upper"] = pairs.interval(x, classes, drawn)
@@ -456,8 +456,17 @@ class Pairs:
         return Pairs(self.first[mask], self.second[mask], self.sign[mask])
 
     def right(self, x: np.ndarray) -> np.ndarray:
-        """(M,) 1 where x (N,) orders the pair as the outcome does, 1/2 where it says that both are alike, else 0."""
-        return 0.5 + 0.5 * np.sign(x[self.first] - x[self.second]) * self.sign
+        """(M,) 1 where x (N,) orders the pair as the outcome does, 1/2 where it says that both are alike, else 0.
+
+        Alike is what differs by at most TIED of the spread of x: rounding, as for ranks.
+        """
+        return self._right(x, x)
+
+    def _right(self, values: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """(..., M) of values (..., N) of x in other places; NaN where one of a pair is."""
+        difference = values[..., self.first] - values[..., self.second]
+        is_rounding = np.abs(difference) <= cross_validation.TIED * (x.max(initial=-np.inf) - x.min(initial=np.inf))
+        return 0.5 + 0.5 * np.where(is_rounding, 0.0, np.sign(difference)) * self.sign
 
     def agreement(self, x: np.ndarray) -> float:
         """The share of pairs that x orders rightly; NaN without pairs."""
@@ -526,7 +535,7 @@ class Pairs:
             orders = np.broadcast_to(np.arange(len(names)), (size, classes.max() + 1, len(names)))
             rows = row_at[mdps, rng.permuted(orders, axis=2)[:, classes, columns]]
             other = np.where(rows >= 0, x[rows], np.nan)
-            right = 0.5 + 0.5 * np.sign(other[:, self.first] - other[:, self.second]) * self.sign
+            right = self._right(other, x)
             some = np.isfinite(right).any(axis=1)
             agreements[start : start + size][some] = np.nanmean(right[some], axis=1)
         return agreements
