@@ -2,9 +2,10 @@
 
 python benchmarks/image_or_vector.py [docs/studies/small/runs.parquet]
 
-For each agent and predictor the share of tasks (instance and chance) in which the predictor says rightly whether
-vectors or images have the larger mean regret of greedy policies, among those whose regrets differ by more than 0.02;
-and Spearman's correlation over all cells. Prints rows of a Markdown table.
+For each agent and predictor the number of tasks (instance and chance) in which the predictor says rightly whether
+vectors or images have the larger mean regret of greedy policies, among those whose regrets differ by more than 0.02
+(one half where it says that both are alike); and Spearman's correlation over all cells, and over those of each class.
+Prints rows of a Markdown table.
 """
 
 import sys
@@ -14,6 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from pharos import study
+from pharos.validation import PRIMARY
+from pharos.validation.cross_validation import spearman
+from pharos.validation.leave_one_class_out import Pairs
 
 CLEAR = 0.02
 PREDICTORS = ("kernel_regret", "kernel_regret_played", "adam_regret", "adam_regret_played", "kernel_learning_time")
@@ -26,19 +30,23 @@ def main():
         runs, points = study.table(place), study.curves(place)
         cells = study.predict(place, progress=lambda line: print(line, file=sys.stderr, flush=True))
         cells = cells.merge(study.outcomes(runs, points))
-    print("| agent | predictor | tasks | clear | image is better | rightly said | rank correlation |")
+    print("| agent | predictor | clear tasks | images are better in | rightly said | rank correlation | of a class |")
     print("|---|---|---|---|---|---|---|")
     for agent, part in cells.groupby("agent"):
-        for predictor in PREDICTORS:
-            wide = part.pivot_table(
-                index=["instance", "chance"], columns="observation", values=["greedy", predictor]
-            ).dropna()
-            truth, said = (wide[name]["simple_image"] - wide[name]["vector"] for name in ("greedy", predictor))
-            clear = truth.abs() > CLEAR
-            right = (np.sign(truth) == np.sign(said))[clear].mean()
-            rho = part[["greedy", predictor]].corr("spearman").iloc[0, 1]
-            counts = f"{len(wide)} | {clear.sum()} | {(truth[clear] < 0).sum()}"
-            print(f"| {agent} | `{predictor}` | {counts} | {right:.2f} | {rho:.2f} |", flush=True)
+        regret, tasks = part["greedy"].to_numpy(float), part.groupby(["instance", "chance"]).ngroup().to_numpy()
+        pairs = Pairs.of(regret, tasks, CLEAR)
+        images = pairs.agreement((part["observation"] == "vector").to_numpy(float)) * len(pairs.first)
+        counts = f"{len(pairs.first)} | {images:g}"
+        for predictor in (*PREDICTORS, PRIMARY[agent]):
+            predicted = part[predictor].to_numpy(float)
+            rho = spearman(predicted, regret)
+            classes = part["environment"].to_numpy()
+            of_classes = [
+                f"{name} {spearman(predicted[classes == name], regret[classes == name]):.2f}"
+                for name in np.unique(classes)
+            ]
+            right = f"{pairs.right(predicted).sum():g}"
+            print(f"| {agent.upper()} | `{predictor}` | {counts} | {right} | {rho:.2f} | {', '.join(of_classes)} |")
 
 
 if __name__ == "__main__":
