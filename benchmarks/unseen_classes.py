@@ -1,9 +1,10 @@
 """What came true of predictions on classes left out, without the rest of a report: the tables of representation.md.
 
 python benchmarks/unseen_classes.py STUDY.yaml RUNS.parquet PREDICTIONS.parquet --out TABLE.csv [--figures FOLDER]
-    [--permutations N] [--hardness FOLDER] [--and STUDY.yaml RUNS.parquet PREDICTIONS.parquet]
+    [--permutations N] [--hardness FOLDER] [--and STUDY.yaml RUNS.parquet PREDICTIONS.parquet] [--later RUNS.parquet]
 
-RUNS.parquet is a packed study (`pharos study pack`); --and adds another one, with predictions of its own. Writes all
+RUNS.parquet is a packed study (`pharos study pack`); --and adds another one, with predictions of its own, --later the
+runs of these studies that another packed study has, such as a preset that all of them are part of. Writes all
 columns of `study.validation`, prints the primary outcome and the regret of training episodes, and how far today's
 predictor is off without a line, and draws predicted against observed regret and the learners' curves.
 """
@@ -35,11 +36,12 @@ def main():
     parser.add_argument("--permutations", type=int, default=PERMUTATIONS)
     parser.add_argument("--hardness", help="folder of a study whose measures of hardness are taken as they are")
     parser.add_argument("--and", dest="more", nargs=3, action="append", default=[], metavar="FILE")
+    parser.add_argument("--later", metavar="FILE", help="packed runs, of which those of the studies are added")
     given = parser.parse_args()
     studies = [(given.spec, given.runs, given.predictions), *given.more]
     foretold = PredictedCells.of([study.read_predictions(file) for _, _, file in studies])
     predictions = foretold.cells
-    each = [_finished(spec, runs, given.hardness) for spec, runs, _ in studies]
+    each = [_finished(spec, runs, given.hardness, given.later) for spec, runs, _ in studies]
     runs, points, measures = (pd.concat(parts, ignore_index=True) for parts in zip(*each, strict=True))
     measures = measures.drop_duplicates(["environment", "instance", "chance"])  # studies may share tasks
     cells = study.outcomes(runs, points)
@@ -72,10 +74,12 @@ def main():
             save_for_page(draw, folder / name)
 
 
-def _finished(spec, packed, hardness):
+def _finished(spec, packed, hardness, later):
     """(runs, points of their curves, measures of hardness of their tasks) of a packed study."""
     with tempfile.TemporaryDirectory() as folder:
         place, _ = study.unpack(packed, Path(folder) / "study")
+        if later is not None:
+            study.unpack(later, place, into=place)
         runs = study.table(place)
         tasks = set(zip(runs["instance"], runs["chance"], strict=True))
         return (
