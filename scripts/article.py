@@ -319,13 +319,13 @@ def facts_of_findings():
         f"{of_freeway:.2f} (images)"
     )
     done = runs("paper")
-    ppo = done[(done["agent"] == "ppo") & (done["chance"] == "plain")]
-    regrets = ppo.groupby(["environment", "instance", "observation"])["normalized_regret"].mean().unstack().dropna()
+    task = ["environment", "instance", "chance", "observation"]
+    regrets = done[done["agent"] == "ppo"].groupby(task)["normalized_regret"].mean().unstack().dropna()
     is_less = (regrets["simple_image"] < regrets["vector"]).groupby("environment")
     of, less = is_less.size(), is_less.sum()
     said.append(
-        f"PPO has less regret with images on {less['breakout']} of {of['breakout']} Breakouts, more on "
-        f"{of['freeway'] - less['freeway']} of {of['freeway']} Freeways"
+        f"PPO has less regret with images on {less['breakout']} of {of['breakout']} tasks of Breakout, more on "
+        f"{of['freeway'] - less['freeway']} of {of['freeway']} of Freeway"
     )
     return said
 
