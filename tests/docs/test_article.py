@@ -22,7 +22,7 @@ def script(name, monkeypatch):
 def test_the_tables_are_those_of_the_packed_runs(monkeypatch):
     article = script("article", monkeypatch)
     tables = {name: table() for name, table in article.TABLES.items()}
-    assert tables.keys() == {"findings", "models", "encodings", "sealed"}
+    assert tables.keys() == {"findings", "encodings", "sealed"}
     for name, table in tables.items():
         assert table in PAGE, f"{name} is now:\n{table}"
     assert len(re.findall(r"\n\n\| ", PAGE)) == len(tables)

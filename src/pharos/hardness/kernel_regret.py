@@ -127,7 +127,8 @@ def kernel_regret(
         pi = epsilon-greedy in Q;   D += c times the occupancy of pi;   y = r + gamma E max_a Q(s', a)
         g times:   Q(., a) += eta K diag(d(., a)) (y(., a) - Q(., a)),   d = D / sum of D
 
-    eta is 1 / (1.05 times the largest eigenvalue of K diag(max_a d)), the largest stable step: no learning rate.
+    eta is 1 / (1.05 times the largest eigenvalue of K diag(max_a d)), the largest step that does not overshoot, half of
+    the largest stable one: no learning rate.
     The value is the mean over phases of (V* - V of the greedy policy) / (V* - V of uniform play).
 
     Args:

@@ -310,8 +310,8 @@ class Schedule:
         exploration_initial_eps, exploration_final_eps, exploration_fraction: epsilon falls linearly from one to the
             other over this share of the steps; before `learning_starts` it is 1.
         gamma: the learner's own discount; that of values is the MDP's.
-        optimizer: "gradient", descent with the largest stable step; or "adam", the same with gradients rescaled as by
-            full-matrix Adam at the standard occupancy, see `KernelOperator.preconditioned`.
+        optimizer: "gradient", descent with the largest step that does not overshoot; or "adam", the same with gradients
+            rescaled as by full-matrix Adam at the standard occupancy, see `KernelOperator.preconditioned`.
     """
 
     steps: int = 30_000
@@ -563,7 +563,7 @@ def return_on_graph(mdp: TabularMDP, actions: np.ndarray, steps: int) -> float:
 def descent(
     apply: KernelOperator, weights: np.ndarray, error: np.ndarray, vector: np.ndarray, steps: int
 ) -> np.ndarray:
-    """(C, A): what `steps` gradient steps of the largest stable size add to values whose error is (C, A).
+    """(C, A): what `steps` gradient steps, the largest that do not overshoot, add to values whose error is (C, A).
 
     Args:
         weights: (C, A), of the squared errors. vector: (C, 1), the last phase's eigenvector; replaced.

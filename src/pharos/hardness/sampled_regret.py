@@ -179,11 +179,11 @@ def sampled_regret(
         y_i = r_i + gamma max_a Q'(s'_i, a), without the second term where the episode ended;   Q' of the period's start
         Q(., a) += eta / |B| sum_i [a_i = a] (y_i - Q(s_i, a_i)) K(., s_i)
 
-    eta is the largest step that is stable in expectation (`kernel_regret`, with the visits so far), or the largest that
-    the minibatch bears, 1 / max_i mean_j [a_i = a_j] |K(s_i, s_j)|, if that is smaller: no learning rate. The value of
-    a walk is the mean over 31 evaluations at equal distances of (V* - V of the greedy policy) / (V* - V of uniform
-    play). The measure is the mean over walks and over two kernels: K, and the root of K, which is what full-matrix Adam
-    makes of K where all observations are equally frequent.
+    eta is the largest step that does not overshoot in expectation (`kernel_regret`, with the visits so far), or the
+    largest that the minibatch bears, 1 / max_i mean_j [a_i = a_j] |K(s_i, s_j)|, if that is smaller: no learning rate.
+    The value of a walk is the mean over 31 evaluations at equal distances of (V* - V of the greedy policy) / (V* - V of
+    uniform play). The measure is the mean over walks and over two kernels: K, and the root of K, which is what
+    full-matrix Adam makes of K where all observations are equally frequent.
 
     Args:
         representation: the kernel; see `pharos.observations.representation`.

@@ -493,7 +493,7 @@ def learn(
     place: int64 (state or -1, previous action or -1, steps in the episode, steps in all); word, noise_word: uint64 (1,)
     noise: (standard deviation of the noise of rewards, its random word); schedule: (gamma, first epsilon, last epsilon,
     steps of exploration, first step of learning, gradient steps in so many steps: two numbers, size of a minibatch).
-    largest_step: the largest stable step; a minibatch takes that, or the largest that it bears itself.
+    largest_step: the largest that does not overshoot; a minibatch takes that, or the largest that it bears itself.
     """
     offsets, next_states, outcome_rewards, cumulative_probabilities = outcomes
     observations, actions, next_observations, rewards = memory
@@ -564,7 +564,7 @@ def learn(
                         best = max(best, _value(kernel, target, next_observations[j], a))
                     y += gamma * best
                 errors[i] = y - _value(kernel, learned, observations[j], actions[j])
-            # largest stable step of this minibatch, by the row sums of its kernel (Gershgorin)
+            # largest step of this minibatch that does not overshoot, by the row sums of its kernel (Gershgorin)
             bound = 0.0
             for i in range(size):
                 total = 0.0
