@@ -325,7 +325,7 @@ def facts_of_findings():
     told = [powers.pop(key) for key in low]
     words = "is {:.2f} and {:.2f} on lakes (images, table), {:.2f} on Freeway (images), {:.2f} on grids (table)"
     said.append(f"{words.format(*told)}, elsewhere above {np.floor(100 * min(powers.values())) / 100:.2f}")
-    said.append(parts_of_the_one_model())
+    said += [parts_of_the_one_model(), verdicts_by_instance()]
     done = runs("paper")
     task = ["environment", "instance", "chance", "observation"]
     regrets = done[done["agent"] == "ppo"].groupby(task)["normalized_regret"].mean().unstack().dropna()
@@ -340,6 +340,28 @@ def facts_of_findings():
     stays = (tables.query("chance == 'plain'").groupby("id")["value"].agg(np.ptp) == 0).all()
     said += ["every table stays on the kerb from step 0 on"] if stays else []
     return said
+
+
+def verdicts_by_instance():
+    """The differences of Table 1 tested over instances, each the mean of its tasks; ValueError if others change."""
+    pairs = {
+        "the harder observation of DQN": (("dqn", "simple_image"), ("dqn", "vector")),
+        "the learner with more regret": (("q_learning", "index"), ("dqn", "vector")),
+    }
+    changed, p_of_grids = [], []
+    for title, name in STUDY_NAMES.items():
+        means = runs(name).groupby(["agent", "observation", "environment", "instance", "chance"])["normalized_regret"]
+        for finding, (one, other) in pairs.items():
+            for of in list(NAMES)[:4]:
+                difference = means.mean()[(*one, of)] - means.mean()[(*other, of)]
+                p = stats.wilcoxon(difference.dropna().groupby("instance").mean()).pvalue
+                if (p < 0.05) != (found(name)[finding, of]["verdict"] in ("agrees", "disagrees")):
+                    changed.append((title, finding, of))
+                if (finding, of) == ("the harder observation of DQN", "simple_grid"):
+                    p_of_grids.append(p)
+    if changed != [("A", "the harder observation of DQN", "simple_grid")]:
+        raise ValueError(f"by instance other verdicts change: {changed}")
+    return f"A's images on grids are undecided (p = {p_of_grids[0]:.2f}, B's {p_of_grids[1]:.2f}), else verdicts stay"
 
 
 def facts_of_the_sealed_test():
