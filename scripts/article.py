@@ -35,17 +35,18 @@ STUDY_NAMES = {"A": "classes", "B": "paper"}  # in the text, and of `runs`
 RESAMPLES = 1000
 NAMES = {"simple_grid": "grids", "frozen_lake": "lakes", "freeway": "Freeway", "breakout": "Breakout", "all": "all"}
 SAME_HARD = "DQN and PPO find the same hard"
+OBSERVED, LEARNER = "the harder observation of DQN", "the learner with more regret"
 NUMBERS = ["zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"]
 PRIMARY = {"dqn": "kernel_regret", "ppo": "clipped_regret_evaluated"}
 ROWS = (  # of the table of findings: in words, the finding and its class as in `study.findings`
-    ("images harder: grids", "the harder observation of DQN", "simple_grid"),
-    ("images harder: lakes", "the harder observation of DQN", "frozen_lake"),
-    ("vectors harder: Freeway", "the harder observation of DQN", "freeway"),
-    ("vectors harder: Breakout", "the harder observation of DQN", "breakout"),
-    ("table easier: grids", "the learner with more regret", "simple_grid"),
-    ("table easier: lakes", "the learner with more regret", "frozen_lake"),
-    ("table harder: Freeway", "the learner with more regret", "freeway"),
-    ("table harder: Breakout", "the learner with more regret", "breakout"),
+    ("images harder: grids", OBSERVED, "simple_grid"),
+    ("images harder: lakes", OBSERVED, "frozen_lake"),
+    ("vectors harder: Freeway", OBSERVED, "freeway"),
+    ("vectors harder: Breakout", OBSERVED, "breakout"),
+    ("table easier: grids", LEARNER, "simple_grid"),
+    ("table easier: lakes", LEARNER, "frozen_lake"),
+    ("table harder: Freeway", LEARNER, "freeway"),
+    ("table harder: Breakout", LEARNER, "breakout"),
     ("one model explains nothing (0.09)", "one model explains next to nothing", "all"),
     ("models by observation beat one (0.48)", "models by representation explain more than one", "all"),
     ("models by class beat one (0.65)", "models by class explain more than one", "all"),
@@ -106,17 +107,17 @@ def found(name):
 
 
 def size(row, done):
-    agents = {"the learner with more regret": ("dqn", "q_learning"), SAME_HARD: ("dqn", "ppo")}
+    agents = {LEARNER: ("dqn", "q_learning"), SAME_HARD: ("dqn", "ppo")}
     used = done[done["agent"].isin(agents.get(row["finding"], ("dqn",)))]
     if row["of"] != "all":
         used = used[used["environment"] == row["of"]]
-    if row["finding"] == "the learner with more regret":
+    if row["finding"] == LEARNER:
         used = used[used["observation"] != "simple_image"]
     task = ["instance", "chance"]
     pairs = {  # cells that both agents have; tasks that have both agents, or both observations
         SAME_HARD: ([*task, "observation"], "agent"),
-        "the learner with more regret": (task, "agent"),
-        "the harder observation of DQN": (task, "observation"),
+        LEARNER: (task, "agent"),
+        OBSERVED: (task, "observation"),
     }
     if row["finding"] in pairs:
         keys, differs = pairs[row["finding"]]
@@ -272,6 +273,11 @@ def variance_share(part, cells):
     return shares[0], *np.percentile(shares[1:], [2.5, 97.5])
 
 
+def share_of_observations(cells):
+    """`variance_share` of what differs between the observations of an MDP."""
+    return variance_share(cells["greedy"] - cells.groupby("instance")["greedy"].transform("mean"), cells)
+
+
 def left_out(cells, predictor):
     """(regret, prediction, class) of cells, each class predicted by a line through the others."""
     classes = np.unique(cells["environment"], return_inverse=True)[1]
@@ -294,11 +300,9 @@ def without_one_class(agent):
 
 def facts():
     """Phrases of the text that hold numbers, each as the text has it."""
-    parts = (
-        *(facts_of_findings, facts_of_the_sealed_test, facts_of_misses),
-        *(facts_of_the_new_block, facts_of_large_instances),
-    )
-    return [phrase for part in parts for phrase in part()]
+    of_study = (facts_of_findings, facts_of_the_sealed_test)
+    of_development = (facts_of_misses, facts_of_the_new_block, facts_of_large_instances)
+    return [phrase for part in (*of_study, *of_development) for phrase in part()]
 
 
 def facts_of_findings():
@@ -319,16 +323,13 @@ def facts_of_findings():
         said.append(f"{(~done['exact']).sum()} of {len(done):,} runs")
     measures = pd.read_csv(STUDIES / "classes" / "hardness.csv")
     said.append(f"{measures['num_states'].min():,} to {measures['num_states'].max():,} states")
-    observed, learner = "the harder observation of DQN", "the learner with more regret"
-    powers = {key: row["power"] for key, row in found("classes").items() if key[0] in (observed, learner)}
-    low = ((observed, "frozen_lake"), (learner, "frozen_lake"), (observed, "freeway"), (learner, "simple_grid"))
+    powers = {key: row["power"] for key, row in found("classes").items() if key[0] in (OBSERVED, LEARNER)}
+    low = ((OBSERVED, "frozen_lake"), (LEARNER, "frozen_lake"), (OBSERVED, "freeway"), (LEARNER, "simple_grid"))
     told = [powers.pop(key) for key in low]
     words = "is {:.2f} and {:.2f} on lakes (images, table), {:.2f} on Freeway (images), {:.2f} on grids (table)"
     said.append(f"{words.format(*told)}, elsewhere above {np.floor(100 * min(powers.values())) / 100:.2f}")
     said += [parts_of_the_one_model(), verdicts_by_instance()]
-    done = runs("paper")
-    task = ["environment", "instance", "chance", "observation"]
-    regrets = done[done["agent"] == "ppo"].groupby(task)["normalized_regret"].mean().unstack().dropna()
+    regrets = regrets_of_ppo()
     is_less = (regrets["simple_image"] < regrets["vector"]).groupby("environment")
     of, less = is_less.size(), is_less.sum()
     said.append(
@@ -342,24 +343,47 @@ def facts_of_findings():
     return [*said, "every table stays on the kerb from step 0 on"]
 
 
+def regrets_of_ppo():
+    """Normalised regret of PPO on each task of study B, a column for each observation; tasks that have all."""
+    task = ["environment", "instance", "chance", "observation"]
+    return runs("paper").query("agent == 'ppo'").groupby(task)["normalized_regret"].mean().unstack().dropna()
+
+
+def images_of_ppo():
+    """Lines: PPO's regret with images less that with vectors, by class and kind of chance, and over all kinds."""
+    regrets = regrets_of_ppo()
+    differences = regrets["simple_image"] - regrets["vector"]
+    groups = [((of, "all chance"), part) for of, part in differences.groupby("environment")]
+    for (of, chance), part in [*groups, *differences.groupby(["environment", "chance"])]:
+        values = part.to_numpy()
+        first, second = np.triu_indices(len(values))
+        middle, low, high = np.median((values[first] + values[second]) / 2), values.min(), values.max()
+        yield (
+            f"PPO, images less vectors, {NAMES[of]}, {chance}: more on {(values > 0).sum()} of {len(values)}, "
+            f"median of averages {number(middle, 3)}, {number(low, 3)} to {number(high, 3)}, "
+            f"p {stats.wilcoxon(values).pvalue:.3f}"
+        )
+
+
 def verdicts_by_instance():
     """The differences of Table 1 tested over instances, each the mean of its tasks; ValueError if others change."""
     pairs = {
-        "the harder observation of DQN": (("dqn", "simple_image"), ("dqn", "vector")),
-        "the learner with more regret": (("q_learning", "index"), ("dqn", "vector")),
+        OBSERVED: (("dqn", "simple_image"), ("dqn", "vector")),
+        LEARNER: (("q_learning", "index"), ("dqn", "vector")),
     }
     changed, p_of_grids = [], []
     for title, name in STUDY_NAMES.items():
-        means = runs(name).groupby(["agent", "observation", "environment", "instance", "chance"])["normalized_regret"]
+        keys = ["agent", "observation", "environment", "instance", "chance"]
+        means = runs(name).groupby(keys)["normalized_regret"].mean()
         for finding, (one, other) in pairs.items():
             for of in list(NAMES)[:4]:
-                difference = means.mean()[(*one, of)] - means.mean()[(*other, of)]
+                difference = means[(*one, of)] - means[(*other, of)]
                 p = stats.wilcoxon(difference.dropna().groupby("instance").mean()).pvalue
                 if (p < 0.05) != (found(name)[finding, of]["verdict"] in ("agrees", "disagrees")):
                     changed.append((title, finding, of))
-                if (finding, of) == ("the harder observation of DQN", "simple_grid"):
+                if (finding, of) == (OBSERVED, "simple_grid"):
                     p_of_grids.append(p)
-    if changed != [("A", "the harder observation of DQN", "simple_grid")]:
+    if changed != [("A", OBSERVED, "simple_grid")]:
         raise ValueError(f"by instance other verdicts change: {changed}")
     return f"A's images on grids are undecided (p = {p_of_grids[0]:.2f}, B's {p_of_grids[1]:.2f}), else verdicts stay"
 
@@ -377,9 +401,8 @@ def facts_of_the_sealed_test():
     ]
     within, pairs, images = {}, {}, {}
     for agent, part in cells.groupby("agent"):
-        mdps = part.groupby("instance")["greedy"]
-        within[agent] = interval(*variance_share(part["greedy"] - mdps.transform("mean"), part))
-        row, sizes = judged()[agent, PRIMARY[agent]], mdps.size()
+        within[agent] = interval(*share_of_observations(part))
+        row, sizes = judged()[agent, PRIMARY[agent]], part.groupby("instance").size()
         pairs[agent] = f"{row['pairs']} of {(sizes * (sizes - 1) // 2).sum()}"
         images[agent] = f"{row['image_agreement'] * row['image_pairs']:g} of {row['image_pairs']}"
     said += [
@@ -394,9 +417,7 @@ def facts_of_the_sealed_test():
     if dqn["greedy"].idxmax() != dqn.index[is_hanoi][0]:
         raise ValueError("another cell than Hanoi's image has the largest regret")
     said.append(f"without this cell R² is {r_squared(*left_out(dqn[~is_hanoi], 'kernel_regret')):.2f} with a line")
-    others = dqn[~is_hanoi]
-    within_mdps = others["greedy"] - others.groupby("instance")["greedy"].transform("mean")
-    said.append(f"without one cell DQN's is {variance_share(within_mdps, others)[0]:.2f}")
+    said.append(f"without one cell DQN's is {share_of_observations(dqn[~is_hanoi])[0]:.2f}")
     said.append(f"its R² ({judged()['dqn', 'kernel_regret']['r_squared']:.3f}) passes by one cell")
     return said
 
@@ -600,6 +621,7 @@ def main():
     for name, table in TABLES.items():
         print(f"{name}\n\n{table()}\n")
     print("phrases\n", *facts(), sep="\n")
+    print("", *images_of_ppo(), sep="\n")
     for agent, predictor in PRIMARY.items():
         told = ", ".join(f"{name} {value:.2f}" for name, value in without_one_class(agent).items())
         print(f"\nR² of {agent.upper()} by {predictor}, without one class: {told}")
