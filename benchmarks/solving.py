@@ -108,7 +108,7 @@ def sweeps(mdp, folder: Path) -> None:
     weights = (0.75, 0.25, 0.0)
     by_previous = {
         "pharos, sticky": lambda *part: bellman.sticky_backup(
-            *ours, weights, 1.0, by_action, out_by_action, actions, np.array([part])
+            *ours, weights, 1.0, by_action, out_by_action, actions, np.empty(num_actions), np.array([part])
         ),
         "C, sticky": lambda *part: sticky(*given, 0.25, values, results, *part),
     }

@@ -22,6 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from pharos.system import compiling
 
 compiling.SMALL = 0  # tests are small, and of compiled code; those of tests/kernels/test_interpreted.py are not
+compiling.announces = False  # else what a test finds on standard error depends on what was compiled before
 
 settings.register_profile("fixed", derandomize=True)
 settings.register_profile("explore", derandomize=False)

@@ -22,6 +22,7 @@ import numpy as np
 
 from pharos import errors
 from pharos.errors import MissingExtra, ParameterError, PharosError
+from pharos.system import compiling
 
 NUMBERS = 3  # most numbers that a rank sends to all others with the header of an exchange
 _ROWS = 1 << 20  # most rows that rank 0 sends to each rank in one exchange
@@ -343,6 +344,7 @@ class _Mpi(Rank):
         self._world = library.COMM_WORLD.Dup()
         self.rank, self.size = self._world.Get_rank(), self._world.Get_size()
         self.neighbors = self._world.Split_type(library.COMM_TYPE_SHARED).Get_size()
+        compiling.announces = compiling.announces and self.rank == 0
         self._is_over = False  # somebody failed: nobody waits for this rank any more
         self._requests: list[Any] = []
         self._kept: list[np.ndarray] = []  # arrays of pending messages

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from naive import mdp as naive_mdp
+from pharos.kernels import bellman, outcomes
 from pharos.kernels.stepping import execute_choices
 from pharos.mdp import (
     BEST,
@@ -21,18 +22,22 @@ from pharos.mdp import (
     Table,
     TabularMDP,
     chosen_mass,
+    lazy_actions,
     random_actions,
     runs_of,
     sticky_actions,
 )
+from pharos.mdp.dynamics import TopologicalOrder
 from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
 from strategies import (
+    LAYOUTS,
     as_outcome_tables,
     deterministic_mdps,
     examples,
     general_mdps,
     lazy_mdps,
     outcome_mdps,
+    outcome_table,
     probabilities,
     small_mdps,
     with_chance,
@@ -186,6 +191,54 @@ def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
     for _ in range(slow.size):
         slow[moved(Listed.of(mdp), play, slow, mdp.width) > 0] = 1.0
     assert ((fast > 0) == (slow > 0))[live].all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "layout", ["table", *(pytest.param(layout, marks=pytest.mark.long) for layout in ("lazy", *LAYOUTS))]
+)
+def test_backups_compiled_for_many_states_and_for_few_have_the_same_bits(layout, monkeypatch):
+    """Each number of actions and outcomes by itself, with rewards as codes; and one form for all, with float64."""
+    answers = []
+    for first in (0, 41):
+        monkeypatch.setattr(outcomes, "UNROLLED_FROM", first)
+        mdp = _drawn_mdp(layout)
+        answers.append(_backed_up(mdp))
+        is_tuple = isinstance(bellman.actions_of(mdp.num_actions, mdp.num_states), tuple)
+        assert (mdp.reward_table.for_kernels[0].dtype, is_tuple) == ((np.uint8, True) if first == 0 else (float, False))
+    assert answers[0] == answers[1] and len(answers[0]) == 27
+
+
+def _drawn_mdp(layout):
+    """40 states of 3 actions, many of which are visited again, with 5 rewards."""
+    rng = np.random.default_rng(7)
+    paid = rng.choice([-1.0, 0.0, 0.1, 1 / 3, 2.0], (40, 3))
+    mdp = TabularMDP.from_arrays(rng.integers(-1, 40, (40, 3), dtype=np.int32), paid, gamma=0.9)
+    if layout in LAYOUTS:
+        ragged, palette, width = LAYOUTS[layout]
+        vectors = [[1.0], [0.5, 0.5], [1 / 3, 2 / 3], [0.7, 0.2, 0.1]][: width + 1]
+        drawn = [vectors[i] for i in rng.integers(len(vectors), size=120)]
+        lists = [[(int(rng.integers(-1, 40)), p) for p in vector] for vector in drawn]
+        return replace(mdp, dynamics=outcome_table(lists, 3, ragged, palette, width))
+    return lazy_actions(mdp, 0.3) if layout == "lazy" else mdp
+
+
+def _backed_up(mdp):
+    """Bytes of a backup and two sweeps, the second one in some order, with all kinds of chance and choice."""
+    rng, found = np.random.default_rng(1), []
+    order = TopologicalOrder(rng.permutation(40), 40)
+    for chance in (Chance(), Chance.of(random=0.2), Chance.of(sticky=0.25)):
+        for policy in (None, rng.integers(3, size=40), rng.dirichlet(np.ones(3), 40)):
+            select = BEST if policy is None else PolicyTable.of(replace(mdp, chance=chance), policy)
+            equation = BellmanEquation(mdp.reward_table, 0.9, chance, select)
+            x = rng.random((41, 3 if chance.is_sticky else 1))
+            x[-1] = 0.0
+            out = np.empty_like(x)
+            mdp.dynamics.backup(equation, x, out)
+            change, after = mdp.dynamics.sweep(equation, x), x.tobytes()
+            mdp.dynamics.sweep_once(equation, x, order)
+            found += [out.tobytes(), (change, after), x.tobytes()]
+    return found
 
 
 @pytest.mark.long

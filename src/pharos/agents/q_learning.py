@@ -60,8 +60,7 @@ class QLearning:
         reward_delay: int = 0,
         **options: object,
     ):
-        table = mdp.dynamics.deterministic_table()
-        self._transitions = mdp.dynamics.for_kernels if table is None else table
+        self._transitions = mdp.dynamics.for_steps
         unknown = set(options) - set(DEFAULTS)
         if unknown:
             raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], DEFAULTS)
@@ -112,8 +111,7 @@ class QLearning:
         )
         q_learning(
             self._transitions,
-            mdp.reward_table.table,
-            mdp.reward_table.palette,
+            *mdp.reward_table.for_kernels,
             np.asarray(mdp.terminal, np.bool_),
             mdp.start_states,
             cumulative,

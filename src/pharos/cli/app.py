@@ -29,7 +29,6 @@ from pharos.cli import (
 from pharos.cli.answers import INTERRUPTED, complain
 from pharos.cli.command import Commands
 from pharos.errors import DivergenceError, ParameterError, PharosError
-from pharos.system import compiling
 from pharos.system.lazy import conflict
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
@@ -174,7 +173,6 @@ app.add_typer(cache.app, name="cache")
 
 def main() -> None:
     """Entry point of the `pharos` command."""
-    compiling.is_told = True  # commands have lines of their own
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):  # closed by whoever started it
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115

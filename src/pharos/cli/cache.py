@@ -46,7 +46,7 @@ def list_() -> Answer:
 
 @app.command("clear")
 def clear(environments: Annotated[list[str] | None, "[ENVIRONMENT]..."] = None) -> Answer:
-    """Delete cached state spaces (and, when no name is given, compiled rules). They are made again when needed.
+    """Delete cached state spaces (and, when no name is given, compiled code). They are made again when needed.
 
     Args:
         environments: Clear only these: names of environments or of cached folders.
@@ -116,7 +116,7 @@ def _print(directory: Path, spaces: list[dict[str, Any]], compiled: int, total: 
     if rows:
         print_table("", ("environment", "parameters", ">states", ">size", ""), rows)
     print(
-        f"{pluralize(len(spaces), 'state space')} and {size_text(compiled)} of compiled rules: "
+        f"{pluralize(len(spaces), 'state space')} and {size_text(compiled)} of compiled code: "
         f"{size_text(total)} in {directory}"
     )
 
@@ -171,6 +171,7 @@ def _use(env: "Environment", chance: ChanceSetting) -> None:
     """Do a little of everything with an environment; a space beyond LARGEST states is stepped through alone."""
     from pharos import hardness, solvers, state_space
     from pharos.interaction import GymEnv, VectorEnv
+    from pharos.kernels import outcomes
     from pharos.training import train
 
     for observation in ("vector", "simple_image"):
@@ -188,5 +189,12 @@ def _use(env: "Environment", chance: ChanceSetting) -> None:
         mdp = chance.of(space.mdp(gamma=0.99))
         solvers.value_iteration(mdp)
         solvers.uniform_value(mdp)
+        few, outcomes.UNROLLED_FROM = outcomes.UNROLLED_FROM, 0  # sweeps of many states are other kernels
+        try:
+            large = chance.of(space.mdp(gamma=0.99))
+            solvers.value_iteration(large)
+            solvers.uniform_value(large)
+        finally:
+            outcomes.UNROLLED_FROM = few
         hardness.report(mdp, budget=10.0, keep=False)
     train("q_learning", env, steps=STEPS, gamma=0.99, horizon=None, evaluation_interval=STEPS, chance=chance)

@@ -3,13 +3,11 @@
 The package announces its files; each is loaded where it is used, and loads Numba.
 """
 
-from pathlib import Path
-
 from pharos.system import compiling
 
-compiling.prepare(Path(__file__).parent)
+compiling.prepare()
 
-from pharos.kernels import outcomes  # noqa: E402  (it loads Numba, which reads where to keep compiled code)
+from pharos.kernels import outcomes  # noqa: E402  (it loads Numba)
 
 _shared = """
     batched bellman gaps graph hash_table hitting horizon linear_algebra many_searches observation_kernels

@@ -22,6 +22,7 @@ from numba import float32, njit, uint32, uint64
 from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at
+from pharos.kernels.kernel_cache import kernel
 from pharos.kernels.outcomes import drawn_outcome, outcome, size_of
 from pharos.kernels.stepping import delayed_reward, executed_by_number, normal_by_numbers, start_by_number
 
@@ -64,7 +65,7 @@ def below(word, n):
     return np.int64((uint64(word) * uint64(n)) >> uint64(32))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def words(keys, stream, step, out):
     """out[i, j] = the four words of draw j of copy 0 at a step, in a stream, for key i; keys (N,), out (N, M, 4)."""
     for i in range(out.shape[0]):
@@ -78,14 +79,14 @@ STEP, EXPLORE, SAMPLE, SHUFFLE, WEIGHTS, ACT = range(6)  # streams of random num
 DONE, TIMEOUT = 1, 2  # bits of a transition's flags
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def exploring(keys, step, epsilon, is_warming, out):
     """out[i] = whether run i acts at random in a step: while it warms up, and with probability epsilon[i]."""
     for i in range(len(keys)):
         out[i] = is_warming[i] or unit(philox(0, 0, step, EXPLORE, keys[i])[0]) < epsilon[i]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def anneal(first, last, share, elapsed, out):
     """out (W,) = linear schedules from first to last (W,) over a share (W,) of the training, at `elapsed`."""
     for i in range(len(out)):
@@ -95,7 +96,7 @@ def anneal(first, last, share, elapsed, out):
             out[i] = first[i] + elapsed * (last[i] - first[i]) / share[i] if share[i] > 0.0 else first[i]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def look_up(table, begins, states, out):
     """out (W, pitch): the rows of a table (R, size), one after another, of the states (W, B) of each run.
 
@@ -109,7 +110,7 @@ def look_up(table, begins, states, out):
                 target[j] = row[j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def choose(keys, step, explores, q, actions):
     """Epsilon-greedy actions (W, E): random ones where a run explores, else the first of the best of q (W, E, A)."""
     for i in range(actions.shape[0]):
@@ -135,7 +136,7 @@ def _outcome_reward(rewards, s, a, k):
     return lambda rewards, s, a, k: outcome(rewards, s, a, k)[0]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def start(keys, runs, starts, cumulative, state):
     """Write the start states of the first episodes of `runs` to state (W, E)."""
     for i in runs:
@@ -143,7 +144,7 @@ def start(keys, runs, starts, cumulative, state):
             state[i, e] = starts[start_by_number(cumulative, unit(philox(1, e, 0, STEP, keys[i])[3]))]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def advance(
     transitions, rewards, staying, terminal, starts, cumulative, runs, setting, knobs, actions, episodes, pending,
     transition, counts,
@@ -208,7 +209,7 @@ def advance(
                 previous[i, e], elapsed[i, e] = -1, 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def act(keys, step, scores, actions, log_probabilities):
     """Draw actions (W, E) from the softmax of scores (W, E, A); log_probabilities: their logarithms, float32."""
     num_actions = scores.shape[2]
@@ -231,7 +232,7 @@ def act(keys, step, scores, actions, log_probabilities):
             log_probabilities[i, e] = np.float64(scores[i, e, action] - best) - np.log(total)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
     """Draw a minibatch of each run from its replay memory, uniformly, with returns of `num_steps` steps.
 
@@ -253,7 +254,7 @@ def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
             states[i, b], actions[i, b], next_states[i, b] = state[i, row, e], action[i, row, e], next_state[i, at, e]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sample_histories(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
     """`sample` from the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
 
@@ -278,7 +279,7 @@ def sample_histories(keys, step, draw, place, filled, gammas, num_steps, memory,
             next_states[i, b, frames - 1] = next_state[i, at, e]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _steps_from(i, row, e, last, gamma, num_steps, reward, flags):
     """(last row, return, discount of the value after it) of at most `num_steps` steps from a row."""
     size = reward.shape[1]
@@ -293,7 +294,7 @@ def _steps_from(i, row, e, last, gamma, num_steps, reward, flags):
     return at, float32(total), float32(0.0) if ended else float32(factor)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _last_states(i, row, e, state, flags, out):
     """out (k,) = the state of a row and those of the k - 1 rows before it, the oldest first, within its episode."""
     size = state.shape[1]
@@ -304,7 +305,7 @@ def _last_states(i, row, e, state, flags, out):
             row = before
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def huber(q, q_next, q_choice, actions, rewards, discounts, dq, loss):
     """The smooth L1 loss of DQN, (W,), and its gradient dq (W, B, A).
 
@@ -331,7 +332,7 @@ def huber(q, q_next, q_choice, actions, rewards, discounts, dq, loss):
         loss[i] = total / num_rows
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@kernel(fastmath={"reassoc", "contract"})
 def _squares(x):
     """Sum of squares of x (P,) float32."""
     total = float32(0.0)
@@ -340,7 +341,7 @@ def _squares(x):
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _adam(parameters, gradient, mean, square, scale, step, eps):
     """One step of Adam for one run, in place; `scale` clips the gradient, `step` and `eps` include bias corrections."""
     first, second, keep = float32(0.1), float32(0.001), float32(0.999)
@@ -352,7 +353,7 @@ def _adam(parameters, gradient, mean, square, scale, step, eps):
         parameters[j] -= step * m / (np.sqrt(v) + eps)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def adam(parameters, gradients, means, squares, counts, is_active, rates, max_norms, eps):
     """One step of Adam (betas 0.9 and 0.999) for the active runs, by gradients clipped to a norm.
 
@@ -368,7 +369,7 @@ def adam(parameters, gradients, means, squares, counts, is_active, rates, max_no
             _adam(parameters[i], gradients[i], means[i], squares[i], scale, step, float32(eps * root))
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def linear_row(parameters, weight, bias, x, is_relu, y):
     """y (W, out) = x (W, in) w + b, at least 0 where `is_relu`; the weights of inputs that are 0 are not read.
 
@@ -390,7 +391,7 @@ def linear_row(parameters, weight, bias, x, is_relu, y):
             y[i, j] = max(total[j], float32(0.0)) if is_relu else total[j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def advantages(rewards, values, begins, last_values, ends, gammas, lambdas, out):
     """out (W, T, E) = generalised advantages of rollouts of T steps.
 
@@ -411,7 +412,7 @@ def advantages(rewards, values, begins, last_values, ends, gammas, lambdas, out)
                 goes_on, next_value = float32(1.0) - begins[i, t, e], values[i, t, e]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shuffle(keys, step, draw, order):
     """order (W, M) = a random permutation of 0 .. M-1 for each run (Fisher and Yates)."""
     number = order.shape[1]
@@ -423,7 +424,7 @@ def shuffle(keys, step, draw, order):
             order[i, j], order[i, other] = order[i, other], order[i, j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def gather(order, first, sources, targets):
     """targets (W, B) of five arrays = the entries order[:, first : first + B] of sources (W, M).
 
@@ -439,7 +440,7 @@ def gather(order, first, sources, targets):
             targets[4][i, b] = sources[4][i, at]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def normalize(advantages):
     """Normalise advantages (W, B) in place: less the mean of each run, by its standard deviation + 1e-8; B >= 2."""
     number = advantages.shape[1]
@@ -455,7 +456,7 @@ def normalize(advantages):
             advantages[i, b] = (advantages[i, b] - mean) / scale
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def clipped_loss(scores, values, minibatch, clip_ranges, entropy_weights, value_weights, dscores, dvalues, loss, kl):
     """The loss of PPO (W,), its gradients, and the approximate divergence from the old policy (W,).
 

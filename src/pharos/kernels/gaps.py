@@ -10,9 +10,9 @@ is none), of the reward and the value that follow, and of those of the previous 
 import math
 
 import numpy as np
-from numba import njit
 
 from pharos.kernels.interpreted import interpreted_first
+from pharos.kernels.kernel_cache import kernel
 
 # Bin b of a histogram holds 10^((b - BIN_OF_ONE) / 4) <= gap < 10^((b + 1 - BIN_OF_ONE) / 4), for all floats.
 BIN_OF_ONE = 1300
@@ -40,7 +40,7 @@ def empty_histogram() -> np.ndarray:
 
 
 @interpreted_first()
-@njit(cache=True, nogil=True)
+@kernel
 def differences(rewards, next_values, gamma):
     """(N, A) gaps: the largest r + gamma x of a row, less each; rewards r, next_values x (N, A)."""
     num_states, num_actions = rewards.shape
@@ -56,7 +56,7 @@ def differences(rewards, next_values, gamma):
 
 
 @interpreted_first("gap")
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def add_up(gap, weight, counted, minimal, tolerance, error, regularizer, sums, counts, histogram):
     """Add the gaps of a block to sums, counts and histogram; returns the smallest gap above the tolerance so far.
 
@@ -95,7 +95,7 @@ def add_up(gap, weight, counted, minimal, tolerance, error, regularizer, sums, c
     return minimal
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add(sums, k, value):
     """Add a value to sum k (Kahan's algorithm): its error is two units, however many numbers there are."""
     value -= sums[1, k]
@@ -111,7 +111,7 @@ FREE = -1  # the bits of a NaN, which no value is
 
 
 @interpreted_first("gap")
-@njit(cache=True, nogil=True)
+@kernel
 def extend(values, rewards, next_values, gap, counted, begin, places, filled):
     """Map values[i, b] to (rewards, next_values) of the best actions; where there are several b, also to those of b.
 
@@ -149,7 +149,7 @@ def extend(values, rewards, next_values, gap, counted, begin, places, filled):
 
 
 @interpreted_first()
-@njit(cache=True, nogil=True)
+@kernel
 def refill(old_places, places):
     """Copy a map into a larger one."""
     for i in range(len(old_places)):
@@ -159,7 +159,7 @@ def refill(old_places, places):
                 places[place, k] = old_places[i, k]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _put(key, reward, next_value, other_reward, other_next_value, places):
     """Enter a key with its row; returns 1 where the key is new, 0 where it has this row, -1 where it has another."""
     place = _place(key, places)
@@ -176,7 +176,7 @@ def _put(key, reward, next_value, other_reward, other_next_value, places):
     return 1 if is_new else 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _place(key, places):
     """The place of a key in the map, or the free one where it belongs.
 

@@ -18,14 +18,14 @@ Symmetries of a deterministic table are maps of the states onto each other under
 """
 
 import numpy as np
-from numba import njit
 
 from pharos.kernels.interpreted import interpreted_first
+from pharos.kernels.kernel_cache import kernel
 from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 
 
 @interpreted_first()
-@njit(cache=True, nogil=True)
+@kernel
 def search(table, reverse, start, source, distance, queue):
     """distance[v] = steps from `source` to v by the table, or from v to `source` by the reversed graph.
 
@@ -82,7 +82,7 @@ def search(table, reverse, start, source, distance, queue):
 
 
 @interpreted_first()
-@njit(cache=True, nogil=True)
+@kernel
 def fill_predecessors(next_states, ends, first, previous):
     """previous[first[v] : first[v + 1]] = distinct predecessors of v other than v, by rows that are followed.
 
@@ -102,7 +102,7 @@ def fill_predecessors(next_states, ends, first, previous):
                 first[w] += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def is_new_edge(next_states, u, a):
     """Whether action a leads from u to another node, to which no action before it leads."""
     v = next_states[u, a]
@@ -129,7 +129,7 @@ def reversed_graph(next_states, ends, num_nodes):
 
 
 @interpreted_first()
-@njit(cache=True, nogil=True)
+@kernel
 def bound_eccentricities(from_pivot, to_pivot, out_pivot, in_pivot, out_lower, out_upper, in_lower, in_upper):
     """Tighten the bounds of all eccentricities from a search in both directions from one pivot p.
 
@@ -145,7 +145,7 @@ def bound_eccentricities(from_pivot, to_pivot, out_pivot, in_pivot, out_lower, o
 
 
 @interpreted_first()
-@njit(cache=True, nogil=True)
+@kernel
 def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
     """Summary of the nodes whose eccentricity may exceed `best`: how many are open, and where to search next.
 
@@ -183,7 +183,7 @@ def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
 
 
 @interpreted_first("n")
-@njit(cache=True, nogil=True)
+@kernel
 def onwards(transitions, nodes, n, next_nodes, is_visited):
     """States that nodes[:n] lead to and that were not visited before; returns how many.
 
@@ -204,7 +204,7 @@ def onwards(transitions, nodes, n, next_nodes, is_visited):
 # Distance sweeps ------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lower_backward(next_states, ends, start, distance, far, first, stop):
     """distance[u] = min(distance[u], 1 + the least distance of its successors), for rows [first, stop), last one first.
 
@@ -229,7 +229,7 @@ def lower_backward(next_states, ends, start, distance, far, first, stop):
     return lowered
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lower_forward(next_states, ends, start, distance, far, first, stop):
     """distance[v] = min(distance[v], distance[u] + 1) for the successors v of rows u in [first, stop), first one first.
 
@@ -252,7 +252,7 @@ def lower_forward(next_states, ends, start, distance, far, first, stop):
     return lowered
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def summary(distance, far):
     """(nodes found, largest distance among them, sum of their distances)."""
     reach, largest, total = 0, 0, 0
@@ -269,7 +269,7 @@ def summary(distance, far):
 
 
 @interpreted_first()
-@njit(cache=True, nogil=True)
+@kernel
 def period(next_states, ends, start, level, has_end):
     """Greatest common divisor of level(u) + 1 - level(v) over all edges (u, v), that is, of the lengths of all cycles.
 
@@ -295,7 +295,7 @@ def period(next_states, ends, start, level, has_end):
     return abs(divisor)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def last_gap(next_states, ends, start, order, layer_first, position, current, coming, max_reads):
     """Largest k such that some node does not yet reach its whole layer in exactly k steps.
 
@@ -364,7 +364,7 @@ def last_gap(next_states, ends, start, order, layer_first, position, current, co
     return gap, reads
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def search_in_step(
     next_states, ends, order, layer_first, position, targets, layer, offset, away, home, best, scratch, visits, largest
 ):
@@ -431,7 +431,7 @@ def search_in_step(
     return reads
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gcd(a, b):
     """Greatest common divisor, but for its sign."""
     while b:
@@ -443,7 +443,7 @@ def _gcd(a, b):
 
 
 @interpreted_first("queue")
-@njit(cache=True, nogil=True)
+@kernel
 def symmetry(next_states, ends, start, s, t, image, preimage, queue):
     """Find the map f with f(s) = t and f(next_states[u, a]) = next_states[f(u), a]; there is at most one.
 
@@ -481,7 +481,7 @@ def symmetry(next_states, ends, start, s, t, image, preimage, queue):
 
 
 @interpreted_first("steps")
-@njit(cache=True, nogil=True)
+@kernel
 def forget(image, preimage, queue, steps):
     """Set image and preimage back to zero where `symmetry` wrote."""
     for i in range(steps):
@@ -489,7 +489,7 @@ def forget(image, preimage, queue, steps):
         image[queue[i]] = 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def join(orbit, image):
     """Unite the orbits of u and its image, for every u, by union-find; returns how many orbits there are.
 

@@ -31,6 +31,7 @@ from numba import int64, njit, types, uint64
 from numba.core import cgutils
 
 from pharos.kernels.interpreted import in_python, interpreted_first
+from pharos.kernels.kernel_cache import kernel
 
 intrinsic: Any = numba.extending.intrinsic  # whose types would hide those of the functions that it makes
 _BATCH = 32  # states whose slots are fetched from memory at the same time
@@ -117,7 +118,7 @@ def hash_of_row(states, i):
 
 
 @interpreted_first("count")
-@njit(cache=True, nogil=True)
+@kernel
 def fill(table, states, count):
     """Put states [0, count), all different, into an empty table (every slot -1)."""
     capacity = table.shape[0]
@@ -136,7 +137,7 @@ def fill(table, states, count):
             table[slot] = first + i
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_range(table, states, count, low, high, left_over):
     """Put the states whose slots are in [low, high) into a table: threads fill disjoint ranges of one table.
 
@@ -174,7 +175,7 @@ def fill_range(table, states, count, low, high, left_over):
     return over
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_more(table, states, indices):
     """Put states[indices] into a table, none of which is there yet."""
     capacity = table.shape[0]
@@ -186,7 +187,7 @@ def fill_more(table, states, indices):
 
 
 @interpreted_first("keys")
-@njit(cache=True, nogil=True)
+@kernel
 def find(table, states, keys, out):
     """out[j] = index of keys[j] among the states, or -1. keys (N, W) uint64."""
     capacity = table.shape[0]
@@ -207,7 +208,7 @@ def find(table, states, keys, out):
 
 
 @interpreted_first("keys")
-@njit(cache=True, nogil=True)
+@kernel
 def slots_of(keys, capacity, out):
     """out[j] = the slot in a table of `capacity` slots from which to search for keys[j]."""
     for j in range(len(keys)):
@@ -215,7 +216,7 @@ def slots_of(keys, capacity, out):
 
 
 @interpreted_first("keys")
-@njit(cache=True, nogil=True)
+@kernel
 def insert_missing(table, states, keys, indices, successors, progress):
     """Number the successors that threads did not find, in order: the serial half of expanding a wide frontier.
 
@@ -271,7 +272,7 @@ _AHEAD = 16
 _OWNER_BITS = 24  # the lowest of a hash, which the slots of tables below 2^32 of them do not depend on
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def route(keys, indices, size, order, counts):
     """Sort candidates by their owners.
 
@@ -297,7 +298,7 @@ def route(keys, indices, size, order, counts):
             place[owners[j]] += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def claim(table, keys, numbers, count, candidates, places, entries):
     """Find the entry of each candidate that this owner is asked for, and make one for each that is new.
 
@@ -368,7 +369,7 @@ def _enter(entries, slot, keys, j, entry):
     entries[slot, words] = entry
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sort_by_bucket(indices, first, order):
     """Fill order (M,) with the candidates to look up, sorted by bucket; returns their number.
 
@@ -402,7 +403,7 @@ def sort_by_bucket(indices, first, order):
     return size
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def look_up(entries, keys, order, low, high, indices, slots):
     """Look up candidates order[low:high], entering those that are new.
 
@@ -427,7 +428,7 @@ def look_up(entries, keys, order, low, high, indices, slots):
             indices[j] = int64(entry) - 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def number(keys, indices, successors, states, appended, progress):
     """Number new states in the order of candidates, and write them to states[count - appended :].
 
@@ -455,7 +456,7 @@ def number(keys, indices, successors, states, appended, progress):
     progress[FIRST], progress[COUNT], progress[LEVEL_END], progress[DEPTH] = first + rows, count, level_end, depth
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def assign_numbers(entries, order, low, high, indices, slots):
     """Replace the provisional entries of new candidates order[low:high] by their numbers."""
     words = entries.shape[1] - 1
@@ -465,7 +466,7 @@ def assign_numbers(entries, order, low, high, indices, slots):
             entries[slots[j], words] = uint64(indices[j] + 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def place(entries, keys, order, low, high, first):
     """Put states order[low:high] of keys, not there yet, into the table; state j has index first + j."""
     for p in range(low, high):
@@ -474,7 +475,7 @@ def place(entries, keys, order, low, high, first):
         _enter(entries, slot, keys, j, uint64(first + j + 1))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def place_from_memory(entries, table, states, low, high):
     """Copy the states in slots [low, high) of a table in memory into an empty table on disk."""
     for i in range(low, high):
@@ -486,7 +487,7 @@ def place_from_memory(entries, table, states, low, high):
             _enter(entries, slot, states, index, uint64(index + 1))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def place_again(entries, old, low, high):
     """Copy the entries in slots [low, high) of an old table into a larger one."""
     words = old.shape[1] - 1
@@ -501,7 +502,7 @@ def place_again(entries, old, low, high):
 
 
 @interpreted_first("states")
-@njit(cache=True, nogil=True)
+@kernel
 def pack_rows(word, shift, low, states, packed):
     """packed (N, W) uint64 |= states (N, D) int64, component i in bits from shift[i] of word[i].
 
@@ -513,7 +514,7 @@ def pack_rows(word, shift, low, states, packed):
 
 
 @interpreted_first("states")
-@njit(cache=True, nogil=True)
+@kernel
 def unpack_rows(word, shift, mask, low, packed, states):
     """states (N, D) int64 = components of packed (N, W); the inverse of `pack_rows`."""
     for n in range(len(packed)):

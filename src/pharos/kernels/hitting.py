@@ -15,13 +15,14 @@ action[i].
 import heapq
 
 import numpy as np
-from numba import njit
+
+from pharos.kernels.kernel_cache import kernel
 
 # Half the distance from 1 to the next float: the relative rounding error of one operation.
 UNIT = 2.0**-53
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def backward_order(first, previous, goal, order, distance):
     """Order nodes by their distance to the goal, by a search on the reversed graph; returns how many reach it.
 
@@ -48,7 +49,7 @@ def backward_order(first, previous, goal, order, distance):
     return tail
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sweep_in_place(rows, common, shares_rows, goal, order, count, j, mode):
     """One sweep of j(n) = 1 + min_a sum p j, in place in the order given; j is 0 at the goal.
 
@@ -107,7 +108,7 @@ def sweep_in_place(rows, common, shares_rows, goal, order, count, j, mode):
     return change, ff, fg, gg
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def residuals(rows, common, shares_rows, goal, order, count, high, low, policy, residual, error):
     """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; T is one Bellman step.
 
@@ -171,7 +172,7 @@ def residuals(rows, common, shares_rows, goal, order, count, high, low, policy, 
     return above, below, largest
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def operations(num_actions, terms):
     """Units in the last place by which a sum of `terms` products may be off, relative to the sum of their sizes.
 
@@ -181,7 +182,7 @@ def operations(num_actions, terms):
     return terms + num_actions + 24
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _difference(high, low, m, value, correction):
     """(high[m] + low[m]) - (value + correction), to a unit of the difference; high[m] - value where low is None.
 
@@ -195,7 +196,7 @@ def _difference(high, low, m, value, correction):
     return total + (rounding + (low[m] - correction))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def almost_surely(first, node, num_actions, goal, sure, attractor):
     """sure[n] = whether some policy leads from n to the goal with probability 1.
 
@@ -233,7 +234,7 @@ def almost_surely(first, node, num_actions, goal, sure, attractor):
             return
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def proper_policy(first, node, weight, num_actions, goal, order, count, sure, policy):
     """policy[n] for n in order[:count]: an action that may lead nearer to the goal and never out of these nodes.
 
@@ -279,7 +280,7 @@ ROUNDING = 1e-12
 EPSILON = 2.0**-52
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _execution(executed, choice, previous, weights):
     """Probability that the action `executed` is executed where `choice` is chosen.
 
@@ -293,7 +294,7 @@ def _execution(executed, choice, previous, weights):
     return uniform + (now if executed == choice else 0.0) + (before if executed == previous else 0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def outcomes_into(node, num_nodes):
     """(first, outcome): outcomes that lead to node n are outcome[first[n]:first[n + 1]]; a counting sort."""
     first = np.zeros(num_nodes + 2, np.int64)
@@ -308,7 +309,7 @@ def outcomes_into(node, num_nodes):
     return first[:-1], outcome
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
     """Search backward from y, along outcomes: the nodes by their distance to y, at most `ball`, are queue[:result].
 
@@ -335,7 +336,7 @@ def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
     return tail
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball, levels, queue, via):
     """Shortest ways back to node[i], for outcomes i into nodes low..high, from the other outcomes of its state.
 
@@ -368,7 +369,7 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
             levels[queue[k]] = 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, length):
     """Drop the longest ways back until the expected steps on the way back are at most `limit`, for every outcome.
 
@@ -408,7 +409,7 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
     return largest
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def attempt(
     begin, end, outcomes, owner, weights, num_previous, square, steps, start, way, constant, times, value, new, once
 ):
@@ -456,7 +457,7 @@ def attempt(
     return increase
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def times_from(hub, first, node, cost, leak):
     """(N,) least t with t(hub) = 0, t(y) = (t(x) + cost[i]) / (1 - leak[i]) over outcomes i from x to y (Dijkstra).
 
@@ -499,7 +500,7 @@ GAIN = 1e-3
 UPDATES = 1 + 1e-9
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scratch):
     """new[z] for z in targets[begin:end]: the least of bound[z] and (bound[x] + c(x)) / (1 - l(x)) over x around z.
 
@@ -578,7 +579,7 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
             place[pushed[i, 0]] = 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _around(z, owner, into, steps, place, scratch):
     """Collect nodes on the way to z, those on short ways from the hub first; returns (size, count of `pushed`).
 

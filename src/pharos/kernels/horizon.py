@@ -10,10 +10,12 @@ lower[i, a] = sum over parts of 1/100 prod over b != a of P(mean b < low), upper
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from pharos.kernels.kernel_cache import kernel
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def values(next_states, rewards, tie, best, worst, explored, best_now, worst_now, explored_now, optimal, variance):
     """One step backwards: the values of optimal, worst and uniform play, and two inputs of the simple bound.
 
@@ -47,7 +49,7 @@ def values(next_states, rewards, tie, best, worst, explored, best_now, worst_now
         variance[s] = spread
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def lookahead(next_states, rewards, gamma, after, now):
     """now (S,) = max over a of r(s, a) + gamma after(next state)."""
     for s in prange(len(next_states)):
@@ -58,7 +60,7 @@ def lookahead(next_states, rewards, gamma, after, now):
         now[s] = high
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def largest(next_states, after, now):
     """now (S,) = max over a of after(next state), at least 0."""
     for s in prange(len(next_states)):
@@ -70,7 +72,7 @@ def largest(next_states, after, now):
         now[s] = high
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def greedy_return(next_states, rewards, after, policy_value, now):
     """now (S,) = min over the actions greedy in r + after(next state) of r + policy_value(next state)."""
     for s in prange(len(next_states)):
@@ -85,7 +87,7 @@ def greedy_return(next_states, rewards, after, policy_value, now):
         now[s] = low
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def step_along(next_states, rewards, after, optimal, variance, log, near, nodes, n, next_nodes, is_visited, hardest):
     """Go one step on from nodes[:n] along greedy actions (`near` False), or all that are better than any not optimal.
 
@@ -137,7 +139,7 @@ def step_along(next_states, rewards, after, optimal, variance, log, near, nodes,
 PARTS = 100
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _below(distance, m, width, variance):
     """Upper bound on P(mean <= expectation - distance) (Bernstein's inequality)."""
     if distance <= 0:
@@ -147,7 +149,7 @@ def _below(distance, m, width, variance):
     return math.exp(-(distance**2) * m / 2 / (variance + width * distance / 3))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _quantile(probability, m, width, variance):
     """The distance beyond which Bernstein's inequality leaves no more than this probability."""
     if width == 0 or variance == 0:
@@ -158,7 +160,7 @@ def _quantile(probability, m, width, variance):
     return (width * bits / m + math.sqrt(18 * variance / m * bits + (width * bits / m) ** 2)) / 3
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def bernstein(means, widths, m, lower, upper):
     """Tail bounds for means of samples in intervals of length `widths` (N, n); writes lower and upper (N, n).
 

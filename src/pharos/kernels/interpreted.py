@@ -5,7 +5,6 @@ compiled, Python runs its text, and that of the functions it calls: the same ope
 bits. (NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64; few entries do not come that far.)
 """
 
-import os
 from collections.abc import Callable
 from functools import cache
 from types import FunctionType
@@ -16,6 +15,7 @@ import numba.extending
 import numpy as np
 from numba.core.registry import CPUDispatcher
 
+from pharos.kernels.kernel_cache import is_on_disk
 from pharos.system import compiling
 
 LOADING = 4
@@ -68,7 +68,7 @@ def interpreted_first(*counted: str) -> Callable:
             nonlocal count
             read = [arguments[i] for i in places] or [each for each in arguments if not isinstance(each, int)]
             count += sum(map(_entries, read))
-            is_small = count < compiling.SMALL // LOADING or (count < compiling.SMALL and not _is_kept(kernel))
+            is_small = count < compiling.SMALL // LOADING or (count < compiling.SMALL and not is_on_disk(kernel))
             return quiet if is_small else compiled(*arguments)
 
         def quiet(*arguments: object) -> object:
@@ -79,12 +79,6 @@ def interpreted_first(*counted: str) -> Callable:
         return kernel
 
     return decorate
-
-
-def _is_kept(kernel: CPUDispatcher) -> bool:
-    """Whether Numba has files of the compiled kernel."""
-    file = getattr(kernel._cache, "_cache_file", None)
-    return file is not None and os.path.exists(file._index_path)
 
 
 def _as_python(result: object) -> object:
@@ -110,13 +104,17 @@ def interpreted(called: Callable) -> Callable:
 
 
 def _in_python(function: FunctionType) -> Callable:
-    """The function with all kernels, overloads and intrinsics that it calls replaced by Python functions."""
+    """The function with all kernels, overloads and intrinsics that it calls replaced by Python functions.
+
+    Numbers of Numba's types are made by NumPy's, which Numba does as well, by some detours.
+    """
     names = {name: function.__globals__.get(name) for name in function.__code__.co_names}
     called = {
         name: interpreted(value)
         for name, value in names.items()
         if callable(value) and (isinstance(value, CPUDispatcher) or value in _overloads or value in _intrinsics)
     }
+    called |= {name: getattr(np, str(value)) for name, value in names.items() if isinstance(value, numba.types.Number)}
     text = (function.__code__, {**function.__globals__, **called}, function.__name__, function.__defaults__)
     return FunctionType(*text, function.__closure__)
 

@@ -8,10 +8,11 @@ with a symmetric matrix read its lower half alone: they are as fast as memory is
 """
 
 import numpy as np
-from numba import njit
+
+from pharos.kernels.kernel_cache import kernel
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def products(a, b):
     """(a . b, b . b), in one pass."""
     ab, bb = 0.0, 0.0
@@ -21,21 +22,21 @@ def products(a, b):
     return ab, bb
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shift(y, constant, out):
     """out = y + constant."""
     for i in range(len(y)):
         out[i] = y[i] + constant
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def subtract_from(y, out):
     """out = y - out."""
     for i in range(len(y)):
         out[i] = y[i] - out[i]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def advance(x, factor, y):
     """x += factor y, in place; returns the sum of x."""
     total = 0.0
@@ -45,7 +46,7 @@ def advance(x, factor, y):
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def turn(direction, beta, omega, moved, residual):
     """direction = residual + beta (direction - omega moved), in place; returns its sum."""
     total = 0.0
@@ -58,7 +59,7 @@ def turn(direction, beta, omega, moved, residual):
 # Elimination ----------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def entries_of_factor(first, columns, limit):
     """(N,) entries below the diagonal in each column of the factor of a matrix whose pattern is symmetric.
 
@@ -95,7 +96,7 @@ def entries_of_factor(first, columns, limit):
 ROWS = 256  # sums over so many rows are float32, sums of these float64
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+@kernel(fastmath={"reassoc", "contract", "nsz"})
 def project(features, z, out):
     """out (A, M) float64 = (F' z)', z (C, A) float32."""
     part = np.zeros(out.shape, np.float32)
@@ -111,7 +112,7 @@ def project(features, z, out):
         out += part
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+@kernel(fastmath={"reassoc", "contract", "nsz"})
 def step(features, diagonal, weights, rate, projected, now, past, out):
     """One term of a Chebyshev series: past = 2 now - 4 rate K (weights now) - past, in place.
 
@@ -140,7 +141,7 @@ def step(features, diagonal, weights, rate, projected, now, past, out):
 # Symmetric ------------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+@kernel(fastmath={"reassoc", "contract", "nsz"})
 def product(matrix, z, out):
     """out (A, C) = z matrix, of a symmetric matrix (C, C) float32 and z (A, C), with float64 sums; the upper half of
     the matrix is not read. z, out: float64. Two rows of the matrix go over z at once."""

@@ -5,12 +5,12 @@ start from 512 nodes at once, in graphs whose levels are few and wide.
 """
 
 import numpy as np
-from numba import njit
 
 from pharos.kernels.graph import is_new_edge
+from pharos.kernels.kernel_cache import kernel
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def search_from_many(table, reverse, start, sources, origins, front, coming, queue, other, largest):
     """Search from up to 64 W sources at once, along the edges or against them.
 
@@ -66,7 +66,7 @@ def search_from_many(table, reverse, start, sources, origins, front, coming, que
     return pairs, reads
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _push(u, v, origins, front, coming, other, size):
     """Pass the bits of u that v lacks on to v; v joins the next level, of `size` nodes, once. Returns its size."""
     waiting, adds = np.uint64(0), np.uint64(0)
@@ -81,7 +81,7 @@ def _push(u, v, origins, front, coming, other, size):
     return size
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _settle(queue, count, other, size, origins, front, coming, level, largest, width):
     """Make the next level the current one; record it as the eccentricity of every source that reached something.
 
@@ -108,7 +108,7 @@ def _settle(queue, count, other, size, origins, front, coming, level, largest, w
     return pairs
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _ones(x):
     """Number of bits of a word x that are 1."""
     x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
@@ -123,7 +123,7 @@ def _ones(x):
 WORDS = 8  # of 64 sources: a cache line
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def dense_search_backward(next_states, ends, start, sources, origins, front, coming, active, arriving, largest):
     """largest[i] = the largest distance to sources[i] of a node that leads there; at most 512 sources, a bit for each.
 
@@ -190,7 +190,7 @@ def dense_search_backward(next_states, ends, start, sources, origins, front, com
     return reads
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def spread_out(next_states, ends, order, blocked, limit):
     """The first nodes of `order`, at most `limit`, none of them a successor of one before; blocked (N,) bool, zero."""
     selection = np.empty(limit, order.dtype)
@@ -211,7 +211,7 @@ def spread_out(next_states, ends, order, blocked, limit):
     return selection[:count]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def num_successors(next_states, ends, num_nodes):
     """(N,) uint8: how many different nodes other than itself each node leads to, at most 255."""
     num_states, num_actions = next_states.shape
@@ -226,7 +226,7 @@ def num_successors(next_states, ends, num_nodes):
     return counts
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lower_along_edges(next_states, ends, start, in_upper, out_upper):
     """One pass of in(v) <= 1 + in(u) and out(u) <= 1 + out(v) over the edges (u, v); whether a bound got lower."""
     num_states, num_actions = next_states.shape
@@ -246,7 +246,7 @@ def lower_along_edges(next_states, ends, start, in_upper, out_upper):
     return lowered
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _successor(next_states, start, v, a, is_end):
     """The node that v leads to by a: `start`, or -1, where v is an end; node S where a ends the episode."""
     if is_end:

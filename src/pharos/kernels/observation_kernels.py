@@ -9,10 +9,11 @@ series in the correlation, made of Hermite coefficients (Daniely, Frostig and Si
 import math
 
 import numpy as np
-from numba import njit
+
+from pharos.kernels.kernel_cache import kernel
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def normalize(states, low, scale, out):
     """out[n, i] = (states[n, i] - low[i]) * scale[i] for the first D columns of out (N, D or more) float32."""
     for n in range(states.shape[0]):
@@ -20,7 +21,7 @@ def normalize(states, low, scale, out):
             out[n, i] = (states[n, i] - low[i]) * scale[i]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mark_components(states, low, offset, out):
     """out[n, offset[i] + states[n, i] - low[i]] = 1 for every component i."""
     for n in range(states.shape[0]):
@@ -28,7 +29,7 @@ def mark_components(states, low, offset, out):
             out[n, offset[i] + states[n, i] - low[i]] = 1
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _mixed(word):
     """Mix the bits of a word by the finalizer of SplitMix64 (Steele, Lea and Flood, 2014)."""
     word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -36,7 +37,7 @@ def _mixed(word):
     return word ^ (word >> np.uint64(31))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def scramble(states, low, lengths, keys, out):
     """out (N, B), zeros: the components of each state in binary, permuted by a Feistel network of len(keys) rounds."""
     one, step = np.uint64(1), np.uint64(0x9E3779B97F4A7C15)
@@ -71,7 +72,7 @@ def scramble(states, low, lengths, keys, out):
 RELU, TANH = 0, 1
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _relu(q, scale):
     """(E[f(u) f(v)], E[f'(u) f'(v)]) of a centred Gaussian pair of covariance q; scale: product of the deviations."""
     if scale <= 0.0:
@@ -81,7 +82,7 @@ def _relu(q, scale):
     return scale * (math.sqrt(1.0 - cosine * cosine) + angle * cosine) / (2 * math.pi), angle / (2 * math.pi)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _series(q, scale, a, b):
     """(E[f(u) f(v)], E[f'(u) f'(v)]) of an odd function, by its Hermite coefficients a, b (M,) of degree 1, 3, 5, ...
 
@@ -97,7 +98,7 @@ def _series(q, scale, a, b):
     return value, slope / scale if scale > 0.0 else a[0] * b[0]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def dense(q, theta, variances_x, variances_y, kinds, coefficients_x, coefficients_y, widths, weights, biases, out):
     """out (I, J) float32 = the tangent kernel of the output of dense layers, the last of them linear.
 
@@ -122,7 +123,7 @@ def dense(q, theta, variances_x, variances_y, kinds, coefficients_x, coefficient
             out[i, j] = tangent
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def patches(gram, codes_x, codes_y, variance_x, variance_y, weight, bias, value, slope):
     """One position of a first convolution with ReLUs: value (I, J) = E[f f], slope (I, J) = E[f' f'] (gram + 1).
 
@@ -144,7 +145,7 @@ def patches(gram, codes_x, codes_y, variance_x, variance_y, weight, bias, value,
             slope[i, j] = slopes[codes_x[i], codes_y[j]]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def gathered(value, slope, taps, filters, weight, bias, q, theta):
     """q, theta (I, J) of a unit that sees some positions of a convolution of `filters` filters: value, slope (P, I, J).
 
@@ -165,7 +166,7 @@ def gathered(value, slope, taps, filters, weight, bias, q, theta):
             q[i, j] = weight * inner + bias
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rectified(q, theta, variance_x, variance_y, value, slope):
     """value (I, J) = E[f f], slope (I, J) = E[f' f'] theta of ReLUs at covariance q (I, J)."""
     for i in range(q.shape[0]):
@@ -175,7 +176,7 @@ def rectified(q, theta, variance_x, variance_y, value, slope):
             slope[i, j] = derivative * theta[i, j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mirrored(square):
     """Copy the upper triangle of square (N, N) to the lower one."""
     for i in range(square.shape[0]):

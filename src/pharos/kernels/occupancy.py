@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from pharos.kernels.interpreted import interpreted_first
+from pharos.kernels.kernel_cache import kernel
 from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 
 
@@ -44,7 +45,7 @@ def _execute(policy, weights, now, s, mass, executed):
 
 
 @interpreted_first()
-@njit(cache=True, nogil=True)
+@kernel
 def push(transitions, live, policy, weights, now, after):
     """after = the distribution one step later, without mass that has ended; returns the mass of live states."""
     num_states, num_actions = size_of(transitions)
@@ -74,7 +75,7 @@ def push(transitions, live, policy, weights, now, after):
 
 
 @interpreted_first()
-@njit(cache=True, nogil=True)
+@kernel
 def count_visits(transitions, live, policy, weights, gamma, least, waiting, visits):
     """Count the mass that waits in each state as a visit, and move it on; from the first state to the last, in place.
 
@@ -107,7 +108,7 @@ def count_visits(transitions, live, policy, weights, gamma, least, waiting, visi
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def support(transitions, live, policy, weights, reachable):
     """Add to `reachable` (S, W), 1 or 0, all pairs that episodes from its pairs may come to under the policy."""
     num_actions = size_of(transitions)[1]
@@ -140,7 +141,7 @@ def support(transitions, live, policy, weights, reachable):
         alone[s, b] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def record(live, policy, weights, now, scale, total, largest):
     """total[s, a] += scale p, largest[s, a] = max(largest[s, a], p), p the probability of s and a by `weights`."""
     executed = np.empty(total.shape[1])

@@ -41,6 +41,7 @@ from numba.extending import (
 
 from pharos.kernels.hash_table import mixed, prefetch, slot_of
 from pharos.kernels.interpreted import interpreted_first, overload
+from pharos.kernels.kernel_cache import kernel
 from pharos.system.arrays import PACKED, PackedIndices
 
 # Indices of 40 bits ---------------------------------------------------------------------------------------------------
@@ -108,11 +109,19 @@ PackedIndices._numba_type_ = property(_type_of)  # type: ignore[attr-defined]
 
 
 UNROLLED = 4  # the largest K for which loops over outcomes are unrolled
+UNROLLED_FROM = 100_000
+"""States from which sweeps are compiled for each number of actions and outcomes; fewer are swept sooner than that."""
 
 
-def each_of(num_outcomes):
-    """The last entry of `transitions`, for sweeps: a tuple of K zeros where K is small, else K."""
-    return (0,) * num_outcomes if num_outcomes <= UNROLLED else num_outcomes
+def is_unrolled(num_states):
+    """Whether sweeps over so many states are compiled for their very numbers of actions and outcomes, and kinds of
+    rewards; else one compiled form serves all."""
+    return num_states >= UNROLLED_FROM
+
+
+def each_of(num_outcomes, num_states):
+    """The last entry of `transitions`, for sweeps: a tuple of K zeros if K is small and states are many, else K."""
+    return (0,) * num_outcomes if num_outcomes <= UNROLLED and is_unrolled(num_states) else num_outcomes
 
 
 def _is_lazy(transitions):
@@ -252,7 +261,7 @@ def fetch_values(transitions, v, actions, s):
     """Ask the processor to fetch the entries of v that `expectation` reads for state s; actions: see bellman.py."""
 
 
-@overload(fetch_values)
+@overload(fetch_values, jit_options={"forceinline": True})
 def _fetch_values(transitions, v, actions, s):
     if not is_table(transitions):
         return lambda transitions, v, actions, s: None
@@ -265,7 +274,7 @@ def _fetch_values(transitions, v, actions, s):
 
 
 @interpreted_first("states")
-@njit(cache=True, nogil=True)
+@kernel
 def expected(transitions, x, states, out):
     """out[i, a] = the mean of x (S + 1, W, M) over what (states[i], a) leads to; W = A by executed action, or 1.
 
@@ -282,7 +291,7 @@ def expected(transitions, x, states, out):
                         out[i, a, m] += p * x[t, a if by_action else 0, m]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def entries(transitions, states, actions, index, next_states, probabilities):
     """The possible outcomes of (states[i], actions[i]), in order; returns how many there are.
 
@@ -299,7 +308,7 @@ def entries(transitions, states, actions, index, next_states, probabilities):
 
 
 @interpreted_first()
-@njit(cache=True, nogil=True)
+@kernel
 def push_forward(transitions, mass, out):
     """out (S, W) += the mass (S, A) of executed actions, moved to their next states; mass that ends is left out."""
     by_action = out.shape[1] > 1
@@ -313,7 +322,7 @@ def push_forward(transitions, mass, out):
 
 
 @interpreted_first("states")
-@njit(cache=True, nogil=True)
+@kernel
 def largest(transitions, x, states, sign, out):
     """out[i, a] = the largest (sign 1) or smallest (-1) of x (S + 1,) over what (states[i], a) may lead to."""
     for i in range(len(states)):
@@ -325,7 +334,7 @@ def largest(transitions, x, states, sign, out):
 
 
 @interpreted_first("states")
-@njit(cache=True, nogil=True)
+@kernel
 def mark_arrivals(transitions, states, out):
     """out[t, a] = True where executing a in one of `states` may lead to t."""
     for s in states:
@@ -360,7 +369,7 @@ def _drawn_outcome(transitions, s, a, u):
     return several
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def drawn(transitions, s, a, u):
     """The next state of (s, a), -1 for the end, drawn by u in [0, 1); probabilities need not sum to 1."""
     total = 0.0
@@ -369,7 +378,7 @@ def drawn(transitions, s, a, u):
     return np.int64(outcome(transitions, s, a, drawn_outcome(transitions, s, a, u * total)[0])[0])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def draw(transitions, states, actions, u, out):
     """out[i] = the next state of (states[i], actions[i]) drawn by u[i], as by `drawn`."""
     for i in range(len(states)):
@@ -377,7 +386,7 @@ def draw(transitions, states, actions, u, out):
 
 
 @interpreted_first()
-@njit(cache=True, nogil=True)
+@kernel
 def have_one_outcome(transitions):
     """Whether every (s, a) has one outcome, of probability 1."""
     num_states, num_actions = size_of(transitions)
@@ -396,7 +405,7 @@ def have_one_outcome(transitions):
 _SEED = uint64(0x9E3779B97F4A7C15)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def possible(successors, bits, num_actions, out, out_bits, counts):
     """Write the possible outcomes of some states one after another; returns how many there are, N.
 
@@ -417,7 +426,7 @@ def possible(successors, bits, num_actions, out, out_bits, counts):
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def encode(bits, counts, first_row, first, palette, size, table, codes):
     """codes[r] = the palette's code of row r's probabilities, for the rows from `first_row` on; new ones are entered.
 
@@ -458,7 +467,7 @@ def encode(bits, counts, first_row, first, palette, size, table, codes):
     return row, first, size
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def enter(palette, size, table):
     """Put the first `size` vectors of a palette, all different, into an empty table (every slot -1)."""
     slots = table.shape[0]
@@ -484,7 +493,7 @@ def _is(palette, code, bits, first, n):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def padded(values, counts, fill_with_first, out):
     """out[r] (K,) = the values of row r, then its first value again, or zeros.
 

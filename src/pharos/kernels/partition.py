@@ -13,12 +13,13 @@ O(m log n) time Markov chain lumping".
 """
 
 import numpy as np
-from numba import njit, uint64
+from numba import uint64
 
 from pharos.kernels.hash_table import mixed
+from pharos.kernels.kernel_cache import kernel
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def number_rows(rows, before, slots, numbers):
     """numbers[i] = the same for equal pairs (before[i], rows[i]), counted in the order of appearance; returns how many.
 
@@ -71,7 +72,7 @@ def slots_for(rows):
     return np.full(1 << max(3, (2 * rows - 1).bit_length()), -1, np.int32 if rows < 2**31 else np.int64)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def affected_states(next_states, changed, candidates):
     """candidates[:n] = the states with a next state that changed its class; returns n."""
     n = 0
@@ -85,7 +86,7 @@ def affected_states(next_states, changed, candidates):
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def split(next_states, classes, sizes, count, candidates, n, slots, used, new, changed):
     """Split classes by the classes that the candidates lead to; returns the number of classes.
 
@@ -154,7 +155,7 @@ def split(next_states, classes, sizes, count, candidates, n, slots, used, new, c
 UNITS = 2.0**40
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def predecessors(first, column, num_actions, edges, states):
     """states[edges[t]:edges[t + 1]] = the states that some action may lead to t.
 
@@ -180,7 +181,7 @@ def predecessors(first, column, num_actions, edges, states):
     edges[0] = 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _class_probabilities(matrix, row, classes, mass, keys):
     """mass[c] = the probability of reaching class c, for the c in keys[:result]; mass is 0 before."""
     first, column, weight = matrix
@@ -195,7 +196,7 @@ def _class_probabilities(matrix, row, classes, mass, keys):
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _hash(matrix, num_actions, s, classes, mass, keys):
     """A hash of the rows of s: equal for states with equal rows, in whatever order they name classes."""
     result = uint64(num_actions)
@@ -210,7 +211,7 @@ def _hash(matrix, num_actions, s, classes, mass, keys):
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _have_equal_rows(matrix, num_actions, s, other, classes, mass, keys, mass_of_other, keys_of_other):
     """Whether states s and `other` reach every class with the same probability under each action."""
     for a in range(num_actions):
@@ -229,7 +230,7 @@ def _have_equal_rows(matrix, num_actions, s, other, classes, mass, keys, mass_of
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def refine(matrix, num_actions, into, classes, layout, slots):
     """Split classes (S,), numbered from 0 without gaps, until nothing splits; returns the number of rounds.
 
@@ -276,7 +277,7 @@ def refine(matrix, num_actions, into, classes, layout, slots):
             is_candidate[candidates[i]] = False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _move_to_front(candidates, n, classes, layout, num_candidates, touched):
     """Move the candidates to the front of their class, num_candidates[c] of them; returns how many classes have some.
 
@@ -298,7 +299,7 @@ def _move_to_front(candidates, n, classes, layout, num_candidates, touched):
     return num_touched
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _group_members(matrix, num_actions, c, k, classes, layout, groups, group_sizes, rows):
     """group[j] of the first k members of class c, the candidates, by equal rows; returns how many groups.
 
@@ -334,7 +335,7 @@ def _group_members(matrix, num_actions, c, k, classes, layout, groups, group_siz
     return num_groups
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, number, changed):
     """Lay the groups of class c side by side and renumber all but the largest; returns (classes, renumbered states).
 
@@ -370,7 +371,7 @@ def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, num
     return count, changed
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _lay_out(classes, layout):
     """Lay the members of each class side by side; returns the number of classes.
 

@@ -13,7 +13,9 @@ Cost: with G groups at all pixels together 3 * 16 G outputs multiplications, in 
 """
 
 import numpy as np
-from numba import float32, njit, uint64
+from numba import float32, uint64
+
+from pharos.kernels.kernel_cache import kernel
 
 FILTERS = 16
 COLOURS = 127  # that fit into seven bits, beside what is outside
@@ -21,7 +23,7 @@ RECENT = 1024  # places for patches that have been convolved
 SCATTER = 0x9E3779B97F4A7C15
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_alike(one, pixel, other, at, channels, pixels):
     """Whether a pixel of one picture has the colour of one of another; pictures (C pixels,)."""
     for c in range(channels):
@@ -30,7 +32,7 @@ def _is_alike(one, pixel, other, at, channels, pixels):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def patch_keys(pictures, shape, keys):
     """keys (pixels, B) int64: equal where patches are; pictures (B, C pixels), shape (C, H, W).
 
@@ -65,7 +67,7 @@ def patch_keys(pictures, shape, keys):
                 keys[y * width + x, b] = rows[y, x] | rows[y + 1, x] << 21 | rows[y + 2, x] << 42
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _grouped(keys, members, samples, slots):
     """Put B pictures into groups by their keys (B,) at a pixel; return the number of groups.
 
@@ -88,7 +90,7 @@ def _grouped(keys, members, samples, slots):
     return count
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def _convolve(picture, neighbours, kernel, bias, hidden):
     """hidden (16,) = max(0, patch K + k); neighbours (9 C,): of a pixel in the picture, beyond its end where none."""
     for f in range(FILTERS):
@@ -103,7 +105,7 @@ def _convolve(picture, neighbours, kernel, bias, hidden):
         hidden[f] = max(hidden[f], float32(0.0))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _live(values, at):
     """Write to `at` where values (n,) are not 0; return how many there are."""
     count = 0
@@ -113,7 +115,7 @@ def _live(values, at):
     return count
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def _combine(factors, rows, at, count, out):
     """out (outputs,) = the sum of factors times rows (n, outputs) over the `count` first places `at`."""
     out[:] = 0.0
@@ -129,7 +131,7 @@ def _combine(factors, rows, at, count, out):
             out[j] += factor * row[j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _spread(products, members, total):
     """Add products (G, outputs) of groups to total (B, outputs) of their members (B,)."""
     for b in range(len(members)):
@@ -138,7 +140,7 @@ def _spread(products, members, total):
             target[j] += row[j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _collected(dy, members, dz):
     """dz (G, outputs) = the sum of dy (B, outputs) over the members of each group."""
     dz[:] = 0.0
@@ -148,7 +150,7 @@ def _collected(dy, members, dz):
             target[j] += row[j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _parts(row, offsets, neighbours, pixels, outputs):
     """Kernel (9 C, 16), its bias (16,), weight (16 pixels, outputs) and its bias (outputs,) as views of a row (P,)."""
     kernel = row[offsets[0] : offsets[0] + neighbours * FILTERS].reshape(neighbours, FILTERS)
@@ -156,7 +158,7 @@ def _parts(row, offsets, neighbours, pixels, outputs):
     return kernel, row[offsets[1] : offsets[1] + FILTERS], weight, row[offsets[3] : offsets[3] + outputs]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def forward(parameters, offsets, shape, places, x, y, memory):
     """y (W, B, outputs) = max(0, z) of pictures x, for each row of parameters (W, P).
 
@@ -204,7 +206,7 @@ def forward(parameters, offsets, shape, places, x, y, memory):
                 total[b, j] = max(total[b, j], float32(0.0))
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@kernel(fastmath={"reassoc", "contract"})
 def _dots(rows, vector, at, count, out):
     """out (n,) = rows (n, outputs) times a vector (outputs,) at the `count` first places `at`, elsewhere 0."""
     out[:] = 0.0
@@ -221,7 +223,7 @@ def _dots(rows, vector, at, count, out):
         out[f0], out[f1], out[f2], out[f3] = s0, s1, s2, s3
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def _add_patch(picture, neighbours, dh, of_kernel):
     """Add a patch (9 C,) times dh (16,) to the gradient of the kernel (9 C, 16)."""
     for k in range(len(neighbours)):
@@ -232,7 +234,7 @@ def _add_patch(picture, neighbours, dh, of_kernel):
                 row[f] += value * dh[f]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def backward(parameters, gradients, offsets, shape, places, x, dy, memory):
     """Write the gradients (W, P) of the four parameters; dy (W, B, outputs): of z, before the activation.
 

@@ -16,6 +16,7 @@ from numba import float64, njit, uint64
 from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at
+from pharos.kernels.kernel_cache import kernel
 from pharos.kernels.outcomes import drawn, drawn_outcome, is_table, outcome, size_of
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)  # when an environment that has ended is reset
@@ -87,7 +88,7 @@ def uniform_number(rng, i):
     return float64(z >> uint64(11)) * 2.0**-53
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def next_number(rng):
     """The next number of the only stream of rng (1,)."""
     return uniform_number(rng, 0)
@@ -129,7 +130,7 @@ def delayed_reward(pending, elapsed, earned, is_last):
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def modify_rewards(rng, deviation, pending, elapsed, is_step, ended, rewards):
     """Replace the earned rewards (N,) of environments by the paid ones: late (pending (N, D)), and with noise.
 
@@ -144,7 +145,7 @@ def modify_rewards(rng, deviation, pending, elapsed, is_step, ended, rewards):
                 rewards[i] += deviation * normal_number(rng, i)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def flip_coins(rng, out):
     """out[i, j] = 0 or 1, a fair coin of stream i for each j."""
     for i in range(len(out)):
@@ -212,7 +213,7 @@ def drawn_start(cumulative, rng, i):
     return start_by_number(cumulative, uniform_number(rng, i)) if len(cumulative) > 1 else 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def draw_starts(cumulative, rng, mask, out):
     """out[i] = number of a start state, for every i in `mask`."""
     for i in range(len(out)):
@@ -220,7 +221,7 @@ def draw_starts(cumulative, rng, mask, out):
             out[i] = drawn_start(cumulative, rng, i)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def first_outside(actions, num_actions):
     """The first i whose action is not in [0, num_actions), or -1."""
     for i in range(len(actions)):
@@ -229,7 +230,7 @@ def first_outside(actions, num_actions):
     return -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def execute_choices(policy, places, numbers, chance, table, palette, states, discount, alive, previous, returns):
     """One step of the episodes `alive` (N,): the executed actions become their `previous`, what these pay is added up.
 
@@ -271,7 +272,7 @@ def _outcome_on_table(transitions, rewards, s, a, rng, i):
     return drawn
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def walk_table(transitions, table_rewards, staying, is_terminal, setting, batch, first, last):
     """One step of environments first .. last - 1 on a tabulated state space: `step_many`, with indices for states.
 
@@ -328,7 +329,7 @@ def _next_state_of(transitions, s, a, word):
     return lambda transitions, s, a, word: drawn(transitions, s, a, uniform_number(word, 0))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def q_learning(
     transitions,
     table,
@@ -428,7 +429,7 @@ def q_learning(
             place[0] = -1
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@kernel(fastmath={"reassoc", "contract"})
 def _product(x, y):
     """x . y, summed in the order of the machine's vectors."""
     total = 0.0
@@ -469,7 +470,7 @@ def _add(kernel, learned, c, a, step):
             weights[a, i] += step * features[c, i]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def values(kernel, learned, out):
     """out (C, A) = Q of all observations and actions."""
     for c in range(out.shape[0]):
@@ -477,7 +478,7 @@ def values(kernel, learned, out):
             out[c, a] = _value(kernel, learned, c, a)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def learn(
     outcomes, terminal, group, starts, cumulative, chance, limit, kernel, learned, target, memory, visits, place, word,
     noise, schedule, largest_step, steps,

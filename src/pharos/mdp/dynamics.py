@@ -25,7 +25,7 @@ from pharos.errors import ParameterError
 from pharos.kernels import bellman, graph, occupancy, outcomes
 from pharos.mdp.actions import Chance, Extreme, PolicyTable, Selection, States
 from pharos.mdp.rewards import Rewards
-from pharos.system.arrays import Indices, room_for_indices
+from pharos.system.arrays import Indices, read_only, room_for_indices
 from pharos.system.memory import pieces_from_the_end, rows_with_room
 
 if TYPE_CHECKING:
@@ -142,6 +142,12 @@ class Dynamics(ABC):
         """The argument `transitions` of kernels, see kernels/outcomes.py."""
 
     @property
+    def for_steps(self) -> object:
+        """The argument `transitions` of kernels that play: a table of next states if each execution has one outcome."""
+        table = self.deterministic_table()
+        return self.for_kernels if table is None else read_only(table)
+
+    @property
     def for_sweeps(self) -> object:
         """The argument `transitions` of sweeps, in types that let the compiler make them faster."""
         return self.for_kernels
@@ -188,7 +194,7 @@ class Dynamics(ABC):
         """
         rewards, gamma, chance, select = equation
         choice = _choice(select)
-        arrays: tuple[object, ...] = (self.for_sweeps, rewards.table, rewards.palette, gamma)
+        arrays: tuple[object, ...] = (self.for_sweeps, *rewards.for_kernels, gamma)
         x_, out_ = (x, out) if chance.is_sticky else (x[:, 0], out[:, 0])
         out[-1] = 0.0
         if choice is None:
@@ -199,9 +205,14 @@ class Dynamics(ABC):
             kernel = bellman.sticky_backup if chance.is_sticky else bellman.optimal_backup
             weights = chance.triple if chance.is_sticky else chance.uniform
             arrays += weights, choice
-        arrays += x_, out_, bellman.actions_of(self.num_actions)
+        arrays += x_, out_, bellman.actions_of(self.num_actions, self.num_states)
         whole = np.array([[0, self.num_states]])
-        _shared(lambda part: kernel(*arrays, part), self, whole if runs is None else runs)
+
+        def block(part: np.ndarray) -> None:
+            scratch = (np.empty(self.num_actions),) if chance.is_sticky else ()
+            kernel(*arrays, *scratch, part)
+
+        _shared(block, self, whole if runs is None else runs)
 
     def sweep(
         self, equation: BellmanEquation, x: np.ndarray, threads: int = 1, part: tuple[int, int] | None = None
@@ -351,8 +362,8 @@ class Dynamics(ABC):
         if choice is not None and not equation.chance.is_sticky:
             from pharos.kernels import bellman
 
-            tables = (self.for_sweeps, equation.rewards.table, equation.rewards.palette, equation.gamma)
-            actions, chance = bellman.actions_of(self.num_actions), equation.chance.uniform
+            tables = (self.for_sweeps, *equation.rewards.for_kernels, equation.gamma)
+            actions, chance = bellman.actions_of(self.num_actions, self.num_states), equation.chance.uniform
             groups = (parts.order, parts.starts, parts.has_cycle)
             bellman.sweep_groups(*tables, chance, choice, x[:, 0], actions, *groups, target, settled, most, before)
             return
@@ -423,15 +434,15 @@ def swept(
         part: the places [start, stop) of the order that are swept; None: all.
     """
     rewards, gamma, chance, select = equation
-    others = (rewards.table, rewards.palette, gamma)
+    others = (*rewards.for_kernels, gamma)
     tables = (transitions, *others)
-    actions, scratch = bellman.actions_of(num_actions), np.empty(num_actions)
+    actions, scratch = bellman.actions_of(num_actions, rewards.shape[0]), np.empty(num_actions)
     choice, places = _choice(select), part or (0, rewards.shape[0])
     if choice is None:
         assert isinstance(select, PolicyTable)
         if chance.is_sticky:
             return bellman.sticky_policy_sweep(
-                *tables, chance.triple, select.later, x, actions, scratch, order, *places
+                *tables, chance.triple, select.later, x, actions, scratch, np.empty(num_actions), order, *places
             )
         return bellman.policy_sweep(*tables, chance.triple, select.later[:, 0], x[:, 0], actions, order, *places)
     if chance.is_sticky:
@@ -441,7 +452,9 @@ def swept(
     def change_of(low: int, high: int) -> float:
         change = 0.0
         for piece, start, stop in pieces_from_the_end(transitions, low, high, border):
-            largest = bellman.optimal_sweep(piece, *others, chance.uniform, choice, v, actions, order, start, stop)
+            largest = bellman.optimal_sweep(
+                read_only(piece), *others, chance.uniform, choice, v, actions, order, start, stop
+            )
             change = float(np.maximum(change, largest))
         return change
 
@@ -458,7 +471,7 @@ def _choice(select: Selection) -> "float | np.ndarray | None":
     if isinstance(select, Extreme):
         return select.sign
     assert isinstance(select, PolicyTable)
-    return None if select.actions is None else np.ascontiguousarray(select.actions, np.int64)
+    return None if select.actions is None else read_only(np.ascontiguousarray(select.actions, np.int64))
 
 
 def _shared(block: Callable[[np.ndarray], None], dynamics: Dynamics, runs: np.ndarray) -> None:

@@ -11,6 +11,7 @@ import inspect
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,7 +19,9 @@ import numpy.typing as npt
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError, StateSpaceError
+from pharos.kernels import outcomes
 from pharos.mdp.arguments import as_array
+from pharos.system.arrays import read_only
 from pharos.system.memory import large_zeros
 from pharos.system.workers import usable_workers
 
@@ -65,6 +68,13 @@ class Rewards:
     def shape(self) -> tuple[int, int]:
         """(S, A)."""
         return self.table.shape  # type: ignore[return-value]
+
+    @cached_property
+    def for_kernels(self) -> tuple[np.ndarray, np.ndarray]:
+        """(table, palette), the arguments of kernels; the rewards of few states are float64, one type for all."""
+        if outcomes.is_unrolled(self.shape[0]):
+            return read_only(self.table), read_only(self.palette)
+        return read_only(np.ascontiguousarray(self.array)), read_only(np.empty(0))
 
     @property
     def array(self) -> np.ndarray:

@@ -29,6 +29,7 @@ from pharos.system.arrays import (
     WrongOutcomes,
     blocks_of,
     holds_end,
+    read_only,
     rows_of,
 )
 
@@ -52,7 +53,7 @@ class Table(Dynamics):
 
     @property
     def for_kernels(self) -> Indices:
-        return self.next_states
+        return read_only(self.next_states)
 
     @property
     def has_ends(self) -> bool:  # type: ignore[override]
@@ -359,7 +360,8 @@ class OutcomeTable(OutcomeRows, Dynamics):
         if self.probabilities is not None:
             weights = self.probabilities.reshape(-1)
         shape = (self.num_states, self.num_actions)
-        return self.flat, self.offsets, None if codes is None else codes.reshape(-1), weights, shape, self.num_outcomes
+        arrays = self.flat, self.offsets, None if codes is None else codes.reshape(-1), weights
+        return (*map(read_only, arrays), shape, self.num_outcomes)
 
     def for_kernels_with(self, values: np.ndarray) -> tuple[object, ...]:
         """`for_kernels` with other values, (N,) of all possible outcomes in order, in the place of the successors."""
@@ -370,11 +372,11 @@ class OutcomeTable(OutcomeRows, Dynamics):
             padded = np.zeros((len(rows), self.num_outcomes), values.dtype)
             padded[np.arange(self.num_outcomes) < counts[:, None]] = values
             values = padded.reshape(-1)
-        return (values, *self.for_kernels[1:])
+        return (read_only(values), *self.for_kernels[1:])
 
     @cached_property
     def for_sweeps(self) -> tuple[object, ...]:  # type: ignore[override]
-        return (*self.for_kernels[:-1], kernels.each_of(self.num_outcomes))
+        return (*self.for_kernels[:-1], kernels.each_of(self.num_outcomes, self.num_states))
 
     @cached_property
     def mass(self) -> float:  # type: ignore[override]

@@ -629,7 +629,7 @@ def estimate(
     """
     mdp, chance = answers.mdp, (*answers.mdp.chance.triple, float(answers.mdp.chance.first_chosen))
     steps = mdp.horizon or math.ceil(math.log(1e-9) / math.log(mdp.gamma)) if mdp.gamma > 0 else 1
-    rewards, terminal = mdp.reward_table, np.asarray(mdp.terminal)
+    rewards, terminal = mdp.reward_table.for_kernels, np.asarray(mdp.terminal)
     states = rng.choice(mdp.start_states, episodes, p=mdp.start_probabilities)
     previous, rows = np.full(episodes, mdp.num_actions), answers.first_rows(states)
     returns, alive = np.zeros(episodes), np.arange(episodes)
@@ -637,9 +637,8 @@ def estimate(
         places = answers.places(rows)
         numbers = rng.random(alive.size), rng.random(alive.size), rng.integers(mdp.num_actions, size=alive.size)
         execute_choices(
-            answers.probabilities, places, numbers, chance, rewards.table, rewards.palette, states, mdp.gamma**step,
-            alive, previous, returns,
-        )  # fmt: skip
+            answers.probabilities, places, numbers, chance, *rewards, states, mdp.gamma**step, alive, previous, returns
+        )
         executed = previous[alive]
         next_states = mdp.dynamics.sample(states[alive], executed, rng)
         goes_on = (next_states >= 0) & ~terminal[next_states]

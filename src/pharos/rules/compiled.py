@@ -12,7 +12,8 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import RuleError
-from pharos.rules.compiler import Function, KernelCache, compiler_of, numeric_attributes, type_text
+from pharos.kernels.kernel_cache import is_on_disk
+from pharos.rules.compiler import Function, compiler_of, numeric_attributes, type_text
 from pharos.rules.layout import Layout
 from pharos.system.arrays import Indices, PackedIndices
 
@@ -66,8 +67,7 @@ class _Compiled:
 
 def is_kept(env: Environment, layout: Layout) -> bool:
     """Whether exploration by the rules of the class was compiled before, and is on disk."""
-    cache = getattr(_Compiled(env, layout).kernels.explore, "_cache", None)
-    return isinstance(cache, KernelCache) and cache.holds_any()
+    return is_on_disk(_Compiled(env, layout).kernels.explore)
 
 
 class CompiledExpansion(_Compiled):

@@ -5,22 +5,15 @@ that call a user's rules (`exploration.py`, `interaction.py`) are cached under a
 code around them: edited rules get another file, unchanged ones are found compiled. The parameters of an instance are
 arguments, not constants: all instances of a class share one compilation.
 
-Compiled kernels on disk: one file for each kernel and each signature, in a folder that nobody else can write to.
-
-Reading such a file runs its content (it is a pickle, and machine code), so the folder is private to its user. Damage is
-noticed by a checksum: a damaged file is deleted, and the kernel is compiled again.
-
 The fingerprint: a text that changes whenever the behaviour of the rules may change. It covers a rule's bytecode and
 constants, and everything that the rule reaches by name: functions, constants, arrays, enums, attributes of modules, and
 methods and attributes of `self`. Compiled code and cached state spaces are filed under it, so that edited rules never
 meet results of the old ones.
 """
 
-import contextlib
 import enum
 import hashlib
 import os
-import pickle  # noqa: TID251  (a folder that is private to its user)
 import re
 import sys
 import types
@@ -28,18 +21,14 @@ from collections import namedtuple
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numba
 import numpy as np
-from numba.core.caching import NullCache
-from numba.core.compiler import CompileResult
-from numba.core.serialize import dumps
 from numba.extending import overload
 
 from pharos.environments import Environment
-from pharos.system import storage
-from pharos.system.compiling import private_folder
+from pharos.kernels.kernel_cache import cache_in, folder_of_rules
 
 Function = Callable[..., Any]
 """A function that Numba compiles, or has compiled."""
@@ -158,7 +147,7 @@ class Compiler:
     def kernel(self, function: Function) -> Function:
         """Compile a function that Python calls; the compiled form is kept on disk."""
         kernel: Any = numba.njit(nogil=True)(self._named(function))
-        kernel._cache = cache_of_kernel(f"{self.name}.{function.__name__}")
+        kernel._cache = cache_in(folder_of_rules(), f"{self.name}.{function.__name__}")
         return kernel
 
     def _named(self, function: Function) -> Function:
@@ -256,84 +245,6 @@ def reason_of(error: BaseException) -> str:
     ours = tuple(os.path.join("rules", file) for file in ("exploration.py", "interaction.py"))
     where = [line for line in lines if line.startswith("File ") and not any(file in line for file in ours)]
     return what + (f" ({where[-1].rstrip(':')})" if where else "")
-
-
-# Kernel cache ---------------------------------------------------------------------------------------------------------
-
-
-DIGEST_BYTES = 32
-
-
-class Codegen(Protocol):
-    """Numba's interface to the processor, as far as the cache needs it."""
-
-    def magic_tuple(self) -> object:
-        """Features of the processor on which compiled code depends."""
-
-
-class TargetContext(Protocol):
-    """Numba's interface to the process that loads a kernel, as far as the cache needs it."""
-
-    def refresh(self) -> None:
-        """Take over functions registered since."""
-
-    def codegen(self) -> Codegen:
-        """The interface to the processor."""
-
-
-class KernelCache(NullCache):
-    """Cache of the compiled forms of one kernel, a file for each signature: the interface that Numba calls.
-
-    Args:
-        path: of the files, without the ending that tells one signature from another.
-    """
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    @property
-    def cache_path(self) -> str:
-        return str(self.path.parent)
-
-    def holds_any(self) -> bool:
-        """Whether a compiled form is on disk, for any signature."""
-        return any(self.path.parent.glob(f"{self.path.name}.*.nbc"))
-
-    def load_overload(self, sig: object, target_context: TargetContext) -> CompileResult | None:
-        """The compiled kernel of a signature; None where there is none, or a damaged one, which is deleted."""
-        target_context.refresh()
-        file = self._file(sig, target_context.codegen())
-        try:
-            data = file.read_bytes()
-        except OSError:
-            return None
-        try:
-            if hashlib.sha256(data[DIGEST_BYTES:]).digest() != data[:DIGEST_BYTES]:
-                raise ValueError("it was changed after it was written")
-            return CompileResult._rebuild(target_context, *pickle.loads(data[DIGEST_BYTES:]))
-        except Exception:  # whatever is wrong with it: the kernel is compiled again
-            with contextlib.suppress(OSError):
-                file.unlink()
-            return None
-
-    def save_overload(self, sig: object, cres: Any) -> None:
-        """Write a compiled kernel to disk; without room for it, the next process compiles again."""
-        if cres.lifted or cres.library.has_dynamic_globals:  # it refers to addresses of this process
-            return
-        data = dumps(cres._reduce())
-        file = self._file(sig, cres.codegen)
-        with contextlib.suppress(OSError):
-            storage.replace_file(file, hashlib.sha256(data).digest() + data, durable=False)
-
-    def _file(self, sig: object, codegen: Codegen) -> Path:
-        key = repr((sig, codegen.magic_tuple(), numba.__version__, sys.version_info[:2]))
-        return self.path.with_name(f"{self.path.name}.{hashlib.sha256(key.encode()).hexdigest()[:16]}.nbc")
-
-
-def cache_of_kernel(name: str) -> NullCache:
-    """The cache of the kernel with this name; one that stores nothing where no folder is private."""
-    folder = private_folder(storage.cache_directory())
-    return NullCache() if folder is None else KernelCache(folder / name)
 
 
 # Fingerprints of rules ------------------------------------------------------------------------------------------------

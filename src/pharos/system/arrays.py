@@ -13,7 +13,7 @@ action a in state s. Nobody else asks which layout it is; kernels/outcomes.py sa
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from types import EllipsisType
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -122,6 +122,18 @@ def unpacked(entries: np.ndarray) -> np.ndarray:
 def as_array(indices: object) -> Indices:
     """Indices as an array of NumPy; `PackedIndices` stay as they are."""
     return indices if isinstance(indices, PackedIndices) else np.asarray(indices)
+
+
+T = TypeVar("T")
+
+
+def read_only(array: T) -> T:
+    """An array as kernels read it: a view that cannot be written to, so that all are of one type; all else as it is."""
+    if not isinstance(array, np.ndarray) or not array.flags.writeable:
+        return array
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def blocks_of(indices: Indices) -> Iterator[tuple[int, np.ndarray]]:

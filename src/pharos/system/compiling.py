@@ -1,13 +1,13 @@
-"""Folders that keep compiled code, so that it is compiled once; and the seconds of compiling, apart from work.
+"""The folder that keeps compiled code, so that it is compiled once; and the seconds of compiling, apart from work.
 
 `pharos.kernels` calls `prepare` as it is loaded; before that nothing can have been compiled.
 """
 
 import contextlib
 import os
+import re
 import stat
 import sys
-import tempfile
 import threading
 import time
 import warnings
@@ -22,13 +22,16 @@ from pharos.system.storage import compiled_folders
 SMALL = 1 << 16
 """Entries below which rules and kernels are interpreted, as compiling takes longer (benchmarks/startup.py); 0: none."""
 
-SOURCES = "sources.json"
-"""Names, times and sizes of the files whose kernels lie compiled beside it."""
+TOLD_AFTER, TOLD_EVERY = 2.0, 10.0
+"""Seconds of compiling after which a line on standard error says so, and says so again."""
+
+announces = True
+"""Whether this process writes such lines; of several that work for another one, one does."""
 
 _lock = threading.Lock()
 _total, _running, _began = 0.0, 0, 0.0
-is_told = False
-"""Whether a line on the terminal has told that this process compiles, or need not, as the command does it itself."""
+_next, _kernels = TOLD_AFTER, 0
+_timer: threading.Timer | None = None
 
 
 def seconds() -> float:
@@ -54,64 +57,29 @@ class Stopwatch:
         return max(0.0, time.perf_counter() - self._began - self.compiling)
 
 
-def prepare(kernels: Path) -> None:
-    """Start the timing, and give Numba a folder for the compiled code of the files in `kernels`; loads Numba.
-
-    Numba keeps it beside the files. Where nothing can be written there (an installation for all users, a container), it
-    goes into the private folder of the cache, for the processes that this one starts, too; where there is none, into a
-    temporary folder of this process.
+def prepare() -> None:
+    """Start the timing of what Numba compiles; loads Numba.
 
     Raises:
         ParameterError: variables of the environment keep Numba from compiling.
     """
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         raise ParameterError("NUMBA_DISABLE_JIT is set, and pharos' kernels work compiled alone; unset it")
-    if not os.environ.get("NUMBA_CACHE_DIR") and not _can_be_written(kernels / "__pycache__"):
-        os.environ["NUMBA_CACHE_DIR"] = str(
-            private_folder(storage.cache_directory()) or storage.temporary_folder("pharos-")
-        )
-    if not os.environ.get("NUMBA_CACHE_DIR"):
-        _forget_outdated(kernels)
-    _start_timing()
-
-
-def _forget_outdated(kernels: Path) -> None:
-    """Delete compiled code of older sources: Numba checks a kernel's own file, not the files of what it calls."""
-    files = [(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in sorted(kernels.glob("*.py"))]
-    text, compiled = storage.json_text(files), kernels / "__pycache__"
-    with contextlib.suppress(OSError):  # of a process that does the same at the same time
-        if not (compiled / SOURCES).is_file() or (compiled / SOURCES).read_text() != text:
-            for index in compiled.glob("*.nbi"):
-                index.unlink()
-            storage.replace_file(compiled / SOURCES, text, durable=False)
-
-
-def _can_be_written(folder: Path) -> bool:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
-
-
-def _start_timing() -> None:
-    """Register a listener of Numba that adds up the seconds of compiling."""
-    try:
-        from numba.core import config, event
+        from numba.core import event
     except (ValueError, RuntimeError) as error:
         raise ParameterError(f"Numba cannot be loaded: {error}; look at its variables, NUMBA_...") from error
 
-    vars(config)["CACHE_DIR"] = os.environ.get("NUMBA_CACHE_DIR", "")  # Numba may have been loaded before
-
     class Compiling(event.Listener):
+        """Adds up the seconds of compiling; kernels that others call are compiled within them."""
+
         def on_start(self, event: event.Event) -> None:
             global _running, _began
             with _lock:
                 if not _running:
                     _began = time.perf_counter()
+                    _announce_later(event.data["dispatcher"].py_func)
                 _running += 1
-            _tell(event.data["dispatcher"].py_func)
 
         def on_end(self, event: object) -> None:
             global _running, _total
@@ -119,16 +87,46 @@ def _start_timing() -> None:
                 _running -= 1
                 if not _running:
                     _total += time.perf_counter() - _began
+                    if _timer is not None:
+                        _timer.cancel()
 
     event.register("numba:compile", Compiling())
 
 
-def _tell(function: Callable) -> None:
-    """Print once, on a terminal, that the first call compiles, which takes some seconds."""
-    global is_told
-    if not is_told and function.__module__.startswith("pharos.") and sys.stderr is not None and sys.stderr.isatty():
-        is_told = True
-        print("pharos: compiling, some seconds; kept for the next time", file=sys.stderr, flush=True)
+def _announce_later(function: Callable) -> None:
+    """Say on standard error that a function is being compiled, if that is not done when the time for a line comes."""
+    global _kernels
+    if function.__module__.startswith("pharos."):
+        _kernels += 1
+        if announces:
+            _start_timer(max(0.0, _next - _total), _name_of(function))
+
+
+def _start_timer(wait: float, name: str) -> None:
+    global _timer
+    _timer = threading.Timer(wait, _announce, [name])
+    _timer.daemon = True
+    _timer.start()
+
+
+def _announce(name: str) -> None:
+    global _next
+    with _lock:
+        if not _running:
+            return
+        now = _total + time.perf_counter() - _began
+        _next = now + TOLD_EVERY
+        _start_timer(TOLD_EVERY, name)
+    kept = "" if storage.is_cache_temporary() else "; kept for the next time"
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # of a stream that is closed, or None
+        sys.stderr.write(f"pharos: compiling {name}, kernel {_kernels}, {now:.0f} s so far{kept}\n")
+        sys.stderr.flush()
+
+
+def _name_of(function: Callable) -> str:
+    """A kernel's name, and that of the class of environments for whose rules it is made."""
+    owner = re.fullmatch(r"(\w+)_[0-9a-f]{20}\.\w+", function.__qualname__)
+    return f"{function.__name__} for {owner[1]}" if owner else function.__name__
 
 
 @cache

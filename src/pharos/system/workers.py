@@ -14,6 +14,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from pharos.errors import ParameterError
+from pharos.system import compiling
 
 PARENT_GONE = 76  # the exit status of a worker that nobody waits for
 CLEAN_SECONDS = 2.0  # until it ends at once
@@ -78,7 +79,8 @@ class Workers:
             EOFError, ConnectionError: the process from which it is to be forked is gone.
         """
         receiver, sender = self._context.Pipe(duplex=False)
-        process = self._context.Process(target=_work, args=(function, arguments, sender, dict(os.environ)), name=key)
+        settings = dict(os.environ), not self._running
+        process = self._context.Process(target=_work, args=(function, arguments, sender, *settings), name=key)
         with without_main(*definitions):
             if isinstance(self._context, ForkServerContext):
                 from multiprocessing import forkserver
@@ -126,11 +128,16 @@ def _work(
     arguments: Sequence[Any],
     sender: connection.Connection,
     environment: Mapping[str, str],
+    announces: bool,
 ) -> None:
     """The body of a process; `environment` are the variables of the one that started it, now.
 
     They may not be those of when processes began to be forked; Numba refuses that the numbers of threads change.
+
+    Args:
+        announces: whether it says that it compiles: others compile the same.
     """
+    compiling.announces = compiling.announces and announces
     threads = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
     os.environ.clear()
     os.environ.update({**environment, **threads})

@@ -414,10 +414,9 @@ class World:
     def __init__(self, run: BatchRun, runs: Sequence[int]):
         mdp, dynamics = run.mdp, run.mdp.dynamics
         self.runs = np.array(runs, np.int64)
-        table = dynamics.deterministic_table()
-        self.transitions = dynamics.for_kernels if table is None else table
-        self.rewards: tuple[Any, ...] = (mdp.reward_table.table, mdp.reward_table.palette)
-        if run.outcome_rewards is not None and table is None:
+        self.transitions = dynamics.for_steps
+        self.rewards: tuple[Any, ...] = mdp.reward_table.for_kernels
+        if run.outcome_rewards is not None and not dynamics.is_deterministic:
             self.rewards = dynamics.for_kernels_with(run.outcome_rewards)  # type: ignore[attr-defined]
         self.staying = np.zeros((0, 0)) if run.staying is None else np.asarray(run.staying, np.float64)
         self.terminal = np.asarray(mdp.terminal, np.bool_)
