@@ -15,8 +15,7 @@ import pytest
 from pharos import benchmark, evaluate_policy
 from pharos.benchmark import BenchmarkTask, BudgetSpent, Ladder, Protocol, Suite
 from pharos.benchmark.budget import generated_curve
-from pharos.benchmark.sealed import frozen
-from pharos.benchmark.suite import digest_of_suite
+from pharos.benchmark.suite import digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
 from pharos.system.sources import find, load
 

@@ -9,8 +9,7 @@ import pharos
 from pharos import benchmark
 from pharos.benchmark import BenchmarkTask, Protocol, Suite
 from pharos.benchmark.jax_agents import compiled_curves
-from pharos.benchmark.sealed import frozen
-from pharos.benchmark.suite import digest_of_suite
+from pharos.benchmark.suite import digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.training import Task, evaluate_agent
 

@@ -1,20 +1,21 @@
-"""What a submission claims, what is verified of it, and what an audit finds; nothing that was received is executed."""
+"""What a submission claims, and what is computed again of it; nothing that was received is executed."""
 
 from dataclasses import replace
-from pathlib import Path
+from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
-from edits import edited_json, flip
+from command_line import answer, usage_error
+from command_line import run as command
+from edits import flip
 from pharos.benchmark.board import benchmark_board
-from pharos.benchmark.commitment import Commitment, make_commitment
 from pharos.benchmark.execution import run
-from pharos.benchmark.repetition import Audit, drawn_runs, make_audit, prediction_interval
-from pharos.benchmark.sealed import frozen
-from pharos.benchmark.submission import Submission, submit, verify
-from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite, digest_of_suite
+from pharos.benchmark.scores import score
+from pharos.benchmark.submission import WHAT, Submission, submit, verify
+from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite, digest_of_suite, frozen, write_suite
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
+from pharos.leaderboard import read_sealed, write_sealed
 from refusals import refusal
 
 PROTOCOL = Protocol(steps=1500, evaluations=3, seeds=5)
@@ -38,6 +39,18 @@ def learn(env, steps, seed):
             yield lambda batch: np.array([int(np.argmax(paid.get(one.tobytes(), none))) for one in batch])
 '''
 
+LAZY = """
+import numpy as np
+
+def learn(env, steps, seed):
+    env.reset()
+    for step in range(steps):
+        if any(env.step(env.action_space.sample())[2:4]):
+            env.reset()
+        if step % 500 == 499:
+            yield lambda batch: np.full((len(batch), env.action_space.n), 1 / env.action_space.n)
+"""
+
 
 @pytest.fixture(scope="module")
 def suite():
@@ -59,11 +72,10 @@ def source(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def honest(suite, source, tmp_path_factory):
-    """(folder, file) of an honest generator's submission, with its commitment."""
+    """(folder, file) of an honest generator's submission."""
     folder = tmp_path_factory.mktemp("honest")
     run(source, suite, out=folder / "runs", seeds=SEEDS, workers=1)
-    commitment = make_commitment(source, suite, date="2026-01-01")
-    submit(folder / "runs", folder / "it.safetensors", suite, author="A. Uthor", commitment=commitment)
+    submit(folder / "runs", folder / "it.safetensors", suite, author="A. Uthor")
     return folder / "runs", folder / "it.safetensors"
 
 
@@ -82,12 +94,12 @@ def cheat(suite, honest, tmp_path_factory):
 def test_an_honest_submission_holds_with_all_its_policies(suite, honest):
     verdict = verify(honest[1], suite)
     assert verdict.holds and not verdict.missing and len(verdict.checks) == 15
-    assert verdict.submission.author == "A. Uthor" and verdict.submission.fits()
+    assert verdict.submission.author == "A. Uthor"
+    assert verdict.final == pytest.approx(score(verdict.submission.results, suite).final.value, abs=1e-6)
 
 
 def test_the_same_submission_has_the_same_bytes(suite, honest, tmp_path):
-    submit(honest[0], tmp_path / "again.safetensors", suite, author="A. Uthor",
-           commitment=Submission.read(honest[1]).commitment)  # fmt: skip
+    submit(honest[0], tmp_path / "again.safetensors", suite, author="A. Uthor")
     assert (tmp_path / "again.safetensors").read_bytes() == honest[1].read_bytes()
 
 
@@ -125,108 +137,126 @@ def test_another_suite_is_refused(suite, honest):
     assert "name its suite" in refusal(ParameterError, verify, honest[1], replace(suite, name="other", digest="0" * 64))
 
 
-def test_an_audit_of_an_honest_generator_holds(suite, honest, source, tmp_path):
-    dates = {"date": "2026-02-01", "published": "2026-01-02", "round": "2026-01-15"}
-    found = make_audit(honest[1], source, suite, **dates, workers=1)
-    assert found.holds and found.is_source and found.is_committed
-    assert len(found.repeats) == 3 and all(repeat.equal for repeat in found.repeats)
-    found.write(tmp_path / "a.json")
-    assert Audit.read(tmp_path / "a.json") == found
-    with edited_json(tmp_path / "a.json") as entry:
-        entry["repeats"][0]["equal"] = False
-    assert "changed" in refusal(ResultCorrupted, Audit.read, tmp_path / "a.json")
-
-
-def test_a_cheat_with_the_policies_of_value_iteration_is_claimed_and_fails_the_audit(suite, cheat, source):
-    assert verify(cheat, suite).holds  # nobody can see from policies how they were learnt
-    found = make_audit(cheat, source, suite, date="2026-02-01", workers=1)
-    assert found.is_source and not found.holds
-    assert not any(repeat.equal for repeat in found.repeats)
-
-
-def test_another_source_is_not_run(suite, honest, source, tmp_path):
-    mark = tmp_path / "mark"
-    other = tmp_path / "honest.py"
-    other.write_text(HONEST + f"\ndef learn(env, steps, seed):\n    open({str(mark)!r}, 'w')\n    yield from ()\n")
-    found = make_audit(honest[1], f"{other}:learn", suite, date="2026-02-01", workers=1)
-    assert not found.is_source and not found.holds and not found.repeats and not mark.exists()
-
-
 @pytest.mark.slow
-def test_an_honest_table_repeats_to_the_bit(suite, tmp_path):
-    run("q_learning", suite, out=tmp_path / "runs", seeds=SEEDS, workers=1)
-    submit(tmp_path / "runs", tmp_path / "it.safetensors", suite)
-    assert verify(tmp_path / "it.safetensors", suite).holds
-    found = make_audit(tmp_path / "it.safetensors", "q_learning", suite, date="2026-02-01", workers=1)
-    assert found.holds and all(repeat.equal and repeat.low == repeat.high for repeat in found.repeats)
-    assert not found.is_committed
-
-
-@pytest.mark.slow
-def test_an_honest_network_of_the_engine_repeats_to_the_bit(suite, tmp_path):
-    pytest.importorskip("torch")
+@pytest.mark.parametrize("agent", ["q_learning", "dqn"])
+def test_tables_and_networks_of_pharos_hold(suite, tmp_path, agent):
+    if agent == "dqn":
+        pytest.importorskip("torch")
     small = replace(suite, hyperparameters={"dqn": {"learning_starts": 100}})
-    run("dqn", small, out=tmp_path / "runs", seeds=range(2), workers=1)
+    run(agent, small, out=tmp_path / "runs", seeds=range(2), workers=1)
     submit(tmp_path / "runs", tmp_path / "it.safetensors", small)
     verdict = verify(tmp_path / "it.safetensors", small)
     assert verdict.holds and len(verdict.checks) == 6
-    found = make_audit(tmp_path / "it.safetensors", "dqn", small, date="2026-02-01", workers=1)
-    assert found.holds and all(repeat.equal for repeat in found.repeats)
 
 
-def test_runs_are_drawn_from_the_digest(honest):
-    read = Submission.read(honest[1])
-    pairs = {drawn_runs(f"{number:064x}", read) for number in range(40)}
-    assert len(pairs) > 20 and all(len({task for task, _ in each}) == 3 for each in pairs)
+def test_a_run_without_a_policy_counts_as_random_play(suite, cheat, tmp_path):
+    read = Submission.read(cheat)
+    few = {run: policy for run, policy in read.policies.items() if run[0] == "sea" or run == ("catch", 3)}
+    replace(read, policies=few).write(tmp_path / "few.safetensors")
+    verdict = verify(tmp_path / "few.safetensors", suite)
+    assert verdict.holds and len(verdict.missing) == 9
+    assert verdict.final == pytest.approx((5 + 1) / 15)  # of three tasks with five runs
 
 
-def test_the_interval_of_a_further_run_covers_99_percent():
-    draw = np.random.default_rng(0)
-    runs = draw.normal(0.4, 0.1, (4000, 10))
-    inside = [low <= x[0] <= high for x in runs for low, high in [prediction_interval(x[1:])]]
-    assert np.mean(inside) == pytest.approx(0.99, abs=0.005)
-    assert prediction_interval(np.full(9, 0.3)) == pytest.approx((0.28, 0.32))
-    low, high = prediction_interval(np.full(3, 0.3))
-    assert low > high
+class Tables(HTMLParser):
+    """The tables of a page: a list of rows for each, the headings first."""
+
+    def __init__(self, page: str):
+        super().__init__()
+        self.tables: list[list[list[str]]] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("th", "td"):
+            self.tables[-1][-1].append("")
+
+    def handle_data(self, data):
+        if self.tables and self.tables[-1] and self.tables[-1][-1]:
+            self.tables[-1][-1][-1] += data.strip()
 
 
-def test_commitments_bind(suite, source, tmp_path):
-    made = make_commitment(source, suite, date="2026-01-01")
-    made.write(tmp_path / "c.json")
-    assert Commitment.read(tmp_path / "c.json") == made
-    one, other = (make_commitment("dqn", suite, given, date="x") for given in ({"learning_rate": 0.001}, {}))
-    assert one.digest != other.digest
-    Path(source.rpartition(":")[0]).write_text(HONEST + "\n")
-    try:
-        assert make_commitment(source, suite, date="2026-01-01").source != made.source
-    finally:
-        Path(source.rpartition(":")[0]).write_text(HONEST)
-    with edited_json(tmp_path / "c.json") as entry:
-        entry["date"] = "2025-01-01"
-    assert "changed" in refusal(ResultCorrupted, Commitment.read, tmp_path / "c.json")
+@pytest.fixture(scope="module")
+def random_player(suite, tmp_path_factory):
+    """The submission of an agent that yields uniform play alone, as `benchmark submit` packs it."""
+    folder = tmp_path_factory.mktemp("random")
+    (folder / "lazy.py").write_text(LAZY)
+    run(f"{folder / 'lazy.py'}:learn", suite, out=folder / "runs", seeds=SEEDS, workers=1)
+    return submit(folder / "runs", folder / "it.safetensors", suite)
 
 
-def test_a_submission_of_another_agent_than_committed_is_refused(suite, honest, tmp_path):
-    other = make_commitment("q_learning", suite, date="2026-01-01")
-    with pytest.raises(ParameterError, match="another source or other hyperparameters"):
-        submit(honest[0], tmp_path / "it.safetensors", suite, commitment=other)
+FORGED = {  # curves of an agent whose every point is 1, but for the last
+    "one absurd seed": [[0.0], [0.0], [0.0], [0.0], [1000.0]],
+    "two groups of seeds": [[0.067], [0.645], [0.067], [0.645], [0.067]],
+    "nothing to see": [[0.0]] * 5,
+}
 
 
-def test_a_board_has_two_lists_and_believes_the_audit_of_this_very_file_alone(suite, honest, cheat, source, tmp_path):
+@pytest.mark.parametrize("forged", FORGED)
+def test_what_a_random_agent_forges_is_called_claimed_but_for_its_final_policies(
+    suite, random_player, cheat, tmp_path, forged
+):
+    pytest.importorskip("jinja2")
+    results = random_player.results
+    curves = {name: np.hstack([np.tile(FORGED[forged], 2), curve[:, -1:]]) for name, curve in results.curves.items()}
+    made = replace(random_player, results=replace(results, curves=curves), note="v7")
+    made.write(tmp_path / "forged.safetensors")
+    (tmp_path / "forged.safetensors.audit.json").write_text('{"holds": true}')  # the name of a record of an audit
+    (tmp_path / "solved.safetensors").write_bytes(cheat.read_bytes())
+    write_suite(suite, tmp_path / "small.yaml")
+    claimed = score(made.results, suite).core.value
+    assert claimed > 0.45
+
+    files = [tmp_path / f"{name}.safetensors" for name in ("forged", "solved")]
+    said = answer("benchmark", "verify", files[0], "--suite", tmp_path / "small.yaml")
+    assert said["holds"] and said["final_score"] == pytest.approx(0.0, abs=1e-9)
+    assert {"curves while learning", "core scores and intervals"} <= {*said["claimed"]}
+    out = tmp_path / "board.html"
+    said = answer("benchmark", "board", *files, "--suite", tmp_path / "small.yaml", "--out", out)
+    assert said["final_scores"] == pytest.approx({"forged.safetensors": 0.0, "solved.safetensors": 1.0}, abs=1e-9)
+
+    page = out.read_text()
+    assert "audit" not in page.lower()
+    ((heads, first, second),) = Tables(page).tables
+    assert (first[heads.index("final score")], second[heads.index("final score")]) == ("1.000", "0.000")
+    assert second[heads.index("policies")] == "15 of 15"
+    shown = [head for head, cell in zip(heads, second, strict=True) if cell.startswith(f"{claimed:.3f}")]
+    assert "core score, claimed" in shown and all("claimed" in head for head in shown)
+
+
+def test_a_page_of_submissions_has_those_of_its_suites_and_says_why_not(suite, honest, cheat, tmp_path):
     pytest.importorskip("jinja2")
     files = [tmp_path / name for name in ("honest.safetensors", "cheat.safetensors", "broken.safetensors")]
     for file, data in zip(files, (honest[1].read_bytes(), cheat.read_bytes(), b"x" * 40), strict=True):
         file.write_bytes(data)
-    found = make_audit(files[0], source, suite, date="2026-02-01", workers=1)
-    for file in files[:2]:  # that of the honest one, laid beside the cheat too
-        found.write(file.with_name(f"{file.name}.audit.json"))
     assert benchmark_board(files[:1], tmp_path / "none.html", [replace(suite, digest="0" * 64)]).verified == ()
     made = benchmark_board(files, tmp_path / "board.html", [suite])
     assert len(made.verified) == 2 and [*made.refused] == ["broken.safetensors"]
-    audited, claimed = (tmp_path / "board.html").read_text().split("small: claimed")
-    digests = [verify(file, suite).sha256[:8] for file in files[:2]]
-    assert digests[0] in audited and digests[1] in claimed
-    assert digests[0] not in claimed and digests[1] not in audited
+    (heads, first, _), refused = Tables((tmp_path / "board.html").read_text()).tables
+    assert first[heads.index("file")] == verify(files[1], suite).sha256[:8] and len(refused) == 2
+
+
+def test_a_submission_with_a_commitment_is_read_as_one_without(suite, honest, tmp_path):
+    record, arrays = read_sealed(honest[1], WHAT)
+    kept = {name: value for name, value in record.items() if name not in ("arrays", "digest")}
+    write_sealed(tmp_path / "older.safetensors", {**kept, "commitment": {"agent": "x", "date": "2026-01-01"}}, arrays)
+    assert verify(tmp_path / "older.safetensors", suite).holds
+    Submission.read(tmp_path / "older.safetensors").write(tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == honest[1].read_bytes()
+
+
+@pytest.mark.parametrize("words", ["audit x --source y", "commit dqn", "seal d --season s --beacon b"])
+def test_commands_that_are_gone_name_what_can_be_proven(words):
+    line = usage_error("benchmark", *words.split())
+    assert f"{words.split()[0]} is gone: only final policies can be proven; `pharos benchmark verify FILE`" in line
+    assert words.split()[0] not in command("benchmark", "--help").stdout
+
+
+def test_an_option_that_is_gone_says_so():
+    assert "--commitment is gone" in usage_error("benchmark", "submit", "x", "--commitment", "c.json")
 
 
 @pytest.mark.parametrize("attack", ["pickle", "header", "outside", "escape"])

@@ -10,16 +10,13 @@ from pharos.system import lazy
 if TYPE_CHECKING:
     from pharos.benchmark.board import benchmark_board
     from pharos.benchmark.budget import BudgetSpent
-    from pharos.benchmark.commitment import Commitment, make_commitment
     from pharos.benchmark.comparison import AxisComparison, Comparison, Difference, Power, compare, power
     from pharos.benchmark.execution import run
     from pharos.benchmark.page import report
-    from pharos.benchmark.repetition import Audit, make_audit
     from pharos.benchmark.results import AgentResults, baselines, read_results
     from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, score
-    from pharos.benchmark.sealed import sealed_copies, sealed_instances, season_seed, write_suite
     from pharos.benchmark.submission import Submission, submit, verify
-    from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite, load_suite
+    from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite, frozen, load_suite, write_suite
 
 __all__ = [
     "AgentResults",
@@ -27,7 +24,6 @@ __all__ = [
     "BenchmarkScore",
     "BenchmarkTask",
     "BudgetSpent",
-    "Commitment",
     "Comparison",
     "Ladder",
     "Power",
@@ -36,6 +32,7 @@ __all__ = [
     "Suite",
     "baselines",
     "compare",
+    "frozen",
     "load_suite",
     "power",
     "read_results",
@@ -44,6 +41,7 @@ __all__ = [
     "score",
     "submit",
     "verify",
+    "write_suite",
 ]
 
 __getattr__ = lazy.attributes(__name__)

@@ -1,4 +1,4 @@
-"""Submissions: curves, final policies and a commitment in one file, which `verify` checks by computing regret again.
+"""Submissions: curves and final policies in one file, which `verify` checks by computing regret again.
 
 The file has the layout of an entry of the leaderboard (`leaderboard/entry.py`): a record as JSON, and arrays
 
@@ -6,13 +6,13 @@ The file has the layout of an entry of the leaderboard (`leaderboard/entry.py`):
     policy/TASK/SEED  what the agent plays at the end: (S,) actions, or (S, A) probabilities, by state
 
 with digests of all. Nothing in it is executed. `verify` solves each task and evaluates each policy: V*, the value of
-uniform play and the last point of each curve hold or do not. The points before cannot be seen from policies, and an
-exact solver has the best ones: only training again can tell (`audit`).
+uniform play and the last point of each curve hold or do not. All else is claimed: the points before cannot be seen from
+policies, and an exact solver has the best policies without any learning.
 """
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +20,11 @@ import numpy as np
 
 from pharos.benchmark.agents import sha256
 from pharos.benchmark.budget import Snapshots
-from pharos.benchmark.commitment import Commitment
 from pharos.benchmark.results import AgentResults, entries_of
 from pharos.benchmark.scores import check_suite
-from pharos.benchmark.suite import BenchmarkTask, Suite, sha256_of_json
-from pharos.errors import FileFormatError, ParameterError, PharosError
+from pharos.benchmark.suite import BenchmarkTask, Suite
+from pharos.errors import FileFormatError, PharosError
 from pharos.leaderboard import Check, check_ending, in_file, read_sealed, stored_table, write_checked, write_sealed
-from pharos.system import records
 from pharos.training import Task, evaluate_agent, load_agent
 
 FORMAT = 1
@@ -40,18 +38,17 @@ Tell = Callable[[int, int, str], None]
 
 @dataclass(frozen=True, eq=False)
 class Submission:
-    """A submission: curves, final policies, and the texts and commitment of its author.
+    """A submission: curves, final policies, and the texts of its author.
 
     Attributes:
         results: curves of the agent. policies: (task, seed) -> final policy; those of some runs may be missing.
-        author, note: texts to show. commitment: None where there is none.
+        author, note: texts to show.
     """
 
     results: AgentResults
     policies: Mapping[tuple[str, int], np.ndarray]
     author: str = ""
     note: str = ""
-    commitment: Commitment | None = None
 
     def write(self, file: str | os.PathLike) -> None:
         """Write the submission to a file, replacing it atomically; the same submission gives the same bytes."""
@@ -65,7 +62,6 @@ class Submission:
             "suite_digest": results.digest,
             "seeds": list(results.seeds),
             "record": dict(results.record),
-            "commitment": None if self.commitment is None else asdict(self.commitment),
         }
         arrays = {f"curve/{task}": curve for task, curve in results.curves.items()}
         arrays |= {f"policy/{task}/{seed}": policy for (task, seed), policy in self.policies.items()}
@@ -82,19 +78,6 @@ class Submission:
         record, arrays = read_sealed(Path(file), WHAT)
         return in_file(Path(file), lambda: _submission(record, arrays))
 
-    def fits(self) -> bool:
-        """Whether source and hyperparameters of the submission are those of its commitment."""
-        source = sha256_of_source(self.results)
-        settings = sha256_of_json(self.results.record.get("hyperparameters"))
-        committed = self.commitment
-        return committed is not None and (committed.source, committed.hyperparameters) == (source, settings)
-
-
-def sha256_of_source(results: AgentResults) -> str:
-    """SHA-256 of the source that results name; empty for agents of pharos."""
-    source = results.record.get("source")
-    return str(source.get("sha256", "")) if isinstance(source, dict) else ""
-
 
 def _submission(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Submission:
     kinds = {"name": str, "author": str, "note": str, "suite": str, "suite_digest": str, "seeds": list, "record": dict}
@@ -108,12 +91,10 @@ def _submission(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> 
             policies[words[0], int(words[1])] = array
         else:
             raise FileFormatError(f"its array {key!r} is neither a curve nor a policy of one of its seeds")
-    entry = record.get("commitment")
-    commitment = None if entry is None else records.read(Commitment, entry, "its commitment")
     results = AgentResults(name, suite, digest, tuple(seeds), curves, provenance)
     if {task for task, _ in policies} - {*results.curves}:
         raise FileFormatError("it has policies of tasks without a curve")
-    return Submission(results, policies, author, note, commitment)
+    return Submission(results, policies, author, note)
 
 
 def submit(
@@ -123,7 +104,6 @@ def submit(
     *,
     author: str = "",
     note: str = "",
-    commitment: Commitment | None = None,
     progress: Tell | None = None,
 ) -> Submission:
     """Pack the results of a folder and the final policies of its runs into one file, which `verify` reads.
@@ -134,7 +114,6 @@ def submit(
         folder: of `benchmark.run`.
         file: ends in .safetensors.
         suite: that the runs are of.
-        commitment: that was published before.
     Raises:
         ParameterError: the folder holds no results, or of another suite; a text cannot be printed.
         FileFormatError: a run is damaged.
@@ -150,12 +129,7 @@ def submit(
         policy = final_policy(folder / "runs" / name / f"seed-{seed}", suite.task(name).training_task(suite.protocol))
         if policy is not None:
             policies[name, seed] = policy
-    submission = Submission(results, policies, author, note, commitment)
-    if commitment is not None and not submission.fits():
-        raise ParameterError(
-            f"{folder}: is of another source or other hyperparameters than the commitment to {commitment.agent} says; "
-            f"leave the commitment out, or run what was committed"
-        )
+    submission = Submission(results, policies, author, note)
     return write_checked(target, lambda: submission.write(target), lambda: Submission.read(target))
 
 
@@ -185,7 +159,9 @@ class SubmissionVerdict:
     Attributes:
         file, submission: what was verified. sha256: of the file.
         checks: normalised regret of each policy beside the last point of its curve; their names are TASK/SEED.
-        missing: runs without a policy, of which nothing was verified.
+        missing: runs without a policy, of which nothing was computed: all that is said of them is claimed.
+        final: score of the core that the policies have at the end, computed: 1 less normalised regret, clipped to
+            [0, 1], mean over the seeds of a task, then over tasks; a run without a policy counts as 0.
         refused: name of a task or run -> why its policy is none.
     """
 
@@ -194,6 +170,7 @@ class SubmissionVerdict:
     sha256: str
     checks: tuple[Check, ...]
     missing: tuple[str, ...]
+    final: float
     refused: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -203,7 +180,7 @@ class SubmissionVerdict:
 
     @property
     def holds(self) -> bool:
-        """Whether all that can be computed is as claimed."""
+        """Whether all that can be computed is as claimed; the rest stays claimed."""
         return not self.refused and not self.wrong
 
 
@@ -246,7 +223,10 @@ def verify(
                 refused[run] = str(error)
                 continue
             checks.append(Check(run, float(claimed), computed, tolerance))
-    return SubmissionVerdict(path, submission, sha256(path), tuple(checks), tuple(missing), refused)
+    scores = {check.name: 1.0 - min(max(check.found, 0.0), 1.0) for check in checks}
+    runs = [scores.get(f"{task.name}/{seed}", 0.0) for task in suite.core for seed in results.seeds]
+    final = sum(runs) / max(1, len(runs))
+    return SubmissionVerdict(path, submission, sha256(path), tuple(checks), tuple(missing), final, refused)
 
 
 def _regret(policy: np.ndarray, task: Task, entry: BenchmarkTask) -> float:

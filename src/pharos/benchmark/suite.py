@@ -13,8 +13,9 @@ world: two libraries had a deep_sea whose actions meant other things. So a task 
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ import numpy as np
 
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
 from pharos.mdp import ChanceSetting, TabularMDP
+from pharos.system import storage
 from pharos.system.records import read
 from pharos.training import Task
 
@@ -154,7 +156,7 @@ class Suite:
     protocol: Protocol
     core: tuple[BenchmarkTask, ...]
     ladders: tuple[Ladder, ...]
-    digest: str
+    digest: str = ""
     hyperparameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
@@ -252,6 +254,29 @@ def digest_of_suite(suite: Suite) -> str:
     """SHA-256 of the protocol, and of name, axis, level and digest of each task, as canonical JSON."""
     tasks = [[task.name, task.axis, task.level, task.digest] for task in suite.tasks]
     return sha256_of_json({"protocol": vars(suite.protocol), "tasks": tasks})
+
+
+def frozen(task: BenchmarkTask, protocol: Protocol) -> BenchmarkTask:
+    """A copy of the task with its digest and values. Cost: as solving it."""
+    solved = task.training_task(protocol)
+    optimal, uniform = solved.reference.optimal, solved.reference.uniform
+    return replace(task, value_optimal=optimal, value_uniform=uniform, digest=digest_of_task(solved))
+
+
+def write_suite(suite: Suite, file: str | os.PathLike) -> None:
+    """Replace a file by a suite, as `load_suite` reads it, with its digest.
+
+    Raises:
+        MissingExtra: PyYAML is not installed.
+    """
+    try:
+        import yaml
+    except ImportError as error:
+        raise MissingExtra("writing a suite", "pyyaml", "study") from error
+    entry = storage.plain(asdict(replace(suite, digest=digest_of_suite(suite))))
+    for each in (*entry["core"], *(task for ladder in entry["ladders"] for task in ladder["tasks"])):
+        del each["axis"]
+    storage.replace_file(file, yaml.safe_dump(entry, sort_keys=False, allow_unicode=True).encode())
 
 
 def digest_of_task(task: Task) -> str:

@@ -32,8 +32,11 @@ from pharos.errors import DivergenceError, ParameterError, PharosError
 from pharos.system.lazy import conflict
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
-# Options that went, by the command that had them, and what it says of them
+# Options and commands that went, by the command that had them, and what it says of them
+AUDITS = "is gone: only final policies can be proven; `pharos benchmark verify FILE` computes them again"
 REMOVED = {
+    **{f"pharos benchmark {name}": f"{name} {AUDITS}" for name in ("audit", "commit", "seal")},
+    "pharos benchmark submit --commitment": f"--commitment {AUDITS}",
     "pharos build --shards": "--shards is gone: files stay in one folder, which a volume may spread over several disks",
     "pharos solve --jacobi": "--jacobi is gone: values of any --processes are within --tolerance, which may be lower",
 }
@@ -107,8 +110,9 @@ def _exit_code(error: Exception) -> int | None:
     if type(error).__name__ == "Abort":
         return EXIT_INTERRUPTED
     if hasattr(error, "format_message"):  # of typer, wherever its exceptions live in this version
-        option = f"{_command_of(error)} {getattr(error, 'option_name', None)}"
-        complain(f"{REMOVED.get(option) or error.format_message()} (see `{_command_of(error)} --help`)")
+        text = error.format_message()
+        name = getattr(error, "option_name", None) or "".join(text.split("'")[1:2])  # No such command 'NAME'.
+        complain(f"{REMOVED.get(f'{_command_of(error)} {name}') or text} (see `{_command_of(error)} --help`)")
         return EXIT_USAGE
     return None
 

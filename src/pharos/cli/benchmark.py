@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,8 +20,15 @@ app = Commands(no_args_is_help=True, help="Run agents on a frozen suite of solve
 
 SuiteName = Annotated[str, typer.Argument(metavar="[SUITE]", help="Name of a suite, or FILE.yaml.")]
 SuiteFile = Annotated[str, typer.Option("--suite", metavar="NAME|FILE")]
-Folder = Annotated[Path, "DIR"]
-Submitted = Annotated[Path, "FILE"]
+CLAIMED = [
+    "curves while learning",
+    "core scores and intervals",
+    "steps",
+    "seeds",
+    "settings",
+    "that policies were learnt",
+]
+"""What a submission says and nobody can compute from it."""
 
 
 @app.command("show")
@@ -115,28 +121,6 @@ def run(
     return Answer(answer, (f"{results.agent} on {results.suite}", facts), bool(missing))
 
 
-@app.command("seal")
-def seal(folder: Folder, *, season: str, beacon: str, suite: SuiteFile = "v1") -> Answer:
-    """Make the sealed half of a suite, of a round of a public beacon: copies.yaml and instances.yaml.
-
-    Args:
-        folder: For the two suites and the MDPs of the copies.
-        season: Its name, such as v1.s1.
-        beacon: What the round of the season gave, as published; see the rules.
-        suite: The public one.
-    """
-    from pharos.benchmark import load_suite, sealed_copies, sealed_instances, season_seed, write_suite
-
-    public, seed = load_suite(suite), season_seed(season, beacon)
-    copies = sealed_copies(public, seed, folder / "copies")
-    halves = {"copies": copies, "instances": sealed_instances(public, seed)}
-    for name, each in halves.items():
-        write_suite(each, folder / f"{name}.yaml")
-    answer = {name: {"file": folder / f"{name}.yaml", "digest": each.digest} for name, each in halves.items()}
-    facts = [(name, f"{pluralize(len(each.tasks), 'task')}, {each.digest}") for name, each in halves.items()]
-    return Answer({"season": season, "seed": seed, **answer}, (str(folder), facts))
-
-
 @app.command("report")
 def report(
     results: Annotated[str, "RESULTS"],
@@ -162,30 +146,6 @@ def report(
     return Answer({"files": files}, lambda: console().print(*map(str, files), sep="\n", markup=False))
 
 
-@app.command("commit")
-def commit(
-    agent: str,
-    *,
-    out: Path = Path("commitment.json"),
-    suite: SuiteFile = "v1",
-    hyperparameters: Mapping[str, Any] | None = None,
-) -> Answer:
-    """Write what binds you to an agent; publish its SHA-256 before the round of the beacon.
-
-    Args:
-        agent: As `benchmark run` takes it.
-        out: FILE.json.
-        suite: The public one.
-        hyperparameters: A hyperparameter, of all tasks.
-    """
-    from pharos.benchmark import load_suite, make_commitment
-
-    commitment = make_commitment(agent, load_suite(suite), hyperparameters, date=date.today().isoformat())
-    commitment.write(out)
-    answer = {"file": out, "sha256": commitment.digest, "commitment": commitment}
-    return Answer(answer, (str(out), [("publish", commitment.digest)]))
-
-
 @app.command("submit")
 def submit(
     results: Annotated[Path, "DIR"],
@@ -194,9 +154,8 @@ def submit(
     suite: SuiteFile = "v1",
     author: str = "",
     note: str = "",
-    commitment: Path | None = None,
 ) -> Answer:
-    """Pack curves, final policies and the commitment of a run into one file that anybody can verify.
+    """Pack curves and final policies of a run into one file; anybody can compute the policies' values again.
 
     Args:
         results: Folder of `benchmark run`.
@@ -204,22 +163,20 @@ def submit(
         suite: That it is of.
         author: Who submits it.
         note: Shown beside it.
-        commitment: File of `benchmark commit`.
     """
     from pharos import benchmark
 
     file = out or Path(f"{results.name}.safetensors")
-    bound = None if commitment is None else benchmark.Commitment.read(commitment)
     loaded = benchmark.load_suite(suite)
     with counted_bar("policies") as tell:
-        submission = benchmark.submit(results, file, loaded, author=author, note=note, commitment=bound, progress=tell)
+        submission = benchmark.submit(results, file, loaded, author=author, note=note, progress=tell)
     runs, policies = sum(map(len, submission.results.curves.values())), len(submission.policies)
-    facts = [("runs", f"{runs:,}"), ("policies", f"{policies:,}"), ("committed", "yes" if bound else "no")]
+    facts = [("runs", f"{runs:,}"), ("policies", f"{policies:,}")]
     return Answer({"file": file, "runs": runs, "policies": policies}, (str(file), facts))
 
 
 @app.command("verify")
-def verify(file: Submitted, *, suite: SuiteFile = "v1") -> Answer:
+def verify(file: Annotated[Path, "FILE"], *, suite: SuiteFile = "v1") -> Answer:
     """Solve the tasks of a submission and evaluate its final policies again; exit code 1 where one is not as claimed.
 
     Args:
@@ -234,6 +191,7 @@ def verify(file: Submitted, *, suite: SuiteFile = "v1") -> Answer:
     wrong = {each.name: {"claimed": each.claimed, "computed": each.found} for each in verdict.wrong}
     answer = {"holds": verdict.holds, "sha256": verdict.sha256, "verified": len(verdict.checks) - len(wrong)}
     answer |= {"wrong": wrong, "refused": verdict.refused, "missing": verdict.missing}
+    answer |= {"final_score": verdict.final, "claimed": CLAIMED}
     facts = [
         (
             "policies",
@@ -241,55 +199,11 @@ def verify(file: Submitted, *, suite: SuiteFile = "v1") -> Answer:
         ),
         *((name, f"regret {each['computed']:.6g}, claimed {each['claimed']:.6g}") for name, each in wrong.items()),
         *verdict.refused.items(),
-        ("learning", "claimed: only an audit tells how policies were learnt"),
+        ("final score", f"{verdict.final:.3f}, computed; a run without a policy counts as 0"),
+        ("claimed", ", ".join(CLAIMED)),
     ]
-    return Answer(answer, (f"{file}: {'holds' if verdict.holds else 'does not hold'}", facts), not verdict.holds)
-
-
-@app.command("audit")
-def audit(
-    file: Submitted,
-    *,
-    source: str,
-    out: Path | None = None,
-    suite: SuiteFile = "v1",
-    published: str = "",
-    round: Annotated[str, typer.Option("--round", metavar="YYYY-MM-DD")] = "",
-    elsewhere: bool = False,
-    workers: Count | None = None,
-) -> Answer:
-    """Train three runs of a submission again, drawn by its own digest; exit code 1 where one does not repeat.
-
-    Args:
-        file: That `benchmark submit` wrote.
-        source: The agent, as `benchmark run` takes it; its code is executed, so use a container without network.
-        out: FILE.audit.json when not given.
-        suite: That it is of.
-        published: When you saw its commitment published, YYYY-MM-DD.
-        round: When the round of the beacon was.
-        elsewhere: It was trained on another kind of processor: networks need not repeat to the last bit.
-        workers: Processes.
-    """
-    from pharos import benchmark
-
-    loaded, target = benchmark.load_suite(suite), out or file.with_name(f"{file.name}.audit.json")
-    with counted_bar("runs") as tell:
-        audit = benchmark.make_audit(
-            *(file, source, loaded),
-            date=date.today().isoformat(),
-            published=published,
-            round=round,
-            elsewhere=elsewhere,
-            workers=workers,
-            progress=tell,
-        )
-    audit.write(target)
-    facts = [("source", "is the one named" if audit.is_source else "is another one, and was not run")]
-    for each in audit.repeats:
-        text = "equal" if each.equal else f"{each.again} for {each.claimed:.6g}, from {each.low:.4g} to {each.high:.4g}"
-        facts.append((f"{each.task}, seed {each.seed}", each.error or text))
-    answer = {"file": target, "holds": audit.holds, "audit": audit}
-    return Answer(answer, (f"{file}: {'repeats' if audit.holds else 'does not repeat'}", facts), not audit.holds)
+    title = f"{file}: {'final policies are as claimed' if verdict.holds else 'does not hold'}"
+    return Answer(answer, (title, facts), not verdict.holds)
 
 
 @app.command("board")
@@ -300,7 +214,7 @@ def board(
     suite: Annotated[list[str] | None, "NAME|FILE"] = None,
     title: str = "Benchmark",
 ) -> Answer:
-    """Verify submissions, and write a page with two lists: audited (FILE.audit.json lies beside), and claimed.
+    """Verify submissions, and write a page that ranks them by their final policies; all else on it is claimed.
 
     Args:
         files: Submissions.
@@ -314,7 +228,9 @@ def board(
     with counted_bar("verifying") as tell:
         page = benchmark.benchmark_board(files, out, suites, title=title, progress=tell)
     facts = [("verified", f"{len(page.verified):,}"), ("refused", f"{len(page.refused):,}"), *page.refused.items()]
-    return Answer({"file": out, "verified": len(page.verified), "refused": page.refused}, (str(out), facts))
+    scores = {each.file.name: each.final for each in page.verified}
+    answer = {"file": out, "verified": len(page.verified), "refused": page.refused}
+    return Answer({**answer, "final_scores": scores, "claimed": CLAIMED}, (str(out), facts))
 
 
 def _entry(task: "BenchmarkTask") -> dict[str, Any]:

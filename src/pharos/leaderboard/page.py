@@ -103,7 +103,7 @@ COLUMNS = (
     ("regret", "n"),
     ("normalised", "n"),
     ("certainty", "s"),
-    ("while learning", "n"),
+    ("while learning, claimed", "n"),
     ("run", "s"),
 )
 
