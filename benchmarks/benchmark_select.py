@@ -32,7 +32,8 @@ import numpy as np
 import yaml
 
 import pharos
-from pharos.benchmark.suite import CORE, FOLDER, BenchmarkTask, Protocol, Suite, digest_of_suite, digest_of_task
+from pharos.benchmark import BenchmarkTask, Ladder, Protocol, Suite
+from pharos.benchmark.suite import CORE, FOLDER, digest_of_suite, digest_of_task
 from pharos.mdp import ChanceSetting
 from pharos.training import RunConfig, Task
 
@@ -114,10 +115,13 @@ def suite_text(entry, *, freeze=False, foretell=False):
         ladders.append({**ladder, "tasks": [predicted_entry(each, settings, protocol) for each in tasks]})
     made = {"name": entry["name"], "digest": "", "protocol": entry["protocol"]}
     made |= {"hyperparameters": entry["hyperparameters"], "core": core, "ladders": ladders}
-    every = [BenchmarkTask(**each, axis=CORE) for each in core]
-    every += [BenchmarkTask(**each, axis=ladder["axis"]) for ladder in ladders for each in ladder["tasks"]]
-    made["digest"] = digest_of_suite(Suite(entry["name"], protocol, tuple(every), (), ""))
-    return written(made)
+    rungs = [
+        Ladder(**{**each, "tasks": tuple(BenchmarkTask(**task, axis=each["axis"]) for task in each["tasks"])})
+        for each in ladders
+    ]
+    first = tuple(BenchmarkTask(**each, axis=CORE) for each in core)
+    suite = Suite(entry["name"], protocol, first, tuple(rungs), "", entry["hyperparameters"])
+    return written({**made, "digest": digest_of_suite(suite)})
 
 
 def kept(entry, axis, protocol, freeze, level=None):

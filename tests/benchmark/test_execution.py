@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edits import edited_json
 from pharos import benchmark, evaluate_policy
 from pharos.benchmark import BenchmarkTask, BudgetSpent, Ladder, Protocol, Suite
 from pharos.benchmark.budget import generated_curve
-from pharos.benchmark.suite import digest_of_suite, frozen
+from pharos.benchmark.suite import EARLIER, digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
 from pharos.system.sources import find, load
 
@@ -272,12 +273,16 @@ def test_a_file_runs_in_processes_to_the_same_bytes(suite, file, tmp_path):
     assert agent["source"]["sha256"] == benchmark.agents.sha256(file)
 
 
-def test_a_folder_holds_one_agent_with_one_setting_of_one_suite(suite, file, tmp_path):
+def test_a_folder_holds_one_agent_with_one_setting_of_one_suite(suite, file, tmp_path, monkeypatch):
     out = tmp_path / "out"
     benchmark.run("oracle", suite, out=out, seeds=[0], tasks="sea")
     benchmark.run("oracle", suite, out=out, seeds=range(3))  # more of the same
     with pytest.raises(ParameterError, match=r"holds runs with another agent: oracle, now random"):
         benchmark.run("random", suite, out=out, seeds=[0])
+    with edited_json(out / "suite.json") as entry:
+        entry["suite_digest"] = "0" * 64
+    monkeypatch.setitem(EARLIER, "0" * 64, suite.digest)
+    assert benchmark.run("oracle", suite, out=out, seeds=[0], tasks="sea").results.digest == suite.digest
     other = replace(suite, core=suite.core[:1])
     with pytest.raises(ParameterError, match="another suite_digest"):
         benchmark.run("oracle", replace(other, digest=digest_of_suite(other)), out=out, seeds=[0])

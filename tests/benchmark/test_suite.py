@@ -1,5 +1,7 @@
 """Suites: what their files say, and tasks that are refused where they are others."""
 
+import hashlib
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +10,9 @@ import yaml
 
 import pharos
 from pharos import importers
-from pharos.benchmark import BenchmarkTask, Protocol, load_suite
-from pharos.benchmark.suite import FOLDER, digest_of_task, rounded, suite_of
+from pharos.benchmark import BenchmarkTask, Protocol, Suite, baselines, frozen, load_suite, read_results, write_suite
+from pharos.benchmark.results import BASELINES
+from pharos.benchmark.suite import EARLIER, FOLDER, digest_of_task, rounded, suite_of
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.mdp import TabularMDP
 from pharos.state_space import build
@@ -84,11 +87,62 @@ def test_a_file_that_was_changed_is_refused(entry):
         lambda each: each["core"][0].update(digest="0" * 64),
         lambda each: each["ladders"][0]["tasks"][0].update(level=1.0),
         lambda each: each["core"][0].update(name="other"),
+        lambda each: each["core"][0]["predicted"].update(dqn=0.5),
+        lambda each: each["core"][1]["seconds"].update(dqn=0.5),
+        lambda each: each["ladders"][0].update(unit="nats"),
+        lambda each: each["ladders"][0].update(quantity="another"),
+        lambda each: each["hyperparameters"]["ppo"].update(learning_rate=0.1),
+        lambda each: each.update(name="v2"),
     ):
         changed = yaml.safe_load(yaml.safe_dump(entry))
         change(changed)
-        with pytest.raises(FileFormatError, match=r"^file: its tasks and protocol have the digest .*it was changed"):
+        with pytest.raises(FileFormatError, match=r"^file: what it says has the digest .*it was changed"):
             suite_of(changed, "file")
+
+
+def leaves(entry, path=()):
+    """Path of every value in nested objects and lists."""
+    for key, value in entry.items() if isinstance(entry, dict) else enumerate(entry):
+        yield from leaves(value, (*path, key)) if isinstance(value, dict | list) else [(*path, key)]
+
+
+@pytest.mark.slow
+def test_the_digest_covers_every_value_of_the_file(entry):
+    paths = list(leaves(entry))
+    assert len(paths) > 500
+    for path in paths:
+        place = entry
+        for key in path[:-1]:
+            place = place[key]
+        before = place[path[-1]]
+        place[path[-1]] = f"{before}x" if isinstance(before, str) else before + 1
+        with pytest.raises(FileFormatError, match=r"^file: "):
+            suite_of(entry, "file")
+        place[path[-1]] = before
+    suite_of(entry, "file")
+
+
+def test_results_that_name_the_earlier_digest_are_of_the_suite_with_these_tasks():
+    suite = load_suite()
+    tasks = [[task.name, task.axis, task.level, task.digest] for task in suite.tasks]
+    text = json.dumps({"protocol": vars(suite.protocol), "tasks": tasks}, sort_keys=True, separators=(",", ":"))
+    earlier = hashlib.sha256(text.encode()).hexdigest()
+    assert {earlier: suite.digest} == EARLIER
+    for name in baselines():
+        assert earlier.encode() in (BASELINES / "v1" / f"{name}.safetensors").read_bytes()
+        assert read_results(name).digest == suite.digest
+
+
+def test_a_suite_of_your_own_is_read_as_it_was_written(tmp_path):
+    suite = Suite("mine", Protocol(), (frozen(replace(SEA, predicted={"dqn": 1e-5}), Protocol()),), ())
+    write_suite(suite, tmp_path / "mine.yaml")
+    read = load_suite(tmp_path / "mine.yaml")
+    assert replace(read, digest="") == suite and len(read.digest) == 64
+    read.check()
+    text = (tmp_path / "mine.yaml").read_text()
+    (tmp_path / "mine.yaml").write_text(text.replace("hyperparameters: {}", "hyperparameters: {dqn: {x: 2026-01-01}}"))
+    with pytest.raises(FileFormatError, match="expected entries that JSON has"):
+        load_suite(tmp_path / "mine.yaml")
 
 
 def test_errors_say_where(entry, tmp_path):

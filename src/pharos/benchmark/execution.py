@@ -21,7 +21,7 @@ import numpy as np
 from pharos.benchmark.agents import Form, Job, Tell, agent_form
 from pharos.benchmark.results import FILE, AgentResults
 from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, score
-from pharos.benchmark.suite import CORE, BenchmarkTask, Suite, load_suite
+from pharos.benchmark.suite import CORE, EARLIER, BenchmarkTask, Suite, load_suite
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError, PharosError, UnknownName
 from pharos.system import storage
 from pharos.system.wording import in_one_line
@@ -169,6 +169,7 @@ def _claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str,
             storage.replace_json(folder / file, {"format": 1, **entry})
             continue
         before = stored if isinstance(stored, dict) else {}
+        before |= {"suite_digest": EARLIER.get(str(before.get("suite_digest")), before.get("suite_digest"))}
         different = [name for name in entry if before.get(name) != entry[name]]
         if different:
             raise ParameterError(

@@ -26,7 +26,7 @@ def methods(contents: Contents) -> str:
     num_tasks = f"{contents.num_run(suite.tasks)} of {pluralize(len(suite.tasks), 'task')}"
     lines = (
         rf"We ran {latex_text(contents.agent.name)}{others} on the Pharos Benchmark {latex_text(suite.name)}",
-        rf"(SHA-256 of tasks and protocol: \texttt{{{latex_text(suite.digest)}}}): {num_tasks},",
+        rf"(SHA-256 of the suite: \texttt{{{latex_text(suite.digest)}}}): {num_tasks},",
         f"{protocol.steps:,} steps each, with {seeds_text(own)}.",
         f"The policy was evaluated after each of {protocol.evaluations} equal parts; its normalised regret is",
         r"$(V^* - V^\pi) / (V^* - V^U)$, where $U$ is uniform play. The score of a run is 1 less the mean over",

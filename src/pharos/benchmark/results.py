@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from pharos.benchmark.suite import EARLIER
 from pharos.errors import FileFormatError, ParameterError
 from pharos.leaderboard import check_values, in_file, read_sealed, write_sealed
 
@@ -27,7 +28,7 @@ class AgentResults:
 
     Attributes:
         agent: label of the agent.
-        suite, digest: name and digest of the suite.
+        suite, digest: name and digest of the suite; an earlier digest of the same tasks becomes today's.
         seeds: of the runs, in the order of the rows.
         curves: name of a task -> (seeds, evaluations) normalised regret (V* - V) / (V* - U) of the policy after each
             equal part of the steps: 0 is optimal, 1 is uniform play, not clipped. Tasks that were not run, or of which
@@ -47,6 +48,7 @@ class AgentResults:
     def __post_init__(self) -> None:
         curves = {name: np.asarray(self.curves[name], np.float64) for name in sorted(self.curves)}
         object.__setattr__(self, "curves", curves)
+        object.__setattr__(self, "digest", EARLIER.get(self.digest, self.digest))
         object.__setattr__(self, "seeds", tuple(int(seed) for seed in self.seeds))
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
             raise ParameterError(f"seeds of {self.agent} are {self.seeds}; expected at least one, each once")

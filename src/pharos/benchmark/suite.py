@@ -1,7 +1,7 @@
 """Suites: frozen lists of tasks in a file, with a digest of each solved task.
 
     name: v1
-    digest: ...                 of the protocol and of the digests of all tasks
+    digest: ...                 of all the rest
     protocol: {steps: 30000, evaluations: 15, seeds: 10, gamma: 1.0, horizon: limit}
     hyperparameters: {dqn: {...}, ppo: {...}}
     core: [tasks]
@@ -29,6 +29,9 @@ from pharos.system.records import read
 from pharos.training import Task
 
 FOLDER = Path(__file__).parent / "suites"
+V1 = "50d45f848f991081acf6b8ce6a5c532614ebc2139ea50d148094ea50894b1086"
+EARLIER = {"3a1d2bb3986015bb807c596528212e8ea9f8c6579252bc3f53c70a8e596665fe": V1}
+"""Digest of protocol and tasks alone, which results of earlier checkouts name -> digest of the suite that has them."""
 CORE = "core"
 BITS = 40
 """Of a mantissa that enter a digest, 12 digits: what compilers and processors may round differently is beyond."""
@@ -148,7 +151,7 @@ class Suite:
     Attributes:
         name: such as "v1". protocol: of all tasks.
         core: tasks that a score is the mean of. ladders: one for each axis.
-        digest: SHA-256 of the protocol and of the tasks; see `digest_of_suite`.
+        digest: SHA-256 of all the rest; see `digest_of_suite`.
         hyperparameters: of baselines by name, one setting for all tasks.
     """
 
@@ -228,10 +231,14 @@ def suite_of(entry: object, whose: str) -> Suite:
     )
     if len(suite._by_name) < len(suite.tasks):
         raise FileFormatError(f"{whose}: two tasks have the same name; expected a name of its own for each")
-    if (digest := digest_of_suite(suite)) != suite.digest:
+    try:
+        digest = digest_of_suite(suite)
+    except (TypeError, ValueError, RecursionError):
+        raise FileFormatError(f"{whose}: is no suite; expected entries that JSON has: text, numbers, lists") from None
+    if digest != suite.digest:
         raise FileFormatError(
-            f"{whose}: its tasks and protocol have the digest {digest[:16]}...; the file says {suite.digest[:16]}...: "
-            f"it was changed; take the file as it was published"
+            f"{whose}: what it says has the digest {digest[:16]}...; it names {suite.digest[:16]}...: it was changed; "
+            f"take the file as it was published"
         )
     return suite
 
@@ -251,9 +258,14 @@ def _tasks(entries: object, axis: str, whose: str) -> tuple[BenchmarkTask, ...]:
 
 
 def digest_of_suite(suite: Suite) -> str:
-    """SHA-256 of the protocol, and of name, axis, level and digest of each task, as canonical JSON."""
-    tasks = [[task.name, task.axis, task.level, task.digest] for task in suite.tasks]
-    return sha256_of_json({"protocol": vars(suite.protocol), "tasks": tasks})
+    """SHA-256 of all that a suite says but its digest, as canonical JSON.
+
+    So of name and protocol, of hyperparameters of baselines, of each ladder with its unit, quantity and measure, and of
+    each task with its parameters, predictions, values, seconds and digest.
+    """
+    entry = storage.plain(asdict(suite))
+    del entry["digest"]
+    return hashlib.sha256(_canonical(entry)).hexdigest()
 
 
 def frozen(task: BenchmarkTask, protocol: Protocol) -> BenchmarkTask:
@@ -327,11 +339,6 @@ def rounded(values: np.ndarray) -> np.ndarray:
     """Numbers with mantissas of BITS bits; zero has no sign."""
     mantissa, exponent = np.frexp(np.asarray(values, np.float64))
     return np.ldexp(np.round(np.ldexp(mantissa, BITS)), exponent - BITS) + 0.0
-
-
-def sha256_of_json(value: object) -> str:
-    """SHA-256, hexadecimal, of a value as JSON with sorted keys and without blanks."""
-    return hashlib.sha256(_canonical(value)).hexdigest()
 
 
 def _canonical(value: object) -> bytes:
