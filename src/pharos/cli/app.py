@@ -35,7 +35,8 @@ EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 # Options and commands that went, by the command that had them, and what it says of them
 AUDITS = "is gone: only final policies can be proven; `pharos benchmark verify FILE` computes them again"
 REMOVED = {
-    **{f"pharos benchmark {name}": f"{name} {AUDITS}" for name in ("audit", "commit", "seal")},
+    **{f"pharos benchmark {name}": f"{name} {AUDITS}" for name in ("audit", "commit")},
+    "pharos benchmark seal": "seal is gone: pharos.benchmark.write_suite makes a suite of your own, of any seeds",
     "pharos benchmark submit --commitment": f"--commitment {AUDITS}",
     "pharos build --shards": "--shards is gone: files stay in one folder, which a volume may spread over several disks",
     "pharos solve --jacobi": "--jacobi is gone: values of any --processes are within --tolerance, which may be lower",
