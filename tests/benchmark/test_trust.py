@@ -1,5 +1,6 @@
 """What a submission claims, and what is computed again of it; nothing that was received is executed."""
 
+import re
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -11,6 +12,7 @@ from command_line import run as command
 from edits import flip
 from pharos.benchmark.board import benchmark_board
 from pharos.benchmark.execution import run
+from pharos.benchmark.page import report
 from pharos.benchmark.scores import score
 from pharos.benchmark.submission import WHAT, Submission, submit, verify
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite, digest_of_suite, frozen, write_suite
@@ -225,6 +227,10 @@ def test_what_a_random_agent_forges_is_called_claimed_but_for_its_final_policies
     assert second[heads.index("policies")] == "15 of 15"
     shown = [head for head, cell in zip(heads, second, strict=True) if cell.startswith(f"{claimed:.3f}")]
     assert "core score, claimed" in shown and all("claimed" in head for head in shown)
+    report(made.results, out, beside=[], suite=suite)
+    proven, *rest = re.findall("<li>(.*?)</li>", out.read_text().partition("What is proven, and what is claimed")[2])
+    assert proven.startswith("Proven: V* and the value of uniform play") and len(rest) == 2
+    assert all(each.startswith("Claimed") for each in rest)
 
 
 def test_a_page_of_submissions_has_those_of_its_suites_and_says_why_not(suite, honest, cheat, tmp_path):

@@ -309,15 +309,14 @@ def _provenance(contents: Contents) -> Element:
         **{name: excerpt(value) for name, value in own.record.items() if value and name not in ("exact", "division")},
     }
     claims = [
-        "Computed, not sampled: V* and the value of uniform play of each task, frozen in the suite; values of the "
-        "agent's policies, by the run, on the machine where it ran.",
-        "Can be verified by others: the values of the final policies.",
+        "Proven: V* and the value of uniform play of each task, solved when the suite was frozen.",
+        "Claimed, until `pharos benchmark verify` computes them again from a submission: values of the final policies.",
         "Claimed: curves while learning, and so scores and frontiers; the steps used; that one setting was used for "
         "all tasks. Policies cannot show these; only running the code again does.",
     ]
     rows: list[Sequence[str | Element]] = [[name, text] for name, text in facts.items()]
     table = element("div", _table(["what", "value"], rows), class_="words")
-    return _section("What was verified, and what is claimed", "", _list(claims), table)
+    return _section("What is proven, and what is claimed", "", _list(claims), table)
 
 
 SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
