@@ -1,5 +1,6 @@
 """Values of small MDPs in exact fractions: what a proven error bound is held against."""
 
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -10,11 +11,39 @@ from pharos.mdp import OutcomeTable
 
 def exact(array):
     """The same numbers as fractions."""
-    return np.vectorize(Fraction, otypes=[object])(np.asarray(array, np.float64))
+    array = np.asarray(array)
+    return array.copy() if array.dtype == object else np.vectorize(Fraction, otypes=[object])(array.astype(float))
+
+
+@dataclass(frozen=True)
+class AsGiven:
+    """An MDP with the rewards and the laziness that were asked for, in fractions, before any of them was rounded.
+
+    Attributes:
+        mdp: for all else. rewards: (S, A) fractions. laziness: of all in one.
+        tables: the MDP without laziness; None: `mdp` is.
+    """
+
+    mdp: object
+    rewards: np.ndarray
+    laziness: Fraction = Fraction(0)
+    tables: object = None
+
+    def __getattr__(self, name):
+        return getattr(self.mdp, name)
+
+    def lazy(self, p, staying):
+        """With probability p nothing happens, which pays `staying` (S, A)."""
+        p = Fraction(p)
+        rewards = (1 - p) * self.rewards + p * exact(staying)
+        return replace(self, rewards=rewards, laziness=1 - (1 - self.laziness) * (1 - p))
 
 
 def outcomes(mdp, s, x):
     """[(next state, probability)] of executing x in s; what is missing ends."""
+    if isinstance(mdp, AsGiven):
+        stays = mdp.laziness
+        return [(t, (1 - stays) * p) for t, p in outcomes(mdp.tables or mdp.mdp, s, x)] + [(s, stays)] * bool(stays)
     if isinstance(mdp.dynamics, OutcomeTable):
         return [(t, Fraction(p)) for t, p in naive_mdp.listed(mdp.dynamics, s, x) if t >= 0]
     if mdp.transitions is None:

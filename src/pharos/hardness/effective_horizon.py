@@ -504,6 +504,7 @@ class _Nodes:
         tell("values of uniform play")
         explored = solved(uniform_value, mdp, tolerance)
         self.error = mdp.gamma * max(best.error_bound, worst.error_bound, explored.error_bound)
+        self.error += mdp.reward_table.rounding
         everywhere = np.arange(self.num_nodes)
         values = [_ActionValues(self, _on_nodes(each, choices, mdp)) for each in (best, worst, explored)]
         self.best, self.worst, self.explored = (each.at(everywhere) for each in values)

@@ -435,7 +435,7 @@ def _settled(mdp: TabularMDP, solution: Solution, in_place: bool) -> Solution:
         sweeps += 1
         change = mdp.dynamics.sweep(equation, x)
         largest += change
-        rounding = operations * _UNIT * (largest_reward + largest + change)
+        rounding = operations * _UNIT * (largest_reward + largest + change) + mdp.reward_table.rounding
         bound = min(bound, (rho * change + rounding) / (1 - rho) * (1 + _ROUNDING))
         at_rest += change <= rounding
         if change == 0.0 or at_rest == _AT_REST:

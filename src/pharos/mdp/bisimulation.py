@@ -125,7 +125,7 @@ def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -
     return replace(
         mdp,
         dynamics=mdp.dynamics.merged(classes, representatives),
-        reward_table=Rewards.from_array(mdp.reward_table.rows(representatives)),
+        reward_table=Rewards.from_array(mdp.reward_table.rows(representatives), mdp.reward_table.rounding),
         terminal=np.asarray(mdp.terminal)[representatives],
         folder=None,
         environment=None,

@@ -44,13 +44,15 @@ class Rewards:
     Attributes:
         table: (S, A) uint8 codes, or (S, A) float64 rewards.
         palette: (at most 256,) float64, or empty.
+        rounding: bound on the error of each reward: 0 for rewards that were given, above it for means of several.
     """
 
     table: np.ndarray
     palette: np.ndarray
+    rounding: float = 0.0
 
     @staticmethod
-    def from_array(rewards: np.ndarray) -> "Rewards":
+    def from_array(rewards: np.ndarray, rounding: float = 0.0) -> "Rewards":
         """Make rewards of (S, A) numbers; ParameterError where one is NaN or infinite."""
         rewards = np.asarray(rewards, np.float64)
         collector = RewardsCollector((rewards.shape[0], rewards.shape[1]))
@@ -62,7 +64,7 @@ class Rewards:
                     f"the reward of state {start + s}, action {a} is {block[s, a]}; expected a finite number"
                 )
             collector.add(start, block)
-        return collector.finish()
+        return collector.finish(rounding)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -87,16 +89,23 @@ class Rewards:
 
     def of(self, states: slice | np.ndarray) -> "Rewards":
         """The rewards of some states alone."""
-        return Rewards(np.asarray(self.table[states]), self.palette)
+        return Rewards(np.asarray(self.table[states]), self.palette, self.rounding)
 
     def mixed(self, other: "Rewards", p: float) -> "Rewards":
-        """(1 - p) times these rewards plus p times others of the same shape; exact where both are equal."""
-        collector = RewardsCollector(self.shape)
+        """(1 - p) times these rewards plus p times others of the same shape.
+
+        A mean is never outside of its two rewards, so it is exact where these are equal. Elsewhere each of its two
+        terms is rounded up to three times (1 - p, the product, the sum), which `rounding` counts.
+        """
+        collector, largest = RewardsCollector(self.shape), -1.0  # no two rewards that differ
         for start in range(0, len(self.table), _BLOCK):
-            block = slice(start, start + _BLOCK)
-            own = self.rows(block)
-            collector.add(start, own + p * (other.rows(block) - own))
-        return collector.finish()
+            own, theirs = (each.rows(slice(start, start + _BLOCK)) for each in (self, other))
+            terms = (1.0 - p) * own, p * theirs
+            collector.add(start, np.clip(sum(terms), np.minimum(own, theirs), np.maximum(own, theirs)))
+            sizes = np.abs(terms[0]) + np.abs(terms[1])
+            largest = float(np.max(sizes, where=own != theirs, initial=largest))
+        rounding = rounding_of_mean(2, largest) if largest >= 0 else 0.0
+        return collector.finish(max(self.rounding, other.rounding) + rounding)
 
     @property
     def lowest(self) -> float:
@@ -124,12 +133,19 @@ class RangedRewards(Rewards):
     def shape(self) -> tuple[int, int]:
         return vars(self)["_shape"]
 
+    @property
+    def rounding(self) -> float:  # type: ignore[override]
+        return self._computed().rounding
+
     def __getattr__(self, name: str) -> np.ndarray:
         if name not in ("table", "palette"):
             raise AttributeError(name)
+        return getattr(self._computed(), name)
+
+    def _computed(self) -> Rewards:
         if vars(self)["whole"] is None:
             vars(self)["whole"] = vars(self)["_compute"](0, self.shape[0])
-        return getattr(vars(self)["whole"], name)
+        return vars(self)["whole"]
 
     def of(self, states: slice | np.ndarray) -> Rewards:
         if vars(self)["whole"] is None and isinstance(states, slice) and states.step is None:
@@ -178,26 +194,38 @@ class RewardsCollector:
             self._codes[start : start + len(block)] = codes
         return left == 0
 
-    def finish(self) -> Rewards:
-        """The rewards of all states."""
+    def finish(self, rounding: float = 0.0) -> Rewards:
+        """The rewards of all states, each within `rounding` of the true one."""
         if self._values is not None:
-            return Rewards(self._values, np.empty(0))
+            return Rewards(self._values, np.empty(0), rounding)
         codes = self._codes if self._codes is not None else np.zeros(self.shape, np.uint8)
-        return Rewards(codes, self._palette if len(self._palette) else np.zeros(1))
+        return Rewards(codes, self._palette if len(self._palette) else np.zeros(1), rounding)
+
+
+def rounding_of_mean(outcomes: int, largest: float) -> float:
+    """A bound on the error of a mean that was added up from products of probabilities and rewards.
+
+    Each product is rounded at most once more than there are terms, and numbers below 2^-1022 have no digits to lose.
+
+    Args:
+        outcomes: the number of terms.
+        largest: bound on the sum of the absolute products, or on the rewards.
+    """
+    return (outcomes + 2) * (2.0**-53 * largest + 2.0**-1074)
 
 
 # Given by users -------------------------------------------------------------------------------------------------------
 
 
 def rewards_of_shape(rewards: npt.ArrayLike, shape: tuple[int, ...]) -> Rewards:
-    """Rewards of an array; ParameterError where its shape is not `shape`, or an entry is not finite."""
-    array = as_array(rewards, "rewards", np.float64)
+    """Rewards of an array, or those that were made; ParameterError if their shape is not `shape`, or not finite."""
+    array = rewards.array if isinstance(rewards, Rewards) else as_array(rewards, "rewards", np.float64)
     if array.shape != shape:
         raise ParameterError(f"rewards have shape {array.shape}; expected {shape}, one for each state and action")
-    return Rewards.from_array(array)
+    return rewards if isinstance(rewards, Rewards) else Rewards.from_array(array)
 
 
-def expected_over_outcomes(rewards: npt.ArrayLike, probabilities: np.ndarray) -> np.ndarray:
+def expected_over_outcomes(rewards: npt.ArrayLike, probabilities: np.ndarray) -> Rewards | np.ndarray:
     """(S, A) expected rewards: as given, or the mean over outcomes of rewards (S, A, K).
 
     Raises:
@@ -218,13 +246,21 @@ def expected_over_outcomes(rewards: npt.ArrayLike, probabilities: np.ndarray) ->
         raise ParameterError(
             f"the reward of state {s}, action {a}, outcome {k} is {array[s, a, k]}; expected a finite number"
         )
-    return (probabilities * np.where(possible, array, 0.0)).sum(axis=2)
+    return means_of(probabilities * np.where(possible, array, 0.0))
+
+
+def means_of(terms: np.ndarray) -> Rewards:
+    """Expected rewards, from the products (S, A, K) of probabilities and rewards."""
+    largest = float(np.abs(terms).sum(axis=2).max())
+    return Rewards.from_array(terms.sum(axis=2), rounding_of_mean(terms.shape[2], largest))
 
 
 # Rewards of stored transitions ----------------------------------------------------------------------------------------
 
 
 _ROWS = 1 << 16
+# (first state, rewards (N, A), the largest absolute reward of an outcome that was averaged)
+Blocks = Iterator[tuple[int, np.ndarray, float]]
 
 
 def rewards_of_space(
@@ -282,7 +318,7 @@ def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "
     env = space.environment if reward is None else _with_reward(space.environment, reward)
     rules, num_actions = rules_of(env).rewards_of(space.num_states), space.num_actions
 
-    def blocks() -> Iterator[tuple[int, np.ndarray]]:
+    def blocks() -> Blocks:
         for start in range(0, space.num_states, _ROWS):
             stop = min(start + _ROWS, space.num_states)
             states, terminal, count = space.packed_states[start:stop], space.terminal[start:stop], stop - start
@@ -290,10 +326,10 @@ def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "
             if space.has_chance:
                 outcomes = np.arange(len(own)), own, np.ones(len(own))
                 nothing = np.full(len(own), -1)
-                yield start, rules.expected_block(states, outcomes, terminal, 0, count, nothing)
+                yield start, rules.expected_block(states, outcomes, terminal, 0, count, nothing), 0.0
             else:
                 table = own.reshape(count, num_actions).astype(space.successors.dtype)
-                yield start, rules.block(states, table, terminal, 0, count)
+                yield start, rules.block(states, table, terminal, 0, count), 0.0
 
     return _collected(space, env, blocks())
 
@@ -301,21 +337,22 @@ def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "
 def _collected(
     space: "StateSpace",
     env: Environment,
-    blocks: Iterator[tuple[int, np.ndarray]],
+    blocks: Blocks,
     first: int = 0,
     last: int | None = None,
 ) -> "Rewards":
-    """Rewards of the states [first, last), from blocks (first state, rewards); RuleError where one is not finite."""
+    """Rewards of the states [first, last), from blocks; RuleError where one is not finite."""
     from pharos.rules import refused_reward
 
     stop = space.num_states if last is None else last
-    collector = RewardsCollector((stop - first, space.num_actions))
-    for start, block in blocks:
+    collector, largest = RewardsCollector((stop - first, space.num_actions)), 0.0
+    for start, block, averaged in blocks:
+        largest = max(largest, averaged)
         if not np.isfinite(block).all():
             s, a = map(int, np.argwhere(~np.isfinite(block))[0])
             raise refused_reward(env, space.state(start + s), a, f"is {block[s, a]}; expected a finite number")
         collector.add(start - first, block)
-    return collector.finish()
+    return collector.finish(rounding_of_mean(env.outcomes, largest) if largest else 0.0)
 
 
 def rewards_of_outcomes(space: "StateSpace") -> np.ndarray:
@@ -425,8 +462,8 @@ def _joined(outcomes: PaidOutcomes) -> PaidOutcomes:
 
 def _blocks(
     space: "StateSpace", env: Environment, workers: int | None, first: int = 0, last: int | None = None
-) -> Iterator[tuple[int, np.ndarray]]:
-    """(start, rewards of the states from start on), in order, of the states [first, last)."""
+) -> Blocks:
+    """Blocks of rewards of the states [first, last), in order."""
     from pharos.rules import rules_of
 
     rules = rules_of(env).rewards_of(space.num_states)
@@ -435,21 +472,22 @@ def _blocks(
     states, terminal = space.packed_states, space.terminal
     successors, dynamics = None if space.has_chance else space.successors, space.dynamics
 
-    def block(start: int) -> np.ndarray:
-        stop = min(start + _ROWS, end)
+    def block(start: int) -> tuple[np.ndarray, float]:
+        stop, largest = min(start + _ROWS, end), np.zeros(1)
         if successors is not None:
-            return rules.block(states, successors, terminal, start, stop)
-        return rules.expected_block(states, dynamics.entries_of(np.arange(start, stop)), terminal, start, stop)
+            return rules.block(states, successors, terminal, start, stop), 0.0
+        outcomes = dynamics.entries_of(np.arange(start, stop))
+        return rules.expected_block(states, outcomes, terminal, start, stop, largest=largest), float(largest[0])
 
     threads = rules.threads(usable_workers(workers))
     with ThreadPoolExecutor(threads) as pool:
         window = 2 * threads
         pending = [pool.submit(block, start) for start in starts[:window]]
         for i, start in enumerate(starts):
-            rewards = pending[i % window].result()
+            rewards, largest = pending[i % window].result()
             if i + window < len(starts):
                 pending[i % window] = pool.submit(block, starts[i + window])
-            yield start, rewards
+            yield start, rewards, largest
 
 
 def _with_reward(env: Environment, reward: Callable) -> Environment:

@@ -20,6 +20,7 @@ from pharos.kernels import outcomes as kernels
 from pharos.mdp.actions import States
 from pharos.mdp.arguments import as_array
 from pharos.mdp.dynamics import Dynamics, Outcomes, TopologicalOrder, as_indices, split
+from pharos.mdp.rewards import Rewards, means_of
 from pharos.system.arrays import (
     SUM_TOLERANCE,
     Indices,
@@ -126,17 +127,20 @@ class Lazy(Dynamics):
     Attributes:
         tables: the dynamics without laziness; where they are lazy already, their own tables, and p is that of both.
         laziness: p, in (0, 1).
+        roundings: of p and of the mean. Joining two p is off by at most 4 units, which move as much weight from one
+            value to another.
     """
 
     is_deterministic = False
     tables: Dynamics
 
-    def __init__(self, tables: Dynamics, p: float):
+    def __init__(self, tables: Dynamics, p: float, roundings: int = 4):
         if isinstance(tables, Lazy):
-            tables, p = tables.tables, 1.0 - (1.0 - tables.laziness) * (1.0 - p)
-        self.tables, self.laziness = tables, float(p)
+            p, roundings = 1.0 - (1.0 - tables.laziness) * (1.0 - p), tables.roundings + 8
+            tables = tables.tables
+        self.tables, self.laziness, self.roundings = tables, float(p), roundings
         self.num_states, self.num_actions = tables.num_states, tables.num_actions
-        self.operations = tables.operations + 4
+        self.operations = tables.operations + roundings
         # of the products with 1 - p, and of 1 - p
         self.mass = max(1.0, tables.mass) * (1 + (self.operations + 2) * _UNIT)
 
@@ -195,13 +199,13 @@ class Lazy(Dynamics):
 
     def part(self, start: int, stop: int) -> tuple[Dynamics, np.ndarray]:
         tables, halo = self.tables.part(start, stop)
-        return Lazy(tables, self.laziness), halo
+        return Lazy(tables, self.laziness, self.roundings), halo
 
     def restricted_to(self, states: np.ndarray) -> Dynamics:
-        return Lazy(self.tables.restricted_to(states), self.laziness)
+        return Lazy(self.tables.restricted_to(states), self.laziness, self.roundings)
 
     def merged(self, classes: np.ndarray, representatives: np.ndarray) -> Dynamics:
-        return Lazy(self.tables.merged(classes, representatives), self.laziness)
+        return Lazy(self.tables.merged(classes, representatives), self.laziness, self.roundings)
 
 
 # Several outcomes -----------------------------------------------------------------------------------------------------
@@ -552,7 +556,7 @@ def transitions_of(P: object) -> tuple["csr_matrix", int]:
     return matrix, num_actions
 
 
-def expected_rewards(P: object, R: npt.ArrayLike, num_states: int, num_actions: int) -> np.ndarray:
+def expected_rewards(P: object, R: npt.ArrayLike, num_states: int, num_actions: int) -> Rewards | np.ndarray:
     """(S, A) expected rewards, from (S, A); from (S,), alike for every action; or from (S, A, S) with a dense P.
 
     Other shapes are returned unchanged.
@@ -561,7 +565,7 @@ def expected_rewards(P: object, R: npt.ArrayLike, num_states: int, num_actions: 
     if rewards.shape == (num_states, num_actions, num_states) and isinstance(P, np.ndarray | list | tuple):
         probabilities = np.asarray(P)
         if probabilities.dtype != object and probabilities.shape == rewards.shape:
-            return (probabilities * rewards).sum(axis=2)
+            return means_of(probabilities * rewards)
     if rewards.shape == (num_states,):
         return np.repeat(rewards[:, None], num_actions, axis=1)
     return rewards

@@ -160,7 +160,7 @@ class TabularMDP:
     @staticmethod
     def from_outcome_table(
         dynamics: OutcomeTable,
-        rewards: npt.ArrayLike,
+        rewards: npt.ArrayLike | Rewards,
         *,
         gamma: float = 0.99,
         initial: npt.ArrayLike = 0,

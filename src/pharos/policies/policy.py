@@ -432,6 +432,7 @@ class QueriedPolicy:
         initial = np.zeros(count)
         np.add.at(initial, starts, mdp.start_probabilities)
         rewards = mdp.reward_table.rows(states)
+        rounding = mdp.reward_table.rounding
         setting: dict[str, Any] = {"gamma": mdp.gamma, "initial": initial, "horizon": mdp.horizon}
         actions = np.tile(np.arange(num_actions), count)
         outcomes = mdp.dynamics.outcomes(np.repeat(states, num_actions), actions)
@@ -449,9 +450,10 @@ class QueriedPolicy:
             sub_mdp = TabularMDP.from_matrices(
                 sparse.csr_matrix(entries, (count * num_actions, count)), rewards, **setting
             )
+        table = replace(sub_mdp.reward_table, rounding=rounding)
         if mdp.horizon is not None:  # every step reads the rewards: no palette
-            sub_mdp = replace(sub_mdp, reward_table=Rewards(np.asarray(rewards, np.float64), np.empty(0)))
-        return replace(sub_mdp, chance=mdp.chance)
+            table = Rewards(np.asarray(rewards, np.float64), np.empty(0), rounding)
+        return replace(sub_mdp, reward_table=table, chance=mdp.chance)
 
 
 class AnyAnswers(QueriedPolicy):

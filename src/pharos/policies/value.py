@@ -545,7 +545,7 @@ def _copies(mdp: TabularMDP, number: int) -> TabularMDP:
     return replace(
         mdp,
         dynamics=Table(next_states),
-        reward_table=Rewards(np.tile(rewards.table, (number, 1)), rewards.palette),
+        reward_table=Rewards(np.tile(rewards.table, (number, 1)), rewards.palette, rewards.rounding),
         terminal=np.tile(np.asarray(mdp.terminal), number),
         start_states=(mdp.start_states + first[:, None]).ravel(),
         start_probabilities=np.tile(mdp.start_probabilities / number, number),
@@ -586,7 +586,9 @@ def walk_values(
     history = np.repeat(state[:, None], frames, axis=1)
     limits, gammas = np.array([steps for steps, _ in ahead]), np.array([mdp.gamma for mdp in mdps])
     is_over = np.array([bool(mdp.terminal[s]) for mdp, s in zip(mdps, state, strict=True)])
+    rounding = np.array([mdp.reward_table.rounding for mdp in mdps])
     value, size, discount = np.zeros(len(mdps)), np.zeros(len(mdps)), np.ones(len(mdps))
+    of_rewards = np.zeros(len(mdps))
     path: list[np.ndarray] = []
     while not (is_over := is_over | (len(path) >= limits)).all():
         path.append(np.where(is_over[:, None], -1, history))
@@ -598,11 +600,12 @@ def walk_values(
             reward = discount[i] * (rewards.palette[entries] if len(rewards.palette) else entries)
             value[i] += reward
             size[i] += np.abs(reward)
+            of_rewards[i] += discount[i] * rounding[i]
             is_over[i] = (next_states < 0) | terminal[next_states]
             state[i] = np.where(next_states < 0, s, next_states)
         history = np.concatenate([history[:, 1:], state[:, None]], axis=1)
         discount *= gammas
-    bounds = [tail for _, tail in ahead] + 2 * _UNIT * (len(path) + 1) * size
+    bounds = [tail for _, tail in ahead] + 2 * _UNIT * (len(path) + 1) * size + of_rewards
     visited = [
         len(np.unique(column[column[:, 0] >= 0], axis=None if frames == 1 else 0))
         for column in np.array(path, np.int64).reshape(-1, len(mdps), frames).swapaxes(0, 1)

@@ -152,7 +152,7 @@ class CompiledRewards(_Compiled):
             self._rewards_of(states, np.empty((1, env.num_actions), np.int32), terminal, 0, 0)
         else:
             nothing = np.empty(0, np.int64)
-            self._expected_rewards_of(states, (nothing, nothing, np.empty(0)), terminal, 0, 0)
+            self._expected_rewards_of(states, (nothing, nothing, np.empty(0)), terminal, 0, 0, COUNTED, None)
 
     def threads(self, workers: int) -> int:
         return workers
@@ -160,9 +160,9 @@ class CompiledRewards(_Compiled):
     def block(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
         return self._rewards_or_error("block", self._rewards_of, states, successors, terminal, start, stop)
 
-    def expected_block(self, states, outcomes, terminal, start: int, stop: int, ranks=COUNTED) -> np.ndarray:
+    def expected_block(self, states, outcomes, terminal, start, stop, ranks=COUNTED, largest=None) -> np.ndarray:
         return self._rewards_or_error(
-            "expected_block", self._expected_rewards_of, states, outcomes, terminal, start, stop, ranks
+            "expected_block", self._expected_rewards_of, states, outcomes, terminal, start, stop, ranks, largest
         )
 
     def _rewards_or_error(self, name: str, compiled: Callable[..., np.ndarray], *arguments: object) -> np.ndarray:
@@ -182,10 +182,11 @@ class CompiledRewards(_Compiled):
         self.kernels.rewards_of(self.parameters, self.layout.tables, states, successors, terminal, start, stop, out)
         return out
 
-    def _expected_rewards_of(self, states, outcomes, terminal, start: int, stop: int, ranks=COUNTED) -> np.ndarray:
+    def _expected_rewards_of(self, states, outcomes, terminal, start: int, stop: int, ranks, largest) -> np.ndarray:
         out = np.zeros((stop - start, self.env.num_actions))
         arrays = (_read_only(array) for array in (states, *outcomes, ranks, terminal))
-        self.kernels.rewards_of(self.parameters, self.layout.tables, *arrays, start, out)
+        largest = np.zeros(1) if largest is None else largest
+        self.kernels.rewards_of(self.parameters, self.layout.tables, *arrays, start, out, largest)
         return out
 
 

@@ -402,17 +402,18 @@ def expected_rewards_kernel(
     WORDS = (0,) * W
 
     @compiler.kernel
-    def rewards_of(parameters, layout, states, which, successors, probabilities, ranks, terminal, start, out):
+    def rewards_of(parameters, layout, states, which, successors, probabilities, ranks, terminal, start, out, largest):
         """out[i, a] = expected reward of action a in state start + i; 0 in terminal states; out (n, A), zeros.
 
         which (N,), ascending: i A + a of each outcome; successors, probabilities (N,): where it leads, how likely it
         is. ranks (N,): which one of the possible outcomes, -1 for none; without entries: they are counted. Rewards that
-        are all the same are their own expectation, to the last bit.
+        are all the same are their own expectation, to the last bit. largest (1,): raised to the largest absolute reward
+        that is averaged.
         """
         self = Parameters(*parameters)
         state = read_only_view(WORDS, *layout)
         next_state = read_only_view(WORDS, *layout)
-        before, first, same = int64(-1), 0.0, True
+        before, first, same, size = int64(-1), 0.0, True, 0.0
         last_rank, outcome = int64(-1), int64(-1)  # the last possible outcome so far: its rank among these, its number
         for j in range(len(which)):
             i, a = which[j] // A, which[j] % A
@@ -431,13 +432,14 @@ def expected_rewards_kernel(
                         last_rank += 1
             value = float(reward(self, state, a, next_state, outcome))
             if which[j] != before:
-                before, first, same = which[j], value, True
+                before, first, same, size = which[j], value, True, 0.0
                 out[i, a] = 0.0
             # add up; equal rewards are not averaged, so that no rounding changes them
-            same = same and value == first
+            same, size = same and value == first, max(size, abs(value))
             out[i, a] += probabilities[j] * value
             if j + 1 == len(which) or which[j + 1] != before:
                 out[i, a] = first if same else out[i, a]
+                largest[0] = largest[0] if same else max(largest[0], size)
 
     return rewards_of
 

@@ -306,7 +306,7 @@ class InterpretedRewards:
                     out[i, a] = self._reward(rows[i], a, next_states[i])
         return out
 
-    def expected_block(self, states, outcomes, terminal, start: int, stop: int, ranks=()) -> np.ndarray:
+    def expected_block(self, states, outcomes, terminal, start, stop, ranks=(), largest=None) -> np.ndarray:
         num_actions = self.env.num_actions
         out = np.zeros((stop - start) * num_actions)
         rewards: list[list[float]] = [[] for _ in out]
@@ -325,6 +325,8 @@ class InterpretedRewards:
         for pair, values in enumerate(rewards):
             if values and values.count(values[0]) == len(values):
                 out[pair] = values[0]
+            elif largest is not None:
+                largest[0] = max(largest[0], *map(abs, values), 0.0)
         return out.reshape(-1, num_actions)
 
     def _reward(self, state: tuple[int, ...], action: int, next_state: tuple[int, ...], rank: int = 0) -> float:

@@ -110,6 +110,7 @@ class TransitionRewards(Protocol):
         start: int,
         stop: int,
         ranks: np.ndarray = COUNTED,
+        largest: np.ndarray | None = None,
     ) -> np.ndarray:
         """Expected rewards (stop - start, A) of states [start, stop), with chance.
 
@@ -118,6 +119,7 @@ class TransitionRewards(Protocol):
                 (N,) int64, where it leads; probabilities (N,).
             ranks: (N,) int64, which one of the possible outcomes of its state and action each is, -1 for an action
                 without effect; no entries: they are all, in their order.
+            largest: (1,) float64, raised to the largest absolute reward that was averaged with a different one.
         """
 
 

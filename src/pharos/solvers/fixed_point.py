@@ -89,6 +89,7 @@ class Backup(Generic[M]):
         per_state = 4 if chance.is_none else mdp.num_actions + 12
         self.operations = per_state + select.operations(mdp.num_actions) + mdp.dynamics.operations
         self.largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
+        self.rounding_of_rewards = mdp.reward_table.rounding
 
     def factor_of(self, mass: float) -> float:
         """Contraction factor, where the probabilities of choosing sum to at most `mass`."""
@@ -128,8 +129,11 @@ class Backup(Generic[M]):
         return float(self.rounding_of(self.largest_reward, largest)) + self.stored(largest)
 
     def rounding_of(self, rewards: Numbers, largest: Numbers) -> Numbers:
-        """A bound on the rounding error of a backup in 64 bits of rewards up to `rewards`, entries up to `largest`."""
-        return self.operations * (_UNIT * (rewards + largest) + 2.0**-1074)
+        """A bound on the rounding error of a backup in 64 bits of rewards up to `rewards`, entries up to `largest`.
+
+        Rewards that are means have errors of their own, which any choice between them passes on once.
+        """
+        return self.operations * (_UNIT * (rewards + largest) + 2.0**-1074) + self.rounding_of_rewards
 
     def stored(self, largest: float) -> float:
         """A bound on the error of storing a backup, where the result is at most `largest`: 0 in 64 bits."""

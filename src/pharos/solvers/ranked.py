@@ -164,9 +164,9 @@ class RankedBackup:
         self.part = Part.of(mdp, *map(int, self.cuts[rank.rank : rank.rank + 2]))
         self.part.dynamics.workers = max(1, usable_workers(None) // rank.neighbors)
         self.backup = backup = Backup(self.part, self.part.selection(select))
-        numbers = np.array([backup.factor, backup.operations, backup.largest_reward])
-        factor, operations, largest = np.max(rank.allgather(numbers), axis=0)
-        backup.factor, backup.operations, backup.largest_reward = float(factor), int(operations), float(largest)
+        names = ("factor", "operations", "largest_reward", "rounding_of_rewards")
+        numbers = np.max(rank.allgather(np.array([getattr(backup, name) for name in names], np.float64)), axis=0)
+        vars(backup).update(zip(names, numbers.tolist(), strict=True))
         self._halo = Halo(rank, self.part.halo, self.cuts)
         self.first = runs_of(self._halo.is_boundary(len(self.part)), _GAP)
         pieces = min(_LOOKS, 1 + (len(self.part) >> 16)) if rank.needs_progress else 1
