@@ -1,11 +1,14 @@
 """Tables of several outcomes: what they are made from, how compactly they are held, and what is refused."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
+from naive import exact
 from pharos.errors import ParameterError
 from pharos.mdp import OutcomeTable, TabularMDP
-from pharos.solvers import value_iteration
+from pharos.solvers import evaluate_policy, value_iteration
 from strategies import LAYOUTS, outcome_table
 
 # Two states: one action of state 0 stays or goes on, the other ends or goes on; state 1 leads to itself.
@@ -64,6 +67,16 @@ def test_a_table_of_single_outcomes_is_deterministic():
     assert one.dynamics.deterministic_table().tolist() == [[1], [-1]]
     assert value_iteration(one).value_at_start == 2.0
     assert not OutcomeTable.from_arrays(SUCCESSORS, PROBABILITIES).is_deterministic
+
+
+def test_a_small_outcome_behind_a_certain_one_is_an_outcome():
+    """Rows may sum to 1 + 1e-9: what is 1 need not be all."""
+    mdp = TabularMDP.from_outcomes([[[0, 1]], [[1, 1]]], [[[1.0, 9e-10]], [[1.0, 0.0]]], [[0.0], [1.0]], gamma=0.9)
+    assert not mdp.is_deterministic
+    solution = evaluate_policy(mdp, [0, 0])
+    rows = exact.exact(np.ones((2, 1, 1)))
+    truth = exact.values_of(mdp, rows)
+    assert truth[0, 0] > 8e-8 and exact.largest_error(solution.v, truth) <= Fraction(solution.error_bound)
 
 
 def test_rewards_of_outcomes_are_averaged_and_those_of_impossible_ones_ignored():

@@ -67,6 +67,22 @@ def test_tables_are_worth_together_what_they_are_worth_alone(chance, monkeypatch
     assert len({each.value for each in wanted}) == 5
 
 
+@pytest.mark.parametrize("kind", ["outcomes", "matrices"])
+def test_a_table_of_outcomes_with_one_each_is_a_table_of_next_states(kind):
+    """The value and the bound alike: 1 times a number is exact, in whatever arrays the 1 stands."""
+    plain = mdp_of(17)
+    table, setting = np.asarray(plain.next_states), {"gamma": plain.gamma, "horizon": plain.horizon}
+    if kind == "outcomes":
+        mdp = TabularMDP.from_outcomes(table[..., None], np.ones((*table.shape, 1)), plain.rewards, **setting)
+    else:
+        P = np.eye(len(table) + 1)[table][..., :-1]
+        mdp = TabularMDP.from_matrices(P, plain.rewards, **setting)
+    tables = list(np.random.default_rng(2).integers(mdp.num_actions, size=(5, mdp.num_states)))
+    alone = [solvers.evaluate_policy(mdp, table) for table in tables]
+    wanted = [Evaluation(each.value_at_start, True, each.error_bound, mdp.num_states) for each in alone]
+    assert table_values(mdp, tables) == wanted == table_values(plain, tables)
+
+
 def test_many_copies_are_taken_in_groups(monkeypatch):
     mdp = sticky_actions(mdp_of(5), 0.25)
     policies = policies_of(mdp, 7)

@@ -356,7 +356,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
 
     @property
     def operations(self) -> int:  # type: ignore[override]
-        return 2 * self.num_outcomes
+        return 0 if self.is_deterministic else 2 * self.num_outcomes  # 1 times a number is exact
 
     @cached_property
     def for_kernels(self) -> tuple[object, ...]:  # type: ignore[override]
@@ -384,6 +384,8 @@ class OutcomeTable(OutcomeRows, Dynamics):
 
     @cached_property
     def mass(self) -> float:  # type: ignore[override]
+        if self.is_deterministic:
+            return 1.0
         if self.palette is not None:  # the sign of a sum by fsum is that of the exact one
             beyond = max(math.fsum([*vector, -1.0]) for vector in np.asarray(self.palette).tolist())
             return 1.0 if beyond <= 0 else math.nextafter(1.0 + beyond, 2.0)
