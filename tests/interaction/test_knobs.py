@@ -19,7 +19,7 @@ from pharos.agents.batched import BatchRun
 from pharos.agents.batched.lane import BatchedEpisodes
 from pharos.environments import Layer
 from pharos.interaction import GymEnv, VectorEnv
-from pharos.mdp import ChanceSetting, rewards_of_staying
+from pharos.mdp import ChanceSetting, lazy_actions, paid_outcomes, rewards_of_staying
 from pharos.policies.policy import TableAnswers
 from pharos.policies.value import estimate
 from pharos.rules.stepping import InterpretedStepping
@@ -106,6 +106,22 @@ def returned(path):
 
 def of_a_table(states):
     return POLICY[states[-1]]
+
+
+def test_a_lazy_step_and_an_outcome_say_how_probable_they_were(space):
+    expected = {}
+    outcomes = paid_outcomes(lazy_actions(space.mdp(), 0.3))
+    for row, after, probability in zip(outcomes.which, outcomes.states, outcomes.probabilities, strict=True):
+        expected[row // 3, row % 3, after] = probability
+    env = GymEnv(RING, lazy=0.3, time_limit=None)
+    before, seen = int(env.reset(seed=1)[1]["state"][0]), set()
+    for step in range(300):
+        info = env.step(step % 2)[4]  # action 2 may go once around, which looks like staying
+        move = before, info["executed_action"], int(info["state"][0])
+        assert info["prob"] == pytest.approx(expected[move], rel=1e-12)
+        before = move[2]
+        seen.add(move)
+    assert len(seen) == 4 * 2 * 3
 
 
 # Two steps of many episodes by each implementation: (N, 3) states --------------------------------------------------
