@@ -217,7 +217,7 @@ def rounding_of_mean(outcomes: int, largest: float) -> float:
 # Given by users -------------------------------------------------------------------------------------------------------
 
 
-def rewards_of_shape(rewards: npt.ArrayLike, shape: tuple[int, ...]) -> Rewards:
+def rewards_of_shape(rewards: npt.ArrayLike | Rewards, shape: tuple[int, ...]) -> Rewards:
     """Rewards of an array, or those that were made; ParameterError if their shape is not `shape`, or not finite."""
     array = rewards.array if isinstance(rewards, Rewards) else as_array(rewards, "rewards", np.float64)
     if array.shape != shape:

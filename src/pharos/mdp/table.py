@@ -133,6 +133,7 @@ class Lazy(Dynamics):
 
     is_deterministic = False
     tables: Dynamics
+    roundings: int
 
     def __init__(self, tables: Dynamics, p: float, roundings: int = 4):
         if isinstance(tables, Lazy):
