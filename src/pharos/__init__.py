@@ -11,6 +11,26 @@ Importing pharos loads nothing heavy: every name below is imported when it is fi
 once, so that its registry knows the environments.
 """
 
+import os as _os
+import sys as _sys
+
+
+def _is_command() -> bool:
+    """Whether this process began as `pharos` or `python -m pharos`, not as a program that uses the library."""
+    words = getattr(_sys, "argv", None) or [""]
+    if words[0] == "-m":  # as long as Python looks for the module
+        return _sys.orig_argv[-len(words)] in ("pharos", "-mpharos")
+    script = getattr(_sys.modules.get("__main__"), "__file__", None) or ""
+    return _os.path.basename(words[0]) == _os.path.basename(script) == "pharos"
+
+
+if _is_command():
+    import _signal  # which is there from the start: what would be loaded first could be interrupted
+
+    if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
+        _signal.signal(_signal.SIGINT, lambda *_: (_os.write(2, b"pharos: interrupted\n"), _os._exit(130)))
+    from pharos.system import interrupts as _interrupts  # noqa: F401  (its `atexit` is to be the first)
+
 import importlib
 import warnings as _warnings
 from typing import Any

@@ -10,11 +10,13 @@ import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 import typer
 
 from pharos.system import compiling, storage
+from pharos.system.interrupts import INTERRUPTED, is_importing, send_again
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
 
     from pharos.environments import Environment
 
-INTERRUPTED = "interrupted; finished work is kept, and the same command goes on from there"
 NOTABLE_SECONDS = 0.2  # of compiling, beside those of work
 SPECIAL = re.compile(r"[^\w@%+=:,./\[\]-]")  # what a shell would read as more than a character of a word
 
@@ -233,7 +234,10 @@ def bytes_of(folder: Path) -> int:
 def termination() -> Iterator[None]:
     """Turn SIGTERM into SystemExit in the block, so that running work ends first; prints that the command resumes."""
 
-    def leave(*_: object) -> None:
+    def leave(number: int, frame: FrameType | None) -> None:
+        if is_importing(frame):  # where SystemExit may be lost
+            send_again(number)
+            return
         complain(INTERRUPTED)
         sys.exit(128 + signal.SIGTERM)
 

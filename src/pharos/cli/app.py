@@ -26,12 +26,13 @@ from pharos.cli import (
 from pharos.cli import (
     list as list_,
 )
-from pharos.cli.answers import INTERRUPTED, complain
+from pharos.cli.answers import complain
 from pharos.cli.command import Commands
 from pharos.errors import DivergenceError, ParameterError, PharosError
+from pharos.system.interrupts import EXIT_INTERRUPTED, INTERRUPTED, interrupts
 from pharos.system.lazy import conflict
 
-EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_FAILED, EXIT_USAGE = 1, 2
 # Options and commands that went, by the command that had them, and what it says of them
 AUDITS = "is gone: only final policies can be proven; `pharos benchmark verify FILE` computes them again"
 REMOVED = {
@@ -55,24 +56,34 @@ class _Group(TyperGroup):
         words = list(sys.argv[1:] if arguments is None else arguments)
         if words[:1] == ["help"]:
             words = [*words[1:], "--help"]
-        if len(words) < 2 or not {"-h", "--help"}.isdisjoint(words):
-            _hide_types_of_flags(self)
         try:
+            code = self._exit_code_of(words, options)
+            code = EXIT_INTERRUPTED if interrupts.finish() else code
+        except KeyboardInterrupt:
+            interrupts.finish()
+            code = EXIT_INTERRUPTED
+        if code == EXIT_INTERRUPTED and interrupts.report():
+            complain(INTERRUPTED)
+        sys.exit(code)
+
+    def _exit_code_of(self, words: list[str], options: dict[str, Any]) -> int:
+        try:
+            if len(words) < 2 or not {"-h", "--help"}.isdisjoint(words):
+                _hide_types_of_flags(self)
             code = super().main(words, **options)
             sys.stdout.flush()
+            return code if isinstance(code, int) else 0
         except Exception as error:
-            code = _exit_code(error)
+            code = EXIT_INTERRUPTED if _comes_from_interrupt(error) else _exit_code(error)
             if code is None:
                 raise
-        except KeyboardInterrupt:
-            code = EXIT_INTERRUPTED
-        if code == EXIT_INTERRUPTED:
-            complain(INTERRUPTED)
-        sys.exit(code if isinstance(code, int) else 0)
+            return code
 
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
+        except KeyboardInterrupt as error:  # which some releases of Typer answer by an empty line
+            raise typer.Exit(EXIT_INTERRUPTED) from error
         except EOFError as error:  # which would be taken for the keyboard's, and said to be an interruption
             kernels = Path(__file__).parents[1] / "kernels" / "__pycache__"
             raise PharosError(f"a file ended too early ({error}); if it is compiled code, delete {kernels}") from error
@@ -85,6 +96,13 @@ def _hide_types_of_flags(command: Any) -> None:
             option.metavar = ""
     for each in getattr(command, "commands", {}).values():
         _hide_types_of_flags(each)
+
+
+def _comes_from_interrupt(error: BaseException | None) -> bool:
+    """Whether an error was raised while an interrupt was on its way out."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _exit_code(error: Exception) -> int | None:
@@ -178,6 +196,17 @@ app.add_typer(cache.app, name="cache")
 
 def main() -> None:
     """Entry point of the `pharos` command."""
+    try:
+        _main()
+    except KeyboardInterrupt:  # before the command has begun, or a second one
+        interrupts.finish()
+        if interrupts.report():
+            complain(INTERRUPTED)
+        sys.exit(EXIT_INTERRUPTED)
+
+
+def _main() -> None:
+    interrupts.begin()
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):  # closed by whoever started it
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115

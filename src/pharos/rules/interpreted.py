@@ -17,6 +17,7 @@ from pharos.errors import RuleError
 from pharos.kernels.hash_table import COUNT, FIRST, find, insert_missing, pack_rows, slots_of, unpack_rows
 from pharos.rules.layout import Layout, unpack
 from pharos.system.arrays import SUM_TOLERANCE
+from pharos.system.workers import without_interrupts
 
 
 class Branches(NamedTuple):
@@ -390,7 +391,8 @@ class Interpreters:
         for _ in range(workers - 1):
             ours, theirs = context.Pipe()
             work = context.Process(target=_interpret, args=(env, theirs), daemon=True)
-            with warnings.catch_warnings():  # of threads, none of which hold anything that a rule needs
+            with without_interrupts(forks=True), warnings.catch_warnings():
+                # of threads, none of which hold anything that a rule needs
                 warnings.simplefilter("ignore", DeprecationWarning)
                 work.start()
             theirs.close()

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from multiprocessing import connection
+from multiprocessing import connection, resource_tracker
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -220,16 +220,29 @@ def check_guard(exit_code: int | None) -> None:
 
 
 @contextlib.contextmanager
-def without_interrupts() -> Iterator[None]:
-    """Let programs that are started within leave interrupts to this one, from their first line on."""
+def without_interrupts(*, forks: bool = False) -> Iterator[None]:
+    """Let processes that are started within leave interrupts to this one, from their first line on.
+
+    This one is interrupted at the end of the block. To ignore interrupts would lose those that come meanwhile.
+
+    Args:
+        forks: whether the processes are forked from this one.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which new programs inherit
+    if not forks:
+        resource_tracker.ensure_running()  # which unblocks interrupts when it begins, and is needed by the others
+    arrived: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: arrived.append(number))  # of another thread
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which new processes inherit
     try:
         yield
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
+        for number in arrived[:1]:
+            signal.raise_signal(number)
 
 
 def end_with_parent() -> None:
