@@ -7,6 +7,7 @@ import sys
 
 from typer.testing import CliRunner
 
+from patience import PATIENCE
 from pharos.cli import app
 
 
@@ -36,4 +37,6 @@ def process(*words, environment=None, **options):
     `stderr`."""
     line = [sys.executable, "-m", "pharos", *map(str, words)]
     environment = {**os.environ, **{name: str(value) for name, value in (environment or {}).items()}}
-    return subprocess.run(line, **{"capture_output": True, "text": True, "timeout": 600, "env": environment} | options)
+    return subprocess.run(
+        line, **{"capture_output": True, "text": True, "timeout": PATIENCE, "env": environment} | options
+    )

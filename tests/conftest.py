@@ -1,5 +1,6 @@
 """Property tests draw the same examples in every run, so that a failure is a change; `HYPOTHESIS_PROFILE=explore` draws
-others.
+others. None fails because the machine is busy: examples and what draws them may take any time. `patience.py` has the
+limit of all other waiting.
 
 Threads that wait give the processor back: `make test` runs as many processes as there are cores, and threads that spin
 take from them.
@@ -13,7 +14,7 @@ import zlib
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 # before NumPy and Numba are imported
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -24,8 +25,10 @@ from pharos.system import compiling
 compiling.SMALL = 0  # tests are small, and of compiled code; those of tests/kernels/test_interpreted.py are not
 compiling.announces = False  # else what a test finds on standard error depends on what was compiled before
 
-settings.register_profile("fixed", derandomize=True)
-settings.register_profile("explore", derandomize=False)
+for name, derandomize in (("fixed", True), ("explore", False)):
+    settings.register_profile(
+        name, derandomize=derandomize, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 
 

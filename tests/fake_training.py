@@ -1,7 +1,8 @@
 """A runner that learns nothing: its curves are formulas of the config, so that a study over it takes no time.
 
 The value approaches the optimal one exponentially, more slowly in large instances, from images and under chance. Every
-finished execution leaves a line in the file PHAROS_FAKE_LOG; PHAROS_FAKE_SECONDS makes it last.
+finished execution leaves a line in the file PHAROS_FAKE_LOG; PHAROS_FAKE_SECONDS makes it last, and with
+PHAROS_FAKE_LIMIT so many lines in the file none ends any more.
 """
 
 import json
@@ -24,6 +25,8 @@ SLOWNESS = {"vector": 1.0, "simple_image": 1.7, "index": 0.5}
 def train(config, folder):
     """Write run.json and curve.parquet; fails where the hyperparameter `fail` says so."""
     time.sleep(float(os.environ.get("PHAROS_FAKE_SECONDS", "0")))
+    while (limit := os.environ.get("PHAROS_FAKE_LIMIT")) and number_of_lines() >= int(limit):
+        time.sleep(0.01)
     hyperparameters = config["hyperparameters"]
     if hyperparameters.get("fail") == "always" or config["seed"] == hyperparameters.get("fail_seed"):
         raise ValueError("this seed\nfails on purpose")
@@ -73,6 +76,11 @@ def train(config, folder):
     if log := os.environ.get("PHAROS_FAKE_LOG"):
         with open(log, "a") as file:
             file.write(f"{id}\n")
+
+
+def number_of_lines():
+    """Lines of PHAROS_FAKE_LOG: executions that have finished."""
+    return len(Path(os.environ["PHAROS_FAKE_LOG"]).read_text().split())
 
 
 def specification(name="fake", **given):

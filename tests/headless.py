@@ -8,6 +8,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+from patience import PATIENCE
+
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = (
     *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars"),
@@ -109,7 +111,7 @@ class Page:
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
-    def until(self, expression, seconds=30):
+    def until(self, expression, seconds=PATIENCE):
         """Wait until an expression is true."""
         script = (
             "new Promise((done) => { const began = Date.now(); const look = () => { let is = false; "

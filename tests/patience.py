@@ -2,7 +2,7 @@
 
 import time
 
-PATIENCE = 600.0
+PATIENCE = 1800.0
 """Seconds that a process may take, or what is waited for, before a test gives up."""
 
 

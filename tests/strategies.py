@@ -19,7 +19,7 @@ rewards_of_games = st.sampled_from([-1.0, 0.0, 0.1, 0.5, 1.0])
 
 def examples(count: int, /, *arguments, **named):
     """Return a decorator: the property is tested on so many examples that strategies draw, however long each takes."""
-    return lambda test: settings(max_examples=count, deadline=None)(given(*arguments, **named)(test))
+    return lambda test: settings(max_examples=count)(given(*arguments, **named)(test))
 
 
 @st.composite

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from patience import PATIENCE
 from pharos.system.workers import one_thread
 
 CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link", "os.symlink")
@@ -30,7 +31,6 @@ VOLATILE = {"seconds", "compiling_seconds", "written", "digest", "elapsed", "rem
 UNCOMPARED = ("log.txt", "status.json", "lock")
 REMADE = ("cache/values",)
 """What is computed again where it is not there, and then not kept."""
-LONGEST = 60.0
 PYTHON = "python"
 """A command of this name is code of Python, its second word."""
 
@@ -130,7 +130,7 @@ def _execute(words: list[str], folder: Path, change: int, seconds: float) -> End
         if process == 0:
             _child(words, folder, change, shared, output.fileno())
         status = 0
-        while time.monotonic() < began + (seconds or LONGEST):
+        while time.monotonic() < began + (seconds or PATIENCE):
             ended, status = os.waitpid(process, os.WNOHANG)
             if ended:
                 break
@@ -142,8 +142,17 @@ def _execute(words: list[str], folder: Path, change: int, seconds: float) -> End
         output.seek(0)
         text = output.read().decode(errors="replace")
     code, (changes, killed) = os.waitstatus_to_exitcode(status), struct.unpack("qq", shared)
-    assert took < LONGEST, (words, text)
+    assert took < PATIENCE, (words, text)
     return End(code, text, changes, bool(killed) or code == -signal.SIGKILL, killed not in (0, process), took)
+
+
+def processes_in(folder: Path) -> list[int]:
+    """Living processes whose current folder this is, where the system tells."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended, or is another user's
+            found += [int(process.name)] * os.path.samefile(process / "cwd", folder)
+    return found
 
 
 def _child(words: list[str], folder: Path, change: int, shared: mmap.mmap, output: int) -> None:

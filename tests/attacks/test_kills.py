@@ -2,7 +2,6 @@
 
 import shlex
 import shutil
-import time
 from collections import Counter
 from dataclasses import dataclass
 
@@ -10,7 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from attacks.kills import ForkServer, content
+from attacks.kills import ForkServer, content, processes_in
+from patience import wait_for
 
 pytestmark = pytest.mark.long
 
@@ -124,7 +124,7 @@ def test_a_command_that_is_killed_and_repeated_ends_as_if_it_had_not_been(name, 
             elif again:  # less was left to do than before
                 kills.append(kill)
                 break
-        time.sleep(0.1)  # for workers of a process that was killed, which end with it
+        wait_for(lambda folder=folder: not processes_in(folder))  # workers of a process that was killed end with it
         execute(folder)
         assert_same(content(folder), expected, case)
         shutil.rmtree(folder)

@@ -10,6 +10,7 @@ import warnings
 import numpy as np
 import pytest
 
+from patience import PATIENCE
 from pharos import importers
 from pharos.mdp import TabularMDP
 
@@ -65,7 +66,7 @@ def test_importers_of_one_folder_wait_for_each_other(tmp_path):
     for process in running:
         process.start()
     for process in running:
-        process.join(60)
+        process.join(PATIENCE)
     assert [process.exitcode for process in running] == [0] * NUMBER
     for folder in folders:
         assert 1 <= importers.load(folder).num_states <= NUMBER  # its digests are those of one of them

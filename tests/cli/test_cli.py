@@ -8,12 +8,12 @@ import shlex
 import shutil
 import subprocess
 import sys
-import time
 
 import pytest
 from rich.console import Console
 
 import command_line
+from patience import PATIENCE, wait_for
 from pharos import TabularMDP, build, hardness, importers
 from pharos.cli import answers
 from pharos.cli.options import parse_parameters, parse_size, parse_value
@@ -467,14 +467,13 @@ def test_exit_codes_reach_the_shell(cache):
 @pytest.mark.slow
 def test_a_solve_that_is_terminated_says_that_the_same_command_goes_on(cache, tmp_path):
     code = "import time; from pharos import solvers; from pharos.cli import main; import sys; "
-    code += "solvers.value_iteration = lambda *_, **__: (open('began', 'w'), time.sleep(60)); "
+    code += f"solvers.value_iteration = lambda *_, **__: (open('began', 'w'), time.sleep({PATIENCE})); "
     code += "sys.argv = ['pharos', 'solve', 'simple_grid']; main()"
     place = {"cwd": tmp_path, "env": {**os.environ, "PHAROS_CACHE_DIR": str(cache)}}
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, **place)
-    while process.poll() is None and not (tmp_path / "began").exists():
-        time.sleep(0.05)
+    wait_for((tmp_path / "began").exists, process)
     process.terminate()
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=PATIENCE)
     assert (process.returncode, said) == (
         143,
         "pharos: interrupted; finished work is kept, and the same command goes on from there\n",
@@ -488,7 +487,7 @@ def test_what_the_environment_lacks_or_forbids_is_a_line(cache):
         assert done.returncode == 2 and done.stderr.count("\n") == 1 and "NUMBA_" in done.stderr, done.stderr
     for words, code, said in (("list >&-", 0, ""), ("play frozen_lake/4x4 <&-", 1, "pharos: play needs a terminal")):
         line = f"{sys.executable} -m pharos {words}"
-        done = subprocess.run(line, shell=True, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
+        done = subprocess.run(line, shell=True, stderr=subprocess.PIPE, text=True, timeout=PATIENCE, check=False)
         assert done.returncode == done.stderr.count("\n") == code and done.stderr.startswith(said)
 
 
@@ -498,7 +497,7 @@ def test_help_and_list_load_nothing_heavy(words):
     heavy = ("numba", "scipy.stats", "pandas", "matplotlib", "torch")
     code = f"import atexit, os, sys; from pharos.cli import app; heavy = {heavy!r}; "
     code += f"atexit.register(lambda: os._exit(9) if {{*heavy}} & {{*sys.modules}} else None); app({words!r})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
 
 

@@ -24,7 +24,7 @@ SOURCE = Path(__file__).parents[2] / "src"
 SITE = """
 import os, re, signal, sys
 
-place, _, number = os.environ.pop("INTERRUPT_AT").rpartition(" ")
+place, _, number = os.environ.pop("INTERRUPT_AT", "none 0").rpartition(" ")
 pattern, number, seen, has_begun = re.compile(place.removeprefix("main ")), int(number), 0, place[:5] != "main "
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -48,10 +48,10 @@ class Finder:
     def find_spec(self, name, path=None, target=None):
         if name == "pharos":
             self.is_loading = True
-            if place != "module":
-                sys.setprofile(on_event)
         elif place == "module" and hasattr(self, "is_loading"):
             arrive(name)
+        elif self.__dict__.pop("is_loading", False):
+            sys.setprofile(on_event)
 
 sys.meta_path.insert(0, Finder())
 """

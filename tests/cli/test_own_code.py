@@ -12,6 +12,7 @@ import pytest
 import fake_training
 import pharos
 from command_line import answer, process, run, usage_error
+from patience import PATIENCE
 from pharos import study
 from pharos.environments import catalog
 from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, UntrustedCode
@@ -405,7 +406,7 @@ def test_a_script_needs_no_guard_for_workers(tmp_path):
     """Workers do not import the script again: what it prints, it prints once."""
     (tmp_path / "script.py").write_text(SCRIPT)
     line = [sys.executable, "script.py"]
-    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=300, env=dict(os.environ))
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE, env=dict(os.environ))
     assert (done.returncode, done.stdout) == (0, "2 2\n40 {True}\n"), done.stderr
     assert "Traceback" not in done.stderr
 
@@ -469,7 +470,7 @@ if GUARD:
 def test_a_script_that_defines_a_class_needs_a_guard_and_says_so(guard, said, tmp_path):
     (tmp_path / "script.py").write_text(WALK.replace("GUARD", guard))
     line = [sys.executable, "script.py"]
-    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=300, env=dict(os.environ))
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE, env=dict(os.environ))
     assert done.returncode == 0 and done.stdout.startswith(said) and "Traceback" not in done.stderr, done.stderr
     assert done.stdout.count("\n") == 1
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from patience import PATIENCE
 from pharos.environments import class_called, named_instances
 from pharos.environments.built_in import BUILT_IN
 from pharos.explorer.pages import MOST_POSITIONS
@@ -77,7 +78,7 @@ def test_the_code_of_pages_prints_what_they_say(name):
 def test_tutorials_print_what_they_show(name):
     done = subprocess.run(
         [sys.executable, str(SCRIPTS / "notebooks.py"), "--check", name],
-        **{"capture_output": True, "text": True, "timeout": 900, "env": {**os.environ, "MPLBACKEND": "agg"}},
+        **{"capture_output": True, "text": True, "timeout": PATIENCE, "env": {**os.environ, "MPLBACKEND": "agg"}},
     )
     assert done.returncode == 0, done.stderr
 
@@ -90,7 +91,7 @@ def test_tutorials_run_as_scripts(path, tmp_path):
     (tmp_path / "script.py").write_text("\n\n".join("".join(cell["source"]) for cell in cells))
     done = subprocess.run(
         [sys.executable, "script.py"],
-        **{"cwd": tmp_path, "capture_output": True, "text": True, "timeout": 900},
+        **{"cwd": tmp_path, "capture_output": True, "text": True, "timeout": PATIENCE},
         env={**os.environ, "MPLBACKEND": "agg"},
     )
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
@@ -130,7 +131,7 @@ def test_the_code_of_a_page_runs_as_a_script(page, tmp_path):
     (tmp_path / "script.py").write_text(BEFORE.get(page.name, "") + code)
     done = subprocess.run(
         [sys.executable, "script.py"],
-        **{"cwd": tmp_path, "capture_output": True, "text": True, "timeout": 900},
+        **{"cwd": tmp_path, "capture_output": True, "text": True, "timeout": PATIENCE},
         env={**os.environ, "MPLBACKEND": "agg", "PHAROS_CACHE_DIR": str(tmp_path / "cache")},
     )
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr

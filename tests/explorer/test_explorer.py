@@ -4,7 +4,6 @@ import contextlib
 import http.client
 import json
 import socket
-import time
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -13,6 +12,7 @@ import pytest
 import pharos
 from command_line import run
 from naive import mdp as naive_mdp
+from patience import PATIENCE, wait_for
 from pharos.errors import ParameterError, UnknownName
 from pharos.explorer import Exploration, Explorer, Learnt, exploration_of, page, write
 from pharos.explorer.exploration import Pictures
@@ -239,7 +239,7 @@ def served(lake):
 def ask(explorer, path, method="GET", host=None, **headers):
     """(status, headers, text) of a request with this Host header."""
     at = urlsplit(explorer.url)
-    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", at.port, timeout=20)) as connection:
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", at.port, timeout=PATIENCE)) as connection:
         connection.putrequest(method, path, skip_host=True)
         for name, value in {"Host": host or at.netloc, **headers}.items():
             connection.putheader(name, value)
@@ -303,18 +303,17 @@ def test_a_target_that_is_no_address_is_answered(served):
     assert ask(served, "http://[")[0] == 400
 
 
-def test_one_connection_too_many_is_closed_at_once_and_the_next_is_answered(served):
+def test_one_connection_too_many_is_closed_at_once_and_the_next_is_answered(served, monkeypatch):
+    monkeypatch.setattr(served._http.RequestHandlerClass, "timeout", PATIENCE)  # none is given up meanwhile
     at = ("127.0.0.1", urlsplit(served.url).port)
     http_server = served._http
     with contextlib.ExitStack() as stack:
         for _ in range(MOST_CONNECTIONS):
-            stack.enter_context(socket.create_connection(at, timeout=20))
-        while http_server.places._value:
-            time.sleep(0.01)
-        extra = stack.enter_context(socket.create_connection(at, timeout=20))
+            stack.enter_context(socket.create_connection(at, timeout=PATIENCE))
+        wait_for(lambda: not http_server.places._value)
+        extra = stack.enter_context(socket.create_connection(at, timeout=PATIENCE))
         assert extra.recv(1) == b""
-    while http_server.places._value < MOST_CONNECTIONS:
-        time.sleep(0.01)
+    wait_for(lambda: http_server.places._value == MOST_CONNECTIONS)
     assert ask(served, urlsplit(served.url).path)[0] == 200
 
 

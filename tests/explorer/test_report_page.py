@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from patience import PATIENCE
 from pharos.study.figures import Curves, Line, Panel, lines, regret_curves
 from pharos.study.report.page import Section, image, render, table
 
@@ -121,7 +122,7 @@ def test_a_reader_points_at_curves_hides_lines_and_sorts_tables(tmp_path):
     (tmp_path / "used.html").write_text(used)
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
     command = [CHROMIUM, *options, f"--user-data-dir={tmp_path}", "--dump-dom", str(tmp_path / "used.html")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE).stdout
     said = json.loads(html.unescape(done.split("SAID")[1]))
     assert said["panels"] == ["lakes", "grids"] and said["picture"] and said["gone"]
     assert said["told"] == ["steps 400", "DQN, image: 9 (8 to 10)", "DQN, vector: 7 (6 to 8)"]

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import strategies as st
 
 from naive.hardness import distances
+from patience import PATIENCE
 from pharos import TabularMDP, hardness, random_actions
 from pharos.errors import ParameterError
 from pharos.hardness import sum_sweep
@@ -111,7 +112,7 @@ def test_the_default_budget_is_not_spent_on_counting_the_pairs_of_an_infinite_di
     monkeypatch.setattr(sum_sweep, "COUNTING", 0.0)
     size = 5000
     forward = TabularMDP.from_arrays(np.minimum(np.arange(size) + 1, size - 1)[:, None], np.zeros((size, 1)))
-    known, counted = hardness.diameter(forward), hardness.diameter(forward, budget=60)
+    known, counted = hardness.diameter(forward), hardness.diameter(forward, budget=PATIENCE)
     assert known.exact and known.upper == counted.upper == math.inf and not known.counted
     assert 1 <= known.unreachable_pairs <= counted.unreachable_pairs == size * (size - 1) // 2
     assert known.finite_part <= counted.finite_part == size - 1 and counted.counted
@@ -290,7 +291,7 @@ def test_seconds_of_compiling_are_not_taken_from_a_budget(monkeypatch):
     spending = BudgetClock(hardness.Budget(seconds=0.01), None)
     time.sleep(0.02)
     assert spending.is_over
-    monkeypatch.setattr(compiling, "_total", compiling.seconds() + 60)
+    monkeypatch.setattr(compiling, "_total", compiling.seconds() + PATIENCE)
     assert not spending.is_over
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from test_effective_horizon import key_corridor
 
@@ -137,7 +137,6 @@ def test_values_whose_squares_are_no_floats_have_their_deviation(reward):
     assert found.lower <= reward / 2 <= found.upper <= reward * (0.5 + 1e-6)
 
 
-@settings(deadline=None)
 @given(st.floats(2e-15, 1e-3), st.floats(0.1, 0.99))
 def test_what_a_row_lacks_is_an_end_for_values_and_measures_alike(lack, gamma):
     """A state that pays 1 and goes on with what its row holds, written as a matrix and as outcomes."""

@@ -10,6 +10,7 @@ import pytest
 
 import pharos
 from children import exit_code
+from patience import PATIENCE
 from pharos import drawing, exporters, hardness, importers
 from pharos.cli.evaluate import save
 from pharos.errors import FileFormatError
@@ -73,14 +74,14 @@ def test_a_full_disk_leaves_the_older_file(name, tmp_path):
 
 
 @pytest.fixture
-def at_most_20_seconds():
+def with_patience():
     """A reader that waits for a pipe is ended."""
 
     def stop(*_):
         raise TimeoutError
 
     before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(20)
+    signal.alarm(int(PATIENCE))
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
@@ -99,7 +100,7 @@ def be_endless(path):
 @pytest.mark.slow
 @pytest.mark.parametrize("become", [be_a_pipe, be_endless])
 @pytest.mark.parametrize("name", ["run.json", "curve.parquet", "policy.npy"])
-def test_pipes_and_devices_in_the_folder_of_a_run_are_refused(name, become, tmp_path, at_most_20_seconds):
+def test_pipes_and_devices_in_the_folder_of_a_run_are_refused(name, become, tmp_path, with_patience):
     pharos.train("q_learning", "frozen_lake/4x4", steps=50, out=tmp_path / "run")
     become(tmp_path / "run" / name)
     with pytest.raises(FileFormatError, match=rf"{name}: cannot be read.* it is no regular file"):
@@ -107,7 +108,7 @@ def test_pipes_and_devices_in_the_folder_of_a_run_are_refused(name, become, tmp_
 
 
 @pytest.mark.parametrize("become", [be_a_pipe, be_endless])
-def test_pipes_and_devices_among_the_files_of_mdps_are_refused(become, tmp_path, at_most_20_seconds):
+def test_pipes_and_devices_among_the_files_of_mdps_are_refused(become, tmp_path, with_patience):
     importers.save(mdp(), tmp_path / "mdp")
     for file in sorted((tmp_path / "mdp").glob("*.npy")):
         whole = file.read_bytes()

@@ -29,7 +29,7 @@ def by_torch(layer, values, pictures, dy):
     return z.detach().relu().numpy(), {name: each.grad.numpy() for name, each in own.items()}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),
     shape=st.tuples(st.integers(1, 4), st.integers(1, 6), st.integers(1, 6)),
@@ -63,7 +63,7 @@ def test_answers_and_gradients_are_those_of_a_convolution(seed, shape, number, c
     assert np.array_equal(layer.forward(values, one).numpy()[:, 0], y[:, -1])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),
     shape=st.tuples(st.integers(1, 3), st.integers(1, 5), st.integers(1, 5)),

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import pharos
@@ -18,7 +18,6 @@ CELLS = np.array(list(itertools.product(range(16), range(16))), np.int64)
 WORDS = ["1011111101001001", "1010000111000001", "0111111110100111"]
 
 
-@settings(deadline=None)
 @given(bits=st.integers(8, 200), seed=st.integers(0, 2**70))
 def test_different_states_have_different_words(bits, seed):
     words = observe(GRID, "hash", bits=bits, seed=seed)(CELLS)

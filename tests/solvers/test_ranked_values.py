@@ -16,6 +16,7 @@ import pytest
 from hypothesis import strategies as st
 
 import pharos
+from patience import PATIENCE
 from pharos.errors import ParameterError, PrecisionError
 from pharos.mdp import BEST, WORST, PolicyTable, TabularMDP
 from pharos.ranks import RankFailed
@@ -304,7 +305,7 @@ if solution is not None:
 def ranks_of_mpi(size, program, *arguments):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [MPIEXEC, "-n", str(size), sys.executable, "-c", program, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=500, env=environment)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=environment)
 
 
 WORLD = ["breakout", "height=7", "columns=5", "brick_rows=1", "--gamma", "0.5"]
@@ -314,7 +315,7 @@ def run(tmp_path, *arguments, ranks_of_mpi=0):
     launcher = [MPIEXEC, "-n", str(ranks_of_mpi)] if ranks_of_mpi else []
     command = [*launcher, sys.executable, "-m", "pharos", "solve", *arguments]
     environment = {**os.environ, "PHAROS_CACHE_DIR": str(tmp_path / "cache")}
-    return subprocess.run(command, capture_output=True, text=True, timeout=500, env=environment)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=environment)
 
 
 @pytest.mark.long

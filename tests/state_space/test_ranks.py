@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from test_resuming import build, files_of
 
 import pharos
+from patience import PATIENCE
 from pharos import ranks
 from pharos.errors import MissingExtra, ParameterError, RuleError, StateSpaceError, StateSpaceTooLarge
 from pharos.kernels import hash_table
@@ -272,7 +273,7 @@ pathlib.Path(sys.argv[2], str(os.getpid())).write_text(line)
 def test_ranks_of_mpi_send_messages(what, line, tmp_path):
     command = [Path(sys.executable).parent / "mpiexec", "-n", "3", sys.executable, "-c", PROGRAM, what, tmp_path]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(Path(__file__).parents[1])])}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=environment)
     assert [said.read_text() for said in tmp_path.iterdir()] == [line] * 3, done.stderr
 
 
@@ -331,7 +332,7 @@ def test_ranks_of_mpi_write_the_same_files_and_go_on_after_a_kill(tmp_path):
     def run(*more, last=0):
         command = [sys.executable, "-c", BUILD, "build", *world, *more]
         environment = {**os.environ, "LAST_EXCHANGE": str(last)}
-        return subprocess.run(command, capture_output=True, text=True, timeout=500, env=environment)
+        return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=environment)
 
     stopped = run("--max-states", "1000")
     assert stopped.returncode == 1

@@ -9,8 +9,8 @@ import resource
 import shutil
 import signal
 import sys
-import threading
 import time
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ import pytest
 
 import pharos
 from children import exit_code, fork, in_a_child, kill
+from patience import PATIENCE
 from pharos.errors import DiskFull, RuleError, StateSpaceIncomplete, StateSpaceLocked, StateSpaceTooLarge
 from pharos.state_space import manifest as writing
 from pharos.system import storage
@@ -99,16 +100,22 @@ def test_a_table_that_threads_fill_together_gives_the_same_files(room, tmp_path,
     assert_same_files(tmp_path / "space", undisturbed["breakout"])
 
 
-def _build_slowly(env, folder):
-    build(env, folder, checkpoint_seconds=0.0, workers=2, progress=lambda _: time.sleep(0.02))
+def _build_a_part(env, folder):
+    """Build some blocks, each of which is slow, and then wait to be killed."""
+    blocks = iter(range(6))
+
+    def go_on(_):
+        time.sleep(0.02 if next(blocks, None) is not None else PATIENCE)
+
+    build(env, folder, checkpoint_seconds=0.0, workers=2, progress=go_on)
 
 
 @pytest.mark.slow
 def test_a_build_killed_again_and_again_ends_in_the_same_files(tmp_path, undisturbed, small_blocks):
     folder = tmp_path / "space"
     rng = np.random.default_rng(0)
-    for _ in range(8):  # 55 blocks that take 0.02 s each are more than 8 times 0.12 s
-        process = in_a_child(_build_slowly, BREAKOUT, folder)
+    for _ in range(8):  # of 55 blocks
+        process = in_a_child(_build_a_part, BREAKOUT, folder)
         while process.is_alive() and not (folder / "manifest.json").exists():  # the first child's first checkpoint
             time.sleep(0.001)
         process.join(timeout=rng.uniform(0.03, 0.12))
@@ -313,7 +320,7 @@ def test_a_build_on_disk_killed_again_and_again_leaves_no_table_behind(tmp_path,
     folder = tmp_path / "space"
     rng = np.random.default_rng(0)
     for _ in range(6):
-        process = in_a_child(_build_slowly, BREAKOUT, folder)
+        process = in_a_child(_build_a_part, BREAKOUT, folder)
         process.join(timeout=rng.uniform(0.05, 0.2))
         kill(process)
         left = {name for name in files_of(folder) if not storage.is_temporary(name)}
@@ -392,7 +399,7 @@ def test_files_do_not_depend_on_processes_that_interpret(env, workers, tmp_path,
     build(env, tmp_path / "space", workers=workers)
     assert_same_files(tmp_path / "space", undisturbed[env.name])
     for child in multiprocessing.active_children():
-        child.join(5)
+        child.join(PATIENCE)
         assert not child.is_alive()
 
 
@@ -686,7 +693,8 @@ def test_in_the_cache_another_build_is_waited_for(tmp_path, undisturbed, small_b
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
     folder = building.cached_folder(BREAKOUT)
     process, release = another_build(folder)
-    threading.Timer(0.5, release.set).start()
+    warn = warnings.warn
+    monkeypatch.setattr(warnings, "warn", lambda *given, **options: (release.set(), warn(*given, **options)))
     with pytest.warns(RuntimeWarning, match="another process is building there; waiting until it is done"):
         build(BREAKOUT, None)
     process.join()

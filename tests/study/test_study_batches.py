@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections import deque
 from dataclasses import asdict
 from pathlib import Path
@@ -16,6 +15,7 @@ import pytest
 
 import fake_batches
 import fake_training
+from patience import wait_for
 from pharos import study
 from pharos.agents.batched import lane_width
 from pharos.errors import ParameterError
@@ -160,9 +160,7 @@ def test_a_runner_that_is_killed_leaves_nothing_half_done(tmp_path, sizes):
     environment = {**os.environ, "PHAROS_FAKE_SECONDS": "0.1"}
     folders = [str(TESTS), str(TESTS / "study")]
     process = subprocess.Popen([sys.executable, str(script), *folders, str(tmp_path / "out")], env=environment)
-    while not sizes():
-        assert process.poll() is None
-        time.sleep(0.05)
+    wait_for(sizes, process)
     process.send_signal(signal.SIGKILL)
     process.wait()
     end = run(specification(seeds=6), tmp_path / "out")

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import fake_training
+from patience import PATIENCE
 from pharos import study
 from pharos.errors import UnknownName
 
@@ -27,7 +28,7 @@ def pharos(*arguments, cwd):
     command = [sys.executable, "-m", "pharos", "study", *arguments]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cwd / "numba")}  # nothing is compiled yet
     environment.pop("NUMBA_NUM_THREADS", None)
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, env=environment)
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=PATIENCE, env=environment)
 
 
 @pytest.fixture(scope="module")

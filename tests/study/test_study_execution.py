@@ -14,6 +14,7 @@ import pytest
 import fake_training
 from children import exit_code
 from edits import edited_json, flip
+from patience import PATIENCE, wait_for
 from pharos import study
 from pharos.errors import AllRunsFailed, ParameterError, PharosError
 from pharos.study import execution as _execution
@@ -97,7 +98,7 @@ def write_nothing(config, folder):
 
 
 def never_end(config, folder):
-    time.sleep(60)
+    time.sleep(PATIENCE)
 
 
 def kill_itself(config, folder):
@@ -194,19 +195,12 @@ if __name__ == "__main__":
 """
 
 
-def start_runner(tmp_path, log):
+def start_runner(tmp_path, log, limit=10**6):
     path = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
     environment = {"PYTHONPATH": path, "PHAROS_FAKE_LOG": str(log), "PHAROS_FAKE_SECONDS": "0.2"}
+    environment["PHAROS_FAKE_LIMIT"] = str(limit)
     arguments = [sys.executable, "-c", RUNNER, str(tmp_path / "fake.yaml"), str(tmp_path / "out")]
     return subprocess.Popen(arguments, env={**os.environ, **environment})
-
-
-def wait_for(condition, seconds=600):
-    end = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.01)
-    return value
 
 
 def workers_of(folder):
@@ -233,8 +227,8 @@ def test_killing_runner_and_workers_loses_and_repeats_nothing(tmp_path, log):
     assert len(expected) == 16
 
     for killed in (1, 2):
-        runner = start_runner(tmp_path, log)
         target = len(log.read_text().split()) + 2
+        runner = start_runner(tmp_path, log, limit=target + 3)  # it cannot end before it is killed
         wait_for(lambda target=target: len(log.read_text().split()) >= target)
         os.kill(wait_for(lambda: workers_of(out))[0], signal.SIGKILL)
         wait_for(lambda target=target: len(log.read_text().split()) >= target + 2)
@@ -244,7 +238,7 @@ def test_killing_runner_and_workers_loses_and_repeats_nothing(tmp_path, log):
         wait_for(lambda orphans=orphans: not any(Path(f"/proc/{pid}").exists() for pid in orphans))
         assert len(fake_training.results(out)) < 16, f"kill {killed} came too late"
 
-    assert start_runner(tmp_path, log).wait(60) == 0
+    assert start_runner(tmp_path, log).wait(PATIENCE) == 0
     assert fake_training.results(out) == expected
     assert set(Counter(log.read_text().split()).values()) == {1}
     assert not (out / "partial").exists()
@@ -254,7 +248,7 @@ def test_killing_runner_and_workers_loses_and_repeats_nothing(tmp_path, log):
 def test_two_runners_on_one_folder_share_the_work(tmp_path, log):
     expected = undisturbed(specification(seeds=4), tmp_path, log)
     both = [start_runner(tmp_path, log) for _ in range(2)]
-    assert [runner.wait(60) for runner in both] == [0, 0]
+    assert [runner.wait(PATIENCE) for runner in both] == [0, 0]
     assert fake_training.results(tmp_path / "out") == expected
     assert set(Counter(log.read_text().split()).values()) == {1}
 
@@ -430,7 +424,7 @@ def test_an_interrupted_study_leaves_no_warning_of_semaphores(tmp_path, log, sen
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, **place)
     wait_for(lambda: len([*(tmp_path / "studies/fake/partial").glob("*/held")]) == 2)
     process.send_signal(sent)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == (130 if sent == signal.SIGINT else 143)
     assert "resource_tracker" not in errors and "Traceback" not in errors, errors
 

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import strategies as st
 
 from children import exit_code, fork, in_a_child, kill
+from patience import PATIENCE
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, StateSpaceLocked
 from pharos.system import storage
 from refusals import failing
@@ -213,7 +214,7 @@ def test_a_claim_that_cannot_be_removed_is_said_to_be_there(no_locks, tmp_path, 
 
 
 def _count(folder, times, counter):
-    done, deadline = 0, time.monotonic() + 60
+    done, deadline = 0, time.monotonic() + PATIENCE
     while done < times and time.monotonic() < deadline:
         try:
             with storage.lock(folder):

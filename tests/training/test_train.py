@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ import pandas as pd
 import pytest
 
 import pharos
+from patience import PATIENCE, wait_for
 from pharos.agents.deep import check_hyperparameters
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UnknownName
 from pharos.training import read_curve, read_record, train, train_config
@@ -235,9 +235,7 @@ def test_a_killed_process_loses_no_more_than_an_interval(tmp_path):
     folder = tmp_path / "run"
     process = multiprocessing.get_context("spawn").Process(target=_long_run, args=(folder,))
     process.start()
-    deadline = time.monotonic() + 60
-    while not (folder / "checkpoint" / "curve.json").exists() and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_for((folder / "checkpoint" / "curve.json").exists)
     os.kill(process.pid, signal.SIGKILL)
     process.join()
     places = [folder / name / "curve.json" for name in ("checkpoint", "checkpoint.old")]  # one of them, at any moment
@@ -399,7 +397,7 @@ except pharos.errors.MissingExtra as error:
     print(error)
 """
     here = train("q_learning", "frozen_lake/4x4", steps=200, out=tmp_path / "here")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE)
     first, second, refused, holds, unread = done.stdout.splitlines() or [done.stderr] * 5
     assert first == second and first.startswith("101 200 "), done.stderr
     assert holds == "True"

@@ -4,7 +4,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 
 import optuna
 import pytest
@@ -12,6 +11,7 @@ import yaml
 from optuna.storages.journal import JournalFileBackend
 
 from command_line import run
+from patience import PATIENCE, wait_for
 from pharos.agents import hyperparameters
 from pharos.errors import FileFormatError, ParameterError
 from pharos.training import SPACES, read_record, run_id, train, tune
@@ -262,8 +262,7 @@ def test_an_interrupted_search_says_one_line(tmp_path):
     code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); from pharos.cli import main; "
     code += f"sys.argv = 'pharos tune {LAKE} --agent q_learning --steps 200000 --trials 99 --out out'.split(); main()"
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, cwd=tmp_path)
-    while process.poll() is None and not (tmp_path / "out" / "lock").exists():
-        time.sleep(0.05)
+    wait_for((tmp_path / "out" / "lock").exists, process)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130 and errors.startswith("pharos: interrupted") and errors.count("\n") == 1, errors
