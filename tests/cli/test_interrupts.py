@@ -183,6 +183,7 @@ def _take_an_interrupt():
 
 def test_an_import_is_not_interrupted_and_what_was_lost_comes_again(handler, monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    monkeypatch.setattr("pharos.system.interrupts.IMPORT_SECONDS", PATIENCE)
     interrupts = CommandInterrupts()
     interrupts.begin()
     (tmp_path / "interrupted_module.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nend = 1\n")

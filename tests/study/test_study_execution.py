@@ -418,6 +418,7 @@ def test_a_run_that_another_process_holds_is_busy_and_says_so_of_training(tmp_pa
 def test_an_interrupted_study_leaves_no_warning_of_semaphores(tmp_path, log, sent):
     (tmp_path / "fake.yaml").write_text(json.dumps(specification().model_dump(mode="json", exclude_unset=True)))
     code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); from pharos.cli import main; "
+    code += f"from pharos.system import workers; workers.TERMINATION_SECONDS = {PATIENCE}; "  # none is killed
     code += "import fake_training, pharos.study.execution as e; e.run.__kwdefaults__['runner'] = fake_training.hold; "
     code += "sys.argv = ['pharos', 'study', 'run', 'fake.yaml', '--workers', '2']; main()"
     place = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), *sys.path])}}

@@ -495,6 +495,8 @@ def lazy_actions(mdp: "TabularMDP", p: float, *, staying: "npt.ArrayLike | None"
     action is executed, then whether it has an effect. An action without effect is the previous one of the next step.
     Colosseum's `p_lazy`; its `p_rand` is `random_actions`.
 
+    The mean of both rewards is exact if they are equal; elsewhere the bound of values counts its rounding.
+
     Args:
         p: in [0, 1).
         staying: (S, A) what staying pays. None: what the rules pay for going from s to s by a, where the MDP is of a
