@@ -168,11 +168,14 @@ def test_a_policy_with_a_memory_counts_as_it_was_when_it_was_yielded():
 
 def test_an_agent_that_ends_early_keeps_its_last_policy():
     def learn(env, steps, seed):
+        env.reset()
+        env.step(0)
         yield always(1)
 
     _, curve = curve_of(learn)
     values = [row["value"] for row in curve.rows]
     assert values[1] == values[2] == values[3] and curve.rows[-1]["episodes"] == 0
+    assert curve.counted_steps == curve.result()["counted_steps"] == 1
 
 
 def test_copies_share_the_budget_and_have_other_random_numbers():
@@ -200,7 +203,7 @@ def test_the_action_space_is_that_of_the_seed():
 
     def learn(env, steps, seed):
         drawn.append([env.action_space.sample() for _ in range(40)])
-        yield always(0)
+        yield from ()
 
     for seed in (0, 0, 1):
         curve_of(learn, seed=seed)
@@ -210,6 +213,8 @@ def test_the_action_space_is_that_of_the_seed():
 def test_tables_probabilities_and_networks_in_a_wrapper_are_policies():
     def yielding(policy):
         def learn(env, steps, seed):
+            env.reset()
+            env.step(0)
             yield policy
 
         return curve_of(learn, TASKS[1])
@@ -244,6 +249,8 @@ def test_a_run_that_fails_stops_no_other(suite, tmp_path):
     def learn(env, steps, seed):
         if env.action_space.n == 4 and seed == 1:
             raise RuntimeError("no idea")
+        env.reset()
+        env.step(0)
         yield always(0)
 
     found = benchmark.run(learn, suite, out=tmp_path, seeds=range(2))

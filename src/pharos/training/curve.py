@@ -174,11 +174,13 @@ class Curve:
 
     Attributes:
         table: the policy of the last row, where it is a table.
+        counted_steps: of the environment, where it counts them itself (`pharos.benchmark`).
     """
 
     task: Task
     rows: list[dict[str, Any]] = field(default_factory=list)
     table: np.ndarray | None = None
+    counted_steps: int | None = None
 
     def add(
         self,
@@ -223,6 +225,7 @@ class Curve:
         """The summary of a finished run."""
         values, last = self.task.reference, self.rows[-1]
         scale = last["episodes"] * values.spread() or math.nan
+        counted = {} if self.counted_steps is None else {"counted_steps": self.counted_steps}
         return {
             "value_optimal": values.optimal,
             "value_uniform": values.uniform,
@@ -238,6 +241,7 @@ class Curve:
             "episodes": last["episodes"],
             "exact": all(row["exact"] for row in self.rows),
             "conventions": self.task.conventions,
+            **counted,
         }
 
 
