@@ -50,7 +50,7 @@ def drn(mdp: TabularMDP, path: str | os.PathLike) -> Path:
         file.write(f"state {s + several} [0]{init}{' terminal' if s in absorbing else ''}\n")
         for a in range(mdp.num_actions):
             _choice(file, table[s][a], a, s in absorbing, mdp.gamma, s, end, several)
-    storage.replace_file(path, file.getvalue())
+    storage.replace_file(path, file.getvalue(), follow=True)
     return path
 
 
@@ -144,6 +144,6 @@ def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     order[[0, start]] = order[[start, 0]]
     table = np.where(table[order] >= 0, order[table[order]], -1)
     rewards = mdp.rewards[order].astype(np.float32)
-    with storage.replacing(path) as file:
+    with storage.replacing(path, follow=True) as file:
         np.savez_compressed(file, transitions=np.asfortranarray(table), rewards=rewards)
     return path

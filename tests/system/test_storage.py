@@ -6,6 +6,7 @@ import math
 import os
 import resource
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -96,14 +97,92 @@ def test_writers_with_the_same_process_number_do_not_meet(tmp_path, monkeypatch)
     assert names(tmp_path) == ["status.json"]
 
 
-def test_links_are_followed_and_devices_are_written_to(tmp_path):
+def test_links_and_devices_that_the_user_named_are_written_through(tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "real" / "file").write_text("old")
     (tmp_path / "link").symlink_to(tmp_path / "real" / "file")
-    storage.replace_file(tmp_path / "link", "new")
+    storage.replace_file(tmp_path / "link", "new", follow=True)
     assert (tmp_path / "link").is_symlink() and (tmp_path / "real" / "file").read_text() == "new"
-    code = "from pharos.system import storage; storage.replace_file('/dev/stdout', 'hello')"
+    code = "from pharos.system import storage; storage.replace_file('/dev/stdout', 'hello', follow=True)"
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "hello"
+
+
+WRITERS = {
+    "file": lambda path: storage.replace_file(path, "new"),
+    "JSON": lambda path: storage.replace_json(path, {}),
+    "array": lambda path: storage.replace_array(path, np.zeros(2)),
+    "growing": lambda path: open(path, "w+b", opener=storage.own_file).close(),
+    "log": lambda path: open(path, "ab", opener=storage.own_file).close(),
+    "lock": lambda path: storage.lock(path.parent).__enter__(),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("leads_to", ["a file", "nothing", "a device", "a folder"])
+def test_links_in_a_folder_of_results_are_replaced(name, leads_to, tmp_path):
+    (tmp_path / "results").mkdir()
+    (tmp_path / "victim").write_text("precious")
+    (tmp_path / "other").mkdir()
+    target = {"a file": "victim", "nothing": "none", "a device": "/dev/full", "a folder": "other"}[leads_to]
+    link = tmp_path / "results" / "lock"
+    link.symlink_to(tmp_path / target)
+    WRITERS[name](link)
+    assert link.is_file() and not link.is_symlink()
+    assert (tmp_path / "victim").read_text() == "precious" and names(tmp_path) == ["other", "results", "victim"]
+    assert names(tmp_path / "other") == [] and names(tmp_path / "results") == ["lock"]
+
+
+def test_a_file_that_goes_on_is_not_one_behind_a_link(tmp_path):
+    (tmp_path / "victim").write_text("precious")
+    (tmp_path / "link").symlink_to("victim")
+    with pytest.raises(OSError, match="symbolic link"), open(tmp_path / "link", "r+b", opener=storage.own_file):
+        pass
+
+
+def test_folders_behind_links_are_none_of_the_results(tmp_path):
+    (tmp_path / "elsewhere" / "b").mkdir(parents=True)
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "a").symlink_to(tmp_path / "elsewhere")
+    place = storage.inside(tmp_path / "results", "a", "b")
+    assert place == tmp_path / "results" / "a" / "b" and not place.exists() and (tmp_path / "elsewhere" / "b").is_dir()
+    (tmp_path / "named").symlink_to(tmp_path / "results")
+    assert storage.inside(tmp_path / "named", "a") == tmp_path / "named" / "a" and (tmp_path / "named").is_symlink()
+
+
+def test_names_that_lead_out_of_a_folder_are_refused():
+    for name in ("v1", "deep_sea-6", "4x4.plain", "A"):
+        assert storage.check_name(name) == name
+    for name in (
+        "",
+        ".",
+        "..",
+        "../x",
+        "/x",
+        "a/b",
+        "a\nb",
+        "a\n",
+        "a\0b",
+        ".a",
+        "-a",
+        " a",
+        "a b",
+        "\u00e4",
+        "a\x1b[2J",
+    ):
+        with pytest.raises(ParameterError, match="expected letters") as error:
+            storage.check_name(name, "the name of a task")
+        assert "\n" not in str(error.value)
+
+
+def test_pipes_devices_sockets_and_folders_are_no_regular_files(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(tmp_path / "socket"))
+        for path in (tmp_path / "pipe", tmp_path / "socket", tmp_path, "/dev/zero"):
+            with pytest.raises(OSError, match="no regular file"):
+                storage.check_regular(path)
+    with pytest.raises(FileNotFoundError):
+        storage.check_regular("a\0b")
 
 
 def test_leftovers_of_killed_processes_are_removed_and_others_stay(tmp_path):

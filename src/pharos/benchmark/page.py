@@ -79,7 +79,7 @@ def report(
     texts = {Path(out): page(contents)} | ({Path(out).with_suffix(".tex"): latex_of(contents)} if latex else {})
     for file, text in texts.items():
         file.parent.mkdir(parents=True, exist_ok=True)
-        storage.replace_file(file, text.encode(errors="replace"))
+        storage.replace_file(file, text.encode(errors="replace"), follow=True)
     return tuple(texts)
 
 

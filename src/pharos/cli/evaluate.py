@@ -124,9 +124,9 @@ def save(path: Path, solution: "Solution") -> None:
     from pharos.system import storage
 
     if path.suffix.lower() == ".npy":
-        storage.replace_array(path, solution.policy)
+        storage.replace_array(path, solution.policy, follow=True)
         return
-    with storage.replacing(path) as file:
+    with storage.replacing(path, follow=True) as file:
         np.savez_compressed(file, v=solution.v, policy=solution.policy)
 
 

@@ -170,7 +170,7 @@ def export(
     elif format == "drn":
         exporters.drn(mdp, out)
     else:
-        storage.replace_file(out, json.dumps(exporters.gym_p(mdp)) + "\n")
+        storage.replace_file(out, json.dumps(exporters.gym_p(mdp)) + "\n", follow=True)
     answer = {"format": format, "file": out, "bytes": out.stat().st_size, "num_states": mdp.num_states}
     facts = [("format", format), ("states", f"{mdp.num_states:,}"), ("bytes", f"{answer['bytes']:,}")]
     return Answer(answer, (str(out), facts))

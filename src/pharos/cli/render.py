@@ -78,7 +78,7 @@ def render(
         console().print(drawing.colored_text(env, last))
     elif out is not None and suffix == ".txt":
         frames = [drawing.text_drawing(env, each) for each, _, _ in played]
-        storage.replace_file(out, "\n\n".join(frames) + "\n")
+        storage.replace_file(out, "\n\n".join(frames) + "\n", follow=True)
     elif out is not None and suffix == ".gif":
         shown = played if len(played) > 1 else [played[0]]
         pictures = [observations.render(env, each, observation, **option) for each, _, _ in shown]

@@ -198,7 +198,7 @@ def _plot(out: Path | None) -> Path | None:
     try:
         from pharos import plots
 
-        return plots.save(plots.regret([out]), out / "regret.png")
+        return plots.save(plots.regret([out]), out / "regret.png", follow=False)
     except ImportError:
         return None
 

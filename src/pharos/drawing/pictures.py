@@ -154,7 +154,7 @@ def image(picture: np.ndarray, caption: str = "") -> "Image":
 def save_png(path: str | os.PathLike, picture: np.ndarray, *, caption: str = "", at_least: int = 0) -> Path:
     """Write a picture as PNG; small ones are enlarged by a whole factor to `at_least` pixels on their longer side."""
     path = Path(path)
-    with storage.replacing(path) as file:
+    with storage.replacing(path, follow=True) as file:
         image(enlarged(picture, at_least), caption).save(file, format="PNG", optimize=True)
     return path
 
@@ -181,7 +181,7 @@ def save_gif(
     frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     milliseconds = [max(20, round(1000 / frames_per_second))] * len(frames)
     milliseconds[-1] += 1000
-    with storage.replacing(path) as file:
+    with storage.replacing(path, follow=True) as file:
         frames[0].save(file, format="GIF", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0)
     return path
 

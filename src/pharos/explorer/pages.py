@@ -270,7 +270,7 @@ def write(world: Exploration, path: str | os.PathLike) -> Path:
             f"smaller instance, or leave out --out (out= in Python) for a local server"
         )
     path = Path(path)
-    storage.replace_file(path, text)
+    storage.replace_file(path, text, follow=True)
     return path
 
 

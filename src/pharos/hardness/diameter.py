@@ -299,7 +299,7 @@ class KeptBounds:
 
         The record is written once these are on the disk: after a power failure a file may hold what it held before.
         """
-        path, record = self._folder / _FILE, self._folder / _RECORD
+        path, record = storage.inside(self._folder, _FILE), self._folder / _RECORD
         try:
             if self.dtype != dtype:
                 record.unlink(missing_ok=True)

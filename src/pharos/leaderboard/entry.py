@@ -105,20 +105,29 @@ def write(entry: Entry, file: str | os.PathLike) -> None:
     """Write an entry to a file, replacing it atomically; the same entry gives the same bytes."""
     body = {name: value for name, value in vars(entry).items() if name != _ARRAYS}
     record = {**body, "format": FORMAT, "id": entry.id, "config": entry.config.to_dict(), "claim": asdict(entry.claim)}
-    write_sealed(file, record, entry.arrays)
+    write_sealed(file, record, entry.arrays, follow=True)
 
 
 def write_sealed(
-    file: str | os.PathLike, record: Mapping[str, Any], arrays: Mapping[str, np.ndarray], what: str = ENTRY
+    file: str | os.PathLike,
+    record: Mapping[str, Any],
+    arrays: Mapping[str, np.ndarray],
+    what: str = ENTRY,
+    *,
+    follow: bool = False,
 ) -> None:
-    """Write a record and arrays, with their digests, to a file, replacing it atomically; same input, same bytes."""
+    """Write a record and arrays, with their digests, to a file, replacing it atomically; same input, same bytes.
+
+    Args:
+        follow: whether the user named the file, see `storage.replacing`.
+    """
     checked = {name: _checked(name, array) for name, array in arrays.items()}
     digests = {name: _digest(array) for name, array in checked.items()}
     text = json.dumps(storage.sealed({**record, _ARRAYS: digests}), sort_keys=True, allow_nan=False)
     data = save(checked, {_RECORD: text})
     if len(data) > LARGEST_FILE:
         raise ParameterError(f"{file}: the {what} would have {len(data):,} bytes; expected at most {LARGEST_FILE:,}")
-    storage.replace_file(file, data)
+    storage.replace_file(file, data, follow=follow)
 
 
 def read(file: str | os.PathLike) -> Entry:
@@ -358,6 +367,7 @@ def stored_table(run: Path) -> np.ndarray:
         ResultCorrupted: policy.npy cannot be read.
     """
     try:
+        storage.check_regular(run / "policy.npy")
         table = np.load(run / "policy.npy", allow_pickle=False)
     except Exception as error:  # the header is read as Python
         raise ResultCorrupted(f"{run / 'policy.npy'}: cannot be read: {error}") from None

@@ -172,7 +172,7 @@ def write_page(
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
     Path(file).parent.mkdir(parents=True, exist_ok=True)
-    storage.replace_file(file, text.encode(errors="replace"))  # names of files may be no text
+    storage.replace_file(file, text.encode(errors="replace"), follow=True)  # names of files may be no text
 
 
 def _template() -> "Template":

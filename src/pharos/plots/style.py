@@ -117,9 +117,11 @@ def color_among(name: str, names: Sequence[str], colors: Mapping[str, str]) -> s
     return colors.get(name) or MORE_COLORS[others.index(name) % len(MORE_COLORS)]
 
 
-def save(figure: "Figure", path: str | os.PathLike) -> Path:
+def save(figure: "Figure", path: str | os.PathLike, *, follow: bool = True) -> Path:
     """Write a figure as PNG, PDF or SVG, by the ending of the name.
 
+    Args:
+        follow: whether a symbolic link there is followed, not replaced, as in a folder of results.
     Raises:
         ParameterError: another ending, or no such folder.
     """
@@ -129,7 +131,7 @@ def save(figure: "Figure", path: str | os.PathLike) -> Path:
         raise ParameterError(f"{path}: expected a name that ends in .png, .pdf or .svg")
     if not path.parent.is_dir():
         raise ParameterError(f"{path.parent}: no such folder")
-    replace_file(path, file_of(figure, kind))
+    replace_file(path, file_of(figure, kind), follow=follow)
     return path
 
 

@@ -123,6 +123,7 @@ class SolverCheckpoint:
         nothing = np.zeros(_HEADER), None
         assert self._path is not None
         try:
+            storage.check_regular(self._path)
             with open(self._path, "rb") as file:
                 data, digests = file.read(8 * _HEADER), file.read(2 * _DIGEST).decode(errors="replace")
             begin = 8 * _HEADER + 2 * _DIGEST

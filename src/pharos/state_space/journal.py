@@ -445,6 +445,8 @@ def _padded(values: np.ndarray, counts: np.ndarray, most: int, *, fill_with_firs
 
 def _link(source: Path, target: Path) -> None:
     """Give a file another name; copy it where the file system has no hard links."""
+    if target.is_symlink():
+        target.unlink()
     try:
         os.link(source, target)
     except OSError:

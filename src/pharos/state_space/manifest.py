@@ -357,7 +357,9 @@ class GrowingFile:
         self._unsynced: DiskFull | None = None
         self._sent = 0  # bytes that the system was asked to write out
         try:
-            self._file = open(path, "r+b" if committed else "w+b", buffering=0)  # noqa: SIM115
+            self._file = open(  # noqa: SIM115
+                path, "r+b" if committed else "w+b", buffering=0, opener=storage.own_file
+            )
         except OSError as error:
             raise cannot_write(path, error) from error
         if committed:

@@ -81,7 +81,7 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
     metadata = {_STUDY: text.encode(), _FORMAT: str(FORMAT).encode(), _DIGESTS: json.dumps(digests).encode()}
     file = Path(file)
     file.parent.mkdir(parents=True, exist_ok=True)
-    training.write_table(file, pa.table(columns).replace_schema_metadata(metadata))
+    training.write_table(file, pa.table(columns).replace_schema_metadata(metadata), follow=True)
     return len(ids)
 
 

@@ -189,7 +189,7 @@ def claim(study: Specification, folder: Path) -> None:
         name = study_name(file)
         if name is not None and name != study.name:
             raise ParameterError(f"{folder}: holds the study {name!r}, not {study.name!r}; choose another --out")
-    replace_file(file, study.to_yaml(), devices=False)
+    replace_file(file, study.to_yaml())
 
 
 # Custom code ----------------------------------------------------------------------------------------------------------

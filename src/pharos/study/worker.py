@@ -88,7 +88,7 @@ def attempt(
     with contextlib.ExitStack() as held:
         todo = []
         for config, id in zip(configs, ids, strict=True):
-            holder, partial = folder / "locks" / id, folder / "partial" / id
+            holder, partial = storage.inside(folder, "locks", id), storage.inside(folder, "partial", id)
             holder.mkdir(parents=True, exist_ok=True)
             try:
                 held.enter_context(storage.lock(holder, FolderLocked, "training"))
@@ -150,7 +150,7 @@ def publish(partial: Path, folder: Path, id: str) -> None:
     for path in partial.rglob("*"):
         if path.is_file():
             storage.sync(path)
-    runs = folder / "runs"
+    runs = storage.inside(folder, "runs")
     runs.mkdir(parents=True, exist_ok=True)
     place = runs / id
     if place.exists():
@@ -177,7 +177,7 @@ def log(path: Path):
     sys.stdout.flush()
     sys.stderr.flush()
     saved = os.dup(1), os.dup(2)
-    with open(path, "ab") as file:
+    with open(path, "ab", opener=storage.own_file) as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
         try:

@@ -325,7 +325,7 @@ def kept_array(path: str | os.PathLike, shape: tuple[int, ...], dtype: DTypeLike
 def _make(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
     """Write a file of zeros, its room on the disk taken: a full disk would kill the process later."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with storage.replacing(path, durable=False) as file:
+    with storage.replacing(path, durable=False, follow=True) as file:
         np.lib.format.write_array_header_1_0(file, {"descr": dtype.str, "fortran_order": False, "shape": shape})
         append_zeros(file, dtype.itemsize * int(np.prod(shape, dtype=np.int64)))
 

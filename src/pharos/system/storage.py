@@ -14,6 +14,7 @@ import errno
 import json
 import math
 import os
+import re
 import shutil
 import socket
 import stat
@@ -54,23 +55,23 @@ _LEFTOVER_SECONDS = 86400.0
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike, *, durable: bool = True, devices: bool = True) -> Iterator[BinaryIO]:
+def replacing(path: str | os.PathLike, *, durable: bool = True, follow: bool = False) -> Iterator[BinaryIO]:
     """Open a file for writing that takes the place of `path` when the block ends, and never where it raises.
 
     Args:
-        path: where a symbolic link stands, the file it leads to is replaced; what is no file (a pipe, a device) is
-            written to, or, without `devices`, replaced.
+        path: a symbolic link, a pipe or a device there is replaced, so that a folder of results that somebody else has
+            made decides about no file elsewhere.
+        follow: whether it is a path that the user named: a link is followed, a pipe or a device written to.
         durable: the new file is on the disk before it has its name, and the name before this returns.
     Raises:
         OSError: the file cannot be written; an older one of that name is then as it was.
     """
     path = Path(path)
-    is_special = _is_special(path)
-    if is_special and devices:
+    if follow and _is_special(path):
         with open(path, "wb") as file:
             yield file
         return
-    path = path if is_special else Path(os.path.realpath(path))
+    path = Path(os.path.realpath(path)) if follow else path
     remove_leftovers(path)
     temporary = temporary_path(path)
     try:
@@ -91,18 +92,18 @@ def replacing(path: str | os.PathLike, *, durable: bool = True, devices: bool = 
             temporary.unlink(missing_ok=True)
 
 
-def replace_file(path: str | os.PathLike, data: bytes | str, *, durable: bool = True, devices: bool = True) -> None:
+def replace_file(path: str | os.PathLike, data: bytes | str, *, durable: bool = True, follow: bool = False) -> None:
     """Replace a file by these bytes, or by this text in UTF-8, in one step; see `replacing`."""
-    with replacing(path, durable=durable, devices=devices) as file:
+    with replacing(path, durable=durable, follow=follow) as file:
         file.write(data.encode() if isinstance(data, str) else data)
 
 
 def replace_json(path: str | os.PathLike, value: object, *, durable: bool = True) -> None:
-    """Replace a file by a value in JSON (see `json_text`), in one step; what is no file there too."""
-    replace_file(path, json_text(value) + "\n", durable=durable, devices=False)
+    """Replace a file by a value in JSON (see `json_text`), in one step; see `replacing`."""
+    replace_file(path, json_text(value) + "\n", durable=durable)
 
 
-def replace_array(path: str | os.PathLike, array: object) -> None:
+def replace_array(path: str | os.PathLike, array: object, *, follow: bool = False) -> None:
     """Replace a file by an array as .npy, in one step; see `replacing`.
 
     NumPy writes to a real file by C's `fwrite` and does not notice a full disk at its end, so it gets no real file
@@ -110,7 +111,7 @@ def replace_array(path: str | os.PathLike, array: object) -> None:
     """
     import numpy as np
 
-    with replacing(path) as file:
+    with replacing(path, follow=follow) as file:
         np.lib.format.write_array(_Writer(file), np.asanyarray(array), allow_pickle=False)
 
 
@@ -119,6 +120,36 @@ class _Writer:
 
     def __init__(self, file: BinaryIO):
         self.write = file.write
+
+
+def inside(root: Path, *names: str) -> Path:
+    """The path of a folder within a folder of results; a symbolic link on the way below `root` is removed."""
+    place = root
+    for name in names:
+        place = place / name
+        if place.is_symlink():
+            place.unlink()
+    return place
+
+
+def own_file(path: str, flags: int) -> int:
+    """Opener of `open` for a file in a folder of results: a symbolic link there is replaced, never followed."""
+    if flags & os.O_CREAT and os.path.islink(path):
+        os.unlink(path)
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
+
+
+def check_name(name: str, whose: str = "name") -> str:
+    """Return a name that is fit for a file: letters, digits and `._-`, and a letter or digit first.
+
+    Raises:
+        ParameterError: it is another one, such as one that leads out of a folder.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
+        raise ParameterError(
+            f"{whose} is {name[:60]!r}; expected letters, digits and ._- alone, and a letter or a digit first"
+        )
+    return name
 
 
 def sync(path: Path) -> None:
@@ -247,9 +278,9 @@ def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = 
     """
     path = folder / LOCK
     try:
-        if path.exists():
+        if path.exists() and not path.is_symlink():
             check_regular(path)
-        file = open(path, "a+")  # noqa: SIM115
+        file = open(path, "a+", opener=own_file)  # noqa: SIM115
     except OSError as problem:
         raise ParameterError(f"{folder}: cannot be written to: {problem.strerror}; choose another folder") from problem
     with file:
@@ -420,12 +451,18 @@ def plain(value: object) -> Any:
 
 
 def check_regular(path: str | os.PathLike) -> None:
-    """Refuse what is there and is no regular file: a pipe or a device, which may never end.
+    """Refuse what is there and is no regular file: a pipe, a socket or a device, which may never end.
+
+    Every reader of a file that somebody else may have written calls it before the file is opened.
 
     Raises:
         OSError: it is none, or there is nothing; `strerror` says so.
     """
-    if not stat.S_ISREG(os.stat(path).st_mode):
+    try:
+        is_regular = stat.S_ISREG(os.stat(path).st_mode)
+    except ValueError as error:  # a zero in its name
+        raise FileNotFoundError(errno.ENOENT, f"{error}", ascii(os.fspath(path))) from None
+    if not is_regular:
         raise OSError(errno.EINVAL, "it is no regular file", os.fspath(path))
 
 

@@ -22,7 +22,7 @@ from typing import Any
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
 from pharos.policies import is_small_table
 from pharos.system import compiling
-from pharos.system.storage import digest_of_json, lock, read_json, remove_leftovers, replace_json
+from pharos.system.storage import digest_of_json, inside, lock, read_json, remove_leftovers, replace_json
 from pharos.system.wording import in_one_line, pluralize
 from pharos.training import results as _results
 from pharos.training.curve import joint_values
@@ -351,7 +351,7 @@ class TrainingGroup:
         folder = self._folder
         if folder is None:
             return None
-        folder.mkdir(parents=True, exist_ok=True)
+        inside(folder.parent, folder.name).mkdir(parents=True, exist_ok=True)
         try:
             self.held.enter_context(lock(folder, FolderLocked, "training"))
         except FolderLocked:

@@ -20,6 +20,7 @@ from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import TabularMDP
 from pharos.policies import PolicyLike, deep_policy
 from pharos.state_space import StateSpace
+from pharos.system import storage
 from pharos.system.wording import in_one_line
 from pharos.training import results
 from pharos.training.curve import Curve
@@ -337,8 +338,7 @@ class Networks(_Arrays):
         """Write the network, as `Deep` reads it, with the names of parameters in the policy of Stable-Baselines3."""
         import torch
 
-        place = folder / results.AGENT
-        place.mkdir(parents=True, exist_ok=True)
+        place = results.new_agent(folder)
         parameters = self.batch.parameters(i).items()
         policy = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters}
         torch.save({"policy": policy}, place / "parameters.pt")
@@ -451,13 +451,15 @@ class Deep:
 
     def publish(self, i: int, folder: Path) -> None:
         """Write the network into the folder agent."""
-        self.save(folder / results.AGENT)
+        self.save(results.new_agent(folder))
 
 
 @contextlib.contextmanager
 def _reading_checkpoint(folder: Path) -> Iterator[None]:
     """Raise FileFormatError, one line that names the folder, for any error in reading a checkpoint."""
     try:
+        for file in folder.iterdir():
+            storage.check_regular(file)
         yield
     except Exception as error:  # torch and NumPy have many
         first = str(error).split(". ")[0].splitlines()  # torch goes on with advice that is not ours

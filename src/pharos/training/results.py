@@ -202,6 +202,7 @@ def _read_text(path: Path) -> dict[str, np.ndarray]:
     """
     read: dict[str, Callable[[str], Any]] = {"int64": int, "float64": float, "bool": _TRUTHS.__getitem__}
     try:
+        check_regular(path)
         with open(path, encoding="utf-8", newline="") as file:
             head, *rows = csv.reader(file, strict=True)
         return {
@@ -237,11 +238,11 @@ def check_agent(folder: Path) -> None:
             raise ResultCorrupted(f"{folder / name}: was changed after it was written; {AGAIN}")
 
 
-def write_table(path: Path, table: "pa.Table") -> None:
-    """Replace a Parquet file in one step, with checksums of its pages."""
+def write_table(path: Path, table: "pa.Table", *, follow: bool = False) -> None:
+    """Replace a Parquet file in one step, with checksums of its pages; see `storage.replacing`."""
     import pyarrow.parquet as pq
 
-    with storage.replacing(path) as file:
+    with storage.replacing(path, follow=follow) as file:
         pq.write_table(table, file, compression="zstd", write_page_checksum=True)
 
 
@@ -324,6 +325,14 @@ def _expected_checksums(folder: Path) -> dict[str, str]:
 def write_policy(folder: Path, policy: object) -> None:
     """Replace policy.npy: the policy of a tabular agent, as `pharos evaluate --policy` takes it."""
     storage.replace_array(folder / POLICY, policy)
+
+
+def new_agent(folder: Path) -> Path:
+    """The empty folder of the agent of a run; an older one is removed, so that no link in it is written through."""
+    place = storage.inside(folder, AGENT)
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(parents=True)
+    return place
 
 
 # Checkpoints and agents -----------------------------------------------------------------------------------------------

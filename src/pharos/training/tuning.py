@@ -484,7 +484,7 @@ def _write(folder: Path, search: _Search, trials: Sequence[dict[str, Any]]) -> N
         text = head + yaml.safe_dump(
             {search.agent: {search.environment: {search.observation_name: mine}}}, sort_keys=False
         )
-        storage.replace_file(folder / "hyperparameters.yaml", text, devices=False)
+        storage.replace_file(folder / "hyperparameters.yaml", text)
     storage.replace_json(folder / "tuning.json", storage.sealed(storage.plain(record)))
     (folder / JOURNAL).unlink(missing_ok=True)
 

@@ -470,12 +470,12 @@ def write_predictions(study: "NamedStudy", predictions: "pd.DataFrame", file: st
     table = table.replace_schema_metadata({_KEY: json.dumps(about).encode()})
     Path(file).parent.mkdir(parents=True, exist_ok=True)
     if older is None:
-        training.write_table(Path(file), table)
+        training.write_table(Path(file), table, follow=True)
         return about
     older_file = _place_beside(Path(file), older["date"])
     os.replace(file, older_file)
     try:
-        training.write_table(Path(file), table)
+        training.write_table(Path(file), table, follow=True)
     except BaseException:
         os.replace(older_file, file)
         raise

@@ -233,7 +233,10 @@ def level_text(source: str) -> str:
 
 
 def _levels_of(file: Path) -> dict[int, list[str]]:
+    from pharos.system.storage import check_regular  # which levels in text do without
+
     try:
+        check_regular(file)
         if file.stat().st_size > LARGEST_FILE:
             raise ValueError(f"the file is larger than {LARGEST_FILE >> 20} MiB")
         lines = file.read_text(encoding="utf-8").splitlines()

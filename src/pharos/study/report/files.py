@@ -14,7 +14,7 @@ from pharos.study.report.results import Results, coefficients, results_of
 from pharos.study.report.sections import sections_of
 from pharos.study.specification import Source
 from pharos.study.status import opened
-from pharos.system.storage import replace_file
+from pharos.system.storage import inside, replace_file
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -73,6 +73,8 @@ def report(
     results = results_of(study, place, tell)
     target = Path(out) if out is not None else place / "report"
     target.mkdir(parents=True, exist_ok=True)
+    for name in ("figures", "tables"):
+        inside(target, name)
     # Figures of the results
     figures: dict[str, dict[str, bytes] | None] = {}
     curves = all_curves(results.points, results.profiles)
