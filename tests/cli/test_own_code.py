@@ -14,6 +14,7 @@ import pharos
 from command_line import answer, process, run, usage_error
 from patience import PATIENCE
 from pharos import study
+from pharos.agents import check_hyperparameters
 from pharos.environments import catalog
 from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, UntrustedCode
 from pharos.observations import observation
@@ -380,6 +381,24 @@ def test_algorithms_of_known_libraries_need_no_trust():
     setting = {"environment": "frozen_lake", "steps": 1, "horizon": 1, "evaluation_interval": 1}
     config = RunConfig(agent="stable_baselines3:SAC", **setting)
     assert config.algorithm() == "stable_baselines3:SAC"
+
+
+@pytest.mark.parametrize(
+    "agent",
+    [
+        "stable_baselines3.common.utils:os",
+        "stable_baselines3.common.save_util:pickle",
+        "stable_baselines3.common.utils:set_random_seed",
+        "stable_baselines3.common.buffers:ReplayBuffer",
+        "stable_baselines3:__loader__",
+        "stable_baselines3:__path__",
+    ],
+)
+def test_of_known_libraries_classes_of_algorithms_are_taken_and_nothing_else(agent):
+    pytest.importorskip("stable_baselines3")
+    said = refusal(ParameterError, check_hyperparameters, agent, {})
+    assert "expected the class of an algorithm" in said and agent in said
+    assert agent in usage_error("train", "frozen_lake/4x4", "--agent", agent, "--steps", 4)
 
 
 SCRIPT = """

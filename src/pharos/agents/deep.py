@@ -38,11 +38,11 @@ def algorithm(agent: str | type) -> type:
     """The class of an algorithm: "dqn", "ppo", "a2c", "module:Class" or "file.py:Class"; or a class itself.
 
     Raises:
-        UnknownName: no such name or class. ParameterError: no such module or file.
+        UnknownName: no such name or class. ParameterError: no such module or file, or something else than a class.
         MissingExtra: Stable-Baselines3 is not installed.
     """
-    if isinstance(agent, type):
-        return agent
+    if not isinstance(agent, str):
+        return _class(agent, agent)
     path = ALGORITHMS.get(agent, agent)
     module, colon, name = path.partition(":")
     if not colon:
@@ -50,9 +50,12 @@ def algorithm(agent: str | type) -> type:
     if not is_known(path):
         source = agent_source(path)
         assert source is not None
-        return load(source)
+        return _class(agent, load(source))
     try:
-        return getattr(importlib.import_module(module), name)
+        target = getattr(importlib.import_module(module), name)
+        from stable_baselines3.common.base_class import BaseAlgorithm
+
+        return _class(agent, target, BaseAlgorithm)
     except ModuleNotFoundError as error:
         if (error.name or "").startswith(("stable_baselines3", "torch")):
             raise MissingExtra(f"the agent {agent!r}", "stable-baselines3", "agents") from error
@@ -65,6 +68,16 @@ def algorithm(agent: str | type) -> type:
         raise UnknownName(
             "agent", path, [f"{module}:{each}" for each in dir(importlib.import_module(module))]
         ) from error
+
+
+def _class(agent: object, target: object, base: type = object) -> type:
+    """Return what an agent's name stands for if it is a class; what else a module has is neither called nor read."""
+    if not isinstance(target, type) or not issubclass(target, base):
+        raise ParameterError(
+            f"agent {str(agent)[:60]!r}: found {str(target)[:60]}; expected the class of an algorithm for "
+            f"Stable-Baselines3"
+        )
+    return target
 
 
 def check_hyperparameters(agent: str | type, hyperparameters: Mapping[str, Any], also: Iterable[str] = ()) -> None:

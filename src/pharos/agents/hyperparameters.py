@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pharos.environments import class_called
-from pharos.errors import MissingExtra, ParameterError
-from pharos.system.storage import check_regular
+from pharos.errors import ParameterError
 
 
 def hyperparameters(
@@ -40,18 +39,10 @@ def hyperparameters(
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        import yaml
-    except ImportError as error:
-        raise MissingExtra("reading hyperparameters", "pyyaml", "study") from error
-    try:
-        check_regular(path)
-        table = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except RecursionError:
-        raise ParameterError(f"{path}: cannot be read: its brackets are nested too deeply") from None
-    except (OSError, yaml.YAMLError, ValueError) as error:
-        raise ParameterError(f"{path}: cannot be read: {' '.join(str(error).split())[:300]}") from error
-    if not _is_table(table, 4):
+    from pharos.system.yaml_files import read_yaml  # which needs PyYAML
+
+    table = read_yaml(path)
+    if not isinstance(table, dict) or not _is_table(table, 4):
         raise ParameterError(f"{path}: expected agent, then class, then observation, each with names and values")
     return table
 

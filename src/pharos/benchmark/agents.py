@@ -37,6 +37,7 @@ from pharos.training import (
     RunConfig,
     Task,
     TaskCache,
+    check_agent,
     clear_run,
     evaluate_agent,
     read_record,
@@ -93,11 +94,12 @@ class Form:
         """(evaluations,) normalised regret, and whether all of it is exact.
 
         Raises:
-            PharosError: the run has not finished; why not.
+            PharosError: the run has not finished; why not. ResultCorrupted: a file of it was changed since.
         """
         record = read_record(job.folder) if (job.folder / "run.json").exists() else {}
         if record.get("status") != "finished":
             raise PharosError(record.get("error") or "its process ended without a result; the same command goes on")
+        check_agent(job.folder)
         rows = {row["step"]: row for row in read_rows(job.folder)}
         points = [protocol.evaluation_interval * (i + 1) for i in range(protocol.evaluations)]
         exact = all(rows[point]["exact"] for point in points)

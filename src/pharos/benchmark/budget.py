@@ -21,7 +21,7 @@ import copy
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NoReturn, SupportsIndex
 
 import gymnasium
 import numpy as np
@@ -109,7 +109,7 @@ class CountedEnv(gymnasium.Wrapper):
             twin.env, twin._return, twin._is_seeded = copy.deepcopy(self.env, memo), self._return, True
         return twin
 
-    def __reduce_ex__(self, protocol: Any) -> Any:
+    def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
         raise ParameterError(
             f"the environment of the benchmark cannot be pickled: its steps are counted in this process alone; "
             f"{SEVERAL}"

@@ -87,7 +87,7 @@ def run(
         agent: a name (q_learning, dqn, ppo, a2c; oracle, random), `module:Class` or `file.py:Class` with
             Stable-Baselines3's interface, `file.py:learn`, or a generator function `learn(env, steps, seed)` that
             yields policies. Code that is named here is imported.
-        suite: name, file, or a suite that was loaded.
+        suite: name, file, or a suite that was loaded, by `load_suite(file, trust=True)` if it names code.
         out: folder of one agent with one setting, of one suite.
         seeds: of the runs of each task.
         quick: the first three seeds of the core alone; what is made of it is preliminary.
@@ -117,8 +117,13 @@ def run(
     folder.mkdir(parents=True, exist_ok=True)
     with storage.lock(folder, FolderLocked, "running a benchmark"):
         record = _claimed(folder, form, suite, name or form.label)
-        jobs = [Job(task, seed, folder / "runs" / task.name / f"seed-{seed}") for task in entries for seed in numbers]
-        form.train(jobs, protocol, usable_workers(workers), folder / "checkpoints", progress or (lambda *_: None))
+        jobs = [
+            Job(task, seed, storage.inside(folder, "runs", task.name, f"seed-{seed}"))
+            for task in entries
+            for seed in numbers
+        ]
+        checkpoints = storage.inside(folder, "checkpoints")
+        form.train(jobs, protocol, usable_workers(workers), checkpoints, progress or (lambda *_: None))
         return _collected(folder, form, suite, record, jobs)
 
 

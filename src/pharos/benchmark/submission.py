@@ -25,7 +25,7 @@ from pharos.benchmark.scores import check_suite
 from pharos.benchmark.suite import BenchmarkTask, Suite
 from pharos.errors import FileFormatError, PharosError
 from pharos.leaderboard import Check, check_ending, in_file, read_sealed, stored_table, write_checked, write_sealed
-from pharos.training import Task, evaluate_agent, load_agent
+from pharos.training import Task, check_agent, evaluate_agent, load_agent
 
 FORMAT = 1
 WHAT = "submission to a benchmark"
@@ -65,7 +65,7 @@ class Submission:
         }
         arrays = {f"curve/{task}": curve for task, curve in results.curves.items()}
         arrays |= {f"policy/{task}/{seed}": policy for (task, seed), policy in self.policies.items()}
-        write_sealed(file, record, arrays, WHAT)
+        write_sealed(file, record, arrays, WHAT, follow=True)
 
     @staticmethod
     def read(file: str | os.PathLike) -> "Submission":
@@ -104,6 +104,7 @@ def submit(
     *,
     author: str = "",
     note: str = "",
+    trust: bool = False,
     progress: Tell | None = None,
 ) -> Submission:
     """Pack the results of a folder and the final policies of its runs into one file, which `verify` reads.
@@ -114,9 +115,11 @@ def submit(
         folder: of `benchmark.run`.
         file: ends in .safetensors.
         suite: that the runs are of.
+        trust: whether code that the run.json of a run names, the class of an agent, may be imported.
     Raises:
         ParameterError: the folder holds no results, or of another suite; a text cannot be printed.
-        FileFormatError: a run is damaged.
+        FileFormatError: a run is damaged, or its files are not the ones that its run.json has checksums of.
+        UntrustedCode: a run names code, and is not trusted.
     """
     folder, target = Path(folder), check_ending(Path(file))
     results = AgentResults.read(folder)
@@ -126,23 +129,32 @@ def submit(
     for place, (name, seed) in enumerate(runs):
         if progress is not None:
             progress(place, len(runs), name)
-        policy = final_policy(folder / "runs" / name / f"seed-{seed}", suite.task(name).training_task(suite.protocol))
+        task = suite.task(name).training_task(suite.protocol)
+        policy = final_policy(folder / "runs" / name / f"seed-{seed}", task, trust=trust)
         if policy is not None:
             policies[name, seed] = policy
     submission = Submission(results, policies, author, note)
     return write_checked(target, lambda: submission.write(target), lambda: Submission.read(target))
 
 
-def final_policy(run: Path, task: Task) -> np.ndarray | None:
+def final_policy(run: Path, task: Task, *, trust: bool = False) -> np.ndarray | None:
     """Final policy of a finished run: (S,) actions or (S, A) probabilities.
 
     None if the policy sees more than the state, or the run kept none.
+
+    Args:
+        trust: whether code that its run.json names may be imported.
+    Raises:
+        ResultCorrupted: its files are not the ones that its run.json has checksums of.
+        UntrustedCode: it names code, and is not trusted.
     """
     table: Any
-    if (run / "policy.npy").is_file():
+    if (run / "run.json").exists():
+        check_agent(run)
+    if (run / "policy.npy").exists():
         table = stored_table(run)
     elif (run / "agent").is_dir():
-        table = Snapshots(task).taken(load_agent(run, trust=True)[1])
+        table = Snapshots(task).taken(load_agent(run, trust=trust)[1])
     else:
         return None
     if not isinstance(table, np.ndarray) or table.ndim > 2:

@@ -22,10 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
+from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
 from pharos.mdp import ChanceSetting, TabularMDP
 from pharos.system import storage
 from pharos.system.records import read
+from pharos.system.sources import is_reference
+from pharos.system.storage import check_name
 from pharos.training import Task
 
 FOLDER = Path(__file__).parent / "suites"
@@ -66,7 +68,7 @@ class BenchmarkTask:
     """One task of a suite: an environment, an observation, and facts known before any run (values, predictions).
 
     Attributes:
-        name: unique in its suite, and fit for a file name.
+        name: unique in its suite, and fit for a file name (`check_name`), since runs are written below it.
         environment, parameters: as `pharos.make` takes them. observation, observation_options: as `pharos.observe`.
         chance: the kinds of `ChanceSetting` that are not 0.
         axis: "core", or that of its ladder.
@@ -76,6 +78,8 @@ class BenchmarkTask:
         value_optimal, value_uniform: at the start, of the optimal policy and of uniform play.
         digest: SHA-256 of the task as it was frozen; see `digest_of_task`.
         seconds: processor time of one run of a baseline that was measured, by its name; a guide.
+    Raises:
+        ParameterError: the name is not fit for a file name.
     """
 
     name: str
@@ -91,6 +95,9 @@ class BenchmarkTask:
     value_uniform: float = float("nan")
     digest: str = ""
     seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_name(self.name, "the name of a task")
 
     def training_task(self, protocol: Protocol) -> Task:
         """The task as agents are trained on it; nothing is built before it is needed."""
@@ -183,28 +190,33 @@ class Suite:
             task.check(self.protocol)
 
 
-def load_suite(name_or_file: str | Path = "v1") -> Suite:
-    """Read a suite: one of pharos' own by its name, or a file of the same form.
+def load_suite(name_or_file: str | Path = "v1", *, trust: bool = False) -> Suite:
+    """Read a suite: one of pharos' own by its name, or a file of the same form. Nothing that it names is imported.
 
+    Args:
+        trust: whether its tasks may name code, `module:Name` or `file.py:Name`, which is executed when they are made.
     Raises:
         UnknownName: no such suite. FileFormatError: the file is no suite, or not what its digest says.
+        UntrustedCode: a task names code, and is not trusted.
         MissingExtra: PyYAML is not installed.
     """
-    try:
-        import yaml
-    except ImportError as error:
-        raise MissingExtra("reading a suite", "pyyaml", "study") from error
+    from pharos.system.yaml_files import read_yaml  # which needs PyYAML
+
     path = Path(name_or_file)
     if path.suffix not in (".yaml", ".yml"):
         path = FOLDER / f"{name_or_file}.yaml"
         names = sorted(each.stem for each in FOLDER.glob("*.yaml"))
         if str(name_or_file) not in names:
             raise UnknownName("suite", str(name_or_file), names)
-    try:
-        entry = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{path}: is no YAML: {str(error).splitlines()[0]}") from error
-    return suite_of(entry, str(path))
+    suite = suite_of(read_yaml(path, FileFormatError), str(path))
+    for task in suite.tasks:
+        named = [name for name in (task.environment, task.observation) if is_reference(name)]
+        if named and not trust:
+            raise UntrustedCode(
+                f"{path}: task {task.name} names code, {named[0]!r}, which is executed only if you trust it: add "
+                f"--trust (in Python: trust=True)"
+            )
+    return suite
 
 
 def suite_of(entry: object, whose: str) -> Suite:
@@ -221,13 +233,16 @@ def suite_of(entry: object, whose: str) -> Suite:
         of = f"{whose}: ladder {each.get('axis')}"
         tasks = _tasks(each.get("tasks"), str(each.get("axis")), of)
         ladders.append(replace(read(Ladder, {**each, "tasks": ()}, of, ("measure",)), tasks=tasks))
+    settings = entry["hyperparameters"]
+    if not isinstance(settings, dict) or not all(isinstance(each, dict) for each in settings.values()):
+        raise FileFormatError(f"{whose}: hyperparameters are {str(settings)[:60]}; expected some of each baseline")
     suite = Suite(
         str(entry["name"]),
         read(Protocol, entry["protocol"], f"{whose}: protocol"),
         _tasks(entry["core"], CORE, f"{whose}: core"),
         tuple(ladders),
         str(entry["digest"]),
-        entry["hyperparameters"],
+        settings,
     )
     if len(suite._by_name) < len(suite.tasks):
         raise FileFormatError(f"{whose}: two tasks have the same name; expected a name of its own for each")
@@ -251,10 +266,13 @@ def _list(value: object, whose: str) -> list[dict[str, Any]]:
 
 def _tasks(entries: object, axis: str, whose: str) -> tuple[BenchmarkTask, ...]:
     optional = [each.name for each in fields(BenchmarkTask) if each.name not in ("name", "environment", "digest")]
-    return tuple(
-        read(BenchmarkTask, {**each, "axis": axis}, f"{whose}: task {each.get('name')}", optional)
-        for each in _list(entries, whose)
-    )
+    try:
+        return tuple(
+            read(BenchmarkTask, {**each, "axis": axis}, f"{whose}: task {str(each.get('name'))[:60]}", optional)
+            for each in _list(entries, whose)
+        )
+    except ParameterError as error:  # of a name
+        raise FileFormatError(f"{whose}: {error}") from None
 
 
 def digest_of_suite(suite: Suite) -> str:

@@ -249,5 +249,7 @@ def termination() -> Iterator[None]:
 
 
 def complain(message: object) -> None:
-    """Print one line on standard error."""
-    print(f"pharos: {' '.join(str(message).split())}", file=sys.stderr)
+    """Print one line on standard error, with nothing that a terminal would obey."""
+    text = " ".join(str(message).split())
+    shown = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
+    print(f"pharos: {shown}", file=sys.stderr)

@@ -14,11 +14,13 @@ from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.observations import OwnObservation, names, own_observation, title
 from pharos.study.regression import MEASURES
 from pharos.system.sources import is_reference
+from pharos.system.storage import check_name
 from pharos.training import ENGINES, ChanceSetting, Horizon, RunConfig
 
 try:
     import yaml
     from pydantic import (
+        AfterValidator,
         BaseModel,
         BeforeValidator,
         ConfigDict,
@@ -262,7 +264,7 @@ class Block(_Part):
 class Specification(_Part):
     """Specification of a study: its blocks, and the settings of those that have none of their own."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    name: Annotated[str, AfterValidator(check_name)]
     description: str = ""
     folder: str | None = None
     blocks: list[Block] = Field(min_length=1)

@@ -19,11 +19,10 @@ Environments, observations and agents of one's own are named as module:Name or f
 imported where the user names a folder, for the study.yaml beside results, or for a packed study, which somebody else
 may have written, unless it is trusted.
 
-Nodes of a YAML file: their lines, for messages, and a refusal of those that no specification needs.
+Messages name the line of the node of the YAML file that they are about.
 """
 
 import os
-import re
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
@@ -44,20 +43,9 @@ from pharos.study.blocks import (
 )
 from pharos.system import mdp_files
 from pharos.system.sources import is_reference
+from pharos.system.yaml_files import nodes_and_data, read_text
 
-# Limit that reports every mistake at once, and keeps aliases from standing for millions of entries
-MOST_NODES = 1_000_000
 Loc = tuple[int | str, ...]
-
-
-class Loader(yaml.SafeLoader):
-    """Safe YAML in which 1e-4 is a number, not a text."""
-
-
-Loader.yaml_implicit_resolvers = {k: list(v) for k, v in yaml.SafeLoader.yaml_implicit_resolvers.items()}
-Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+0123456789.")
-)
 
 
 def where(name: str, root: "yaml.Node | None", loc: Loc) -> str:
@@ -77,48 +65,6 @@ def where(name: str, root: "yaml.Node | None", loc: Loc) -> str:
         else:
             break
     return f"{name}:{line + 1}"
-
-
-def check_nodes(root: "yaml.Node", name: str) -> None:
-    """Refuse what no specification needs: keys that are no words or repeated, nodes within themselves, millions by
-    aliases.
-
-    A node that aliases share is looked at once; its size counts wherever it stands.
-    """
-    sizes: dict[int, int] = {}
-
-    def size(node: "yaml.Node") -> int:
-        """Number of nodes of the tree from this one on, aliases written out."""
-        if id(node) in sizes:
-            if not sizes[id(node)]:
-                raise ParameterError(f"{name}:{node.start_mark.line + 1}: an alias stands within what it names")
-            return sizes[id(node)]
-        sizes[id(node)] = 0  # until all below it are counted
-        children: list[Any] = []
-        if isinstance(node, yaml.MappingNode):
-            _check_keys(node, name)
-            children = [value for _, value in node.value]
-        elif isinstance(node, yaml.SequenceNode):
-            children = node.value
-        total = 1 + sum(map(size, children))
-        if total > MOST_NODES:
-            line = node.start_mark.line + 1
-            raise ParameterError(f"{name}:{line}: stands for more than {MOST_NODES:,} entries, aliases written out")
-        sizes[id(node)] = total
-        return total
-
-    size(root)
-
-
-def _check_keys(node: "yaml.Node", name: str) -> None:
-    lines: dict[str, int] = {}
-    for key, _ in node.value:
-        line = key.start_mark.line + 1
-        if not isinstance(key, yaml.ScalarNode):
-            raise ParameterError(f"{name}:{line}: a key is a list or a mapping; expected a word")
-        if key.value in lines:
-            raise ParameterError(f"{name}:{line}: the key {key.value!r} stands there twice (line {lines[key.value]})")
-        lines[key.value] = line
 
 
 STUDIES = "studies"
@@ -179,7 +125,7 @@ def specification(
     if not path.is_file():
         raise UnknownName("study (no such file, and no such preset)", source, [*presets(), *_studies_here()])
     trusted = path == Path(source) and not _is_of_results(path) if trust is None else trust
-    return parse(_text_of(path), str(path), folder=path.absolute().parent, trust=trusted, entries=entries)
+    return parse(read_text(path), str(path), folder=path.absolute().parent, trust=trusted, entries=entries)
 
 
 def given_environments(file: str | os.PathLike, *, trust: bool = False) -> list[Any]:
@@ -197,7 +143,7 @@ def given_environments(file: str | os.PathLike, *, trust: bool = False) -> list[
         ParameterError: it is no such list. UntrustedCode: it names code, and is not trusted.
     """
     path = Path(file)
-    _, entries = _nodes_and_data(_text_of(path), str(path))
+    _, entries = nodes_and_data(read_text(path), str(path))
     if not isinstance(entries, list) or not entries or not all(isinstance(each, str | dict) for each in entries):
         raise ParameterError(
             f"{path}: expected a list of environments, such as `- taxi/5x5` and `- {{name: taxi, ...}}`"
@@ -239,7 +185,7 @@ def _studies_here() -> list[str]:
 def study_name(file: Path) -> str | None:
     """The name in a YAML file of a study, which is not looked at otherwise; None where there is none."""
     try:
-        _, data = _nodes_and_data(_text_of(file), str(file))
+        _, data = nodes_and_data(read_text(file), str(file))
     except ParameterError:
         return None
     name = data.get("name") if isinstance(data, dict) else None
@@ -249,15 +195,6 @@ def study_name(file: Path) -> str | None:
 def _is_of_results(path: Path) -> bool:
     """Whether a YAML file is what a runner wrote beside its results, which may come from somebody else."""
     return path.name == STUDY_FILE and any((path.parent / name).exists() for name in ("runs", "partial", "status.json"))
-
-
-def _text_of(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise ParameterError(f"{path}: byte {error.start} is not UTF-8; expected a text file in YAML") from error
-    except OSError as error:
-        raise ParameterError(f"{path}: cannot be read ({error.strerror}); expected a YAML file") from error
 
 
 def parse(
@@ -276,32 +213,12 @@ def parse(
         trust: whether they may be imported.
         entries: the environments of blocks that say `environments: given`.
     """
-    root, data = _nodes_and_data(text, name)
+    root, data = nodes_and_data(text, name)
     if root is None:
         raise ParameterError(f"{name}: is empty; expected a mapping with name and blocks")
     if not isinstance(data, dict):
         raise ParameterError(f"{name}:1: found {type(data).__name__}; expected a mapping with name and blocks")
     return _validated(data, name, root, folder or Path.cwd(), trust, entries)
-
-
-def _nodes_and_data(text: str, name: str) -> tuple["yaml.Node | None", Any]:
-    """(root node, data) of a text in YAML; both None for an empty one."""
-    try:
-        root = yaml.compose(text, Loader)
-        if root is not None:
-            check_nodes(root, name)
-        return root, yaml.load(text, Loader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f"{name}:{mark.line + 1}" if mark is not None else name
-        problem = getattr(error, "problem", None) or "this is no YAML"
-        raise ParameterError(f"{place}: {problem}") from error
-    except RecursionError:
-        raise ParameterError(f"{name}: is nested too deeply; expected a mapping with name and blocks") from None
-    except ParameterError:
-        raise
-    except (ValueError, OverflowError) as error:  # numbers and dates that Python cannot hold
-        raise ParameterError(f"{name}: {' '.join(str(error).split())}") from error
 
 
 def _validated(
