@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from pharos.benchmark.sealed import frozen
 
 from command_line import answer, process, run, usage_error
 from pharos import benchmark
 from pharos.benchmark import BenchmarkTask, Protocol, Submission, Suite, load_suite, submit, verify, write_suite
-from pharos.benchmark.sealed import frozen
 from pharos.benchmark.suite import digest_of_suite
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UntrustedCode
 from pharos.system import storage

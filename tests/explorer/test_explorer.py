@@ -303,18 +303,24 @@ def test_a_target_that_is_no_address_is_answered(served):
     assert ask(served, "http://[")[0] == 400
 
 
-def test_one_connection_too_many_is_closed_at_once_and_the_next_is_answered(served, monkeypatch):
-    monkeypatch.setattr(served._http.RequestHandlerClass, "timeout", PATIENCE)  # none is given up meanwhile
-    at = ("127.0.0.1", urlsplit(served.url).port)
-    http_server = served._http
+def test_slow_clients_hold_no_places_of_others(served):
+    """Clients that send a byte now and then: who has waited longest for a whole request makes room, one by one."""
+    path, at = urlsplit(served.url).path, ("127.0.0.1", urlsplit(served.url).port)
+    server = served._http
     with contextlib.ExitStack() as stack:
-        for _ in range(MOST_CONNECTIONS):
-            stack.enter_context(socket.create_connection(at, timeout=PATIENCE))
-        wait_for(lambda: not http_server.places._value)
-        extra = stack.enter_context(socket.create_connection(at, timeout=PATIENCE))
-        assert extra.recv(1) == b""
-    wait_for(lambda: http_server.places._value == MOST_CONNECTIONS)
-    assert ask(served, urlsplit(served.url).path)[0] == 200
+        slow = [stack.enter_context(socket.create_connection(at, timeout=PATIENCE)) for _ in range(MOST_CONNECTIONS)]
+        for client in slow:
+            client.sendall(b"GET / HT")
+        wait_for(lambda: not server.places._value and len(server.incomplete) == MOST_CONNECTIONS)
+        for _ in range(15):
+            assert ask(served, path)[0] == 200
+            for client in slow:
+                with contextlib.suppress(OSError):  # it was ended
+                    client.sendall(b"T")
+        with contextlib.suppress(ConnectionError):  # it was ended with or without a last word
+            assert slow[0].recv(1) == b""
+    wait_for(lambda: server.places._value == MOST_CONNECTIONS)
+    assert not server.incomplete and ask(served, path)[0] == 200
 
 
 def test_another_pages_script_is_refused(served):

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
+from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName, UntrustedCode
 from pharos.mdp import ChanceSetting, TabularMDP
 from pharos.system import storage
 from pharos.system.records import read

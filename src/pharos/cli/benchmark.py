@@ -179,7 +179,7 @@ def submit(
 
 
 @app.command("verify")
-def verify(file: Submitted, *, suite: SuiteFile = "v1", trust: Trust = False) -> Answer:
+def verify(file: Annotated[Path, "FILE"], *, suite: SuiteFile = "v1", trust: Trust = False) -> Answer:
     """Solve the tasks of a submission and evaluate its final policies again; exit code 1 where one is not as claimed.
 
     Args:

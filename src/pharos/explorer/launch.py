@@ -35,7 +35,8 @@ from pharos.training import ChanceSetting, Task, load_agent, read_record
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")  # that a Host header may have
 LONGEST_QUERY = 8192  # characters
-SECONDS = 30  # of waiting for a request
+SECONDS = 30  # of waiting for the next bytes of a request
+FREE_SECONDS = 5  # of waiting for the place of a connection that was ended
 MOST_CONNECTIONS = 64  # at once; a thread each
 
 
@@ -163,14 +164,18 @@ class _Http(ThreadingHTTPServer):
 
     def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]):
         self.places = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        self.incomplete: dict[socket.socket, None] = {}  # whose requests have not arrived, the oldest first
         super().__init__(address, handler)
 
     def process_request(self, request: Request, client_address: Address) -> None:
-        """Give the connection a thread; one too many is closed at once."""
-        if self.places.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
+        """Give the connection a thread; if there is none left, the one that has waited longest for a request ends."""
+        if not self.places.acquire(blocking=False):
+            with contextlib.suppress(StopIteration, OSError):  # of those that send a byte now and then
+                next(iter(list(self.incomplete))).shutdown(socket.SHUT_RDWR)
+            if not self.places.acquire(timeout=FREE_SECONDS):
+                self.shutdown_request(request)
+                return
+        super().process_request(request, client_address)
 
     def process_request_thread(self, request: Request, client_address: Address) -> None:
         try:
@@ -187,6 +192,22 @@ class _Handler(BaseHTTPRequestHandler):
     server: _Http
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "pharos", ""
+
+    def setup(self) -> None:
+        """Begin to wait for a request."""
+        super().setup()
+        self.server.incomplete[self.connection] = None
+
+    def parse_request(self) -> bool:
+        """Read a request, which is not incomplete any more."""
+        is_whole = super().parse_request()
+        self.server.incomplete.pop(self.connection, None)
+        return is_whole
+
+    def finish(self) -> None:
+        """End the connection."""
+        self.server.incomplete.pop(self.connection, None)
+        super().finish()
 
     def do_GET(self) -> None:
         self._reply(with_content=True)
