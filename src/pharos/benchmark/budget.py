@@ -19,6 +19,7 @@ without a single counted step cannot have learnt: if its policy is better or wor
 
 import copy
 import os
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, NoReturn, SupportsIndex
@@ -56,7 +57,7 @@ class StepBudget:
         limit: steps that may be taken. interval: between evaluation points.
         steps, episodes, returns: taken; finished; the sum of the returns of finished ones, without noise and delay.
         at: episodes and returns at the evaluation points so far.
-        process: the one that counts.
+        process: the one that counts. lock: held during a step.
     """
 
     limit: int
@@ -66,6 +67,7 @@ class StepBudget:
     returns: float = 0.0
     at: list[tuple[int, float]] = field(default_factory=list)
     process: int = field(default_factory=os.getpid)
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
     def check_process(self) -> None:
         """Raise ParameterError in any other process, whose steps would not be counted."""
@@ -138,18 +140,19 @@ class CountedEnv(gymnasium.Wrapper):
         """Step as in Gymnasium. Raises BudgetSpent if no steps are left, ParameterError in another process."""
         budget = self.budget
         budget.check_process()
-        if budget.steps >= budget.limit:
-            raise BudgetSpent(f"{budget.limit:,} steps are taken")
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        budget.steps += 1
-        self._last_seed = None
-        self._return += float(info.get("earned_reward", reward))
-        if terminated or truncated:
-            budget.episodes += 1
-            budget.returns += self._return
-            self._return = 0.0
-        if budget.steps % budget.interval == 0:
-            budget.at.append((budget.episodes, budget.returns))
+        with budget.lock:  # of threads
+            if budget.steps >= budget.limit:
+                raise BudgetSpent(f"{budget.limit:,} steps are taken")
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            budget.steps += 1
+            self._last_seed = None
+            self._return += float(info.get("earned_reward", reward))
+            if terminated or truncated:
+                budget.episodes += 1
+                budget.returns += self._return
+                self._return = 0.0
+            if budget.steps % budget.interval == 0:
+                budget.at.append((budget.episodes, budget.returns))
         return observation, float(reward), terminated, truncated, info
 
 

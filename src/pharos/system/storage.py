@@ -140,14 +140,14 @@ def own_file(path: str, flags: int) -> int:
 
 
 def check_name(name: str, whose: str = "name") -> str:
-    """Return a name that is fit for a file: letters, digits and `._-`, and a letter or digit first.
+    """Return a name that is fit for a file: at most 128 letters, digits and `._-`, and a letter or digit first.
 
     Raises:
         ParameterError: it is another one, such as one that leads out of a folder.
     """
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{,127}", name):
         raise ParameterError(
-            f"{whose} is {name[:60]!r}; expected letters, digits and ._- alone, and a letter or a digit first"
+            f"{whose} is {name[:60]!r}; expected at most 128 letters, digits and ._-, and a letter or a digit first"
         )
     return name
 

@@ -1,0 +1,441 @@
+"""What is brought to the benchmark and to folders of results: hostile suites, links that lead out, uncounted copies.
+
+Suites decide about no code and no file outside; links in folders of results about no file elsewhere; and each step of
+whatever copy of a benchmark's environment is counted, by a witness within the environment.
+"""
+
+import concurrent.futures
+import copy
+import io
+import itertools
+import multiprocessing
+import pickle
+import shutil
+import threading
+import warnings
+from contextlib import redirect_stderr, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import yaml
+
+import pharos
+from attacks.damage import Attack, Refused, Tally, command, outcome
+from pharos import benchmark, importers, study
+from pharos.benchmark import BenchmarkTask, BudgetSpent, Protocol, Suite, load_suite, write_suite
+from pharos.benchmark.budget import generated_curve
+from pharos.benchmark.sealed import frozen
+from pharos.benchmark.suite import digest_of_suite
+from pharos.errors import ParameterError, PharosError
+from pharos.interaction import GymEnv
+from pharos.mdp import TabularMDP
+
+pytestmark = pytest.mark.long
+
+PROTOCOL = Protocol(steps=120, evaluations=3, seeds=2)
+SEA = BenchmarkTask("sea", "deep_sea", {"size": 4, "mapping_seed": 1}, "one_hot")
+LAKE = BenchmarkTask("lake", "frozen_lake", {"size": 4}, "vector", chance={"sticky": 0.25})
+CANARY = """
+import pathlib
+from pharos.environments import DeepSea
+
+pathlib.Path(__file__).with_name("executed").mkdir(exist_ok=True)
+
+class Evil(DeepSea):
+    name = "evil_sea"
+"""
+
+
+@pytest.fixture(scope="module")
+def suite():
+    made = Suite("mini", PROTOCOL, tuple(frozen(task, PROTOCOL) for task in (SEA, LAKE)), (), "", {"dqn": {}})
+    return replace(made, digest=digest_of_suite(made))
+
+
+# Suites ---------------------------------------------------------------------------------------------------------------
+
+
+def test_damaged_suites(suite, tmp_path, count):
+    """What is read has its tasks, or is refused: its digest says so."""
+    (tmp_path / "suites").mkdir()
+    write_suite(suite, tmp_path / "suites" / "mini.yaml")
+
+    def read(folder):
+        loaded = load_suite(folder / "mini.yaml")
+        return loaded.digest, [(task.name, task.digest) for task in loaded.tasks], loaded.protocol
+
+    (tmp_path / "copies").mkdir()
+    tally = Attack(tmp_path / "suites", ("mini.yaml",), read).run(tmp_path / "copies")
+    count(f"{tally.total} damaged suites: {tally}")
+    assert tally.total >= 25 and tally.counts["refused"] >= 15
+
+
+NAMES = ("../x", "../../x", "/tmp/x", ".", "..", "", "a/b", "a\\b", "a\nb", "a\0b", "a b", ".hidden", "-rf", "x" * 300)
+CODE = ("evil.py:Evil", "evil:Evil", "./evil.py:Evil", "evil.py:", ":Evil", "os:system", "frozen_lake/4x4:x")
+COMMANDS = (
+    ("run", "--agent", "random", "--out", "deep/deep/out"),
+    ("verify", "it.safetensors"),
+    ("submit", "runs"),
+    ("board", "it.safetensors", "--out", "board.html"),
+)
+
+
+def forged(suite, text, **changes):
+    """The text of a suite whose first task was changed, with the digest that fits."""
+    entry = yaml.safe_load(text)
+    entry["core"][0] |= changes
+    task = object.__new__(BenchmarkTask)  # which no name can be given that is refused
+    task.__dict__.update({**vars(suite.core[0]), **changes})
+    entry["digest"] = digest_of_suite(replace(suite, core=(task, *suite.core[1:])))
+    return yaml.safe_dump(entry)
+
+
+def test_hostile_suites_execute_and_write_nothing(suite, tmp_path, monkeypatch, count):
+    place = tmp_path / "here"
+    place.mkdir()
+    monkeypatch.chdir(place)
+    (place / "evil.py").write_text(CANARY)
+    benchmark.run("random", suite, out="runs", seeds=range(2))
+    benchmark.submit("runs", "it.safetensors", suite)
+    write_suite(suite, "mini.yaml")
+    text_of_suite = (place / "mini.yaml").read_text()
+    cases = [{"name": name} for name in NAMES]
+    cases += [{name: code} for name in ("environment", "observation") for code in CODE]
+    options = [{"parameters": {"size": 4, "map": code}} for code in CODE]
+    options += [{"observation_options": {"function": code}} for code in CODE]
+    before, tally = _contents(tmp_path), Tally()
+    for change, words in [*itertools.product(cases, COMMANDS), *itertools.product(options, COMMANDS[:2])]:
+        (place / "received.yaml").write_text(forged(suite, text_of_suite, **change))
+        what, text = outcome(lambda words=words: command("benchmark", *words, "--suite", "received.yaml"), ("",))
+        (place / "received.yaml").unlink()
+        if _contents(tmp_path) != before:
+            what, text = "failed", f"wrote {_contents(tmp_path).keys() ^ before.keys()}"
+        tally.note(f"{change} by {words[0]}", what, text)
+    count(f"{tally.total} hostile suites: {tally}")
+    tally.check()
+    assert tally.counts["refused"] == tally.total >= 140
+
+
+def _contents(folder):
+    """Path -> bytes of all files below a folder, None of folders and links."""
+    return {
+        path: path.read_bytes() if path.is_file() and not path.is_symlink() else None
+        for path in sorted(folder.rglob("*"))
+        if "__pycache__" not in path.parts
+    }
+
+
+# Links ----------------------------------------------------------------------------------------------------------------
+
+
+BLOCK = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "seeds": [0]}
+STUDY = {"name": "mine", "steps": 64, "evaluations": 4, "blocks": [BLOCK]}
+SMALL = {"n_steps": 16, "n_envs": 2, "batch_size": 16, "net_arch": [8]}
+BREAKOUT = {"height": 7, "columns": 4, "brick_rows": 1}
+
+
+def learn(env, steps, seed):
+    """An agent that plays one action."""
+    env.reset()
+    try:
+        while True:
+            if any(env.step(0)[2:4]):
+                env.reset()
+    except BudgetSpent:
+        yield lambda seen: np.zeros(len(seen), int)
+
+
+def trained(agent, **options):
+    def train(folder, _):
+        setting = {"steps": 64, "evaluation_interval": 32, "out": folder, **options}
+        return pharos.train(agent, "frozen_lake/4x4", **setting)
+
+    return train
+
+
+def built(folder, _):
+    env = pharos.make("breakout", **BREAKOUT)
+    return pharos.build(env, folder, progress=False)
+
+
+def half_built(folder, _):
+    with pytest.raises(pharos.errors.StateSpaceTooLarge):
+        pharos.build(pharos.make("breakout", **BREAKOUT), folder, max_states=900, progress=False)
+
+
+def imported(folder, _):
+    rng = np.random.default_rng(0)
+    mdp = TabularMDP.from_arrays(rng.integers(-1, 40, (40, 3)), rng.random((40, 3)))
+    return importers.save(mdp, folder, observations=np.eye(40, dtype=np.float32))
+
+
+def searched(folder, _):
+    options = ["frozen_lake/4x4", "--steps", 60, "--seeds", 0]
+    return command("tune", *options, "--trials", 2, "--out", folder)
+
+
+# What makes a folder, what writes into it again, and files without which it does
+DOORS = {
+    "a table": (trained("q_learning"), trained("q_learning"), ["run.json"]),
+    "a network": (*[trained("ppo", engine="batched", hyperparameters=SMALL)] * 2, ["run.json"]),
+    "a benchmark's tables": (
+        *[lambda folder, suite: benchmark.run("q_learning", suite, out=folder, seeds=[0], tasks="sea", workers=1)] * 2,
+        ["runs/*/*/run.json"],
+    ),
+    "a benchmark's generator": (
+        *[lambda folder, suite: benchmark.run(learn, suite, out=folder, seeds=[0], tasks="sea")] * 2,
+        ["runs/*/*/run.json"],
+    ),
+    "a study": (*[lambda folder, _: study.run(STUDY, folder, workers=1)] * 2, ["runs/*/run.json"]),
+    "states": (half_built, built, []),
+    "an import": (imported, imported, []),
+    "a search": (searched, searched, ["tuning.json"]),
+}
+
+
+def places(folder):
+    """Files and folders below a folder, and a lock in each folder."""
+    found = [path.relative_to(folder) for path in folder.rglob("*")]
+    return sorted({*found, Path("lock"), *(path / "lock" for path in found if (folder / path).is_dir())})
+
+
+@pytest.mark.parametrize("name", DOORS)
+def test_links_in_folders_of_results(name, suite, tmp_path, count, monkeypatch):
+    """Each file and folder in turn is a link to its copy elsewhere, to nothing or to a device: none is written to."""
+    monkeypatch.setattr("attacks.damage.SECONDS", 120)  # each is a run of its own
+    make, again, forgotten = DOORS[name]
+    whole = tmp_path / "whole"
+    with redirect_stderr(io.StringIO()):
+        make(whole, suite)
+    tally = Tally()
+    for number, (place, leads_to) in enumerate(itertools.product(places(whole), ("its copy", "nothing", "/dev/full"))):
+        if number % 3 and number // 3 % 3 != number % 3:  # a third of the places, for each of the other two
+            continue
+        copied, elsewhere = tmp_path / f"{number}" / "results", tmp_path / f"{number}" / "elsewhere"
+        shutil.copytree(whole, copied, symlinks=True)
+        for pattern in forgotten:
+            for path in copied.glob(pattern):
+                path.unlink()
+        shutil.copytree(copied, elsewhere)
+        link, target = copied / place, elsewhere / place
+        if target.name == "lock" and not target.exists():
+            target.write_text("precious")
+        if leads_to == "nothing" and target.exists():
+            shutil.rmtree(target) if target.is_dir() else target.unlink()
+        if link.exists():
+            shutil.rmtree(link) if link.is_dir() else link.unlink()
+        link.symlink_to(leads_to if leads_to.startswith("/dev") else target)
+        before = _contents(elsewhere)
+        what, text = outcome(lambda folder=copied: _done(again, folder, suite), ("None",))
+        if _contents(elsewhere) != before:
+            what, text = "failed", "another file was written"
+        tally.note(f"{place} leads to {leads_to}", what, text)
+        shutil.rmtree(tmp_path / f"{number}")
+    count(f"{tally.total} links in the folder of {name}: {tally}")
+    tally.check()
+    assert tally.total >= 6 and tally.counts["unchanged"] >= 1
+
+
+def _done(again, folder, suite):
+    """Write into a folder again; what the system says of a file is one line of a command."""
+    try:
+        with redirect_stderr(io.StringIO()):
+            again(folder, suite)
+    except OSError as error:
+        if isinstance(error, PharosError) or not error.filename:
+            raise
+        raise Refused(f"{error.filename}: {error.strerror}") from error
+
+
+# Copies ---------------------------------------------------------------------------------------------------------------
+
+
+class Witness:
+    """The number of steps that environments of pharos take in this process and in all that are forked from it."""
+
+    def __init__(self, monkeypatch):
+        self.steps = multiprocessing.get_context("fork").Value("q", 0)
+        step = GymEnv.step
+
+        def seen(env, action):
+            result = step(env, action)
+            with self.steps.get_lock():
+                self.steps.value += 1
+            return result
+
+        monkeypatch.setattr(GymEnv, "step", seen)
+
+
+def play(env, steps=60):
+    """Play with an environment, which was reset or was not."""
+    env.reset()
+    for _ in range(steps):
+        if any(env.step(0)[2:4]):
+            env.reset()
+
+
+def play_vector(envs, steps=60):
+    """Play with a vector environment of Gymnasium."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Gymnasium logs the traceback of a worker
+            envs.reset()
+            for _ in range(steps):
+                envs.step(np.zeros(envs.num_envs, int))
+    finally:
+        envs.close(**({"terminate": True} if isinstance(envs, gymnasium.vector.AsyncVectorEnv) else {}))
+
+
+def play_sb3(envs, steps=60):
+    """Play with a vector environment of Stable-Baselines3."""
+    try:
+        envs.reset()
+        for _ in range(steps):
+            envs.step(np.zeros(envs.num_envs, int))
+    finally:
+        if type(envs).__name__ != "SubprocVecEnv":
+            envs.close()
+
+
+def fork(work):
+    """Work in a fork; its error is this process' error."""
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+
+    def child():
+        try:
+            work()
+            sender.send(None)
+        except ParameterError as error:
+            sender.send(str(error))
+
+    process = context.Process(target=child)
+    process.start()
+    error = receiver.recv()
+    process.join()
+    if error is not None:
+        raise ParameterError(error)
+
+
+def threads(env):
+    """Play in threads."""
+    started = [threading.Thread(target=_quietly, args=(env.copy(),)) for _ in range(4)]
+    for each in started:
+        each.start()
+    for each in started:
+        each.join()
+
+
+def _quietly(env):
+    with suppress(BudgetSpent):
+        play(env)
+
+
+def in_pool(env, kind):
+    """Play in a process of a pool."""
+    with concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context(kind)) as pool:
+        pool.submit(play, env).result()
+
+
+class Holder:
+    """An object that has an environment somewhere."""
+
+    def __init__(self, env):
+        self.parts = {"env": [env]}
+
+
+def _async(env, kind):
+    play_vector(gymnasium.vector.AsyncVectorEnv([env.copy] * 2, context=kind))
+
+
+def _subprocesses(env, kind):
+    from stable_baselines3.common.vec_env import SubprocVecEnv
+
+    play_sb3(SubprocVecEnv([env.copy] * 2, start_method=kind))
+
+
+def _dummy(env):
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    play_sb3(copy.deepcopy(DummyVecEnv([env.copy] * 4)))
+
+
+def _unpickled(env, protocol):
+    play(pickle.loads(pickle.dumps(env, protocol)))
+
+
+def _cloudpickled(env):
+    import cloudpickle
+
+    play(pickle.loads(cloudpickle.dumps(lambda: env))())
+
+
+MEANS = {
+    "itself": lambda env: [play(env) for _ in range(4)],
+    "env.copy": lambda env: [play(env.copy()) for _ in range(4)],
+    "copies of copies": lambda env: [play(env.copy().copy().copy()) for _ in range(4)],
+    "copy.copy": lambda env: [play(copy.copy(env)) for _ in range(4)],
+    "copy.deepcopy": lambda env: [play(copy.deepcopy(env)) for _ in range(4)],
+    "copy.replace": lambda env: [play(type(env)(env.task, env.budget, k)) for k in range(4)],
+    "a list": lambda env: [play(each) for each in copy.deepcopy([env] * 4)],
+    "a holder": lambda env: [play(copy.deepcopy(Holder(env)).parts["env"][0]) for _ in range(4)],
+    "a wrapper": lambda env: [play(copy.deepcopy(gymnasium.wrappers.OrderEnforcing(env))) for _ in range(4)],
+    "a method": lambda env: [play(copy.deepcopy(env.reset).__self__) for _ in range(4)],
+    "a vector": lambda env: play_vector(copy.deepcopy(gymnasium.vector.SyncVectorEnv([env.copy] * 4))),
+    "a vector of deep copies": lambda env: play_vector(
+        gymnasium.vector.SyncVectorEnv([lambda: copy.deepcopy(env) for _ in range(4)])
+    ),
+    "Stable-Baselines3": _dummy,
+    "threads": threads,
+    "a fork": lambda env: fork(lambda: play(env)),
+    "a copy in a fork": lambda env: fork(lambda: play(env.copy())),
+    "a deep copy in a fork": lambda env: fork(lambda: play(copy.deepcopy(env))),
+    "a fork of a copy": lambda env: (lambda twin: fork(lambda: play(twin)))(copy.deepcopy(env)),
+    "cloudpickle": _cloudpickled,
+    **{f"pickle {k}": lambda env, k=k: _unpickled(env, k) for k in range(pickle.HIGHEST_PROTOCOL + 1)},
+    **{f"a pool by {kind}": lambda env, kind=kind: in_pool(env, kind) for kind in ("spawn", "fork", "forkserver")},
+    **{f"asynchronous by {kind}": lambda env, kind=kind: _async(env, kind) for kind in ("fork", "spawn", "forkserver")},
+    **{f"processes by {kind}": lambda env, kind=kind: _subprocesses(env, kind) for kind in ("spawn", "forkserver")},
+}
+COUNTED = 14
+"""Of MEANS, the first ones, which are an honest way; the others are refused."""
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_copies_of_the_environment(monkeypatch, count):
+    pytest.importorskip("stable_baselines3")
+    witness, tally = Witness(monkeypatch), Tally()
+    for (number, (name, means)), task, begins, wants in itertools.product(
+        enumerate(MEANS.items()), (SEA, LAKE), (False, True), (60, 2000)
+    ):
+        if number >= COUNTED and wants > 60:
+            continue
+        solved, before = task.training_task(PROTOCOL), witness.steps.value
+
+        def learn(env, steps, seed, means=means, begins=begins, wants=wants):
+            if begins:
+                play(env, 7)
+            for _ in range(wants // 60):
+                means(env)
+            yield lambda seen: np.zeros(len(seen), int)
+
+        what, text = outcome(lambda learn=learn, solved=solved: _counted(learn, solved), ("",))
+        taken = witness.steps.value - before
+        if what == "failed" and text.startswith("another answer: "):
+            counted = int(text.removeprefix("another answer: ").partition(";")[0])
+            honest = counted == taken <= PROTOCOL.steps and number < COUNTED
+            what, text = ("unchanged", "") if honest else ("failed", f"{counted} counted of {taken}")
+        elif what == "refused" and (number < COUNTED or taken > 7 or "env.copy" not in text):
+            what = "failed"
+        tally.note(f"{name} of {task.name}", what, text)
+    count(f"{tally.total} copies of a benchmark's environment: {tally}")
+    tally.check()
+    assert tally.total >= 160 and tally.counts["refused"] >= 40
+
+
+def _counted(learn, task):
+    with redirect_stderr(io.StringIO()):
+        return generated_curve(learn, task, steps=PROTOCOL.steps, evaluations=3, seed=0).counted_steps
