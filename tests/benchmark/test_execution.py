@@ -15,7 +15,7 @@ import pytest
 from edits import edited_json
 from patience import PATIENCE, wait_for
 from pharos import benchmark, evaluate_policy
-from pharos.benchmark import BenchmarkTask, BudgetSpent, Ladder, Protocol, Suite
+from pharos.benchmark import BenchmarkTask, BudgetSpent, Ladder, Protocol, Suite, write_suite
 from pharos.benchmark.budget import generated_curve
 from pharos.benchmark.suite import EARLIER, digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
@@ -233,6 +233,8 @@ def test_tables_probabilities_and_networks_in_a_wrapper_are_policies():
         (lambda seen: np.full((len(seen), 2), 0.3), "sum to 0.6"),
         (lambda seen: np.full(len(seen), 7), "action 7"),
         (lambda seen: np.zeros(1), "shape"),
+        (lambda seen: np.zeros(len(seen)), r"shape \(\d+,\) of float64 for .*actions, which are integers"),
+        (lambda seen: np.zeros(len(seen), bool), r"shape \(\d+,\) of bool for .*actions, which are integers"),
         (3, "expected a policy"),
     ],
 )
@@ -279,6 +281,20 @@ def test_a_file_runs_in_processes_to_the_same_bytes(suite, file, tmp_path):
     agent = json.loads((tmp_path / "1" / "agent.json").read_text())
     assert agent["form"] == "generator" and agent["agent"] == "mine.py:learn"
     assert agent["source"]["sha256"] == benchmark.agents.sha256(file)
+
+
+@pytest.mark.slow
+def test_streams_may_be_closed_and_a_folder_need_not_be_of_utf8(suite, file, tmp_path):
+    """As a job scheduler begins it; processes of the generator have closed streams as well."""
+    write_suite(suite, tmp_path / "small.yaml")
+    words = "--agent mine.py:learn --suite small.yaml --seeds 1 --tasks sea --workers 1 --out bad\udcff"
+    command = f"exec {sys.executable} -m pharos benchmark run {words} <&- >&- 2>&-"
+    for _ in range(2):  # whole, and read again
+        assert subprocess.run(command, shell=True, cwd=tmp_path, timeout=PATIENCE, check=False).returncode == 0
+    found = benchmark.read_results(tmp_path / "bad\udcff")
+    assert found.curves["sea"].shape == (1, 3)
+    record = json.loads((tmp_path / "bad\udcff" / "runs" / "sea" / "seed-0" / "run.json").read_text())
+    assert record["status"] == "finished" and record["result"]["counted_steps"] == 300
 
 
 def test_a_folder_holds_one_agent_with_one_setting_of_one_suite(suite, file, tmp_path, monkeypatch):

@@ -111,6 +111,11 @@ def test_defaults_of_a_study_go_before_those_of_the_library_and_below_those_of_a
     [
         (2, "stepz: 1000", "specification:2: unknown key 'stepz'; did you mean 'steps'?"),
         (2, "steps: many", "specification:2: steps: found 'many'; expected: a valid integer"),
+        (2, "steps: true", "specification:2: found True; expected a number"),
+        (3, "evaluations: true", "specification:3: found True; expected a number"),
+        (3, "gamma: true", "specification:3: found True; expected a number"),
+        (4, "seeds: [true]", "specification:4: found True; expected a number"),
+        (3, "hardness: {budget: true}", "specification:3: found True; expected a number"),
         (4, "seeds: 0", "specification:4: seeds: found 0; expected how many, at least 1, or a list of seeds"),
         (8, "  - environments: [frozen_lake/5x5]", "unknown environment 'frozen_lake/5x5'; did you mean 'frozen_lake/"),
         (8, "  - environments: [{name: frozen_lake, parameters: {sise: 8}}]", "specification:8: unknown parameter of frozen_lake 'sise'; did you mean 'size'?"),  # noqa: E501

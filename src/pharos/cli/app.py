@@ -209,7 +209,11 @@ def _main() -> None:
     interrupts.begin()
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):  # closed by whoever started it
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
+            stream = open(os.devnull, mode, errors="replace")  # noqa: SIM115
+            os.set_inheritable(stream.fileno(), True)  # else processes that start have it closed again
+            setattr(sys, name, stream)
+    if getattr(sys.stdout, "errors", "") == "strict" and hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be UTF-8
     warnings.showwarning = lambda message, *_, **__: complain(f"warning: {message}")
     if not hasattr(sys.modules["pharos"], "make") and (wrong := conflict()):  # the __init__.py is the other project's
         complain(wrong)

@@ -534,6 +534,7 @@ class PolicyAnswers(QueriedPolicy):
                     f"the policy chose action {answer.min()} to {answer.max()}; expected 0 to {self.num_actions - 1}"
                 )
             return np.eye(self.num_actions)[answer]
+        kind = answer.dtype
         answer = answer.astype(np.float64)
         if np.isnan(answer).any():
             raise ParameterError(
@@ -541,8 +542,8 @@ class PolicyAnswers(QueriedPolicy):
             )
         if answer.shape != (count, self.num_actions) or not (answer >= 0).all():
             raise ParameterError(
-                f"the policy answered with shape {answer.shape} for {count} observations; expected "
-                f"({count}, {self.num_actions}) probabilities, or ({count},) actions"
+                f"the policy answered with shape {answer.shape} of {kind} for {count} observations; expected "
+                f"({count}, {self.num_actions}) probabilities, or ({count},) actions, which are integers"
             )
         total = answer.sum(axis=1, keepdims=True)
         if not (np.abs(total - 1) <= 1.1e-4).all():

@@ -130,6 +130,15 @@ def _seeds(value: object) -> object:
     return list(range(value))
 
 
+def _number(value: object) -> object:
+    if isinstance(value, bool):  # which pydantic, as Python, counts as 0 or 1
+        raise ParameterError(f"found {value!r}; expected a number")
+    return value
+
+
+Gamma = Annotated[float, BeforeValidator(_number), Field(ge=0, le=1)]
+
+
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -198,9 +207,9 @@ class EnvironmentEntry(_Named):
 class Hardness(_Part):
     """Measures of hardness that are computed, their discount, and the seconds that each may take for one instance."""
 
-    gamma: float = Field(default=0.99, ge=0, le=1)
+    gamma: Gamma = 0.99
     measures: list[str] = Field(default_factory=lambda: [name for name in MEASURES if name in registered()])
-    budget: float = Field(default=60.0, gt=0)
+    budget: Annotated[float, BeforeValidator(_number)] = Field(default=60.0, gt=0)
 
     @field_validator("measures")
     @classmethod
@@ -232,9 +241,10 @@ def _horizon(value: Horizon | int | str | None) -> int | str:
     return Horizon.of(value).value
 
 
-Seeds = Annotated[list[Annotated[int, Field(ge=0)]], BeforeValidator(_seeds), Field(min_length=1)]
-StepCount = Annotated[int, Field(ge=1)]
-Gamma = Annotated[float, Field(ge=0, le=1)]
+Seeds = Annotated[
+    list[Annotated[int, BeforeValidator(_number), Field(ge=0)]], BeforeValidator(_seeds), Field(min_length=1)
+]
+StepCount = Annotated[int, BeforeValidator(_number), Field(ge=1)]
 ChanceEntry = Annotated[
     ChanceSetting, PlainValidator(_chance), PlainSerializer(lambda chance: {k: p for k, p in vars(chance).items() if p})
 ]
