@@ -284,6 +284,17 @@ def test_a_file_runs_in_processes_to_the_same_bytes(suite, file, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_full_disk_is_said_by_the_runs_of_a_generator(suite, tmp_path):
+    full = "raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), '/results/curve.parquet')"
+    text = f"import errno, os\nfrom pharos.benchmark import agents\n\ndef write(*_):\n    {full}\n\n"
+    text += "agents.write_curve = write\n"
+    (tmp_path / "mine.py").write_text(text + LEARN)
+    with pytest.raises(AllRunsFailed) as error:
+        benchmark.run(f"{tmp_path / 'mine.py'}:learn", suite, out=tmp_path / "out", seeds=range(2), tasks="sea")
+    assert {*error.value.outcome.missing.values()} == {"No space left on device; the same command goes on"}
+
+
+@pytest.mark.slow
 def test_streams_may_be_closed_and_a_folder_need_not_be_of_utf8(suite, file, tmp_path):
     """As a job scheduler begins it; processes of the generator have closed streams as well."""
     write_suite(suite, tmp_path / "small.yaml")

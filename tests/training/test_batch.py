@@ -1,5 +1,6 @@
 """Many runs at once: each leaves what it leaves alone, whoever else is there, however often it is killed."""
 
+import errno
 import importlib
 import json
 import sys
@@ -27,7 +28,7 @@ from pharos.training import (
 )
 from pharos.training.results import COLUMNS
 from pharos.training.runs import parts_of
-from refusals import refusal
+from refusals import failing, refusal
 
 _results = importlib.import_module("pharos.training.results")
 
@@ -117,6 +118,18 @@ def test_a_run_that_ends_the_program_is_found_and_the_others_finish(engine, tmp_
     assert read_record(tmp_path / "2")["status"] == "failed"
     alone = train_configs([runs[4]])
     assert str(alone[0].curve) == str(results[4].curve)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_full_disk_ends_all_runs_with_its_own_words(engine, tmp_path, monkeypatch):
+    """A batch is not halved, as for memory: fewer runs at once need as much room. The same call goes on later."""
+    runs, folders = [config(seed) for seed in range(4)], [tmp_path / f"{seed}" for seed in range(4)]
+    with monkeypatch.context() as disk:
+        disk.setattr(_results, "write_curve", failing(errno.ENOSPC))
+        with pytest.raises(OSError, match="No space left"):
+            train_configs(runs, folders)
+    assert engine.made == [4]
+    assert not any(isinstance(each, FailedRun) for each in train_configs(runs, folders))
 
 
 def test_a_batch_that_memory_has_no_room_for_is_halved_with_one_line(engine, monkeypatch):

@@ -78,6 +78,7 @@ class Form:
         hyperparameters: all that are known; one setting for all tasks.
         source: where code of the user's own comes from.
         checksum: SHA-256 of that file, or of the text of a function that is in none; empty where pharos has the code.
+        errors: of runs that could not write their own, by folder.
     """
 
     label: str
@@ -85,6 +86,7 @@ class Form:
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)
     source: Source | None = None
     checksum: str = ""
+    errors: dict[Path, str] = field(default_factory=dict)
 
     def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
         """Train all runs. Each leaves a finished run.json and a curve in its folder, or a run.json with its error."""
@@ -98,7 +100,8 @@ class Form:
         """
         record = read_record(job.folder) if (job.folder / "run.json").exists() else {}
         if record.get("status") != "finished":
-            raise PharosError(record.get("error") or "its process ended without a result; the same command goes on")
+            error = record.get("error") or self.errors.get(job.folder)
+            raise PharosError(error or "its process ended without a result; the same command goes on")
         check_agent(job.folder)
         rows = {row["step"]: row for row in read_rows(job.folder)}
         points = [protocol.evaluation_interval * (i + 1) for i in range(protocol.evaluations)]
@@ -288,9 +291,11 @@ class GeneratedForm(Form):
         pool = ProcessPoolExecutor(min(workers, len(jobs)), context, _begin, (dict.fromkeys(THREADS, "1"),))
         try:
             with without_main(self.learn), without_interrupts():
-                ends = [pool.submit(_generate_from, self.source, self.label, job, protocol) for job in jobs]
+                ends = {pool.submit(_generate_from, self.source, self.label, job, protocol): job for job in jobs}
             for end in as_completed(ends):
-                error = end.exception()  # its process is gone; its folder says nothing
+                error = end.exception()  # its process is gone, or could not write: its folder says nothing
+                if isinstance(error, OSError):
+                    self.errors[ends[end].folder] = f"{error.strerror or error}; the same command goes on"
                 yield end.result() if error is None else in_one_line(error)
         finally:
             processes = list((pool._processes or {}).values())

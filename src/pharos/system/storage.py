@@ -152,6 +152,11 @@ def check_name(name: str, whose: str = "name") -> str:
     return name
 
 
+def is_full(error: BaseException) -> bool:
+    """Whether an error says that the disk, or the user's part of it, is full."""
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
 def sync(path: Path) -> None:
     """Wait until a file, or the list of files of a folder, is on the disk."""
     is_folder = path.is_dir()

@@ -22,7 +22,7 @@ from typing import Any
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
 from pharos.policies import is_small_table
 from pharos.system import compiling
-from pharos.system.storage import digest_of_json, inside, lock, read_json, remove_leftovers, replace_json
+from pharos.system.storage import digest_of_json, inside, is_full, lock, read_json, remove_leftovers, replace_json
 from pharos.system.wording import in_one_line, pluralize
 from pharos.training import results as _results
 from pharos.training.curve import joint_values
@@ -84,7 +84,7 @@ def train_configs(
     Raises:
         FileFormatError: not the configuration of a run. ParameterError: there is no such device, or the tasks are
             for another one.
-        MissingExtra: PyTorch is not installed.
+        MissingExtra: PyTorch is not installed. OSError: the disk is full.
     """
     tasks = TaskCache(device=device or "cpu") if tasks is None else tasks
     if device not in (None, tasks.device):
@@ -273,6 +273,8 @@ class TrainingGroup:
                     self.group[0].fail(cause)
                 raise cause from None
             except Exception as error:
+                if is_full(error):  # which is no fault of these runs, and fewer at once need as much
+                    raise
                 failure = error
                 vars(self).pop("learner", None)
                 self._remove_checkpoint()

@@ -226,6 +226,8 @@ def train_parts(
             workers.start(str(number), _train_part, (entries, checkpoints, device), configs[0].definitions)
         while workers:
             for key, now in workers.events():
+                if isinstance(now, OSError):
+                    raise now
                 if not isinstance(now, TrainingProgress):
                     continue  # it has ended
                 number = int(key)
@@ -247,7 +249,10 @@ def _train_part(
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     configs, folders = zip(*entries, strict=True)
     tasks = TaskCache(trust=True, device=device)  # of code that the process which started this one has imported
-    train_configs(configs, folders, checkpoints=checkpoints, progress=tell, tasks=tasks)
+    try:
+        train_configs(configs, folders, checkpoints=checkpoints, progress=tell, tasks=tasks)
+    except OSError as error:  # a full disk, which ends the other parts as well
+        tell(error)  # type: ignore[arg-type]
 
 
 def _end(config: RunConfig, folder: Path) -> TrainingResult | FailedRun:
