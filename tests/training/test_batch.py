@@ -4,6 +4,7 @@ import errno
 import importlib
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import pharos
 from batched_runs import Killed, bytes_of, kill_at
 from pharos.agents import hyperparameters
 from pharos.errors import AllRunsFailed, ParameterError, PharosError, UnknownName
+from pharos.system import storage
 from pharos.training import (
     FailedRun,
     RunConfig,
@@ -95,6 +97,28 @@ def test_a_killed_batch_goes_on_to_the_bytes_of_an_undisturbed_one(asked_again, 
         whole, killed = (tmp_path / name / f"seed-{seed}" for name in ("whole", "killed"))
         assert bytes_of(whole) == bytes_of(killed)
     assert not (tmp_path / "killed" / "checkpoints").exists()
+
+
+@pytest.mark.parametrize("named", ["source", "name", "observation", "agent"])
+def test_a_checkpoint_runs_no_code_that_no_run_names(named, engine, tmp_path, monkeypatch):
+    """A folder that somebody else has made: its batch has another run, of a class in a file."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(Killed):
+        many("killed", progress=kill_at(3 * 20))
+    (file,) = Path("killed", "checkpoints").glob("*/batch.json")
+    evil = tmp_path / "evil.py"
+    evil.write_text("import pathlib\npathlib.Path(__file__).with_name('mark').touch()\n")
+    source = {"name": "evil.py:Evil", "file": str(evil), "checksum": storage.digest_of_file(evil)}
+    change = {"name": {"environment": "evil.py:Evil"}, "source": {"sources": {"environment": source}}}
+    change |= {"observation": {"observation": "evil.py:Evil"}, "agent": {"agent": "evil.py:Evil", "engine": "sb3"}}
+    stored = json.loads(file.read_text())
+    configs = [RunConfig.from_dict(entry) for entry in stored["configs"]]
+    folders = [Path("killed", f"seed-{each.seed}") for each in configs]
+    stored["configs"].append(stored["configs"][0] | {"seed": 9} | change[named])
+    storage.replace_json(file, stored)
+    tasks = TaskCache(trust=True)  # as a benchmark and a study have, whose own code was looked at
+    ends = train_configs(configs, folders, checkpoints=Path("killed", "checkpoints"), tasks=tasks)
+    assert not any(isinstance(each, FailedRun) for each in ends) and not Path("mark").exists()
 
 
 def test_a_run_with_what_the_engine_lacks_is_named_and_the_others_go_on(engine, tmp_path):

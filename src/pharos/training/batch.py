@@ -19,9 +19,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pharos.agents import is_known
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
 from pharos.policies import is_small_table
 from pharos.system import compiling
+from pharos.system.sources import is_reference
 from pharos.system.storage import digest_of_json, inside, is_full, lock, read_json, remove_leftovers, replace_json
 from pharos.system.wording import in_one_line, pluralize
 from pharos.training import results as _results
@@ -231,9 +233,13 @@ class TrainingJobs:
                 if finished.issuperset(config.id for config in configs):  # it was killed before it removed this
                     shutil.rmtree(folder, ignore_errors=True)
                 continue
+            if any(place is None and self._is_foreign(config) for place, config in zip(places, configs, strict=True)):
+                continue
             try:
                 group = [
-                    self.tasks.prepare(place, config, None if place is None else self.folders[place])
+                    self.tasks.prepare(None, config, None)
+                    if place is None
+                    else self.tasks.prepare(place, self.configs[place], self.folders[place])
                     for place, config in zip(places, configs, strict=True)
                 ]
             except Exception:  # what is wrong with a run is found later, where it fails alone
@@ -242,6 +248,15 @@ class TrainingJobs:
                 if config.id in by_id:
                     del waiting[by_id.pop(config.id)]
             yield group
+
+    def _is_foreign(self, config: RunConfig) -> bool:
+        """Whether a run of a checkpoint, which somebody else may have written, names code that no run here names."""
+        names = {"environment": config.environment, "observation": config.observation}
+        if not is_known(config.agent):
+            names["agent"] = config.agent
+        has_no_source = any(is_reference(name) and part not in config.sources for part, name in names.items())
+        known = [item for each in self.configs for item in each.sources.items()]
+        return has_no_source or any(item not in known for item in config.sources.items())
 
     def _stored_batches(self) -> Iterator[tuple[Path, list[RunConfig]]]:
         for folder in [] if self.checkpoints is None else sorted(self.checkpoints.glob("*")):
