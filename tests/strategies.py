@@ -51,7 +51,7 @@ def general_mdps(draw, max_states: int = 5, max_actions: int = 3):
     weights[..., 0] += weights.sum(axis=2) == 0
     matrix = (weights / weights.sum(axis=2, keepdims=True))[..., :num_states]
     paid = draw(hnp.arrays(np.float64, (num_states, num_actions), elements=rewards_of_games))
-    return TabularMDP.from_matrices(matrix, paid, gamma=draw(gammas))
+    return TabularMDP.from_matrices(matrix, paid, gamma=draw(gammas), axes="SAS", ends=True)
 
 
 # How tables of several outcomes can be held: (rows one after another, palette, outcomes of the widest row).
@@ -132,7 +132,7 @@ def acyclic_mdps(draw):
         mdp = replace(mdp, dynamics=outcome_table(rows, num_actions, False, True, 2))
     if kind == "matrices":
         matrix = mdp.dynamics.matrix()[:, :-1]
-        mdp = TabularMDP.from_matrices(matrix, paid)
+        mdp = TabularMDP.from_matrices(matrix, paid, ends=True)
     age = np.empty(num_states, np.int64)
     age[number] = 3 * np.arange(num_states) - 4
     return _with_chance(draw, mdp.with_gamma(draw(st.sampled_from([1.0, 1.0, 0.9, 1 - 1e-7])))), age

@@ -29,9 +29,20 @@ import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+LONGEST = 2000
+"""Characters of a message: one that quotes more is cut in the middle."""
+
 
 class PharosError(Exception):
     """Base class: `except PharosError` catches everything that pharos raises on purpose."""
+
+    def __init__(self, *args: Any):
+        super().__init__(*(_cut(each) if isinstance(each, str) else each for each in args))
+
+
+def _cut(text: str) -> str:
+    half = LONGEST // 2
+    return text if len(text) <= LONGEST else f"{text[: half - 5]} ... {text[-half:]}"
 
 
 class ParameterError(PharosError, ValueError):

@@ -95,7 +95,7 @@ def imported(kind, seed):
     if kind == "matrices":
         matrices = rng.random((20, 2, 20)) * (rng.random((20, 2, 20)) < 0.2)
         matrices /= np.maximum(matrices.sum(2, keepdims=True), 1)
-        return TabularMDP.from_matrices(matrices, rng.random((20, 2)))
+        return TabularMDP.from_matrices(matrices, rng.random((20, 2)), ends=True)
     successors, probabilities = rng.integers(-1, 20, (20, 2, 3)), rng.dirichlet([1, 1, 1], (20, 2))
     return TabularMDP.from_outcomes(successors, probabilities, rng.random((20, 2)))
 

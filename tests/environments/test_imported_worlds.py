@@ -29,7 +29,7 @@ R = np.array([[1.0, 0.25], [0.5, -1.0], [0.0, 0.0], [9.0, 9.0]])
 
 def in_every_form():
     """The same MDP with chance, kept as matrices and as both layouts of outcomes."""
-    general = TabularMDP.from_matrices(P, R, gamma=0.9)
+    general = TabularMDP.from_matrices(P, R, gamma=0.9, ends=True)
     successors = np.where(P > 0, np.arange(4), -1)
     likely = np.concatenate([P, 1 - P.sum(axis=2, keepdims=True)], axis=2)
     ends = np.concatenate([successors, np.full((4, 2, 1), -1)], axis=2)

@@ -55,7 +55,7 @@ def by_iteration(P, start, horizon):
 def test_it_is_that_of_the_time_augmented_chain(seed, size, num_actions, horizon):
     rng = np.random.default_rng(seed)
     P = 0.7 * rng.dirichlet(np.ones(size), (size, num_actions)) + 0.3 / size  # so that iteration converges
-    mdp = TabularMDP.from_matrices(P, np.zeros((size, num_actions)))
+    mdp = TabularMDP.from_matrices(P, np.zeros((size, num_actions)), axes="SAS")
     start = int(mdp.start_states[0])
     assert colosseum_diameter(mdp, horizon=horizon) == pytest.approx(by_iteration(P, start, horizon), rel=1e-6)
 

@@ -304,7 +304,7 @@ def test_two_actions_have_the_same_outcomes_where_their_rows_and_rewards_are_the
     rng = np.random.default_rng(seed)
     rows = np.array([[0.5, 0.25, 0.25], [0.25, 0.5, 0.25], [0.5, 0.5, 0.0], [0.5, 0.25, 0.0], [0.0, 0.0, 1.0]])
     matrix, rewards = rows[rng.integers(0, 5, (3, 6))], rng.integers(0, 2, (3, 6)).astype(float)
-    mdp = TabularMDP.from_matrices(matrix, rewards)
+    mdp = TabularMDP.from_matrices(matrix, rewards, ends=True)
     state, action, other = (each.ravel() for each in np.indices((3, 6, 6)))
     expected = (matrix[state, action] == matrix[state, other]).all(axis=1)
     expected &= rewards[state, action] == rewards[state, other]

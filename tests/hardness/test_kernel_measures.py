@@ -195,7 +195,12 @@ def test_the_order_of_states_does_not_matter():
     place = np.argsort(order)
     P = matrix_of(mdp)[order][:, :, order]
     turned = TabularMDP.from_matrices(
-        P * ~(order == 6)[:, None, None], mdp.rewards[order], gamma=1.0, horizon=9, initial=place[[0, 1]].tolist()
+        P * ~(order == 6)[:, None, None],
+        mdp.rewards[order],
+        gamma=1.0,
+        horizon=9,
+        initial=place[[0, 1]].tolist(),
+        ends=True,
     )
     plain = hardness.report(mdp, MEASURES, representation=Representation.of_matrix(kernel), schedule=SHORT)
     other = hardness.report(

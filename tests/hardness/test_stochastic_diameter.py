@@ -352,7 +352,7 @@ def test_intervals_hold_the_hitting_times_of_exact_fractions(rows):
         matrix[s, a, rare] += 2.0**-k
     times = naive_hitting.exact_hitting_times(matrix)
     truth = max(times[s][e] for s in range(num_states) for e in range(num_states) if s != e)
-    mdp = TabularMDP.from_matrices(matrix, np.zeros((num_states, num_actions)))
+    mdp = TabularMDP.from_matrices(matrix, np.zeros((num_states, num_actions)), axes="SAS")
     found = hardness.diameter(mdp, budget=PATIENCE)
     start = hardness.start_eccentricity_interval(mdp, budget=PATIENCE)
     for interval, value in ((found, truth), (start, max(times[0]))):
@@ -469,7 +469,9 @@ def test_a_target_without_an_upper_bound_so_far_is_not_ruled_out():
         [[1, 0, 2, 1], [0, 2, 1, 1], [0, 1e-6, 1, 0]],
     ]
     matrix = np.array(weights) / np.sum(weights, axis=2, keepdims=True)
-    mdp = TabularMDP.from_matrices(matrix[..., :3], np.zeros((3, 3))).with_initial([1, 2])
+    mdp = TabularMDP.from_matrices(
+        matrix[..., :3], np.zeros((3, 3)), axes="SAS", ends=1 - matrix[..., :3].sum(axis=2)
+    ).with_initial([1, 2])
     mdp = sticky_actions(replace(mdp, start_probabilities=np.array([1 / 6, 5 / 6])), 1.0)
     found = hardness.start_eccentricity_interval(mdp)
     assert found.exact

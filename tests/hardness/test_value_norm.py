@@ -56,7 +56,7 @@ def test_the_norm_of_a_coin_is_its_deviation():
     """One action leads to a state worth 1 with probability 0.3, else to the end: sqrt(0.3 x 0.7)."""
     matrix = np.zeros((2, 1, 2))
     matrix[0, 0, 1] = 0.3
-    mdp = TabularMDP.from_matrices(matrix, np.array([[0.0], [1.0]]), gamma=0.5)
+    mdp = TabularMDP.from_matrices(matrix, np.array([[0.0], [1.0]]), gamma=0.5, ends=True)
     assert hardness.environmental_value_norm(mdp) == pytest.approx(math.sqrt(0.21))
 
 
@@ -142,7 +142,8 @@ def test_what_a_row_lacks_is_an_end_for_values_and_measures_alike(lack, gamma):
     """A state that pays 1 and goes on with what its row holds, written as a matrix and as outcomes."""
     stays = 1 - lack
     lack = float(1 - Fraction(stays))  # exact, as the row is what it holds
-    matrix = TabularMDP.from_matrices([[[0.0, stays]], [[1.0, 0.0]]], [[1.0], [0.0]], gamma=gamma)
+    rows = [[[0.0, stays]], [[1.0, 0.0]]]
+    matrix = TabularMDP.from_matrices(rows, [[1.0], [0.0]], gamma=gamma, ends=[[lack], [0.0]])
     outcomes = TabularMDP.from_outcomes([[[1, -1]], [[0, 0]]], [[[stays, lack]], [[1, 0]]], [[1.0], [0.0]], gamma=gamma)
     assert matrix.has_ends == outcomes.has_ends == (lack > 0)
     truth = gamma * math.sqrt(lack * stays) / (1 - gamma**2 * stays)

@@ -67,7 +67,7 @@ def bet(rewards):
 
 
 def built(monkeypatch, rewards=()):
-    monkeypatch.setattr(storm, "_model", lambda *_: bet(rewards))
+    monkeypatch.setattr(storm, "_model", lambda *_: (bet(rewards), ""))
 
 
 def law(outcomes, row):
@@ -105,7 +105,7 @@ def test_reaching_a_target_pays_one_when_it_is_reached(monkeypatch):
 def test_where_no_transition_pays_otherwise_the_mdp_says_it_all(monkeypatch):
     model = bet(["money"])
     model.reward_models["money"].has_transition_rewards = False
-    monkeypatch.setattr(storm, "_model", lambda *_: model)
+    monkeypatch.setattr(storm, "_model", lambda *_: (model, ""))
     mdp, outcomes = importers.storm_recording("bet.nm", target="won", reward="money")
     assert outcomes is None
     assert mdp.rewards.tolist() == [[-1.0, -0.5], [0.0, 0.0], [-2.0, -2.0]]

@@ -130,7 +130,7 @@ def test_values_of_general_mdps_are_kept_when_states_are_doubled(mdp, sticky, ra
     share = data.draw(st.sampled_from([0.0, 0.3, 0.5]))
     plain = mdp.transitions.toarray().reshape(size, actions, size)
     doubled = np.tile(np.concatenate([share * plain, (1 - share) * plain], axis=2), (2, 1, 1))
-    twice = TabularMDP.from_matrices(doubled, np.tile(mdp.rewards, (2, 1)), gamma=mdp.gamma)
+    twice = TabularMDP.from_matrices(doubled, np.tile(mdp.rewards, (2, 1)), gamma=mdp.gamma, axes="SAS", ends=True)
     one, other = (random_actions(sticky_actions(each, sticky), random) for each in (mdp, twice))
     found = minimize(other)
     assert found.num_classes == minimize(one).num_classes

@@ -159,7 +159,7 @@ def test_measures_are_those_of_the_chain_that_is_written_out(lake, grid):
     for space in (lake, grid):
         mdp = random_actions(lazy_actions(space.mdp(gamma=0.9), 0.3), 0.1)
         P = mdp.dynamics.matrix()[:, : mdp.num_states]
-        other = TabularMDP.from_matrices(P, mdp.rewards, gamma=0.9, initial=mdp.initial)
+        other = TabularMDP.from_matrices(P, mdp.rewards, gamma=0.9, initial=mdp.initial, ends=True)
         other = random_actions(replace(other, terminal=mdp.terminal), 0.1)
         one, two = (hardness.report(each, horizon=20, keep=False) for each in (mdp, other))
         for name, mine in one.results.items():

@@ -94,7 +94,7 @@ def test_rewards_of_transitions_are_averaged_over_them():
 
 def test_rewards_of_states_are_those_of_every_action():
     P = np.array([[[0.25, 0.75], [1.0, 0.0]], [[0.0, 1.0], [0.5, 0.5]]])
-    assert TabularMDP.from_matrices(P, [3.0, 4.0]).rewards.tolist() == [[3.0, 3.0], [4.0, 4.0]]
+    assert TabularMDP.from_matrices(P, [3.0, 4.0], axes="SAS").rewards.tolist() == [[3.0, 3.0], [4.0, 4.0]]
 
 
 @pytest.mark.parametrize("paid", [0, 1])
@@ -141,8 +141,8 @@ def test_arrays_that_are_no_mdp_get_a_clear_error(change, message):
         (np.ones((2, 0, 2)), np.zeros((2, 0)), "expected"),
         (sparse.csr_matrix(np.ones((5, 2)) / 2), np.zeros((2, 2)), r"shape \(5, 2\); expected \(states \* actions"),
         (sparse.csr_matrix([[1.0, 0], [0, 1], [0, 1], [0.5, 0.6]]), np.zeros((2, 2)), "state 1, action 1 sums to 1.1"),
-        (sparse.csr_matrix([[0, 0], [1 + 2e-9, 0], [0, 1], [0, 1]]), np.zeros((2, 2)), "state 0, action 1 sums to 1"),
-        (sparse.csr_matrix([[1.0, 0], [0, 1]]), np.zeros((2, 1, 2)), "shape"),
+        (sparse.csr_matrix([[0, 1], [1 + 2e-6, 0], [0, 1], [0, 1]]), np.zeros((2, 2)), "state 0, action 1 sums to 1"),
+        (sparse.csr_matrix([[1.0, 0], [0, 1]]), np.zeros((2, 1, 3)), "shape"),
     ],
 )
 def test_matrices_that_are_no_mdp_get_a_clear_error(P, R, message):

@@ -106,7 +106,7 @@ def test_terminal_states_are_those_that_end_or_stay_with_reward_0():
         (SUCCESSORS, changed(PROBABILITIES, (0, 1, 0), 1.5), REWARDS, r"probabilities\[0, 1, 0\] is 1.5"),
         (SUCCESSORS, changed(PROBABILITIES, (0, 1, 0), np.nan), REWARDS, r"probabilities\[0, 1, 0\] is nan"),
         (SUCCESSORS, changed(PROBABILITIES, (1, 0, 0), 0.9), REWARDS, "state 1, action 0 sum to 0.9"),
-        (SUCCESSORS, changed(PROBABILITIES, (1, 0, 0), 1 - 2e-9), REWARDS, "state 1, action 0 sum to 0.99"),
+        (SUCCESSORS, changed(PROBABILITIES, (1, 0, 0), 1 - 2e-6), REWARDS, "state 1, action 0 sum to 0.99"),
         (SUCCESSORS, PROBABILITIES, np.zeros(2), r"rewards have shape \(2,\); expected \(2, 2\)"),
         (SUCCESSORS, PROBABILITIES, changed(REWARDS, (0, 1), np.nan), "reward of state 0, action 1 is nan"),
         (SUCCESSORS, PROBABILITIES, np.full((2, 2, 2), np.inf), "reward of state 0, action 0, outcome 0 is inf"),

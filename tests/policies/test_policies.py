@@ -37,7 +37,7 @@ def test_what_a_policy_reaches_has_the_values_of_the_whole_mdp(mdp, seed, horizo
 def test_an_estimate_on_a_general_mdp_holds_the_value(seed):
     rng = np.random.default_rng(seed)
     matrix = 0.9 * rng.dirichlet(np.ones(4), (4, 2))
-    mdp = TabularMDP.from_matrices(matrix, rng.random((4, 2)), gamma=1.0, horizon=5)
+    mdp = TabularMDP.from_matrices(matrix, rng.random((4, 2)), gamma=1.0, horizon=5, ends=True)
     table = np.full((4, 2), 0.5)
     estimate = policy_value(table, mdp, None, lambda: (0.0, 5.0), max_states=0, episodes=2000, seed=seed)
     assert not estimate.exact and estimate.episodes == 2000

@@ -9,11 +9,12 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from hypothesis import strategies as st
+from scipy import sparse
 
 from naive import exact as naive_exact
 from pharos import hardness
 from pharos.errors import DivergenceError, ParameterError, PrecisionError
-from pharos.mdp import TabularMDP, random_actions, sticky_actions
+from pharos.mdp import Matrices, TabularMDP, random_actions, sticky_actions
 from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
 from pharos.solvers.policy_iteration import PolicyIteration
 from refusals import refusal
@@ -197,7 +198,7 @@ def test_rounding_adds_up_along_a_path_at_gamma_1():
     path = TabularMDP.from_arrays([[i + 1] for i in range(length - 1)] + [[-1]], np.full((length, 1), 0.1), gamma=1.0)
     error = 1000 * Fraction(0.1) - Fraction(float(value_iteration(path).v[0]))
     assert Fraction(1, 10**12) < abs(error) <= Fraction(value_iteration(path).error_bound)
-    by_matrix = TabularMDP.from_matrices(np.eye(length, k=1)[:, None], np.full((length, 1), 0.1), gamma=1.0)
+    by_matrix = TabularMDP.from_matrices(np.eye(length, k=1)[:, None], np.full((length, 1), 0.1), gamma=1.0, ends=True)
     assert abs(error) <= Fraction(value_iteration(by_matrix).error_bound)
 
 
@@ -214,7 +215,8 @@ def test_rounding_counts_every_operation_of_a_backup():
 
 
 def test_probabilities_that_sum_to_more_than_1_over_gamma_give_no_false_bound():
-    grows = TabularMDP.from_matrices(np.full((1, 1, 1), 1 + 9e-10), [[1.0]], gamma=1 - 1e-10)
+    one = TabularMDP.from_matrices(np.ones((1, 1, 1)), [[1.0]], gamma=1 - 1e-10)
+    grows = replace(one, dynamics=Matrices(sparse.csr_matrix([[1 + 9e-10]]), 1))
     for solve in (value_iteration, worst_value, uniform_value):  # the value is infinite
         assert "1 / gamma" in refusal(PrecisionError, solve, grows, 1e30)
     for policy in ([0], [[1.0]]):
@@ -288,7 +290,7 @@ def test_values_beyond_the_largest_float_are_an_error(solve):
 def test_a_state_that_leads_to_itself_may_be_visited_again_at_gamma_1():
     waits = TabularMDP.from_arrays([[0, -1]], [[0.0, 1.0]], gamma=1.0)
     assert "again and again" in refusal(DivergenceError, value_iteration, waits)
-    by_matrix = TabularMDP.from_matrices(np.array([[[1.0], [0.0]]]), [[0.0, 1.0]], gamma=1.0)
+    by_matrix = TabularMDP.from_matrices(np.array([[[1.0], [0.0]]]), [[0.0, 1.0]], gamma=1.0, ends=True)
     assert "again and again" in refusal(DivergenceError, value_iteration, by_matrix)
     assert value_iteration(replace(waits, gamma=0.9), 1e-9).v[0] == 1.0
 

@@ -325,9 +325,10 @@ class Target:
             return self.environment
         assert self.path is not None
         if self.path.is_file():
+            from pharos.importers import how_to_import
+
             raise ParameterError(
-                f"{self.path}: a file is no environment; bring it into a folder: "
-                f"pharos import bridge {self.path} --out FOLDER"
+                f"{self.path}: a file is no environment; bring it into a folder: {how_to_import(self.path)}"
             )
         if self.is_imported:
             from pharos.environments import make

@@ -407,6 +407,7 @@ class Environment:
         first_version: int          the `version` that the Gymnasium id pharos/ClassName-v0 stands for
         outcomes: int               K, how many outcomes an action has at most: of classes with chance; an attribute or
                                     a property. 1 in the base class
+        residual: tuple             of an imported MDP: what its source leaves open, see mdp/row_sums.py
 
     Parameters are the fields of the dataclass. `parameter(12, low=4)` as a default declares what they may be.
 
@@ -454,6 +455,7 @@ class Environment:
     hyperparameters: ClassVar[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {}
     foreign_parameters: ClassVar[Mapping[str, str]] = {}
     first_version: ClassVar[int] = 1
+    residual: ClassVar[tuple[float, float]] = (0.0, 0.0)
 
     if TYPE_CHECKING:  # attributes, or properties
 

@@ -85,6 +85,14 @@ class ImportedWorld(Environment):
         """The horizon of the MDP; else the time limit of its source; else 1,000."""
         return int(self.manifest.get("horizon") or self.manifest.get("time_limit") or TIME_LIMIT)
 
+    @cached_property
+    def residual(self) -> tuple[float, float]:  # type: ignore[override]
+        """What the sums of the rows of the source leave open, in probability and in reward."""
+        try:
+            return mdp_files.residual_of(self.manifest)
+        except ValueError as error:
+            raise FileFormatError(f"{self.folder}: {error}; {mdp_files.AGAIN}") from None
+
     @property
     def outcomes(self) -> int:  # type: ignore[override]
         """K, the most outcomes of an action."""

@@ -3,7 +3,7 @@
 Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """
 
-from pharos.importers.files import bridge, bridge_screens, has_screens, storm, storm_recording
+from pharos.importers.files import bridge, bridge_screens, has_screens, how_to_import, storm, storm_recording
 from pharos.importers.folder import environment, is_folder, load, save
 from pharos.importers.gymnasium import (
     gymnasium,

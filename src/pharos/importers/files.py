@@ -7,9 +7,15 @@ Junges, Katoen, Quatmann and Volk (2022), "The probabilistic model checker Storm
 (2011), "PRISM 4.0".
 """
 
+import contextlib
+import ctypes
 import os
 import re
+import sys
+import tempfile
 import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +23,9 @@ import numpy as np
 
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
 from pharos.importers.folder import ImportedOutcomes
-from pharos.mdp import TabularMDP, whole_number
+from pharos.mdp import Residual, TabularMDP, lacking, normalized_rows, whole_number
 from pharos.system import storage
+from pharos.system.wording import capped
 
 MINIGRID_STEPS = 100
 LARGEST_HORIZON = 100_000
@@ -89,9 +96,23 @@ def has_screens(path: str | os.PathLike) -> bool:
         return False
 
 
+def how_to_import(path: Path) -> str:
+    """The command that brings a file into a folder; or which files can be."""
+    kind = "prism" if path.suffix in SUFFIXES else "bridge" if path.suffix == ".npz" else ""
+    if kind:
+        return f"`pharos import {kind} {path} --out FOLDER`"
+    return (
+        f"`pharos import` takes {', '.join(SUFFIXES)} and BRIDGE's .npz; matrices of other files go to "
+        f"importers.matrices(P, R) and importers.save in Python"
+    )
+
+
 def _members(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     try:
         storage.check_regular(path)
+        if path.exists() and not zipfile.is_zipfile(path):
+            advice = "" if path.suffix == ".npz" else f"; {how_to_import(path)}"
+            raise FileFormatError(f"{path}: cannot be read as npz: it is no zip archive{advice}")
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             missing = [name for name in names if name not in stored.files]
             if missing:
@@ -194,7 +215,7 @@ def storm_recording(
     Raises:
         As `storm`.
     """
-    model = _model(Path(path), constants)
+    model, refusal = _model(Path(path), constants)
     labels = sorted(model.labeling.get_labels())
     if target is not None and target not in labels:
         raise UnknownName(f"label of {path}", target, labels)
@@ -212,7 +233,22 @@ def storm_recording(
     if target is not None:
         ended[list(model.labeling.get_states(target))] = True
     outcomes = _outcomes(model, ended, None if reward is None else model.reward_models[reward])
-    return _mdp(model, outcomes, gamma, horizon), outcomes if _differ(outcomes) else None
+    actions = (len(outcomes.offsets) - 1) // model.nr_states
+
+    def refuse(row: int, total: float) -> FileFormatError:
+        where = f"state {row // actions}, choice {row % actions}"
+        return FileFormatError(
+            f"{path}: the probabilities of {where} sum to {total:.9g}; expected 1{refusal and f'; Storm: {refusal}'}"
+        )
+
+    of = np.repeat(np.arange(len(outcomes.offsets) - 1), np.diff(outcomes.offsets))
+    probabilities, residuals = normalized_rows(outcomes.probabilities, of, len(outcomes.offsets) - 1, refuse)
+    outcomes = outcomes._replace(probabilities=probabilities)
+    mdp = replace(
+        _mdp(model, outcomes, gamma, horizon),
+        residual=Residual.of(residuals, np.maximum.reduceat(np.abs(outcomes.rewards), outcomes.offsets[:-1])),
+    )
+    return mdp, outcomes if _differ(outcomes) else None
 
 
 def _outcomes(model: Any, ended: np.ndarray, reward_model: Any) -> ImportedOutcomes:
@@ -273,11 +309,16 @@ def _mdp(model: Any, outcomes: ImportedOutcomes, gamma: float, horizon: int | No
     is_constant = np.minimum.reduceat(outcomes.rewards, begin) == np.maximum.reduceat(outcomes.rewards, begin)
     rewards = np.where(is_constant, outcomes.rewards[begin], means).reshape(states, -1)
     starts = list(model.initial_states)
-    initial = starts[0] if len(starts) == 1 else starts
-    return TabularMDP.from_matrices(table, rewards, gamma=gamma, initial=initial, horizon=horizon)
+    setting: dict[str, Any] = {"gamma": gamma, "initial": starts[0] if len(starts) == 1 else starts}
+    return TabularMDP.from_matrices(table, rewards, horizon=horizon, ends=lacking(table), **setting)
 
 
-def _model(path: Path, constants: str) -> Any:
+NOT_ONE = "do not sum to one"
+"""In the refusal of Storm's checks, which compare sums with 1 as exact fractions."""
+
+
+def _model(path: Path, constants: str) -> tuple[Any, str]:
+    """(model, what Storm says of sums that differ from 1, where it says anything)."""
     try:
         import stormpy
     except ImportError:
@@ -286,18 +327,85 @@ def _model(path: Path, constants: str) -> Any:
         raise ParameterError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise ParameterError(f"{path}: no such file")
-    try:
-        if path.suffix == ".drn":
-            model = stormpy.build_model_from_drn(str(path))
-        else:
-            jani = path.suffix == ".jani"
-            program = stormpy.parse_jani_model(str(path))[0] if jani else stormpy.parse_prism_program(str(path))
-            if constants:
-                program = stormpy.instantiate_constants(program, constants)[0]
-            model = stormpy.build_model(program)
-    except Exception as error:  # of Storm, which has many, and of the bindings
-        raise FileFormatError(f"{path}: Storm cannot build it: {' '.join(str(error).split())}") from None
+    refusal = ""
+    with _storms_output() as printed:
+        try:
+            if path.suffix == ".drn":
+                model = stormpy.build_model_from_drn(str(path))
+            else:
+                jani = path.suffix == ".jani"
+                program = stormpy.parse_jani_model(str(path))[0] if jani else stormpy.parse_prism_program(str(path))
+                if constants:
+                    program = stormpy.instantiate_constants(program, constants)[0]
+                model, refusal = _checked_model(stormpy, program)
+        except Exception as error:  # of Storm, which has many, and of the bindings
+            reason = _first_error(printed()) or _without_type(error)
+            raise FileFormatError(f"{path}: Storm cannot build it: {capped(reason, 600)}") from None
     kind = str(model.model_type).rpartition(".")[2]
     if kind not in ("DTMC", "MDP"):
         raise FileFormatError(f"{path}: is a model of type {kind}; expected an MDP or a DTMC")
-    return model
+    return model, refusal
+
+
+def _checked_model(stormpy: Any, program: Any) -> tuple[Any, str]:
+    """The model, and what Storm says of sums of probabilities that differ from 1, which may be rounded.
+
+    Raises:
+        RuntimeError: of Storm's checks of each command, but the one of sums: an update is out of range, ...
+    """
+    options = stormpy.BuilderOptions(build_full=True)
+    options.set_exploration_checks(True)
+    try:
+        return stormpy.build_model(program, options=options), ""
+    except RuntimeError as error:
+        refusal = _without_type(error)
+        if NOT_ONE not in refusal:
+            raise
+    options = stormpy.BuilderOptions(build_full=True)
+    options.set_add_out_of_bounds_state(True)
+    model = stormpy.build_model(program, options=options)
+    if OUT_OF_BOUNDS in model.labeling.get_labels():
+        raise RuntimeError(refusal)
+    return model, refusal
+
+
+OUT_OF_BOUNDS = "out_of_bounds"
+"""Storm's label of the state that updates out of range lead to."""
+
+
+@contextlib.contextmanager
+def _storms_output() -> Iterator[Callable[[], str]]:
+    """Catch what Storm prints past Python; yields a function that returns it. If all goes well, it goes to stderr."""
+    flush = ctypes.CDLL(None).fflush
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as file:
+        saved = [os.dup(number) for number in (1, 2)]
+
+        def printed() -> str:
+            flush(None)
+            file.seek(0)
+            return file.read().decode(errors="replace")
+
+        try:
+            flush(None)
+            for number in (1, 2):
+                os.dup2(file.fileno(), number)
+            yield printed
+        finally:
+            text = printed()
+            for number, own in zip((1, 2), saved, strict=True):
+                os.dup2(own, number)
+                os.close(own)
+        sys.stderr.write("".join(line for line in text.splitlines(keepends=True) if NOT_ONE not in line))
+
+
+def _without_type(error: Exception) -> str:
+    """What Storm says, in one line, without the name of its exception."""
+    return re.sub(r"^\w+Exception: ", "", " ".join(str(error).split()))
+
+
+def _first_error(printed: str) -> str:
+    """The first error that Storm prints, which is often clearer than the last one."""
+    match = re.search(r"ERROR \([^)]*\): (.*?)(?=\n(?:ERROR|WARN|INFO) |\Z)", printed, re.DOTALL)
+    return " ".join(match[1].split()) if match else ""

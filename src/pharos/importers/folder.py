@@ -11,7 +11,7 @@ import numpy as np
 
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, FolderLocked, ParameterError
-from pharos.mdp import OutcomeTable, TabularMDP, whole_number
+from pharos.mdp import OutcomeTable, Residual, TabularMDP, lacking, whole_number
 from pharos.system import mdp_files, storage
 from pharos.system.mdp_files import (
     AGAIN,
@@ -106,6 +106,7 @@ def save(
             "horizon": None if mdp.horizon is None else int(mdp.horizon),
             "arrays": checksums,
             **description,
+            **({mdp_files.RESIDUAL: list(mdp.residual)} if any(mdp.residual) else {}),
         }
         storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
         (folder / storage.LOCK).unlink()  # whoever waits for it replaces what is whole
@@ -182,6 +183,7 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
     place = storage.cache_directory() / "imported"
     parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
     contents = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon, str(mdp.chance), sorted(parts.items())]
+    contents += [*mdp.residual] if any(mdp.residual) else []
     folder = place / storage.digest_of_json(contents)
     return make("imported", folder=os.fspath(folder if is_folder(folder) else save(mdp, folder)))
 
@@ -213,12 +215,13 @@ def load(folder: str | os.PathLike) -> TabularMDP:
     manifest = mdp_files.read_manifest(folder)
     try:
         mdp = _mdp(manifest, mdp_files.read_arrays(folder, manifest))
+        residual = mdp.residual.plus(Residual(*mdp_files.residual_of(manifest)))
     except FileFormatError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, MemoryError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise FileFormatError(f"{folder}: the imported MDP is damaged: {reason}; {AGAIN}") from None
-    return replace(mdp, folder=folder)
+    return replace(mdp, folder=folder, residual=residual)
 
 
 def _mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> TabularMDP:
@@ -241,7 +244,7 @@ def _mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Tabul
 
     matrix = sparse.csr_matrix(tuple(arrays[name] for name in MATRIX), shape=(rewards.size, len(rewards)))
     matrix.check_format(full_check=True)
-    return TabularMDP.from_matrices(matrix, rewards, **options)
+    return TabularMDP.from_matrices(matrix, rewards, ends=lacking(matrix), **options)
 
 
 def _initial(states: np.ndarray, probabilities: np.ndarray, num_states: int) -> int | np.ndarray:

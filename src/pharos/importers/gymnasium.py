@@ -6,9 +6,12 @@ Source of MiniGrid: Chevalier-Boisvert et al. (2023), "Minigrid & Miniworld".
 import copy
 import io
 import itertools
+import operator
 import pickle  # noqa: TID251  (to copy an environment of the caller)
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +20,8 @@ import numpy.typing as npt
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, RuleError, StateSpaceTooLarge
 from pharos.importers.files import MINIGRID_STEPS
 from pharos.importers.folder import ImportedOutcomes
-from pharos.mdp import TabularMDP
+from pharos.mdp import Residual, TabularMDP, normalized_rows
+from pharos.system.wording import capped
 
 SAMPLED_STEPS = 10_000
 """Steps of the environment that are held against its table; an episode of them ends after SAMPLED_EPISODE."""
@@ -45,36 +49,25 @@ def gymnasium(env: object, *, gamma: float = 0.99, horizon: int | None = None, c
     Returns:
         A table of next states where every action has one outcome, else a general MDP. A transition that terminates ends
         the episode after its reward, wherever it leads.
+        The probabilities of a row that sum to 1 within 1e-6 are divided by their sum, which error bounds of values
+        count (`TabularMDP.residual`).
     Raises:
         FileFormatError: there is no table, states or actions are missing, probabilities do not sum to 1, or the
         environment does what its table does not say.
     """
     inner, rows = _rows(env)
-    states, actions = len(rows), len(rows[0])
-    next_states = np.full((states, actions), -1, np.int64)
-    rewards = np.zeros((states, actions))
-    single = True
-    entries: list[tuple[int, int, float]] = []
-    for s in range(states):
-        for a in range(actions):
-            outcomes = _checked(env, s, a, rows[s][a], states)
-            single &= len(outcomes) == 1
-            for (next_state, ended), (p, reward_share) in outcomes.items():
-                rewards[s, a] += reward_share
-                if not ended:
-                    entries.append((s * actions + a, next_state, p))
-                    next_states[s, a] = next_state
+    states = len(rows)
+    next_states, rewards, ends, probabilities, residual = _table(env, rows)
     start = _start(env, inner, states)
     if check and hasattr(inner, "step") and hasattr(inner, "reset"):
         _compare_with_steps(env, inner, rows)
     initial: Any = int(start.argmax()) if start.max() == 1 else start / start.sum()
-    if single:
-        return TabularMDP.from_arrays(next_states, rewards, gamma=gamma, initial=initial, horizon=horizon)
-    from scipy import sparse
-
-    row, column, data = (np.array(part) for part in zip(*entries, strict=True)) if entries else ([], [], [])
-    matrix = sparse.csr_matrix((data, (row, column)), shape=(states * actions, states))
-    return TabularMDP.from_matrices(matrix, rewards, gamma=gamma, initial=initial, horizon=horizon)
+    if probabilities is None:
+        mdp = TabularMDP.from_arrays(next_states, rewards, gamma=gamma, initial=initial, horizon=horizon)
+    else:
+        setting: dict[str, Any] = {"gamma": gamma, "initial": initial, "horizon": horizon, "ends": ends}
+        mdp = TabularMDP.from_matrices(probabilities, rewards, **setting)
+    return replace(mdp, residual=residual)
 
 
 def gymnasium_outcomes(env: object) -> ImportedOutcomes | None:
@@ -91,48 +84,121 @@ def gymnasium_outcomes(env: object) -> ImportedOutcomes | None:
         for state in rows
         for row in state
     ]
+    refuse = partial(_wrong_sum, env, len(rows[0]))
     if all(len({reward for _, _, reward in row}) == 1 for row in entries):
         return None
     offsets = np.concatenate([[0], np.cumsum([len(row) for row in entries])])
     next_states, probabilities, rewards = (
         np.array(each) for each in zip(*itertools.chain.from_iterable(entries), strict=True)
     )
+    of = np.repeat(np.arange(len(entries)), np.diff(offsets))
+    probabilities, _ = normalized_rows(probabilities, of, len(entries), refuse)
     return ImportedOutcomes(offsets, next_states.astype(np.int64), probabilities, rewards)
+
+
+def _table(env: object, rows: list[list[list]]) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any, Residual]:
+    """(next states (S, A), -1 for the end; rewards (S, A); chance of an end (S, A); (S A, S) sparse probabilities, None
+    if each action has one outcome; residual) of the rows of a table."""
+    states, actions = len(rows), len(rows[0])
+    shape, count = (states, actions), states * actions
+    merged = [_checked(env, s, a, rows[s][a], states) for s in range(states) for a in range(actions)]
+    of = np.repeat(np.arange(count), [len(outcomes) for outcomes in merged])
+    successors = np.array([key[0] for outcomes in merged for key in outcomes], np.int64)
+    p, shares, largest = np.array([each for outcomes in merged for each in outcomes.values()]).reshape(-1, 3).T
+    p, residuals = normalized_rows(p, of, count, partial(_wrong_sum, env, actions))
+    # Rewards of rows that were divided are divided as well
+    sums = np.where(residuals > 0, np.bincount(of, [x[0] for each in merged for x in each.values()], count), 1.0)
+    rewards = (np.bincount(of, shares, count) / sums).reshape(shape)
+    paid = np.zeros(count)
+    np.maximum.at(paid, of, largest)
+    residual = Residual.of(residuals, paid)
+    next_states, ended = np.full(count, -1, np.int64), successors < 0
+    next_states[of] = successors
+    ends = np.bincount(of[ended], p[ended], count).reshape(shape)
+    if len(of) == count:
+        return next_states.reshape(shape), rewards, ends, None, residual
+    from scipy import sparse
+
+    matrix = sparse.csr_matrix((p[~ended], (of[~ended], successors[~ended])), shape=(count, states))
+    return next_states.reshape(shape), rewards, ends, matrix, residual
+
+
+def _wrong_sum(env: object, actions: int, row: int, total: float) -> FileFormatError:
+    s, a = divmod(row, actions)
+    return FileFormatError(f"{name_of(env)}: the probabilities of P[{s}][{a}] sum to {total:.9g}; expected 1")
+
+
+_TERMINAL = "expected the same actions in each state: a terminal one has [(1.0, {}, 0.0, True)] for each"
+
+
+def name_of(env: object) -> str:
+    """A short name of an environment or a table, for messages."""
+    return "table" if isinstance(env, Mapping | list | tuple) else capped(env)
 
 
 def _rows(env: Any) -> tuple[Any, list[list[list]]]:
     """(the environment without wrappers, rows[s][a] of its table); FileFormatError where it has none."""
     inner = getattr(env, "unwrapped", env)
     table = getattr(inner, "P", inner)
+    if isinstance(table, str | bytes) or not hasattr(table, "__getitem__") or not hasattr(table, "__len__"):
+        raise FileFormatError(f"{name_of(env)}: has no table P[s][a] of its transitions{_native(inner)}")
+    return inner, _listed(name_of(env), table)
+
+
+def _listed(name: str, table: Any) -> list[list[list]]:
+    """rows[s][a] of a table; FileFormatError names the first row that is missing."""
+    rows: list[list[list]] = []
+    for s in range(len(table)):
+        row, actions = _entry(table, s), len(rows[0]) if rows else None
+        if not hasattr(row, "__getitem__") or not hasattr(row, "__len__"):
+            raise FileFormatError(f"{name}: has no P[{s}] with actions; expected states 0 to {len(table) - 1}")
+        if not len(row):
+            raise FileFormatError(f"{name}: P[{s}] has no actions; {_TERMINAL.format(s)}")
+        if len(row) != (actions or len(row)):
+            raise FileFormatError(f"{name}: P[{s}] has {len(row)} actions, P[0] {actions}; {_TERMINAL.format(s)}")
+        entries = [_entry(row, a) for a in range(len(row))]
+        for a, entry in enumerate(entries):
+            if not isinstance(entry, Iterable):
+                raise FileFormatError(f"{name}: has no P[{s}][{a}] with outcomes; expected actions 0 to {len(row) - 1}")
+        rows.append([list(entry) for entry in entries])
+    if not rows:
+        raise FileFormatError(f"{name}: its table P has no states")
+    return rows
+
+
+def _entry(table: Any, number: int) -> Any:
+    """table[number]; None where there is none."""
     try:
-        states, actions = len(table), len(table[0])
-        return inner, [[list(table[s][a]) for a in range(actions)] for s in range(states)]
-    except (TypeError, KeyError, IndexError) as error:
-        if inner is env or not hasattr(inner, "P"):
-            raise FileFormatError(f"{env}: has no table P[s][a] of its transitions{_native(inner)}") from None
-        raise FileFormatError(
-            f"{env}: has no table P[s][a] with states 0, 1, ... and the same actions everywhere "
-            f"({type(error).__name__}: {error})"
-        ) from None
+        return table[number]
+    except (KeyError, IndexError, TypeError):
+        return None
 
 
-def _checked(env: object, s: int, a: int, outcomes: list, states: int) -> dict[tuple[int, bool], tuple[float, float]]:
-    """{(next state, terminated): (probability, probability x reward)}, equal outcomes added up."""
-    merged: dict[tuple[int, bool], tuple[float, float]] = {}
-    total = 0.0
+def _checked(
+    env: object, s: int, a: int, outcomes: list, states: int
+) -> dict[tuple[int, bool], tuple[float, float, float]]:
+    """{(next state, terminated): (probability, probability x reward, largest |reward|)}, equal outcomes added up."""
+    merged: dict[tuple[int, bool], tuple[float, float, float]] = {}
     for outcome in outcomes:
-        p, next_state, reward, ended = outcome
+        try:
+            p, next_state, reward, ended = outcome
+            next_state, reward = operator.index(next_state), float(reward)
+        except (TypeError, ValueError):
+            raise FileFormatError(
+                f"{name_of(env)}: P[{s}][{a}] has {capped(outcome)}; expected (probability, next state, reward, "
+                f"terminated), with the number of a state and a number as reward"
+            ) from None
         if not 0 <= next_state < states or not np.isfinite(reward) or not 0 <= p <= 1:
             raise FileFormatError(
-                f"{env}: P[{s}][{a}] has {outcome}; expected a probability, a state below {states}, a finite reward"
+                f"{name_of(env)}: P[{s}][{a}] has {capped(outcome)}; expected a probability, a state below {states}, a "
+                f"finite reward"
             )
-        total += p
         if p > 0:
             key = (-1, True) if ended else (int(next_state), False)
-            before = merged.get(key, (0.0, 0.0))
-            merged[key] = (before[0] + p, before[1] + p * reward)
-    if abs(total - 1) > 1e-6:
-        raise FileFormatError(f"{env}: the probabilities of P[{s}][{a}] sum to {total}; expected 1")
+            before = merged.get(key, (0.0, 0.0, 0.0))
+            merged[key] = (before[0] + p, before[1] + p * reward, max(before[2], abs(reward)))
+    if not merged:
+        raise FileFormatError(f"{name_of(env)}: P[{s}][{a}] has no outcomes; {_TERMINAL.format(s)}")
     return merged
 
 
@@ -141,9 +207,9 @@ def _start(env: object, inner: object, states: int) -> np.ndarray:
     try:
         start = np.asarray(getattr(inner, "initial_state_distrib", np.eye(states)[0]), np.float64)
     except (TypeError, ValueError) as error:
-        raise FileFormatError(f"{env}: initial_state_distrib is no distribution: {error}") from None
+        raise FileFormatError(f"{name_of(env)}: initial_state_distrib is no distribution: {error}") from None
     if start.shape != (states,) or not np.isfinite(start).all() or (start < 0).any() or abs(start.sum() - 1) > 1e-6:
-        raise FileFormatError(f"{env}: initial_state_distrib is no distribution over the {states} states of P")
+        raise FileFormatError(f"{name_of(env)}: initial_state_distrib is no distribution over the {states} states of P")
     return start
 
 
@@ -158,26 +224,46 @@ def _compare_with_steps(env: object, inner: object, rows: list[list[list]]) -> N
     tries = np.zeros((len(rows), len(rows[0])), np.int64)
     rng = np.random.default_rng(0)
     state = None
+    first_state, first_action = (_first(getattr(inner, f"{kind}_space", None)) for kind in ("observation", "action"))
     for step in range(SAMPLED_STEPS):
         if state is None or step % SAMPLED_EPISODE == 0:
-            state = _state_number(stepped.reset(seed=0 if step == 0 else None)[0], len(rows))
+            state = _state_number(stepped.reset(seed=0 if step == 0 else None)[0], len(rows), first_state)
         if state is None:  # what is observed is no number of a state: nothing to compare
             return
         least = np.flatnonzero(tries[state] == tries[state].min())
         action = int(least[rng.integers(len(least))])
         tries[state, action] += 1
-        observation, reward, ended, _, _ = stepped.step(action)
-        next_state = _state_number(observation, len(rows))
+        observation, reward, ended, _, _ = stepped.step(action + first_action)
+        next_state = _state_number(observation, len(rows), first_state)
         outcome = (next_state, float(reward), bool(ended))
         if outcome not in probabilities[state][action]:
             raise FileFormatError(
-                f"{env}: in state {state}, action {action} led to state {next_state} with reward {reward}, which its "
-                f"table P[{state}][{action}] does not hold; its chance is not in the table (as that of Taxi with "
-                f"fickle_passenger=True), so the table is another MDP: switch that chance off{_native(inner)}"
+                f"{name_of(env)}: in state {state}, action {action} led to state {next_state} with reward {reward}, "
+                f"which its table P[{state}][{action}] does not hold; {_reason(outcome, probabilities[state][action])}"
+                f"{_native(inner)}"
             )
         samples.setdefault((state, action), Counter())[outcome] += 1
         state = None if ended else next_state
     _compare_frequencies(env, inner, probabilities, samples)
+
+
+def _first(space: object) -> int:
+    """The number that a space gives its first element: that of Discrete(n, start=k) is k."""
+    return int(getattr(space, "start", 0))
+
+
+def _reason(outcome: tuple, expected: Mapping[tuple, float]) -> str:
+    """Why an outcome that was seen is likely not among those of the table."""
+    next_state, reward, ended = outcome
+    paid = [other[1] for other in expected if (other[0], other[2]) == (next_state, ended)]
+    if paid:
+        return f"its reward differs from that of the table, {paid[0]}, so the table is another MDP"
+    if any(other[:2] == (next_state, reward) for other in expected):
+        return f"the episode {'ended' if ended else 'went on'}, unlike in the table, so the table is another MDP"
+    return (
+        "its chance is not in the table (as that of Taxi with fickle_passenger=True), so the table is another MDP: "
+        "switch that chance off"
+    )
 
 
 def _probabilities(options: list) -> dict[tuple[int, float, bool], float]:
@@ -217,8 +303,8 @@ def _compare_frequencies(env: object, inner: object, table: list, samples: dict[
         chance = float(chdtrc(len(shares) - 1, ((sampled - expected) ** 2 / expected).sum()))
         if chance < LEAST_PROBABILITY / len(tests):
             raise FileFormatError(
-                f"{env}: in state {state}, action {action} (and those with the same probabilities) had its outcomes "
-                f"{', '.join(map(str, sampled))} times in {sampled.sum()} steps, but its table P[{state}][{action}] "
+                f"{name_of(env)}: in state {state}, action {action} (and those with the same probabilities) had its "
+                f"outcomes {', '.join(map(str, sampled))} times in {sampled.sum()} steps, but its table P[{state}][{action}] "
                 f"gives them {', '.join(f'{p:.3g}' for p in shares)}: that is as likely as {chance:.1g}, so the table "
                 f"is another MDP{_native(inner)}"
             )
@@ -240,19 +326,26 @@ def _copy(inner: object) -> Any:
         return inner
 
 
-def _state_number(observation: Any, states: int) -> int | None:
+def _state_number(observation: Any, states: int, first: int = 0) -> int | None:
     try:
-        number = int(observation)
+        number = int(observation) - first
     except (TypeError, ValueError):
         return None
-    return number if 0 <= number < states and number == observation else None
+    return number if 0 <= number < states and number + first == observation else None
 
 
 def matrices(
-    P: object, R: npt.ArrayLike, *, gamma: float = 0.99, initial: npt.ArrayLike = 0, horizon: int | None = None
+    P: object,
+    R: npt.ArrayLike,
+    *,
+    gamma: float = 0.99,
+    initial: npt.ArrayLike = 0,
+    horizon: int | None = None,
+    axes: str | None = None,
+    ends: npt.ArrayLike = False,
 ) -> TabularMDP:
     """Return the MDP of transition probabilities P and rewards R; as `TabularMDP.from_matrices`."""
-    return TabularMDP.from_matrices(P, R, gamma=gamma, initial=initial, horizon=horizon)
+    return TabularMDP.from_matrices(P, R, gamma=gamma, initial=initial, horizon=horizon, axes=axes, ends=ends)
 
 
 # MiniGrid -------------------------------------------------------------------------------------------------------------
@@ -377,8 +470,8 @@ class _Driver:
             instance = env
         self.env: Any = getattr(instance, "unwrapped", instance)
         if not isinstance(self.env, MiniGridEnv):
-            raise ParameterError(f"{env!r}: is no environment of MiniGrid {package.__version__}")
-        self.name = str(env)
+            raise ParameterError(f"{name_of(env)}: is no environment of MiniGrid {package.__version__}")
+        self.name = name_of(env)
         self.wall = Wall
         self.remember_carried = remember_carried
         self.fixed_types = (gymnasium.spaces.Space, np.random.Generator)

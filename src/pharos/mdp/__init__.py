@@ -44,7 +44,8 @@ if TYPE_CHECKING:
         rewards_of_space,
         rewards_of_staying,
     )
-    from pharos.mdp.table import Lazy, Matrices, OutcomeTable, Table
+    from pharos.mdp.row_sums import Residual, normalized_rows
+    from pharos.mdp.table import Lazy, Matrices, OutcomeTable, Table, lacking
     from pharos.mdp.tabular import Part, TabularMDP
 
 __all__ = [

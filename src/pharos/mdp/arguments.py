@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pharos.errors import ParameterError
+from pharos.system.wording import capped
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -28,16 +29,11 @@ def require_mdp(function: Callable[P, R]) -> Callable[P, R]:
         value = args[0] if args else kwargs.get("mdp")
         if not isinstance(value, TabularMDP) and (args or "mdp" in kwargs):
             raise ParameterError(
-                f"{function.__name__}: found {_described(value)}; expected a TabularMDP: write {_remedy(value)}"
+                f"{function.__name__}: found {capped(repr(value), 60)}; expected a TabularMDP: write {_remedy(value)}"
             )
         return function(*args, **kwargs)
 
     return checked
-
-
-def _described(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _remedy(value: object) -> str:
@@ -58,7 +54,7 @@ def as_array(value: object, name: str, dtype: npt.DTypeLike | None = None) -> np
     try:
         return np.asarray(value, dtype)
     except (ValueError, TypeError) as error:
-        raise ParameterError(f"{name}: {' '.join(str(error).split())[:200]}; expected an array of numbers") from None
+        raise ParameterError(f"{name}: {capped(error)}; expected an array of numbers") from None
 
 
 def checked_next_states(next_states: object) -> np.ndarray:

@@ -225,15 +225,17 @@ def rewards_of_shape(rewards: npt.ArrayLike | Rewards, shape: tuple[int, ...]) -
     return rewards if isinstance(rewards, Rewards) else Rewards.from_array(array)
 
 
-def expected_over_outcomes(rewards: npt.ArrayLike, probabilities: np.ndarray) -> Rewards | np.ndarray:
-    """(S, A) expected rewards: as given, or the mean over outcomes of rewards (S, A, K).
+def expected_over_outcomes(
+    rewards: npt.ArrayLike, probabilities: np.ndarray
+) -> tuple[Rewards | np.ndarray, np.ndarray | float]:
+    """((S, A) expected rewards, the largest that an outcome pays): as given, and 0; or means of rewards (S, A, K).
 
     Raises:
         ParameterError: they have neither shape, or one of a possible outcome is not finite.
     """
     array, shape = as_array(rewards, "rewards", np.float64), probabilities.shape
     if array.shape == shape[:2]:
-        return array
+        return array, 0.0
     if array.shape != shape:
         raise ParameterError(
             f"rewards have shape {array.shape}; expected {shape[:2]}, one for each state and action, or {shape}, one "
@@ -246,7 +248,8 @@ def expected_over_outcomes(rewards: npt.ArrayLike, probabilities: np.ndarray) ->
         raise ParameterError(
             f"the reward of state {s}, action {a}, outcome {k} is {array[s, a, k]}; expected a finite number"
         )
-    return means_of(probabilities * np.where(possible, array, 0.0))
+    paid = np.where(possible, array, 0.0)
+    return means_of(probabilities * paid), np.abs(paid).max(axis=2)
 
 
 def means_of(terms: np.ndarray) -> Rewards:

@@ -24,6 +24,7 @@ from pharos.mdp.arguments import (
 )
 from pharos.mdp.dynamics import Dynamics, TopologicalOrder
 from pharos.mdp.rewards import Rewards, expected_over_outcomes, rewards_of_shape
+from pharos.mdp.row_sums import Residual
 from pharos.mdp.table import (
     Lazy,
     Matrices,
@@ -62,6 +63,8 @@ class TabularMDP:
         environment: the one that the states are of, where it is known.
         age: (S,) integers that each transition out of a state that is not terminal makes larger; None where they are
             not known. Solvers take the states in this order then, once.
+        residual: what the sums of rows that were given leave open, see mdp/row_sums.py; error bounds of values count
+            it.
     """
 
     dynamics: Dynamics
@@ -76,6 +79,7 @@ class TabularMDP:
     age: np.ndarray | None = None
     staying: Callable[[], Rewards] | None = None
     environment: Environment | None = None
+    residual: Residual = field(default_factory=Residual)
 
     def __new__(cls, dynamics: object = None, *_: object, **__: object) -> "TabularMDP":
         if isinstance(dynamics, np.ndarray | list | tuple):
@@ -141,21 +145,24 @@ class TabularMDP:
         Args:
             successors: (S, A, K) integers in [-1, S); -1 ends the episode after the transition's reward. Entries of
                 probability 0 count for nothing.
-            probabilities: (S, A, K) of the outcomes; each row sums to 1 within 1e-9.
+            probabilities: (S, A, K) of the outcomes; each row sums to 1 within 1e-6, and is divided by its sum unless
+                that is 1 up to rounding.
             rewards: (S, A) expected rewards; or (S, A, K), averaged.
             gamma, initial, horizon, terminal: as in `from_arrays`.
         Raises:
             ParameterError: as in `from_arrays`, or a probability is not in [0, 1] or a row does not sum to 1.
         """
-        table, chances = checked_outcomes(successors, probabilities)
-        return TabularMDP.from_outcome_table(
+        table, chances, residuals = checked_outcomes(successors, probabilities)
+        means, largest = expected_over_outcomes(rewards, chances)
+        mdp = TabularMDP.from_outcome_table(
             OutcomeTable(**compact_outcomes(table, chances)),
-            expected_over_outcomes(rewards, chances),
+            means,
             gamma=gamma,
             initial=initial,
             horizon=horizon,
             terminal=terminal,
         )
+        return replace(mdp, residual=Residual.of(residuals, largest))
 
     @staticmethod
     def from_outcome_table(
@@ -178,27 +185,42 @@ class TabularMDP:
 
     @staticmethod
     def from_matrices(
-        P: object, R: npt.ArrayLike, *, gamma: float = 0.99, initial: npt.ArrayLike = 0, horizon: int | None = None
+        P: object,
+        R: npt.ArrayLike,
+        *,
+        gamma: float = 0.99,
+        initial: npt.ArrayLike = 0,
+        horizon: int | None = None,
+        axes: str | None = None,
+        ends: npt.ArrayLike = False,
     ) -> "TabularMDP":
         """A general MDP from transition probabilities.
 
         Args:
-            P: (S, A, S) array of probabilities P[s, a, t]; or a sparse (S A, S) matrix with rows s A + a; or a list of
-                A sparse (S, S) matrices. A row that sums to less than 1 ends the episode with the
-                rest, but for what the rounding of its own n entries may lack, 4 (n + 2) units of 2^-53.
-            R: expected rewards (S, A); or (S,) for every action alike; or (S, A, S), dense P only, averaged over P.
+            P: a list of A matrices (S, S), dense or sparse, one an action; or an array (S, A, S) of probabilities
+                P[s, a, t]; or a sparse (S A, S) matrix with rows s A + a. A row that sums to 1 within 1e-6 is divided
+                by its sum unless that is 1 up to rounding; `residual` has what that may change, and error bounds of
+                values count it.
+            R: expected rewards (S, A); or (S,) for every action alike; or one for each transition, in any form of P,
+                averaged over P.
             gamma, initial, horizon: as in `from_arrays`.
+            axes: of arrays with three axes, "SAS" or "ASS" (also "SAS" of a list with one (A, S) matrix a state). It
+                must be given for an array with as many actions as states, which has the shape of both.
+            ends: whether a row that sums to less than 1 - 1e-6 ends the episode with the rest; or (S, A) probabilities
+                of ending, which are then part of the sums of rows.
         Raises:
-            ParameterError: shapes do not fit, or a probability or reward is out of range.
+            ParameterError: shapes do not fit, or a probability or reward is out of range; or a row does not sum to 1:
+                the message names the first one, and the likely reason.
         """
-        matrix, num_actions = transitions_of(P)
+        matrix, num_actions, residuals = transitions_of(P, axes, ends)
         dynamics = Matrices(matrix, num_actions)
         shape = (dynamics.num_states, num_actions)
-        reward_table = rewards_of_shape(expected_rewards(P, R, *shape), shape)
+        means, residual = expected_rewards(matrix, R, axes, num_actions, residuals)
+        reward_table = rewards_of_shape(means, shape)
         ended = np.asarray(matrix.sum(axis=1)).reshape(shape) <= 1e-12
         terminal = ended.all(axis=1) & (reward_table.array == 0).all(axis=1)
         states, probabilities = start_of(initial, dynamics.num_states)
-        return TabularMDP(dynamics, reward_table, terminal, gamma, horizon, states, probabilities)
+        return TabularMDP(dynamics, reward_table, terminal, gamma, horizon, states, probabilities, residual=residual)
 
     @staticmethod
     def from_space(
@@ -222,6 +244,7 @@ class TabularMDP:
             folder=space.folder,
             staying=staying,
             environment=space.environment,
+            residual=Residual() if space.environment is None else Residual(*space.environment.residual),
         )
         has_age = space.environment is not None and space.environment.has_age
         return mdp.with_age(space.ages) if has_age else mdp
@@ -387,7 +410,7 @@ class TabularMDP:
         if wrong.any():
             s, a = map(int, np.argwhere(wrong)[0])
             raise ParameterError(f"rewards[{s}, {a}] is {table.array[s, a]}, but state {s} is terminal; expected 0")
-        return replace(self, reward_table=table, staying=None)
+        return replace(self, reward_table=table, staying=None, residual=self.residual._replace(rewards=0.0))
 
     def lazy(self, p: float, staying: npt.ArrayLike | None = None) -> "TabularMDP":
         """The same MDP in which, with probability p, nothing happens; see `lazy_actions`."""

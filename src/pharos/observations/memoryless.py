@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP, executed_actions
+from pharos.mdp import TabularMDP, executed_actions, lacking
 from pharos.solvers import Solution, evaluate_policy, value_iteration
 
 TOLERANCE = 1e-7
@@ -124,7 +124,8 @@ class _PolicySearch:
             return TabularMDP.from_arrays(table[rows, executed], rewards, terminal=mdp.terminal, **setting)
         matrix, rewards = self.transitions
         pairs = (rows * mdp.num_actions + executed).ravel()
-        return TabularMDP.from_matrices(matrix[pairs], rewards[rows, executed], **setting)
+        chosen = matrix[pairs]
+        return TabularMDP.from_matrices(chosen, rewards[rows, executed], ends=lacking(chosen), **setting)
 
     @cached_property
     def transitions(self) -> tuple[Any, np.ndarray]:

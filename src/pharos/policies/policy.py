@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.mdp import Rewards, TabularMDP
+from pharos.mdp import Rewards, TabularMDP, lacking
 from pharos.observations import ObservationInContext, observe
 from pharos.state_space import StateSpace
 
@@ -447,13 +447,12 @@ class QueriedPolicy:
 
             stays = next_states >= 0
             entries = (outcomes.probabilities[stays], (outcomes.which[stays], next_states[stays]))
-            sub_mdp = TabularMDP.from_matrices(
-                sparse.csr_matrix(entries, (count * num_actions, count)), rewards, **setting
-            )
+            matrix = sparse.csr_matrix(entries, (count * num_actions, count))
+            sub_mdp = TabularMDP.from_matrices(matrix, rewards, ends=lacking(matrix), **setting)
         table = replace(sub_mdp.reward_table, rounding=rounding)
         if mdp.horizon is not None:  # every step reads the rewards: no palette
             table = Rewards(np.asarray(rewards, np.float64), np.empty(0), rounding)
-        return replace(sub_mdp, reward_table=table, chance=mdp.chance)
+        return replace(sub_mdp, reward_table=table, chance=mdp.chance, residual=mdp.residual.plus(sub_mdp.residual))
 
 
 class AnyAnswers(QueriedPolicy):

@@ -239,7 +239,7 @@ def backward_induction(
     largest = 0.0
     for t in range(horizon):
         before, x = x, backup(x, before)
-        bound = backup.factor * bound + backup.rounding(largest)
+        bound = backup.factor * bound + backup.rounding(largest) + mdp.residual.deviation(mdp.gamma, largest)
         largest = largest_of(x)
         if steps is not None:
             steps[t + 1] = x
@@ -250,9 +250,10 @@ def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np
     """The error of values x on the functional graph of a deterministic policy.
 
     gamma < 1: |x - x*| <= |T x - x| / (1 - gamma), with the rounding of T x. gamma = 1: paths that do not end lead into
-    cycles of value 0, and rounding errors add up along at most S steps.
+    cycles of value 0, and rounding errors add up along at most S steps. So does what the residual of the MDP allows.
     """
-    rounding = Backup(mdp, select).rounding(largest_of(x))
+    largest = largest_of(x)
+    rounding = Backup(mdp, select).rounding(largest) + mdp.residual.deviation(mdp.gamma, largest)
     if mdp.gamma == 1.0:
         bound = rounding * mdp.num_states
     else:
@@ -262,6 +263,18 @@ def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np
     if not math.isfinite(bound):
         raise imprecise(mdp, bound, 0.0)
     return bound * MARGIN
+
+
+def within_residual(mdp: TabularMDP, bound: float, x: np.ndarray) -> float:
+    """The error bound of a fixed point x, enlarged so that it holds for every MDP within the residual of this one.
+
+    (gamma d |V| + e) / (1 - gamma), see mdp/row_sums.py; at gamma = 1 the sum over the steps of the longest path.
+    """
+    if not any(mdp.residual):
+        return bound
+    order = None if mdp.gamma < 1 else mdp.order()
+    steps = 1 / (1 - mdp.gamma) if order is None else order.longest + 1
+    return (bound + steps * mdp.residual.deviation(mdp.gamma, largest_of(x) + bound)) * MARGIN
 
 
 def largest_of(x: np.ndarray) -> float:

@@ -37,7 +37,7 @@ from pharos.errors import ParameterError
 from pharos.mdp import Part, Selection, TabularMDP, runs_between, runs_of, shares_of
 from pharos.ranks import Halo, Rank, check_processes, check_ranks, cuts_of, run_spmd
 from pharos.solvers.convergence import Convergence
-from pharos.solvers.fixed_point import Backup, bound_of_steps, largest_of
+from pharos.solvers.fixed_point import Backup, bound_of_steps, largest_of, within_residual
 from pharos.solvers.solution import Solution
 from pharos.system import storage
 from pharos.system.compiling import Stopwatch
@@ -315,6 +315,7 @@ def ranked_induction(
         backup.plain_sweep()
         before, step = backup.previous, step + 1
         bound = backup.backup.factor * bound + backup.backup.rounding(largest)
+        bound += backup.mdp.residual.deviation(backup.mdp.gamma, largest)
         wants = checkpoint.is_due(backup) and step < horizon
         numbers = backup.share(largest_of(backup.x[: len(backup.part)]), wants)
         largest, is_due = map(float, numbers.max(axis=0))
@@ -352,7 +353,7 @@ def shared_solution(
         raise ParameterError(f"checkpoint {folder}: is a file; expected a folder")
 
     def program(rank: Rank) -> tuple[float, int, np.ndarray, np.ndarray] | None:
-        question = f"{mdp.gamma!r} {mdp.chance} horizon {horizon}"
+        question = f"{mdp.gamma!r} {mdp.chance} horizon {horizon}" + (f" {mdp.residual}" if any(mdp.residual) else "")
         file = SolverCheckpoint(folder, question, checkpoint_seconds)
         backup = RankedBackup(mdp, select, rank)
         if horizon is None:
@@ -369,4 +370,6 @@ def shared_solution(
     if answer is None:
         return cast(Any, None)
     bound, sweeps, x, next_x = answer
+    if horizon is None:
+        bound = within_residual(mdp, bound, x)
     return Solution(mdp, bound, sweeps, watch.seconds, horizon, select, x, next_x)

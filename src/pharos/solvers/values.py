@@ -48,6 +48,7 @@ from pharos.solvers.fixed_point import (
     chain_bound,
     fixed_point,
     largest_of,
+    within_residual,
 )
 from pharos.solvers.policy_iteration import chain, chain_values
 from pharos.solvers.solution import Solution
@@ -208,8 +209,8 @@ def solution_of(  # noqa: PLR0913
                 )
             else:
                 result = fixed_point(mdp, select, tolerance, report, x, usable_workers(threads), dtype)
-        result = result if mapped is None else result._replace(x=mapped)
-        next_x = result.x
+        next_x = result.x if mapped is None else mapped
+        result = result._replace(x=next_x, bound=within_residual(mdp, result.bound, next_x))
     elif values is not None:
         raise ParameterError(f"values={str(values)!r}: a file keeps values without a horizon; found {horizon} steps")
     else:
@@ -448,7 +449,7 @@ def evaluate_parts(
     bounds, sizes = np.zeros(len(begins)), np.zeros(len(begins))
     for _ in range(checked_horizon(mdp, None) or 0):
         before, x = x, backup(x, before)
-        bounds = factors * bounds + backup.rounding_of(rewards, sizes)
+        bounds = factors * bounds + backup.rounding_of(rewards, sizes) + mdp.residual.deviation(mdp.gamma, sizes)
         sizes = largest(np.abs(x[:-1]))
     starts = mdp.start_states[np.argsort(part[mdp.start_states], kind="stable")].reshape(len(begins), -1)
     solution = Solution(mdp, 0.0, 0, 0.0, mdp.horizon, select, x, before)

@@ -6,6 +6,7 @@ FOLDER/observations.npy  where the source shows states: format version 2 or 3
 FOLDER/outcome_*.npy     in format version 3: outcomes, with the reward of each
 """
 
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -29,6 +30,8 @@ MATRIX = ("transitions_data", "transitions_indices", "transitions_indptr")
 OUTCOMES = ("successors",)  # and, where they are: offsets; probabilities, or codes and palette
 OBSERVATIONS = "observations"
 PAID = ("outcome_offsets", "outcome_states", "outcome_probabilities", "outcome_rewards")
+RESIDUAL = "residual"
+"""Entry of the manifest: what the sums of given rows leave open, in probability and in reward; absent where nothing."""
 AGAIN = "import it again"
 
 
@@ -86,6 +89,19 @@ def read_arrays(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> dict[
     if set(checksums) != {*names, *shown, *outcomes}:
         raise ValueError(f"its arrays are {', '.join(checksums)}; expected {', '.join((*names, *shown, *outcomes))}")
     return {name: read_array(folder, manifest, name) for name in (*names, *outcomes)}
+
+
+def residual_of(manifest: Mapping[str, Any]) -> tuple[float, float]:
+    """What the sums of the rows that were imported leave open: (in probability, in reward).
+
+    Raises:
+        ValueError: the entry is something else.
+    """
+    found = manifest.get(RESIDUAL, [0.0, 0.0])
+    is_pair = isinstance(found, list) and len(found) == 2 and all(type(each) in (int, float) for each in found)
+    if not is_pair or not all(0 <= each < math.inf for each in found):
+        raise ValueError(f"{RESIDUAL} is {found!r}; expected two numbers from 0 on")
+    return float(found[0]), float(found[1])
 
 
 def read_array(folder: str | os.PathLike, manifest: Mapping[str, Any], name: str) -> np.ndarray:

@@ -14,6 +14,12 @@ def pluralize(count: int, one: str, several: str | None = None) -> str:
     return f"{count:,} {one if count == 1 else several or one + 's'}"
 
 
+def capped(value: object, most: int = 200) -> str:
+    """A value in one line, cut after so many characters: what a message quotes."""
+    text = " ".join(str(value).split())
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
 def in_words(name: str) -> str:
     """A name as prose spells it: `normalized_regret` is "normalised regret"."""
     return name.replace("_", " ").replace("normalized", "normalised")
