@@ -10,6 +10,9 @@ import gymnasium
 import minigrid  # noqa: F401  (registers its environments)
 import numpy as np
 import pytest
+from minigrid.core.grid import Grid
+from minigrid.core.mission import MissionSpace
+from minigrid.minigrid_env import MiniGridEnv
 from minigrid.wrappers import FullyObsWrapper
 
 import pharos
@@ -135,6 +138,51 @@ def test_what_cannot_be_imported_is_refused_in_one_line():
     for actions in ([], [0, 0], [7], [-1]):
         with pytest.raises(ParameterError, match="expected different ones from 0 to 6"):
             importers.minigrid(CORRIDOR, actions=actions)
+
+
+class Corridor(MiniGridEnv):
+    """Six cells: 0.2 at the left end, beside which the agent stands and which it faces, 5 at the right end."""
+
+    def __init__(self, pay=lambda own, place, steps: {1: 0.2, 6: 5.0}.get(place, 0.0), start=2, ends=(1, 6)):
+        self.pay, self.start, self.ends = pay, start, ends
+        super().__init__(MissionSpace(lambda: "go"), width=8, height=3, max_steps=50)
+
+    def _gen_grid(self, width, height):
+        self.grid = Grid(width, height)
+        self.grid.wall_rect(0, 0, width, height)
+        self.agent_pos, self.agent_dir, self.mission = (self.start, 1), 2, "go"
+
+    def step(self, action):
+        *_, truncated, info = super().step(action)
+        place = int(self.agent_pos[0])
+        return {}, self.pay(self._reward(), place, self.step_count), place in self.ends, truncated, info
+
+
+def test_a_task_of_ones_own_pays_what_its_class_pays():
+    mdp = importers.minigrid(Corridor(), gamma=0.9, horizon=None)
+    assert sorted(set(mdp.rewards.ravel())) == [0.0, 0.2, 5.0]
+    solution = pharos.value_iteration(mdp)  # turn round twice and go four cells: 0.9^5 * 5, not one step and 0.2
+    assert solution.value_at_start == pytest.approx(0.9**5 * 5) and solution.policy[0] in (0, 1)
+    costly = importers.minigrid(Corridor(lambda own, place, steps: 0.9 if place == 6 else -0.05))
+    assert sorted(set(costly.rewards.ravel())) == [-0.05, 0.9]
+
+
+def test_the_packages_own_payment_is_1_also_in_a_task_of_ones_own():
+    mdp = importers.minigrid(Corridor(lambda own, place, steps: own if place == 6 else -0.5 * (place == 1)))
+    assert sorted(set(mdp.rewards.ravel())) == [-0.5, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("pay", "message"),
+    [
+        (lambda own, place, steps: 0.5 * own * (place == 6), "pays 0.491 at first and 0.059 after 48 steps"),
+        (lambda own, place, steps: float(steps > 10), "pays 0 at first and 1 after 48 steps by action 0 in state 0"),
+        (lambda own, place, steps: float("nan"), "pays nan in state 0"),
+    ],
+)
+def test_payments_that_depend_on_time_otherwise_are_refused(pay, message):
+    said = refusal(RuleError, importers.minigrid, Corridor(pay))
+    assert message in said
 
 
 def test_without_the_package_the_extra_is_named(monkeypatch):

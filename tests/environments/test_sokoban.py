@@ -125,6 +125,62 @@ def test_levels_without_headings_are_counted_from_0(tmp_path):
     assert len(pharos.make("sokoban", level=f"{file}:1").cells) == 6
 
 
+ONE, TWO, THREE = "#####\n#@$.#\n#####", "######\n#@ $.#\n######", "#######\n#@  $.#\n#######"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"; 1\n\n{ONE}\n\n; 2\n\n{TWO}\n\n; 3\n{THREE}\n",  # Microban: a blank line after the number
+        f"; 1\n{ONE}\n; 2\n{TWO}\n; 3\n{THREE}",  # nothing between levels
+        f"Level 1\n{ONE}\nTitle: first\nAuthor: somebody\n\nlevel 2\n; 'two'\n{TWO}\n\nLevel 3\n\n{THREE}\n",
+        f"A pack of 3 levels\n\n'1'\n{ONE}\n\n'2'\n{TWO}\n-----\n'3'\n{THREE}\n",
+    ],
+)
+def test_a_pack_gives_the_level_whose_number_was_asked_for(text, tmp_path):
+    file = tmp_path / "pack.xsb"
+    file.write_text(text)
+    for number, level in ((1, ONE), (2, TWO), (3, THREE)):
+        assert pharos.make("sokoban", level=f"{file}:{number}").level == level.replace("\n", "/").replace(" ", "-")
+    message = refusal(ParameterError, pharos.make, "sokoban", level=f"{file}:4")
+    assert "the file has no level 4; it has 3, numbered 1 to 3" in message
+
+
+@pytest.mark.parametrize(
+    "between", ["\n\n", "\n; first\n", "\nTitle: first\n\n", "\n \t\n", "\n-----\n", "\nsomething else\n"]
+)
+def test_any_line_that_is_no_row_ends_a_level(between, tmp_path):
+    file = tmp_path / "pack.sok"
+    file.write_text(f"{ONE}{between}{TWO}{between}{THREE}\n")
+    for number, level in enumerate((ONE, TWO, THREE)):
+        assert pharos.make("sokoban", level=f"{file}:{number}").level == level.replace("\n", "/").replace(" ", "-")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            f"{ONE}\n; 1\n\n{TWO}\n; 2\n",
+            "line 1 begins a level without a number; expected a line '; N' before",
+        ),
+        (f"; 1\n{ONE}\n\n; 2 'two'\n{TWO}\n\n; 3\n{THREE}\n", "line 7 begins a level without a number"),
+        (f"; 1\n{ONE}\n\n{TWO}\n", "line 6 begins a level without a number"),
+        (f"; 1\n; 2\n{TWO}\n", "line 2 begins a number without a level"),
+        (f"; 1\n{ONE}\n; 2\n", "line 5 begins a number without a level"),
+        (f"; 1\n{ONE}\n; 1\n{TWO}\n", "line 5: two levels have the number 1"),
+        ("5#|#@$.#|5#\n", "line 1 has run lengths or other letters, '5#|#@$.#|5#'; expected rows of #-@$.+*"),
+        (f"{ONE}\n\n#####\n#p b.#\n#####\n", "line 6 has run lengths or other letters, '#p b.#'"),
+        ("4#\n#@$.\n", "line 1 has run lengths"),
+        ("nothing\n", "; it has none"),
+    ],
+)
+def test_a_pack_whose_numbers_are_not_clear_is_refused(text, message, tmp_path):
+    file = tmp_path / "pack.txt"
+    file.write_text(text)
+    for number in (0, 1, 2):
+        assert message in refusal(ParameterError, pharos.make, "sokoban", level=f"{file}:{number}")
+
+
 def test_a_level_without_walls_around_it_ends_at_its_edge():
     env = pharos.make("sokoban", level="@$.")
     state = env.initial_state()

@@ -95,6 +95,28 @@ def test_what_is_no_npz_is_refused_and_never_run(tmp_path):
     assert not (tmp_path / "exploded").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("model.nm", "`pharos import prism {} --out FOLDER`"),
+        ("model.prism", "`pharos import prism {} --out FOLDER`"),
+        ("model.drn", "`pharos import prism {} --out FOLDER`"),
+        ("tiger.pomdp", "importers.matrices(P, R)"),
+        ("P.mat", "importers.matrices(P, R)"),
+        ("P.csv", "importers.matrices(P, R)"),
+        ("notes.txt", "importers.matrices(P, R)"),
+    ],
+)
+def test_another_file_as_a_target_gets_the_command_that_imports_it(name, advice, tmp_path):
+    file = tmp_path / name
+    file.write_text("mdp\n")
+    for done in (run("hardness", file), run("solve", file)):
+        assert done.exit_code == 1 and len(done.stderr.strip().splitlines()) == 1
+        assert advice.format(file) in done.stderr and "pickle" not in done.stderr
+    done = run("train", file, "--agent", "q_learning", "--steps", 10)
+    assert done.exit_code == 2 and advice.format(file) in done.stderr
+
+
 def test_screens_come_one_a_state(tmp_path):
     file = tmp_path / "screens.npz"
     screens = np.arange(2 * 3 * 4 * 3, dtype=np.uint8).reshape(2, 3, 4, 3)

@@ -196,3 +196,65 @@ def test_what_cannot_be_imported_is_one_line(tmp_path):
     words = (models.prism_mdp_coin_2_2, "--target", "finished", "--reward", "steps", "--out", tmp_path / "coin")
     assert json.loads(run("import", "prism", *words, "--json").stdout)["num_states"] == 272
     assert pharos.make(str(tmp_path / "coin")).has_chance
+
+
+SUMS = """mdp
+module m
+  s : [0..3] init 0;
+  [a] s=0 -> 0.3:(s'=1) + 0.5:(s'=2);
+  [b] s=0 -> 1:(s'=1);
+  [] s=1 | s=2 -> 1:(s'=3);
+  [] s=3 -> true;
+endmodule
+rewards "cost"  s=1 : -10;  s=2 : -4;  endrewards
+label "end" = s=3;
+"""
+
+
+@needs_storm
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("", ""), "the probabilities of state 0, choice 0 sum to 0.8; expected 1; Storm: Probabilities do not sum to "
+         "one for command '[a] (s = 0)"),
+        (("0.3:", "0.6:"), "the probabilities of state 0, choice 0 sum to 1.1; expected 1"),
+        (("0.3:", "1.5:"), "Probability expression in update '3/2 : (s' = 1) evaluates to value 1.5 >1"),
+        (("0.3:", "0.499998:"), "the probabilities of state 0, choice 0 sum to 0.999998; expected 1"),
+        (("0.3:(s'=1)", "0.5:(s'=5)"), "leads to an out-of-bounds value (5) for the variable 's'"),
+        (("0.3:(s'=1) + 0.5:(s'=2);\n", "0.4999999:(s'=1) + 0.5:(s'=2);\n[] s=1 -> (s'=5);"),
+         "some update leaves the range of its variable"),
+        (("s : [0..3]", "ma : [0..3]"), "'ma' is a reserved keyword and cannot be used as an identifier"),
+        (("s : [0..3]", "floor : [0..3]"), "'floor' is a reserved keyword"),
+    ],
+)  # fmt: skip
+def test_a_malformed_model_is_refused_by_what_storm_says_of_it(change, message, tmp_path, capfd):
+    file = tmp_path / "sums.prism"
+    file.write_text(SUMS.replace(*change) if any(change) else SUMS)
+    said = refusal(FileFormatError, importers.storm, file, reward="cost", target="end", horizon=100)
+    assert message in said
+    captured = capfd.readouterr()
+    assert (captured.out, captured.err) == ("", "")  # Storm prints past Python
+    done = run("import", "prism", file, "--reward", "cost", "--target", "end", "--out", tmp_path / "out")
+    assert done.exit_code == 1 and len(done.stderr.strip().splitlines()) == 1
+
+
+@needs_storm
+def test_a_model_with_rounded_probabilities_has_them_divided_by_their_sums(tmp_path, capfd):
+    file = tmp_path / "thirds.prism"
+    thirds = " + ".join(f"0.3333333:(s'={s})" for s in (1, 2, 3))
+    file.write_text(SUMS.replace("0.3:(s'=1) + 0.5:(s'=2)", thirds))
+    mdp = importers.storm(file, reward="cost", target="end", horizon=100)
+    assert mdp.residual.probabilities == pytest.approx(1e-7, rel=1e-6)
+    solution = pharos.value_iteration(mdp)
+    assert solution.value_at_start == pytest.approx(-14 / 3, abs=1e-12)
+    assert 14 / 3 * 1e-7 < solution.error_bound < 1e-3
+    assert capfd.readouterr().out == ""
+
+
+@needs_storm
+def test_an_explicit_model_keeps_the_same_rule(tmp_path):
+    text = exporters.drn(pharos.build(pharos.make("frozen_lake")).mdp(gamma=1.0), tmp_path / "lake.drn").read_text()
+    assert importers.storm(tmp_path / "lake.drn", target="terminal", horizon=10).residual.probabilities < 1e-12
+    (tmp_path / "bad.drn").write_text(text.replace("1 : 1.0", "1 : 0.2", 1))
+    message = refusal(FileFormatError, importers.storm, tmp_path / "bad.drn", target="terminal", horizon=10)
+    assert "the probabilities of state 0, choice 1 sum to 0.2; expected 1" in message

@@ -337,7 +337,9 @@ def _model(path: Path, constants: str) -> tuple[Any, str]:
                 program = stormpy.parse_jani_model(str(path))[0] if jani else stormpy.parse_prism_program(str(path))
                 if constants:
                     program = stormpy.instantiate_constants(program, constants)[0]
-                model, refusal = _checked_model(stormpy, program)
+                model, refusal = _checked_model(path, stormpy, program)
+        except FileFormatError:
+            raise
         except Exception as error:  # of Storm, which has many, and of the bindings
             reason = _first_error(printed()) or _without_type(error)
             raise FileFormatError(f"{path}: Storm cannot build it: {capped(reason, 600)}") from None
@@ -347,11 +349,12 @@ def _model(path: Path, constants: str) -> tuple[Any, str]:
     return model, refusal
 
 
-def _checked_model(stormpy: Any, program: Any) -> tuple[Any, str]:
+def _checked_model(path: Path, stormpy: Any, program: Any) -> tuple[Any, str]:
     """The model, and what Storm says of sums of probabilities that differ from 1, which may be rounded.
 
     Raises:
-        RuntimeError: of Storm's checks of each command, but the one of sums: an update is out of range, ...
+        RuntimeError: of Storm's checks of each command, but the one of sums. FileFormatError: an update leaves the range
+            of a variable, in a command that Storm did not get to.
     """
     options = stormpy.BuilderOptions(build_full=True)
     options.set_exploration_checks(True)
@@ -365,7 +368,9 @@ def _checked_model(stormpy: Any, program: Any) -> tuple[Any, str]:
     options.set_add_out_of_bounds_state(True)
     model = stormpy.build_model(program, options=options)
     if OUT_OF_BOUNDS in model.labeling.get_labels():
-        raise RuntimeError(refusal)
+        raise FileFormatError(
+            f"{path}: some update leaves the range of its variable; Storm stopped before it: {refusal}"
+        )
     return model, refusal
 
 

@@ -11,7 +11,8 @@ import pickle  # noqa: TID251  (to copy an environment of the caller)
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -304,9 +305,9 @@ def _compare_frequencies(env: object, inner: object, table: list, samples: dict[
         if chance < LEAST_PROBABILITY / len(tests):
             raise FileFormatError(
                 f"{name_of(env)}: in state {state}, action {action} (and those with the same probabilities) had its "
-                f"outcomes {', '.join(map(str, sampled))} times in {sampled.sum()} steps, but its table P[{state}][{action}] "
-                f"gives them {', '.join(f'{p:.3g}' for p in shares)}: that is as likely as {chance:.1g}, so the table "
-                f"is another MDP{_native(inner)}"
+                f"outcomes {', '.join(map(str, sampled))} times in {sampled.sum()} steps, but its table "
+                f"P[{state}][{action}] gives them {', '.join(f'{p:.3g}' for p in shares)}: that is as likely as "
+                f"{chance:.1g}, so the table is another MDP{_native(inner)}"
             )
 
 
@@ -387,9 +388,9 @@ def minigrid(
     """Return the MDP of a MiniGrid environment, by stepping the environment from every state that can be reached.
 
     A state is all that the environment keeps, without the number of steps: grid, objects and what they contain,
-    position, direction, what is carried, and which object is which. Rewards do not shrink with time: what pays more
-    than 0 pays 1, as in BRIDGE. A transition that terminates the episode is -1. State 0 is the start, and states are
-    numbered in the order of their discovery.
+    position, direction, what is carried, and which object is which. A transition pays what the class pays, but for the
+    package's own 1 - 0.9 steps / max_steps, which shrinks with time: it pays 1, as in BRIDGE. A transition that
+    terminates the episode is -1. State 0 is the start, and states are numbered in the order of their discovery.
 
     Args:
         env: an environment or its name, such as "MiniGrid-KeyCorridorS3R1-v0". An environment given is reset and left
@@ -405,7 +406,8 @@ def minigrid(
     Raises:
         MissingExtra: the package minigrid is not installed.
         ParameterError: there is no such environment, it is none of MiniGrid, or an action is none of its own.
-        RuleError: a step draws random numbers, or touches what cannot be kept.
+        RuleError: a step draws random numbers, or touches what cannot be kept; or the payment, or the outcome, of a
+            class of one's own depends on the number of steps in another way than the package's.
         StateSpaceTooLarge: there are more than `max_states` states.
     Cost: 0.1 to 1 ms a transition, by the size of the grid; 1 to 20 kB a state while it runs.
     """
@@ -474,7 +476,7 @@ class _Driver:
         self.name = name_of(env)
         self.wall = Wall
         self.remember_carried = remember_carried
-        self.fixed_types = (gymnasium.spaces.Space, np.random.Generator)
+        self.fixed_types = (gymnasium.spaces.Space, np.random.Generator, FunctionType)
         self.fixed: list[Any] = []
         instance.reset(seed=seed)
         vars(self.env)["gen_obs"] = dict  # partial views cost most of a step, and nothing here looks at them
@@ -526,9 +528,34 @@ class _Driver:
 
     def step(self, action: int, state: int) -> tuple[float, bool]:
         """(reward without its discount by time, whether the episode ends)."""
+        late = None
+        if not self._is_paid_by_package:
+            steps = max(int(self.env.max_steps) - 2, 1)
+            late = (*self._stepped(action, state, steps), self.key())
+            self.restore(self.snapshots[state])
+        payment, terminated = self._stepped(action, state, 0)
+        if late is not None and late != (payment, terminated, self.key()):
+            if late[0] != payment:
+                what = f"pays {payment:g} at first and {late[0]:g} after {steps:,} steps"
+            else:
+                what = f"leads elsewhere after {steps:,} steps than at first"
+            raise RuleError(
+                f"{self.name}: {what} by action {action} in state {state}; expected what does not depend on the number "
+                f"of steps, or the package's own payment of 1 - 0.9 steps / max_steps"
+            )
+        return payment, terminated
+
+    @cached_property
+    def _is_paid_by_package(self) -> bool:
+        """Whether the rewards are those of the package, and nobody's else."""
+        functions = (getattr(self.env, name) for name in ("step", "_reward"))
+        return all(str(getattr(each, "__module__", "")).startswith("minigrid.") for each in functions)
+
+    def _stepped(self, action: int, state: int, steps: int) -> tuple[float, bool]:
+        """`step` after so many others; payments equal to the package's are 1."""
         rng = self.env.np_random
         before = rng.bit_generator.state
-        self.env.step_count = 0
+        self.env.step_count = steps
         _, reward, terminated, _, _ = self.env.step(action)
         if self.remember_carried and self.env.carrying is not None:
             self.env.carrying.has_been_carried = True
@@ -537,14 +564,20 @@ class _Driver:
                 f"{self.name}: draws random numbers in state {state} by action {action}; "
                 f"expected one outcome of each action"
             )
-        return (1.0 if reward > 0 else float(reward)), bool(terminated)
+        if not np.isfinite(reward):
+            raise RuleError(f"{self.name}: pays {reward} in state {state} by action {action}; expected a finite number")
+        own = 1 - 0.9 * ((steps + 1) / self.env.max_steps)
+        return (1.0 if abs(reward - own) <= 1e-12 else float(reward)), bool(terminated)
 
     def save(self) -> bytes:
         """Snapshot of the state, for `restore`."""
         stored = io.BytesIO()
         pickler = pickle.Pickler(stored, protocol=5)
         pickler.persistent_id = self._number_of_fixed  # type: ignore[method-assign]
-        pickler.dump(dict(self._attributes()))
+        try:
+            pickler.dump(dict(self._attributes()))
+        except (pickle.PicklingError, TypeError, AttributeError) as error:
+            raise RuleError(f"{self.name}: keeps what cannot be copied: {capped(error)}") from None
         return stored.getvalue()
 
     def restore(self, snapshot: bytes) -> None:
@@ -557,7 +590,7 @@ class _Driver:
         vars(self.env).update(attributes)
 
     def _number_of_fixed(self, value: object) -> int | None:
-        """Number of a value outside the state (the environment itself, its spaces, its generator); None for others."""
+        """Number of a value outside the state (the environment, its spaces, generator, functions); None for others."""
         if value is not self.env and not isinstance(value, self.fixed_types):
             return None
         for number, constant in enumerate(self.fixed):

@@ -1,9 +1,9 @@
 """Sokoban: push the boxes onto the targets. Source: Hiroyuki Imabayashi (1982); rewards of Racaniere et al. (2017)."""
 
+import itertools
 import re
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -204,6 +204,9 @@ def boxes_on(targets, state):
 
 WALL, FLOOR, PLAYER, BOX, TARGET = "#-@$."
 LETTERS = "#-@$.+*"
+ROWS = LETTERS + " _"
+HEADING = r"\W*(?:level|maze|puzzle|title)?\W*(\d+)\W*"
+"""A line of a file that numbers a level."""
 WAYS = ((-1, 0), (0, 1), (1, 0), (0, -1))  # up, right, down, left
 OPEN, PULL = 0.75, 0.5  # chance of a cell to be floor, and of a step to pull a box along
 STEPS, ATTEMPTS = 400, 1000
@@ -215,16 +218,18 @@ Cell = tuple[int, int]
 def level_text(source: str) -> str:
     """The level in one line: of a text, or of a file, `levels.txt` or `levels.txt:3`; ValueError says what is wrong.
 
-    In a file a line such as "; 3" begins level 3, as in Boxoban's; without such lines empty lines separate levels, and
-    they count from 0.
+    In a file any line that is no row ends a level. A line with a number, "; 3" or "Level 3", numbers the level after
+    it, as in Boxoban's files: then each level needs one. Without such lines levels count from 0.
     """
-    if set(source) <= set(LETTERS + " _/\n"):
+    if set(source) <= set(ROWS + "/\n"):
         rows = re.split(r"[/\n]", source.strip("\n"))
     else:
         file, _, number = source.rpartition(":") if re.search(r":\d+$", source) else (source, "", "0")
-        rows = _levels_of(Path(file)).get(int(number), [])
-        if not rows:
-            raise ValueError(f"the file has no level {number}")
+        levels = _levels_of(Path(file))
+        if int(number) not in levels:
+            found = f"it has {len(levels)}, numbered {min(levels)} to {max(levels)}" if levels else "it has none"
+            raise ValueError(f"the file has no level {number}; {found}")
+        rows = levels[int(number)]
     width = max(map(len, rows))
     rows = [re.sub("[ _]", FLOOR, row).ljust(width, FLOOR) for row in rows]
     if not width or set("".join(rows)) - set(LETTERS):
@@ -233,6 +238,7 @@ def level_text(source: str) -> str:
 
 
 def _levels_of(file: Path) -> dict[int, list[str]]:
+    """The rows of each level of a file by its number; ValueError where it is not clear which is which."""
     from pharos.system.storage import check_regular  # which levels in text do without
 
     try:
@@ -242,15 +248,32 @@ def _levels_of(file: Path) -> dict[int, list[str]]:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"it is neither a level nor a file that can be read ({error})") from error
-    levels: dict[int, list[str]] = {}
-    number, has_headings = -1, any(re.match(r";\s*\d+\s*$", line) for line in lines)
-    for before, line in pairwise(["", *lines]):
-        heading = re.match(r";\s*(\d+)\s*$", line)
+    numbers: dict[int, int] = {}  # line -> number
+    boards: dict[int, list[str]] = {}  # first line -> rows
+    first = None
+    for at, line in enumerate(lines, 1):
+        if set(line) & set("#@$.+*") and set(line) <= set(ROWS):
+            first = first or at
+            boards.setdefault(first, []).append(line.rstrip())
+            continue
+        first = None
+        if WALL in line and set(line) <= set(ROWS + "|()pPbB0123456789"):
+            raise ValueError(f"line {at} has run lengths or other letters, {line[:40]!r}; expected rows of {LETTERS}")
+        heading = re.fullmatch(HEADING, line, re.IGNORECASE)
         if heading:
-            number = int(heading[1])
-        elif WALL in line and set(line) <= set(LETTERS + " _"):
-            number += not has_headings and WALL not in before
-            levels.setdefault(number, []).append(line.rstrip())
+            numbers[at] = int(heading[1])
+    boards = {at: rows for at, rows in boards.items() if any(WALL in row for row in rows)}
+    if not numbers:
+        return dict(enumerate(boards.values()))
+    order, levels = sorted([*numbers, *boards]), {}
+    for number_at, board_at in itertools.zip_longest(order[::2], order[1::2]):
+        if number_at not in numbers or board_at not in boards:
+            at = number_at if number_at in boards else board_at if board_at in numbers else number_at
+            kind = "a level without a number" if at in boards else "a number without a level"
+            raise ValueError(f"line {at} begins {kind}; expected a line '; N' before each level, or no such lines")
+        if numbers[number_at] in levels:
+            raise ValueError(f"line {number_at}: two levels have the number {numbers[number_at]}")
+        levels[numbers[number_at]] = boards[board_at]
     return levels
 
 
