@@ -36,7 +36,7 @@ LONGEST = 2000
 class PharosError(Exception):
     """Base class: `except PharosError` catches everything that pharos raises on purpose."""
 
-    def __init__(self, *args: Any):
+    def __init__(self, *args: object):
         super().__init__(*(_cut(each) if isinstance(each, str) else each for each in args))
 
 

@@ -313,8 +313,8 @@ def _mdp(model: Any, outcomes: ImportedOutcomes, gamma: float, horizon: int | No
     return TabularMDP.from_matrices(table, rewards, horizon=horizon, ends=lacking(table), **setting)
 
 
-NOT_ONE = "do not sum to one"
-"""In the refusal of Storm's checks, which compare sums with 1 as exact fractions."""
+NOT_ONE = re.compile("do not s[uo]me? to one")
+"""In the refusal of Storm's checks, which compare sums with 1 as exact fractions; "some" for synchronised commands."""
 
 
 def _model(path: Path, constants: str) -> tuple[Any, str]:
@@ -337,7 +337,7 @@ def _model(path: Path, constants: str) -> tuple[Any, str]:
                 program = stormpy.parse_jani_model(str(path))[0] if jani else stormpy.parse_prism_program(str(path))
                 if constants:
                     program = stormpy.instantiate_constants(program, constants)[0]
-                model, refusal = _checked_model(path, stormpy, program)
+                model, refusal = _checked_model(path, program)
         except FileFormatError:
             raise
         except Exception as error:  # of Storm, which has many, and of the bindings
@@ -349,20 +349,22 @@ def _model(path: Path, constants: str) -> tuple[Any, str]:
     return model, refusal
 
 
-def _checked_model(path: Path, stormpy: Any, program: Any) -> tuple[Any, str]:
+def _checked_model(path: Path, program: object) -> tuple[Any, str]:
     """The model, and what Storm says of sums of probabilities that differ from 1, which may be rounded.
 
     Raises:
-        RuntimeError: of Storm's checks of each command, but the one of sums. FileFormatError: an update leaves the range
-            of a variable, in a command that Storm did not get to.
+        RuntimeError: of Storm's checks of each command, but the one of sums.
+        FileFormatError: an update leaves the range of a variable, in a command that Storm did not get to.
     """
+    import stormpy
+
     options = stormpy.BuilderOptions(build_full=True)
     options.set_exploration_checks(True)
     try:
         return stormpy.build_model(program, options=options), ""
     except RuntimeError as error:
         refusal = _without_type(error)
-        if NOT_ONE not in refusal:
+        if not NOT_ONE.search(refusal):
             raise
     options = stormpy.BuilderOptions(build_full=True)
     options.set_add_out_of_bounds_state(True)
@@ -402,7 +404,7 @@ def _storms_output() -> Iterator[Callable[[], str]]:
             for number, own in zip((1, 2), saved, strict=True):
                 os.dup2(own, number)
                 os.close(own)
-        sys.stderr.write("".join(line for line in text.splitlines(keepends=True) if NOT_ONE not in line))
+        sys.stderr.write("".join(line for line in text.splitlines(keepends=True) if not NOT_ONE.search(line)))
 
 
 def _without_type(error: Exception) -> str:

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from types import FunctionType
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -141,33 +141,43 @@ def _rows(env: Any) -> tuple[Any, list[list[list]]]:
     """(the environment without wrappers, rows[s][a] of its table); FileFormatError where it has none."""
     inner = getattr(env, "unwrapped", env)
     table = getattr(inner, "P", inner)
-    if isinstance(table, str | bytes) or not hasattr(table, "__getitem__") or not hasattr(table, "__len__"):
+    if isinstance(table, str | bytes) or not isinstance(table, _Numbered):
         raise FileFormatError(f"{name_of(env)}: has no table P[s][a] of its transitions{_native(inner)}")
     return inner, _listed(name_of(env), table)
 
 
-def _listed(name: str, table: Any) -> list[list[list]]:
+@runtime_checkable
+class _Numbered(Protocol):
+    """A list or a dictionary whose keys are numbers."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, number: int, /) -> object: ...
+
+
+def _listed(name: str, table: _Numbered) -> list[list[list]]:
     """rows[s][a] of a table; FileFormatError names the first row that is missing."""
     rows: list[list[list]] = []
     for s in range(len(table)):
         row, actions = _entry(table, s), len(rows[0]) if rows else None
-        if not hasattr(row, "__getitem__") or not hasattr(row, "__len__"):
+        if not isinstance(row, _Numbered):
             raise FileFormatError(f"{name}: has no P[{s}] with actions; expected states 0 to {len(table) - 1}")
         if not len(row):
             raise FileFormatError(f"{name}: P[{s}] has no actions; {_TERMINAL.format(s)}")
         if len(row) != (actions or len(row)):
             raise FileFormatError(f"{name}: P[{s}] has {len(row)} actions, P[0] {actions}; {_TERMINAL.format(s)}")
-        entries = [_entry(row, a) for a in range(len(row))]
-        for a, entry in enumerate(entries):
+        rows.append([])
+        for a in range(len(row)):
+            entry = _entry(row, a)
             if not isinstance(entry, Iterable):
                 raise FileFormatError(f"{name}: has no P[{s}][{a}] with outcomes; expected actions 0 to {len(row) - 1}")
-        rows.append([list(entry) for entry in entries])
+            rows[-1].append(list(entry))
     if not rows:
         raise FileFormatError(f"{name}: its table P has no states")
     return rows
 
 
-def _entry(table: Any, number: int) -> Any:
+def _entry(table: _Numbered, number: int) -> object:
     """table[number]; None where there is none."""
     try:
         return table[number]

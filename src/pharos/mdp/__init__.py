@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         shares_of,
     )
     from pharos.mdp.expanded import ExpandedMDP, executed_actions, mean_of_actions, nodes_of_outcomes, outcomes_of
+    from pharos.mdp.matrices import lacking
     from pharos.mdp.rewards import (
         PaidOutcomes,
         Rewards,
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
         rewards_of_staying,
     )
     from pharos.mdp.row_sums import Residual, normalized_rows
-    from pharos.mdp.table import Lazy, Matrices, OutcomeTable, Table, lacking
+    from pharos.mdp.table import Lazy, Matrices, OutcomeTable, Table
     from pharos.mdp.tabular import Part, TabularMDP
 
 __all__ = [

@@ -92,3 +92,9 @@ def normalized_rows(
     if not is_divided.any():
         return probabilities, np.zeros(count)
     return probabilities / np.where(is_divided, sums, 1.0)[rows], np.where(is_divided, away + rounding, 0.0)
+
+
+def rounding_hint(total: float) -> str:
+    """The likely reason where a sum is nearly 1, for the end of a message; else empty."""
+    is_near = abs(total - 1) <= 1e-2
+    return ": were they rounded, or computed in float32? divide each row by its sum" if is_near else ""

@@ -23,6 +23,7 @@ from pharos.mdp.arguments import (
     terminal_states,
 )
 from pharos.mdp.dynamics import Dynamics, TopologicalOrder
+from pharos.mdp.matrices import expected_rewards, transitions_of
 from pharos.mdp.rewards import Rewards, expected_over_outcomes, rewards_of_shape
 from pharos.mdp.row_sums import Residual
 from pharos.mdp.table import (
@@ -32,8 +33,6 @@ from pharos.mdp.table import (
     Table,
     checked_outcomes,
     compact_outcomes,
-    expected_rewards,
-    transitions_of,
 )
 from pharos.system.arrays import Indices
 
