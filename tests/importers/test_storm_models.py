@@ -252,6 +252,20 @@ def test_a_model_with_rounded_probabilities_has_them_divided_by_their_sums(tmp_p
 
 
 @needs_storm
+def test_rounded_probabilities_of_commands_that_go_together_are_divided_as_well(tmp_path):
+    """Storm refuses them with other words than those of a single command."""
+    parts = [
+        f"module m{i}\n x{i} : [0..2];\n [go] x{i}<2 -> 0.3333333:(x{i}'=0) + 0.6666666:(x{i}'=x{i}+1);\nendmodule\n"
+        for i in (1, 2)
+    ]
+    file = tmp_path / "both.prism"
+    file.write_text("mdp\n" + "".join(parts) + 'label "end" = x1=2 & x2=2;\n')
+    mdp = importers.storm(file, target="end", horizon=1)
+    assert mdp.residual.probabilities == pytest.approx(2e-7, rel=1e-3)
+    assert sorted(mdp.rewards.ravel())[-1] == pytest.approx(4 / 9)
+
+
+@needs_storm
 def test_an_explicit_model_keeps_the_same_rule(tmp_path):
     text = exporters.drn(pharos.build(pharos.make("frozen_lake")).mdp(gamma=1.0), tmp_path / "lake.drn").read_text()
     assert importers.storm(tmp_path / "lake.drn", target="terminal", horizon=10).residual.probabilities < 1e-12
