@@ -13,7 +13,7 @@ import numpy as np
 from pharos.environments.base import Environment, Layer, store
 from pharos.errors import FileFormatError, ParameterError
 from pharos.system import mdp_files, storage
-from pharos.system.arrays import OutcomeRows
+from pharos.system.arrays import OutcomeRows, rounding_of_sums
 
 TIME_LIMIT = 1000  # of an MDP that has no horizon, and whose source has no limit
 MOST_ENTRIES = 1 << 28  # of a table of outcomes, written out
@@ -231,7 +231,7 @@ def outcomes_of(
     data, indices, indptr = (arrays[name] for name in mdp_files.MATRIX)
     rows = np.repeat(np.arange(number), np.diff(indptr))
     rest = 1.0 - np.bincount(rows, data, minlength=number)
-    ends = np.flatnonzero(rest > 1e-9)
+    ends = np.flatnonzero(rest > rounding_of_sums(int(np.diff(indptr).max(initial=0))))
     rows, indices = np.concatenate([rows, ends]), np.concatenate([indices, np.full(len(ends), -1, indices.dtype)])
     return rows, indices, np.concatenate([data, rest[ends]])
 

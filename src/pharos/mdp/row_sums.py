@@ -24,11 +24,12 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from pharos.system.arrays import rounding_of_sums
+
 NumberOrArray = TypeVar("NumberOrArray", float, np.ndarray)
 
 ROUNDED = 1e-6
 """The sum of a row that was rounded differs from 1 by at most this."""
-_UNIT = 2.0**-53
 
 
 class Residual(NamedTuple):
@@ -53,11 +54,6 @@ class Residual(NamedTuple):
     def of(residuals: np.ndarray, largest: np.ndarray | float = 0.0) -> "Residual":
         """The largest of |sum - 1| (N,) of all rows, and of its products with the largest reward of each row (N,)."""
         return Residual(float(residuals.max(initial=0.0)), float((residuals * largest).max(initial=0.0)))
-
-
-def rounding_of_sums(most: int) -> float:
-    """What the sum of at most so many rounded probabilities may lack or exceed: 4 (n + 2) units of 2^-53."""
-    return 4 * (most + 2) * _UNIT
 
 
 def normalized_rows(

@@ -20,7 +20,7 @@ from pharos.kernels import outcomes as kernels
 from pharos.mdp.actions import States
 from pharos.mdp.arguments import as_array
 from pharos.mdp.dynamics import Dynamics, Outcomes, TopologicalOrder, as_indices, split
-from pharos.mdp.row_sums import ROUNDED, normalized_rows, rounding_hint, rounding_of_sums
+from pharos.mdp.row_sums import ROUNDED, normalized_rows, rounding_hint
 from pharos.system.arrays import (
     Indices,
     OutcomeCheck,
@@ -30,6 +30,7 @@ from pharos.system.arrays import (
     blocks_of,
     holds_end,
     read_only,
+    rounding_of_sums,
     rows_of,
 )
 

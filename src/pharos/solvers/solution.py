@@ -38,7 +38,9 @@ class Solution:
 
     Attributes:
         mdp: what was solved.
-        error_bound: every entry of `v` and `q` is within this of the true value (proven; in units of return).
+        error_bound: every entry of `v` and `q` is within this of the true value (proven; in units of return). If the
+            probabilities of the MDP were rounded, also of those of each MDP within its `residual`; that part may exceed
+            the tolerance.
         sweeps, seconds: cost of the solve; compiling is not among the seconds.
         horizon: number of steps to go of the values; or None.
         select: which action is chosen: the best one, the worst one, or that of a policy.

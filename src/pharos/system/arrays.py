@@ -182,6 +182,12 @@ def from_stored(stored: np.ndarray) -> Indices:
 SUM_TOLERANCE = 1e-9
 """By how much the probabilities of the outcomes of an action may sum to something else than 1."""
 
+
+def rounding_of_sums(most: int) -> float:
+    """What the sum of at most so many rounded probabilities may lack or exceed: 4 (n + 2) units of 2^-53."""
+    return 4 * (most + 2) * 2.0**-53
+
+
 OutcomesOfState = list[tuple[np.ndarray, np.ndarray]]
 """For each action the next states and their probabilities, possible outcomes alone."""
 
