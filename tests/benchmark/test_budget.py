@@ -10,12 +10,11 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
-from pharos.benchmark.sealed import frozen
 
 from pharos import benchmark
 from pharos.benchmark import BenchmarkTask, BudgetSpent, Protocol, Suite
 from pharos.benchmark.budget import CountedEnv, StepBudget, generated_curve
-from pharos.benchmark.suite import digest_of_suite
+from pharos.benchmark.suite import digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError
 
 PROTOCOL = Protocol(steps=300, evaluations=3, seeds=2)

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from pharos.benchmark.sealed import frozen
 
 from command_line import answer, process, run, usage_error
+from patience import PATIENCE
 from pharos import benchmark
 from pharos.benchmark import BenchmarkTask, Protocol, Submission, Suite, load_suite, submit, verify, write_suite
-from pharos.benchmark.suite import digest_of_suite
+from pharos.benchmark.suite import digest_of_suite, frozen
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UntrustedCode
 from pharos.system import storage
 from pharos.training import read_record
@@ -140,7 +140,7 @@ def test_a_suite_that_is_a_pipe_or_a_device_is_refused_at_once(tmp_path):
     (tmp_path / "zero.yaml").symlink_to("/dev/zero")
     (tmp_path / "folder.yaml").mkdir()
     for name in ("pipe", "zero", "folder"):
-        done = process("benchmark", "verify", "x", "--suite", tmp_path / f"{name}.yaml", timeout=120)
+        done = process("benchmark", "verify", "x", "--suite", tmp_path / f"{name}.yaml", timeout=PATIENCE)
         assert done.returncode == 1 and "no regular file" in done.stderr and done.stderr.count("\n") == 1
 
 

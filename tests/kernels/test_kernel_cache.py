@@ -16,6 +16,7 @@ import pytest
 from numba.extending import overload
 
 import pharos
+from patience import PATIENCE
 from pharos.kernels.kernel_cache import kernel
 from pharos.system import compiling
 
@@ -23,6 +24,7 @@ PACKAGE = Path(pharos.__file__).parent
 ONE_KERNEL = """
 import json, sys
 import numpy as np
+from patience import PATIENCE
 from pharos.system import compiling
 compiling.SMALL = 0
 from pharos.kernels import bellman
@@ -128,7 +130,7 @@ def toy(name, wait, module="pharos.kernels.toy"):
 
 def test_long_compiling_says_what_it_compiles(monkeypatch):
     said = listening(monkeypatch)
-    assert toy(f"breakout_{'0' * 20}.explore", lambda: said.event.wait(600))(1) == 2
+    assert toy(f"breakout_{'0' * 20}.explore", lambda: said.event.wait(PATIENCE))(1) == 2
     words = said.getvalue()
     assert words.startswith("pharos: compiling explore for breakout, kernel ") and words.count("\n") == 1
     assert words.endswith(" s so far; kept for the next time\n")
@@ -137,7 +139,7 @@ def test_long_compiling_says_what_it_compiles(monkeypatch):
     assert toy("sweep", lambda: None)(1) == 2 and said.getvalue() == words
     said.event.clear()
     monkeypatch.setattr(compiling, "_next", 0.0)
-    assert toy("sweep", lambda: said.event.wait(600))(1) == 2
+    assert toy("sweep", lambda: said.event.wait(PATIENCE))(1) == 2
     assert "pharos: compiling sweep, kernel " in said.getvalue()
 
 

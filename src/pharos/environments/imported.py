@@ -87,7 +87,7 @@ class ImportedWorld(Environment):
 
     @cached_property
     def residual(self) -> tuple[float, float]:  # type: ignore[override]
-        """What the sums of the rows of the source leave open, in probability and in reward."""
+        """Distances that the sums of the source's rows leave open, in probability and in reward."""
         try:
             return mdp_files.residual_of(self.manifest)
         except ValueError as error:

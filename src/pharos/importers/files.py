@@ -408,7 +408,7 @@ def _storms_output() -> Iterator[Callable[[], str]]:
 
 
 def _without_type(error: Exception) -> str:
-    """What Storm says, in one line, without the name of its exception."""
+    """Storm's message, in one line, without the name of its exception."""
     return re.sub(r"^\w+Exception: ", "", " ".join(str(error).split()))
 
 

@@ -110,9 +110,9 @@ def _table(env: object, rows: list[list[list]]) -> tuple[np.ndarray, np.ndarray,
     # Rewards of rows that were divided are divided as well
     sums = np.where(residuals > 0, np.bincount(of, [x[0] for each in merged for x in each.values()], count), 1.0)
     rewards = (np.bincount(of, shares, count) / sums).reshape(shape)
-    paid = np.zeros(count)
-    np.maximum.at(paid, of, largest)
-    residual = Residual.of(residuals, paid)
+    most = np.zeros(count)
+    np.maximum.at(most, of, largest)
+    residual = Residual.of(residuals, most)
     next_states, ended = np.full(count, -1, np.int64), successors < 0
     next_states[of] = successors
     ends = np.bincount(of[ended], p[ended], count).reshape(shape)
@@ -266,9 +266,9 @@ def _first(space: object) -> int:
 def _reason(outcome: tuple, expected: Mapping[tuple, float]) -> str:
     """Why an outcome that was seen is likely not among those of the table."""
     next_state, reward, ended = outcome
-    paid = [other[1] for other in expected if (other[0], other[2]) == (next_state, ended)]
-    if paid:
-        return f"its reward differs from that of the table, {paid[0]}, so the table is another MDP"
+    rewards = [other[1] for other in expected if (other[0], other[2]) == (next_state, ended)]
+    if rewards:
+        return f"its reward differs from that of the table, {rewards[0]}, so the table is another MDP"
     if any(other[:2] == (next_state, reward) for other in expected):
         return f"the episode {'ended' if ended else 'went on'}, unlike in the table, so the table is another MDP"
     return (

@@ -34,12 +34,12 @@ def transitions_of(
     if not (np.isfinite(matrix.data).all() and (matrix.data >= 0).all()):
         raise ParameterError("P has entries that are negative, NaN or infinite; expected probabilities")
     if not isinstance(ends, bool | np.bool_):
-        given = as_array(ends, "ends", np.float64)
-        if given.shape != (num_states, num_actions) or not ((given >= 0) & (given <= 1)).all():
+        shares = as_array(ends, "ends", np.float64)
+        if shares.shape != (num_states, num_actions) or not ((shares >= 0) & (shares <= 1)).all():
             raise ParameterError(
-                f"ends has shape {given.shape}; expected True, False or probabilities ({num_states}, {num_actions})"
+                f"ends has shape {shares.shape}; expected True, False or probabilities ({num_states}, {num_actions})"
             )
-        ends = given.ravel()
+        ends = shares.ravel()
 
     def refuse(row: int, total: float) -> Exception:
         s, a = divmod(row, num_actions)
@@ -142,11 +142,13 @@ def expected_rewards(
     if not sparse.issparse(R) and not is_list_of_matrices(R):
         R = as_array(R, "R", np.float64)
     if not isinstance(R, np.ndarray) or R.ndim == 3:
-        paid = by_rows(R, "R", axes)
-        if paid.shape != matrix.shape:
-            raise ParameterError(f"R has rewards for {paid.shape} rows and next states; expected {matrix.shape}, as P")
+        by_transition = by_rows(R, "R", axes)
+        if by_transition.shape != matrix.shape:
+            raise ParameterError(
+                f"R has rewards for {by_transition.shape} rows and next states; expected {matrix.shape}, as P"
+            )
         rows = np.repeat(np.arange(len(residuals)), np.diff(matrix.indptr))
-        each = np.asarray(paid[rows, matrix.indices]).ravel()
+        each = np.asarray(by_transition[rows, matrix.indices]).ravel()
         each[matrix.data == 0] = 0.0
         if not np.isfinite(each).all():
             s, a = divmod(int(rows[~np.isfinite(each)][0]), num_actions)

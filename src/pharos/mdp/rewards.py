@@ -248,8 +248,8 @@ def expected_over_outcomes(
         raise ParameterError(
             f"the reward of state {s}, action {a}, outcome {k} is {array[s, a, k]}; expected a finite number"
         )
-    paid = np.where(possible, array, 0.0)
-    return means_of(probabilities * paid), np.abs(paid).max(axis=2)
+    rewards_of_outcomes = np.where(possible, array, 0.0)
+    return means_of(probabilities * rewards_of_outcomes), np.abs(rewards_of_outcomes).max(axis=2)
 
 
 def means_of(terms: np.ndarray) -> Rewards:

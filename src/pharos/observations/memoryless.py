@@ -124,8 +124,8 @@ class _PolicySearch:
             return TabularMDP.from_arrays(table[rows, executed], rewards, terminal=mdp.terminal, **setting)
         matrix, rewards = self.transitions
         pairs = (rows * mdp.num_actions + executed).ravel()
-        chosen = matrix[pairs]
-        return TabularMDP.from_matrices(chosen, rewards[rows, executed], ends=lacking(chosen), **setting)
+        part = matrix[pairs]
+        return TabularMDP.from_matrices(part, rewards[rows, executed], ends=lacking(part), **setting)
 
     @cached_property
     def transitions(self) -> tuple[Any, np.ndarray]:

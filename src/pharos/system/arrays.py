@@ -184,7 +184,7 @@ SUM_TOLERANCE = 1e-9
 
 
 def rounding_of_sums(most: int) -> float:
-    """What the sum of at most so many rounded probabilities may lack or exceed: 4 (n + 2) units of 2^-53."""
+    """Difference to 1 that the sum of at most so many rounded probabilities may have: 4 (n + 2) units of 2^-53."""
     return 4 * (most + 2) * 2.0**-53
 
 

@@ -117,9 +117,9 @@ def _announce(name: str) -> None:
         now = _total + time.perf_counter() - _began
         _next = now + TOLD_EVERY
         _start_timer(TOLD_EVERY, name)
-    kept = "" if storage.is_cache_temporary() else "; kept for the next time"
+    outcome = "" if storage.is_cache_temporary() else "; kept for the next time"
     with contextlib.suppress(OSError, ValueError, AttributeError):  # of a stream that is closed, or None
-        sys.stderr.write(f"pharos: compiling {name}, kernel {_kernels}, {now:.0f} s so far{kept}\n")
+        sys.stderr.write(f"pharos: compiling {name}, kernel {_kernels}, {now:.0f} s so far{outcome}\n")
         sys.stderr.flush()
 
 

@@ -92,16 +92,16 @@ def read_arrays(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> dict[
 
 
 def residual_of(manifest: Mapping[str, Any]) -> tuple[float, float]:
-    """What the sums of the rows that were imported leave open: (in probability, in reward).
+    """(in probability, in reward): distances that the sums of the imported rows leave open.
 
     Raises:
         ValueError: the entry is something else.
     """
-    found = manifest.get(RESIDUAL, [0.0, 0.0])
-    is_pair = isinstance(found, list) and len(found) == 2 and all(type(each) in (int, float) for each in found)
-    if not is_pair or not all(0 <= each < math.inf for each in found):
-        raise ValueError(f"{RESIDUAL} is {found!r}; expected two numbers from 0 on")
-    return float(found[0]), float(found[1])
+    pair = manifest.get(RESIDUAL, [0.0, 0.0])
+    is_pair = isinstance(pair, list) and len(pair) == 2 and all(type(each) in (int, float) for each in pair)
+    if not is_pair or not all(0 <= each < math.inf for each in pair):
+        raise ValueError(f"{RESIDUAL} is {pair!r}; expected two numbers from 0 on")
+    return float(pair[0]), float(pair[1])
 
 
 def read_array(folder: str | os.PathLike, manifest: Mapping[str, Any], name: str) -> np.ndarray:

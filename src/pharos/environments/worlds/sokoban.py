@@ -227,8 +227,8 @@ def level_text(source: str) -> str:
         file, _, number = source.rpartition(":") if re.search(r":\d+$", source) else (source, "", "0")
         levels = _levels_of(Path(file))
         if int(number) not in levels:
-            found = f"it has {len(levels)}, numbered {min(levels)} to {max(levels)}" if levels else "it has none"
-            raise ValueError(f"the file has no level {number}; {found}")
+            levels_there = f"it has {len(levels)}, numbered {min(levels)} to {max(levels)}" if levels else "it has none"
+            raise ValueError(f"the file has no level {number}; {levels_there}")
         rows = levels[int(number)]
     width = max(map(len, rows))
     rows = [re.sub("[ _]", FLOOR, row).ljust(width, FLOOR) for row in rows]
