@@ -9,9 +9,13 @@ come in messages from those ranks alone that have some of them. They travel whil
 high rows of a range, all but the lowest eighth, may be sent before those of the low ones are known.
 """
 
+import ctypes
 import importlib.util
 import os
+import re
 import shutil
+import signal
+import subprocess
 import sys
 import time
 from abc import ABC, abstractmethod
@@ -248,6 +252,7 @@ _LAUNCHERS = (
 _FAILED = -1
 _VALUES, _NOTICE = 0, 1  # tags of messages
 _LOOKS = 100  # tests of pending messages before other processes get the processor
+_BANNER = "=   BAD TERMINATION OF ONE OF YOUR APPLICATION PROCESSES"  # of MPICH, between lines of =
 _STARTED = "PHAROS_STARTED"  # variable of processes that pharos itself has started under mpiexec
 
 T = TypeVar("T")
@@ -286,11 +291,11 @@ def run_spmd(processes: int | str, program: Callable[[Rank], T]) -> T:
 
 
 def start_under_mpiexec(size: int) -> NoReturn:
-    """Replace this process by `mpiexec`, which starts the same program `size` times.
+    """Start the same program `size` times by `mpiexec`, and end with its exit code and its standard output.
 
     Raises:
         MissingExtra: there is no mpi4py, or no `mpiexec` beside this Python or in PATH. ParameterError: this process
-        has been started so already, and does not know its number.
+        has been started so already, and does not know its number. RankFailed: a process that it started was killed.
     """
     beside = os.path.dirname(sys.executable)
     launcher = shutil.which("mpiexec", path=beside) or shutil.which("mpiexec")
@@ -302,7 +307,40 @@ def start_under_mpiexec(size: int) -> NoReturn:
             f"write mpiexec -n {size} pharos ..., with --processes mpi"
         )
     os.environ[_STARTED] = str(size)
-    os.execv(launcher, [launcher, "-n", str(size), sys.executable, *sys.orig_argv[1:]])
+    code, output = _end_of([launcher, "-n", str(size), sys.executable, *sys.orig_argv[1:]])
+    text, banner, _ = output.partition(_BANNER)
+    sys.stdout.write(re.sub(r"\s*=*\s*$", "", text) if banner else text)
+    sys.stdout.flush()
+    if banner:
+        raise RankFailed(
+            f"one of the {size} processes that {launcher} has started was killed (exit code {code}), by a user or for "
+            f"want of memory; the same command goes on from what is written"
+        )
+    sys.exit(code)
+
+
+def _end_of(command: Sequence[str]) -> tuple[int, str]:
+    """(exit code, standard output) of a launcher, which ends with this process; interrupts are left to its processes.
+
+    MPICH's says on standard output that a process was killed, and in its exit code by which signal.
+    """
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, preexec_fn=_end_with_parent)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        signal.signal(signal.SIGINT, lambda *_: None)
+        signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+        output, _ = process.communicate()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    code = process.returncode
+    return code if code >= 0 else 128 - code, output.decode(errors="replace")
+
+
+def _end_with_parent() -> None:
+    """Have Linux end this process when its parent is gone, however that ended."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM, 0, 0, 0)  # PR_SET_PDEATHSIG
 
 
 def launched() -> tuple[int, int]:

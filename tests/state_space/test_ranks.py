@@ -309,6 +309,36 @@ def test_a_command_that_cannot_be_started_by_mpiexec_is_one_line(monkeypatch):
         ranks.start_under_mpiexec(3)
 
 
+BANNER = f"""
+{"=" * 83}
+=   BAD TERMINATION OF ONE OF YOUR APPLICATION PROCESSES
+=   EXIT CODE: 9
+{"=" * 83}
+YOUR APPLICATION TERMINATED WITH THE EXIT STRING: Killed (signal 9)
+"""
+
+
+@pytest.mark.parametrize(("said", "code"), [("", 0), ("{}\n", 0), ("a\nb\n", 2), (BANNER, 9), (f"row{BANNER}", 9)])
+def test_what_the_launcher_says_of_a_killed_rank_is_an_error_of_ours(said, code, tmp_path, monkeypatch, capfd):
+    launcher = tmp_path / "mpiexec"
+    (tmp_path / "said").write_text(said)
+    launcher.write_text(f"#!/bin/sh\ncat {tmp_path / 'said'}\nexit {code}\n")
+    launcher.chmod(0o755)
+    monkeypatch.setattr(ranks.shutil, "which", lambda *_, **__: str(launcher))
+    monkeypatch.setattr(ranks.importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setenv("PHAROS_STARTED", "")
+    monkeypatch.delenv("PHAROS_STARTED")
+    if BANNER in said:
+        with pytest.raises(ranks.RankFailed, match=r"one of the 3 processes .* was killed \(exit code 9\)"):
+            ranks.start_under_mpiexec(3)
+    else:
+        with pytest.raises(SystemExit) as end:
+            ranks.start_under_mpiexec(3)
+        assert end.value.code == code
+    assert capfd.readouterr().out == said.removesuffix(BANNER)
+    monkeypatch.delenv("PHAROS_STARTED")
+
+
 def test_a_rank_of_mpi_that_fails_tells_the_others(monkeypatch):
     class Second:
         rank, size, told = 1, 2, None
@@ -337,7 +367,9 @@ def test_ranks_of_mpi_write_the_same_files_and_go_on_after_a_kill(tmp_path):
     stopped = run("--max-states", "1000")
     assert stopped.returncode == 1
     assert [line.count("max_states") for line in stopped.stderr.splitlines() if line.startswith("pharos:")] == [1]
-    assert run(last=40).returncode != 0
+    killed = run(last=40)
+    assert (killed.returncode, killed.stdout) == (1, "")
+    assert [line for line in killed.stderr.splitlines() if "was killed (exit code 9)" in line]
     assert not pharos.state_space.read_manifest(tmp_path / "space")["complete"]
     finished = run()
     assert finished.returncode == 0, finished.stderr

@@ -255,8 +255,8 @@ class TrainingJobs:
         if not is_known(config.agent):
             names["agent"] = config.agent
         has_no_source = any(is_reference(name) and part not in config.sources for part, name in names.items())
-        sources = [item for each in self.configs for item in each.sources.items()]
-        return has_no_source or any(item not in sources for item in config.sources.items())
+        ours = [item for each in self.configs for item in each.sources.items()]
+        return has_no_source or any(item not in ours for item in config.sources.items())
 
     def _stored_batches(self) -> Iterator[tuple[Path, list[RunConfig]]]:
         for folder in [] if self.checkpoints is None else sorted(self.checkpoints.glob("*")):
