@@ -270,7 +270,7 @@ def test_folders_and_environments_keep_what_the_rows_leave_open(tmp_path):
     seen = pharos.evaluate_policy(built, lambda seen: np.zeros(len(seen), int), observation="index")
     assert seen.error_bound > 1e-6
     rare = TabularMDP.from_matrices(np.full((1, 1, 1), 1 - 2.0**-40), [1.0], ends=[[2.0**-40]])
-    assert importers.environment(rare).successors.tolist() == [[[0, 1]], [[1, 0]]]  # an end, however rare
+    assert importers.environment(rare).successors[0].tolist() == [[0, 1]]  # an end, however rare
     plain = importers.environment(TabularMDP.from_matrices(mdp.transitions, mdp.rewards, gamma=0.9))
     assert plain.digest != importers.environment(mdp).digest and plain.residual == (0.0, 0.0)
 
