@@ -16,12 +16,14 @@ import heapq
 
 import numpy as np
 
+from pharos.kernels.interpreted import interpreted_first
 from pharos.kernels.kernel_cache import kernel
 
 # Half the distance from 1 to the next float: the relative rounding error of one operation.
 UNIT = 2.0**-53
 
 
+@interpreted_first()
 @kernel
 def backward_order(first, previous, goal, order, distance):
     """Order nodes by their distance to the goal, by a search on the reversed graph; returns how many reach it.
@@ -49,6 +51,7 @@ def backward_order(first, previous, goal, order, distance):
     return tail
 
 
+@interpreted_first()
 @kernel
 def sweep_in_place(rows, common, shares_rows, goal, order, count, j, mode):
     """One sweep of j(n) = 1 + min_a sum p j, in place in the order given; j is 0 at the goal.
@@ -108,6 +111,7 @@ def sweep_in_place(rows, common, shares_rows, goal, order, count, j, mode):
     return change, ff, fg, gg
 
 
+@interpreted_first()
 @kernel
 def residuals(rows, common, shares_rows, goal, order, count, high, low, policy, residual, error):
     """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; T is one Bellman step.
@@ -196,6 +200,7 @@ def _difference(high, low, m, value, correction):
     return total + (rounding + (low[m] - correction))
 
 
+@interpreted_first()
 @kernel
 def almost_surely(first, node, num_actions, goal, sure, attractor):
     """sure[n] = whether some policy leads from n to the goal with probability 1.
@@ -234,6 +239,7 @@ def almost_surely(first, node, num_actions, goal, sure, attractor):
             return
 
 
+@interpreted_first()
 @kernel
 def proper_policy(first, node, weight, num_actions, goal, order, count, sure, policy):
     """policy[n] for n in order[:count]: an action that may lead nearer to the goal and never out of these nodes.
@@ -294,6 +300,7 @@ def _execution(executed, choice, previous, weights):
     return uniform + (now if executed == choice else 0.0) + (before if executed == previous else 0.0)
 
 
+@interpreted_first()
 @kernel
 def outcomes_into(node, num_nodes):
     """(first, outcome): outcomes that lead to node n are outcome[first[n]:first[n + 1]]; a counting sort."""
@@ -336,6 +343,7 @@ def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
     return tail
 
 
+@interpreted_first()
 @kernel
 def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball, levels, queue, via):
     """Shortest ways back to node[i], for outcomes i into nodes low..high, from the other outcomes of its state.
@@ -369,6 +377,7 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
             levels[queue[k]] = 0
 
 
+@interpreted_first()
 @kernel
 def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, length):
     """Drop the longest ways back until the expected steps on the way back are at most `limit`, for every outcome.
@@ -409,6 +418,7 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
     return largest
 
 
+@interpreted_first()
 @kernel
 def attempt(
     begin, end, outcomes, owner, weights, num_previous, square, steps, start, way, constant, times, value, new, once
@@ -457,6 +467,7 @@ def attempt(
     return increase
 
 
+@interpreted_first()
 @kernel
 def times_from(hub, first, node, cost, leak):
     """(N,) least t with t(hub) = 0, t(y) = (t(x) + cost[i]) / (1 - leak[i]) over outcomes i from x to y (Dijkstra).

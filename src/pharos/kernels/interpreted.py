@@ -18,8 +18,9 @@ from numba.core.registry import CPUDispatcher
 from pharos.kernels.kernel_cache import is_on_disk
 from pharos.system import compiling
 
-LOADING = 4
-"""Fewer entries, by this factor, are worth loading a kernel that is compiled on disk (benchmarks/startup.py)."""
+LOADING, COMPILING = 4, 2
+"""Fewer entries, by this factor, are worth loading a kernel that is compiled on disk, and more are worth compiling one:
+an entry takes 0.2 to 4 us, a kernel 0.4 to 1.1 s (benchmarks/startup.py)."""
 
 Intrinsic = TypeVar("Intrinsic", bound=Callable)
 
@@ -50,8 +51,8 @@ def in_python(meaning: Callable) -> Callable:
 def interpreted_first(*counted: str) -> Callable:
     """Decorator of a kernel: its calls are interpreted as long as they are small together, then compiled.
 
-    They are small until they have counted `compiling.SMALL` entries, or 1 / LOADING of that where the compiled kernel
-    is on disk, as loading takes so much less than compiling.
+    They are small until they have counted COMPILING times `compiling.SMALL` entries, or 1 / LOADING of it if the
+    compiled kernel is on disk, as loading takes so much less than compiling.
 
     Args:
         counted: arguments whose entries count, a whole number as so many; none: all arrays. The work of a call must not
@@ -68,7 +69,9 @@ def interpreted_first(*counted: str) -> Callable:
             nonlocal count
             read = [arguments[i] for i in places] or [each for each in arguments if not isinstance(each, int)]
             count += sum(map(_entries, read))
-            is_small = count < compiling.SMALL // LOADING or (count < compiling.SMALL and not is_on_disk(kernel))
+            is_small = count < compiling.SMALL // LOADING or (
+                count < COMPILING * compiling.SMALL and not is_on_disk(kernel)
+            )
             return quiet if is_small else compiled(*arguments)
 
         def quiet(*arguments: object) -> object:
