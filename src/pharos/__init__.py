@@ -24,11 +24,18 @@ def _is_command() -> bool:
     return _os.path.basename(words[0]) == _os.path.basename(script) == "pharos"
 
 
+def _end_at_once(*_: object) -> None:
+    try:
+        _os.write(2, b"pharos: interrupted\n")
+    finally:
+        _os._exit(130)
+
+
 if _is_command():
     import _signal  # which is there from the start: what would be loaded first could be interrupted
 
     if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler:
-        _signal.signal(_signal.SIGINT, lambda *_: (_os.write(2, b"pharos: interrupted\n"), _os._exit(130)))
+        _signal.signal(_signal.SIGINT, _end_at_once)
     from pharos.system import interrupts as _interrupts  # noqa: F401  (its `atexit` is to be the first)
 
 import importlib

@@ -117,7 +117,7 @@ def test_the_script_that_is_installed_is_interrupted_like_the_module(interrupted
 @pytest.mark.long
 @pytest.mark.parametrize("words", [["list", "--json"], ["train", "frozen_lake/4x4", "--steps", 400, "--json"]])
 def test_a_command_is_interrupted_at_every_moment(interrupted, words):
-    """At every 25th module; and at calls of functions, more and more apart."""
+    """At every 25th module, and at calls of functions, more and more apart."""
     number = 1
     while interrupted("module", number, *words):
         number += 25

@@ -69,7 +69,8 @@ class CommandInterrupts:
                 os._exit(EXIT_INTERRUPTED)
             self._is_to_end = True
             if self.report():
-                os.write(2, f"pharos: {INTERRUPTED}\n".encode())
+                with contextlib.suppress(OSError):  # nobody listens
+                    os.write(2, f"pharos: {INTERRUPTED}\n".encode())
             return
         if not self.is_pending:
             self.is_pending, self._since = True, time.monotonic()
