@@ -21,6 +21,7 @@ from pharos.study import execution as _execution
 from pharos.study import execution as preparing
 from pharos.study import worker as _worker
 from pharos.study.execution import shard_of
+from pharos.system import storage
 from refusals import failing
 
 TESTS = Path(__file__).parents[1]
@@ -431,12 +432,11 @@ def test_an_interrupted_study_leaves_no_warning_of_semaphores(tmp_path, log, sen
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-def test_a_worker_on_a_full_disk_says_a_line(tmp_path, capfd):
+def test_a_worker_on_a_full_disk_says_a_line(tmp_path, capfd, monkeypatch):
     """Not even its log takes the reason."""
-    run = specification().runs[0]
-    partial = tmp_path / "partial" / run.id
-    partial.mkdir(parents=True)
-    (partial / "log.txt").symlink_to("/dev/full")
+    run, own_file = specification().runs[0], storage.own_file
+    full = {"log.txt": "/dev/full"}
+    monkeypatch.setattr(storage, "own_file", lambda path, flags: own_file(full.get(Path(path).name, path), flags))
     arguments = (lambda *_: 1 / 0, [run.config], [run.id], tmp_path, (), True, dict(os.environ))
     assert exit_code(_worker.main, *arguments) == 1
     assert capfd.readouterr().err == f"pharos: run {run.id}: No space left on device\n"
