@@ -24,7 +24,6 @@ PACKAGE = Path(pharos.__file__).parent
 ONE_KERNEL = """
 import json, sys
 import numpy as np
-from patience import PATIENCE
 from pharos.system import compiling
 compiling.SMALL = 0
 from pharos.kernels import bellman

@@ -140,11 +140,9 @@ class HubBounds:
         edges = np.linspace(0, len(value), self._threads + 1).astype(np.int64)
         with ThreadPoolExecutor(self._threads) as pool:
             for passes in range(PASSES):
-                arrays = (*self._fixed, *self._ways, own, times, value, new, passes < 2)  # twice, as two take turns
-                parts = [
-                    pool.submit(hitting.attempt, low, high, *arrays)
-                    for low, high in itertools.pairwise(edges)
-                ]
+                # twice with all arrays, as two take turns
+                arrays: tuple[object, ...] = (*self._fixed, *self._ways, own, times, value, new, passes < 2)
+                parts = [pool.submit(hitting.attempt, low, high, *arrays) for low, high in itertools.pairwise(edges)]
                 short = max(part.result() for part in parts)
                 if short <= ACCURACY * (1 - self._rho):
                     break
