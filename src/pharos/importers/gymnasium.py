@@ -3,17 +3,18 @@
 Source of MiniGrid: Chevalier-Boisvert et al. (2023), "Minigrid & Miniworld".
 """
 
+import contextlib
 import copy
 import io
 import itertools
 import operator
 import pickle  # noqa: TID251  (to copy an environment of the caller)
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from types import FunctionType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ import numpy.typing as npt
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, RuleError, StateSpaceTooLarge
 from pharos.importers.files import MINIGRID_STEPS
 from pharos.importers.folder import ImportedOutcomes
+from pharos.importers.wrappers import Layers, as_integer, check_wrappers, first_number, parts_of, reset
 from pharos.mdp import Residual, TabularMDP, normalized_rows
 from pharos.system.wording import capped
 
@@ -36,50 +38,81 @@ NATIVE = {"Blackjack": "blackjack", "CliffWalking": "cliff_walking", "FrozenLake
 LEAST_PROBABILITY = 1e-6
 """A table is refused where outcomes as rare as those sampled were less likely than this, all comparisons together."""
 
+STARTS = ("initial_state_distrib", "isd")
+"""Attributes in which environments say their start distribution, (S,) probabilities: Gymnasium's and old gym's."""
 
-def gymnasium(env: object, *, gamma: float = 0.99, horizon: int | None = None, check: bool = True) -> TabularMDP:
+SAMPLED_RESETS = (1_000, 20_000)
+"""Resets that are held against the start distribution, 20 for each start state: at least and at most."""
+
+OutcomeRewards: TypeAlias = npt.ArrayLike | Callable[[int, int, int, float], float]
+
+
+def gymnasium(
+    env: object,
+    *,
+    gamma: float = 0.99,
+    horizon: int | None = None,
+    check: bool = True,
+    initial: npt.ArrayLike | None = None,
+    rewards: OutcomeRewards | None = None,
+) -> TabularMDP:
     """Return the MDP of an environment with a `P` table, such as FrozenLake, Taxi or CliffWalking.
 
     Args:
-        env: a Gymnasium environment, wrapped or not, or a table P[s][a] = [(probability, next state, reward,
-            terminated), ...]. The start distribution is `initial_state_distrib` where there is one, else state 0.
+        env: a Gymnasium environment, or a table P[s][a] = [(probability, next state, reward, terminated), ...].
+            Wrappers must change nothing of the MDP: time limits, recorders and wrappers of observations pass; any other
+            is stepped beside the environment below it, in every outcome of the table, and refused if they differ.
         gamma, horizon: of the MDP; Gymnasium's time limit is not taken over.
         check: whether an environment is stepped SAMPLED_STEPS times, as a copy where it can be copied, and compared
             with its table: some have chance that is not in it, such as Taxi with `fickle_passenger=True`. Outcomes that
-            the table does not hold are refused, and frequencies that it makes too unlikely (chi-square tests).
+            the table does not hold are refused, and frequencies that it makes too unlikely (exact binomial tests).
+        initial: a start state, a sequence of equally likely ones (fewer than S), or (S,) probabilities. None: what the
+            environment says in `initial_state_distrib` or `isd`, compared with its resets; if it says nothing, the
+            state in which all resets start; of a table, state 0.
+        rewards: in place of the table's, (S, A) numbers, or a function (state, action, next state, reward of the table)
+            -> reward.
     Returns:
         A table of next states where every action has one outcome, else a general MDP. A transition that terminates ends
-        the episode after its reward, wherever it leads.
+        the episode after its reward, wherever it leads. States have the numbers of the table.
         The probabilities of a row that sum to 1 within 1e-6 are divided by their sum, which error bounds of values
         count (`TabularMDP.residual`).
     Raises:
-        FileFormatError: there is no table, states or actions are missing, probabilities do not sum to 1, or the
-        environment does what its table does not say.
+        FileFormatError: there is no table, states or actions are missing, probabilities do not sum to 1, the
+            environment does what its table does not say, or its resets start elsewhere.
+        ParameterError: a wrapper changes the MDP, which is named with the way that works; or rewards do not fit.
     """
     inner, rows = _rows(env)
     states = len(rows)
-    next_states, rewards, ends, probabilities, residual = _table(env, rows)
-    start = _start(env, inner, states)
-    if check and hasattr(inner, "step") and hasattr(inner, "reset"):
+    is_stepped = check and hasattr(inner, "step") and hasattr(inner, "reset")
+    next_states, means, ends, probabilities, residual = _table(env, _with_rewards(env, rows, rewards))
+    _check_wrappers(env, rows, SAMPLED_STEPS if check else 0)
+    if is_stepped:
         _compare_with_steps(env, inner, rows)
-    initial: Any = int(start.argmax()) if start.max() == 1 else start / start.sum()
+    if initial is None:
+        start = _start(env, inner, states, is_stepped)
+        initial = int(start.argmax()) if start.max() == 1 else start / start.sum()
     if probabilities is None:
-        mdp = TabularMDP.from_arrays(next_states, rewards, gamma=gamma, initial=initial, horizon=horizon)
+        mdp = TabularMDP.from_arrays(next_states, means, gamma=gamma, initial=initial, horizon=horizon)
     else:
         setting: dict[str, Any] = {"gamma": gamma, "initial": initial, "horizon": horizon, "ends": ends}
-        mdp = TabularMDP.from_matrices(probabilities, rewards, **setting)
+        mdp = TabularMDP.from_matrices(probabilities, means, **setting)
     return replace(mdp, residual=residual)
 
 
-def gymnasium_outcomes(env: object) -> ImportedOutcomes | None:
+def gymnasium_outcomes(env: object, *, rewards: OutcomeRewards | None = None) -> ImportedOutcomes | None:
     """Return the outcomes of the same table with the reward of each, for `importers.save(..., outcomes=)`.
 
     None where no action pays different rewards, so that the MDP says it all.
 
+    Args:
+        rewards: as for `gymnasium`.
     Raises:
-        FileFormatError: as `gymnasium`.
+        FileFormatError, ParameterError: as `gymnasium`.
     """
     _, rows = _rows(env)
+    _check_rows(env, rows)
+    _check_wrappers(env, rows, 0)
+    rows = _with_rewards(env, rows, rewards)
     entries = [
         [(-1 if ended else int(next_state), p, float(reward)) for p, next_state, reward, ended in row if p > 0]
         for state in rows
@@ -213,15 +246,110 @@ def _checked(
     return merged
 
 
-def _start(env: object, inner: object, states: int) -> np.ndarray:
-    """(S,) the start distribution: `initial_state_distrib`, or state 0."""
+def _check_rows(env: object, rows: list[list[list]]) -> None:
+    """FileFormatError if an outcome is none."""
+    for s, options in enumerate(rows):
+        for a, row in enumerate(options):
+            _checked(env, s, a, row, len(rows))
+
+
+def _with_rewards(env: object, rows: list[list[list]], rewards: OutcomeRewards | None) -> list[list[list]]:
+    """Rows of a table with other rewards; ParameterError if these are no function and no numbers of its shape."""
+    if rewards is None:
+        return rows
+    table = np.empty(0)
+    if not callable(rewards):
+        with contextlib.suppress(TypeError, ValueError):
+            table = np.asarray(rewards, np.float64)
+        if table.shape != (len(rows), len(rows[0])):
+            raise ParameterError(
+                f"rewards have shape {table.shape}; expected ({len(rows)}, {len(rows[0])}) numbers, or a function "
+                f"(state, action, next state, reward) -> reward"
+            )
+    pays: Callable[..., Any] = rewards if callable(rewards) else lambda s, a, *_: table[s, a]
+
+    def rewarded(s: int, a: int, outcome: tuple) -> tuple:
+        p, next_state, reward, ended = outcome
+        value = pays(s, a, int(next_state), float(reward))
+        number = np.nan
+        with contextlib.suppress(TypeError, ValueError):
+            number = float(value)
+        if not np.isfinite(number):
+            raise ParameterError(
+                f"rewards: {capped(value)} in state {s}, action {a}, to {next_state}; expected a finite number"
+            )
+        return p, next_state, number, ended
+
+    _check_rows(env, rows)
+    return [
+        [[rewarded(s, a, outcome) for outcome in row] for a, row in enumerate(options)]
+        for s, options in enumerate(rows)
+    ]
+
+
+def _check_wrappers(env: object, rows: list[list[list]], steps: int) -> None:
+    """ParameterError if a wrapper changes an outcome of the table."""
+    outcomes = (
+        (s, a, int(next_state), float(reward), bool(ended))
+        for s, options in enumerate(rows)
+        for a, row in enumerate(options)
+        for p, next_state, reward, ended in row
+        if p > 0
+    )
+    check_wrappers(env, steps, outcomes, sum(len(row) for options in rows for row in options))
+
+
+def _start(env: object, inner: object, states: int, is_stepped: bool) -> np.ndarray:
+    """(S,) the start distribution that an environment says, compared with resets; else the state of all resets."""
+    name = next((name for name in STARTS if getattr(inner, name, None) is not None), None)
+    start = None if name is None else _distribution(env, name, getattr(inner, name), states)
+    if not is_stepped:
+        return np.eye(states)[0] if start is None else start
+    least, most = SAMPLED_RESETS
+    count = least if start is None else min(most, max(least, 20 * int((start > 0).sum())))
+    layers, seen = Layers(env), np.zeros(states, np.int64)
+    for i in range(count):
+        layers.reset(0 if i == 0 else None)
+        state = _state_number(layers.bottom.observation, states, first_number(inner, "observation"))
+        if state is not None:
+            seen[state] += 1
+    found = np.flatnonzero(seen)
+    if start is None and len(found) == 1 and seen.sum() == count:
+        return np.eye(states)[found[0]]
+    if start is not None and (not len(found) or (not seen[start == 0].any() and not _is_unlikely(seen, start))):
+        return start
+    listed = ", ".join(map(str, found[:5])) + (", ..." if len(found) > 5 else "") if len(found) else "no state's number"
+    says = "it has no initial_state_distrib" if start is None else f"its {name} says otherwise"
+    raise FileFormatError(
+        f"{name_of(env)}: its resets start in {listed}, and {says}; give initial=, the states that are equally likely or (S,) "
+        f"probabilities"
+    )
+
+
+def _distribution(env: object, name: str, value: object, states: int) -> np.ndarray:
+    """(S,) probabilities; FileFormatError if the value is no such thing."""
     try:
-        start = np.asarray(getattr(inner, "initial_state_distrib", np.eye(states)[0]), np.float64)
+        start = np.asarray(value, np.float64)
     except (TypeError, ValueError) as error:
-        raise FileFormatError(f"{name_of(env)}: initial_state_distrib is no distribution: {error}") from None
+        raise FileFormatError(f"{name_of(env)}: {name} is no distribution: {error}") from None
     if start.shape != (states,) or not np.isfinite(start).all() or (start < 0).any() or abs(start.sum() - 1) > 1e-6:
-        raise FileFormatError(f"{name_of(env)}: initial_state_distrib is no distribution over the {states} states of P")
+        raise FileFormatError(f"{name_of(env)}: {name} is no distribution over the {states} states of P")
     return start
+
+
+def _is_unlikely(counts: np.ndarray, probabilities: np.ndarray, comparisons: int = 1) -> bool:
+    """Whether such counts are less likely than LEAST_PROBABILITY, of several comparisons together."""
+    return _probability_of(counts, probabilities) < LEAST_PROBABILITY / comparisons
+
+
+def _probability_of(counts: np.ndarray, probabilities: np.ndarray) -> float:
+    """Upper bound on the probability that some count lies as far out as these, in its binomial distribution."""
+    from scipy.special import bdtr, bdtrc
+
+    total, p = int(counts.sum()), np.minimum(probabilities / probabilities.sum(), 1.0)
+    at_most = bdtr(counts, total, p)
+    at_least = np.where(counts > 0, bdtrc(np.maximum(counts - 1, 0), total, p), 1.0)
+    return min(1.0, 2 * len(counts) * float(np.minimum(at_most, at_least).min()))
 
 
 def _compare_with_steps(env: object, inner: object, rows: list[list[list]]) -> None:
@@ -235,16 +363,16 @@ def _compare_with_steps(env: object, inner: object, rows: list[list[list]]) -> N
     tries = np.zeros((len(rows), len(rows[0])), np.int64)
     rng = np.random.default_rng(0)
     state = None
-    first_state, first_action = (_first(getattr(inner, f"{kind}_space", None)) for kind in ("observation", "action"))
+    first_state, first_action = first_number(inner, "observation"), first_number(inner, "action")
     for step in range(SAMPLED_STEPS):
         if state is None or step % SAMPLED_EPISODE == 0:
-            state = _state_number(stepped.reset(seed=0 if step == 0 else None)[0], len(rows), first_state)
+            state = _state_number(reset(stepped, 0 if step == 0 else None), len(rows), first_state)
         if state is None:  # what is observed is no number of a state: nothing to compare
             return
         least = np.flatnonzero(tries[state] == tries[state].min())
         action = int(least[rng.integers(len(least))])
         tries[state, action] += 1
-        observation, reward, ended, _, _ = stepped.step(action + first_action)
+        observation, reward, ended, _ = parts_of(stepped.step(action + first_action))
         next_state = _state_number(observation, len(rows), first_state)
         outcome = (next_state, float(reward), bool(ended))
         if outcome not in probabilities[state][action]:
@@ -256,11 +384,6 @@ def _compare_with_steps(env: object, inner: object, rows: list[list[list]]) -> N
         samples.setdefault((state, action), Counter())[outcome] += 1
         state = None if ended else next_state
     _compare_frequencies(env, inner, probabilities, samples)
-
-
-def _first(space: object) -> int:
-    """The number that a space gives its first element: that of Discrete(n, start=k) is k."""
-    return int(getattr(space, "start", 0))
 
 
 def _reason(outcome: tuple, expected: Mapping[tuple, float]) -> str:
@@ -289,12 +412,7 @@ def _probabilities(options: list) -> dict[tuple[int, float, bool], float]:
 
 def _compare_frequencies(env: object, inner: object, table: list, samples: dict[tuple[int, int], Counter]) -> None:
     """FileFormatError where the sampled frequencies of a state and action, or of all with the same probabilities in the
-    table, are too unlikely.
-
-    Pearson's chi-square test where each outcome is expected five times; the first test that fails is named.
-    """
-    from scipy.special import chdtrc
-
+    table, are too unlikely; the first test that fails is named."""
     groups: dict[tuple[float, ...], np.ndarray] = {}
     named: dict[tuple[float, ...], tuple[int, int]] = {}
     tests: list[tuple[int, int, tuple[float, ...], np.ndarray]] = []
@@ -308,11 +426,9 @@ def _compare_frequencies(env: object, inner: object, table: list, samples: dict[
         groups[shares] = groups.get(shares, 0) + sampled
         named.setdefault(shares, (state, action))
     tests += [(*named[shares], shares, sampled) for shares, sampled in groups.items()]
-    tests = [each for each in tests if each[3].sum() * min(each[2]) >= 5]
     for state, action, shares, sampled in tests:
-        expected = sampled.sum() * np.array(shares) / sum(shares)
-        chance = float(chdtrc(len(shares) - 1, ((sampled - expected) ** 2 / expected).sum()))
-        if chance < LEAST_PROBABILITY / len(tests):
+        if _is_unlikely(sampled, np.array(shares), len(tests)):
+            chance = _probability_of(sampled, np.array(shares))
             raise FileFormatError(
                 f"{name_of(env)}: in state {state}, action {action} (and those with the same probabilities) had its "
                 f"outcomes {', '.join(map(str, sampled))} times in {sampled.sum()} steps, but its table "
@@ -338,11 +454,8 @@ def _copy(inner: object) -> Any:
 
 
 def _state_number(observation: Any, states: int, first: int = 0) -> int | None:
-    try:
-        number = int(observation) - first
-    except (TypeError, ValueError):
-        return None
-    return number if 0 <= number < states and number + first == observation else None
+    number = as_integer(observation)
+    return number - first if isinstance(number, int) and 0 <= number - first < states else None
 
 
 def matrices(
@@ -404,7 +517,8 @@ def minigrid(
 
     Args:
         env: an environment or its name, such as "MiniGrid-KeyCorridorS3R1-v0". An environment given is reset and left
-            somewhere.
+            somewhere. Wrappers of observations pass, and MiniGrid's NoDeath is taken over; any other must change
+            nothing in any state.
         seed: of the reset that draws the layout.
         actions: those of the MDP, in their order; None: all of the environment, without `done` where it never does
             anything.
@@ -415,7 +529,8 @@ def minigrid(
             there is different.
     Raises:
         MissingExtra: the package minigrid is not installed.
-        ParameterError: there is no such environment, it is none of MiniGrid, or an action is none of its own.
+        ParameterError: there is no such environment, it is none of MiniGrid, an action is none of its own, or a wrapper
+            changes what a step does.
         RuleError: a step draws random numbers, or touches what cannot be kept; or the payment, or the outcome, of a
             class of one's own depends on the number of steps in another way than the package's.
         StateSpaceTooLarge: there are more than `max_states` states.
@@ -488,8 +603,11 @@ class _Driver:
         self.remember_carried = remember_carried
         self.fixed_types = (gymnasium.spaces.Space, np.random.Generator, FunctionType)
         self.fixed: list[Any] = []
+        self.layers = Layers(instance, copied=False)
         instance.reset(seed=seed)
-        vars(self.env)["gen_obs"] = dict  # partial views cost most of a step, and nothing here looks at them
+        self.layers.reset(seed)
+        if not self.layers.suspects:  # partial views cost most of a step, and nothing else looks at them
+            vars(self.env)["gen_obs"] = dict
         self.snapshots: list[bytes] = []
 
     def explore(self, selection: Sequence[int] | None, max_states: int) -> tuple[np.ndarray, np.ndarray]:
@@ -501,7 +619,7 @@ class _Driver:
         try:
             return self._explore(actions, max_states, drop_done=selection is None and num_actions == DONE + 1)
         finally:
-            del self.env.gen_obs
+            vars(self.env).pop("gen_obs", None)
 
     def _explore(self, actions: list[int], max_states: int, drop_done: bool) -> tuple[np.ndarray, np.ndarray]:
         snapshot = self.save()
@@ -557,16 +675,17 @@ class _Driver:
 
     @cached_property
     def _is_paid_by_package(self) -> bool:
-        """Whether the rewards are those of the package, and nobody's else."""
+        """Whether the rewards are those of the package, and no class or wrapper adds to them."""
         functions = (getattr(self.env, name) for name in ("step", "_reward"))
-        return all(str(getattr(each, "__module__", "")).startswith("minigrid.") for each in functions)
+        is_bare = self.layers.top is self.layers.bottom
+        return is_bare and all(str(getattr(each, "__module__", "")).startswith("minigrid.") for each in functions)
 
     def _stepped(self, action: int, state: int, steps: int) -> tuple[float, bool]:
         """`step` after so many others; payments equal to the package's are 1."""
         rng = self.env.np_random
         before = rng.bit_generator.state
         self.env.step_count = steps
-        _, reward, terminated, _, _ = self.env.step(action)
+        _, reward, terminated, _ = self.layers.step(action)
         if self.remember_carried and self.env.carrying is not None:
             self.env.carrying.has_been_carried = True
         if rng.bit_generator.state != before:
