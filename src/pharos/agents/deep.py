@@ -31,6 +31,19 @@ POSITIVE = ("learning_rate", "clip_range", "max_grad_norm")
 NOT_NEGATIVE = ("learning_starts", "ent_coef", "vf_coef")
 # What `make_model` gives itself.
 OURS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}
+NO_NORMALIZER = (
+    "leave it out, as `vector` is in [0, 1] and rewards are small; or train behind VecNormalize yourself, and evaluate "
+    "with pharos.evaluate_policy, which applies it"
+)
+# Hyperparameters of RL Zoo that are wrappers, and what to do here instead.
+ZOO = {
+    "normalize": NO_NORMALIZER,
+    "normalize_kwargs": NO_NORMALIZER,
+    "frame_stack": "give frames=k among the observation's options",
+    "env_wrapper": "choose an observation, chance or a class of your own",
+    "vec_env_wrapper": "choose an observation, chance or a class of your own",
+    "env_kwargs": "give parameters to the environment",
+}
 ALGORITHMS = {"dqn": "stable_baselines3:DQN", "ppo": "stable_baselines3:PPO", "a2c": "stable_baselines3:A2C"}
 
 
@@ -87,10 +100,19 @@ def check_hyperparameters(agent: str | type, hyperparameters: Mapping[str, Any],
         also: names that the engine adds to those of the algorithm.
     Raises:
         UnknownName: with the nearest name that it has. ParameterError: a number out of its range, or something else for
-            one.
+            one; RL Zoo's wrappers; or an algorithm that needs action masks.
     """
     name = _title(agent)
     parameters = inspect.signature(algorithm(agent)).parameters
+    predict = getattr(algorithm(agent), "predict", None)
+    if predict is not None and "action_masks" in inspect.signature(predict).parameters:
+        raise ParameterError(
+            f"agent {name!r}: needs action masks, which pharos does not give while it trains; train it on "
+            f"pharos.GymEnv in sb3_contrib's ActionMasker, and use pharos.evaluate_policy(mdp, model, masks=...)"
+        )
+    for hyperparameter, remedy in ZOO.items():
+        if hyperparameter in hyperparameters and hyperparameter not in parameters:
+            raise ParameterError(f"agent {name!r}: {hyperparameter} is RL Zoo's, for wrappers; {remedy}")
     if all(each.kind is not inspect.Parameter.VAR_KEYWORD for each in parameters.values()):
         names = sorted({*parameters, "n_envs", "n_timesteps", "net_arch", *also} - OURS)
         for hyperparameter in hyperparameters:

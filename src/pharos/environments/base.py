@@ -403,6 +403,8 @@ class Environment:
         hyperparameters: dict       agent -> observation, or "default" for all -> values that suit the class; they go
                                     before those of agents/hyperparameters.py
         foreign_parameters: dict    name that other libraries have -> what to do here instead; for the error message
+        numbered_by: tuple          variables by which the source numbers its states, the last one fastest, as Gymnasium
+                                    does; for the observation `number`
         motion_layers: dict         how each plane of `draw_motion` looks; an attribute or a property
         first_version: int          the `version` that the Gymnasium id pharos/ClassName-v0 stands for
         outcomes: int               K, how many outcomes an action has at most: of classes with chance; an attribute or
@@ -456,6 +458,7 @@ class Environment:
     foreign_parameters: ClassVar[Mapping[str, str]] = {}
     first_version: ClassVar[int] = 1
     residual: ClassVar[tuple[float, float]] = (0.0, 0.0)
+    numbered_by: ClassVar[tuple[str, ...]] = ()
 
     if TYPE_CHECKING:  # attributes, or properties
 
@@ -542,6 +545,12 @@ class Environment:
     def recorded(self) -> np.ndarray | None:
         """(states, ...) recorded observation of each state, for the observation "recorded"; the base class has None."""
         return None
+
+    @property
+    def num_numbered(self) -> int:
+        """How many states the source numbers by `numbered_by`, in the observation `number`."""
+        variables, size = self.components.variables, self.components.size
+        return math.prod(int(size[variables[name]].prod()) for name in self.numbered_by)
 
     # Derived ----------------------------------------------------------------------------------------------------------
 

@@ -47,6 +47,7 @@ class ImportedWorld(Environment):
 
     name = "imported"
     version = 1
+    numbered_by = ("state",)
     layers = {"digit": Layer(tuple("0123456789"), (226, 228, 232), sprite=DIGITS)}
 
     def validate(self) -> None:
@@ -180,6 +181,10 @@ class ImportedWorld(Environment):
         if len(shown) != self.manifest["num_states"]:
             raise FileFormatError(f"{self.folder}: {len(shown)} observations for {self.manifest['num_states']} states")
         return self._with_end(shown, 0)
+
+    @property
+    def num_numbered(self) -> int:
+        return int(self.manifest["num_states"])  # without the end
 
     def _with_end(self, rows: np.ndarray, value: object) -> np.ndarray:
         more = len(self.successors) - len(rows)

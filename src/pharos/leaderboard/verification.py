@@ -93,6 +93,7 @@ def _network(entry: Entry, task: Task, trust: bool) -> PolicyLike:
         model = make_model(agent, env, {**hyperparameters, **smallest}, seed=0)
         tensors = {name: torch.from_numpy(np.array(array)) for name, array in entry.arrays.items()}
         model.policy.load_state_dict(tensors)
+        return deep_policy(model)
     except FileFormatError:
         raise
     except ParameterError as error:
@@ -100,7 +101,6 @@ def _network(entry: Entry, task: Task, trust: bool) -> PolicyLike:
     except (RuntimeError, TypeError, ValueError, KeyError, AttributeError) as error:
         first = " ".join(str(error).split())[:200]
         raise FileFormatError(f"its network is none of {config.agent} on this task: {first}") from None
-    return deep_policy(model)
 
 
 def _known_agent(name: str) -> str:

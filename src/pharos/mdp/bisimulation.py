@@ -129,6 +129,7 @@ def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -
         terminal=np.asarray(mdp.terminal)[representatives],
         folder=None,
         environment=None,
+        is_numbered=False,
         age=None,
         staying=None if mdp.staying is None else _lost,
     ).with_initial(start)

@@ -60,6 +60,7 @@ class TabularMDP:
         chance: weights of the chosen, the previously executed and a uniform action.
         folder: of the state space, where there is one.
         environment: the one that the states are of, where it is known.
+        is_numbered: whether states have the numbers that they were given with; not after some were merged.
         age: (S,) integers that each transition out of a state that is not terminal makes larger; None where they are
             not known. Solvers take the states in this order then, once.
         residual: what the sums of rows that were given leave open, see mdp/row_sums.py; error bounds of values count
@@ -79,6 +80,7 @@ class TabularMDP:
     staying: Callable[[], Rewards] | None = None
     environment: Environment | None = None
     residual: Residual = field(default_factory=Residual)
+    is_numbered: bool = True
 
     def __new__(cls, dynamics: object = None, *_: object, **__: object) -> "TabularMDP":
         if isinstance(dynamics, np.ndarray | list | tuple):

@@ -443,6 +443,7 @@ Renderer = Callable[[Environment, Sequence[int]], np.ndarray]
 
 RENDERERS: dict[str, Renderer] = {"human": human}
 """Name of an observation -> function (environment, state) -> (H, W, 3) or (H, W) uint8. Packages add theirs."""
+NO_IMAGES = ("vector", "one_hot", "index", "number", "hash", "mixed")
 
 
 def render(env: Environment, state: Sequence[int], observation: str = "human", **options: object) -> np.ndarray:
@@ -469,7 +470,7 @@ def render(env: Environment, state: Sequence[int], observation: str = "human", *
 
 def renderers() -> list[str]:
     """The names that `render` knows; of the observations, those that may be images."""
-    return [*RENDERERS, *(name for name in names() if name not in ("vector", "one_hot", "index", "hash", "mixed"))]
+    return [*RENDERERS, *(name for name in names() if name not in NO_IMAGES)]
 
 
 @cache

@@ -139,6 +139,7 @@ _BUILT_IN = {
     "complex_image": "images:ComplexImage",
     "one_hot": "vector:OneHot",
     "index": "vector:Index",
+    "number": "vector:Number",
     "hash": "vector:Hash",
     "mixed": "vector:Mixed",
     "recorded": "vector:Recorded",

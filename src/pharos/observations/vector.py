@@ -1,5 +1,6 @@
-"""Vectors: every component of the state, normalised by its declared range; one-hot; the number of the state; random
-binary codes of all states (`hash`) or of a share (`mixed`), without likeness between neighbours; what was recorded.
+"""Vectors: every component of the state, normalised by its declared range; one-hot; the number of the state, in its
+state space or in its source; random binary codes of all states (`hash`) or of a share (`mixed`), without likeness
+between neighbours; what was recorded.
 """
 
 from collections.abc import Sequence
@@ -153,6 +154,40 @@ class Index(Observation):
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         return self.state_space.indices(states)
+
+
+class Number(Observation):
+    """The number of the state in its source: Discrete(n), with the source's n. What an agent of Gymnasium has seen.
+
+    Toy text has the numbers of Gymnasium: row x columns + column in frozen_lake and cliff_walking; ((row x size +
+    column) x (L + 1) + passenger) x L + destination in taxi with L landmarks, 500 numbers on 5 x 5 cells, which do not
+    say whether a fickle passenger may still change his mind. An imported world has the number in its folder, which is
+    that of the table, matrix or file; 0 for the end of an episode.
+
+    Raises:
+        ParameterError: the source does not number its states.
+    """
+
+    def __init__(self, env: Environment):
+        from gymnasium.spaces import Discrete
+
+        if not env.numbered_by:
+            raise ParameterError(
+                f"{env}: observation 'number' is the source's number of a state, which {env.name} has none of; use "
+                f"'index', the number in its state space"
+            )
+        components = env.components
+        self.name = "number"
+        self.env = env
+        self.space = Discrete(env.num_numbered)
+        columns = [np.arange(len(components))[components.variables[name]] for name in env.numbered_by]
+        self._columns = np.concatenate(columns)
+        self._low, self._sizes = components.low[self._columns], components.size[self._columns]
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        values = (np.asarray(states)[:, self._columns] - self._low).T
+        number = np.ravel_multi_index(tuple(values), tuple(self._sizes.tolist()))
+        return np.where(number < self.space.n, number, 0).astype(np.int64)  # type: ignore[attr-defined]
 
 
 SPARE = 8  # bits beyond those that write the state

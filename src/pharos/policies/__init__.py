@@ -2,6 +2,7 @@
 
 from pharos.policies.policy import (
     DeepPolicy,
+    MasksLike,
     Observer,
     Policy,
     PolicyAnswers,

@@ -8,7 +8,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias, TypeGuard, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias, TypedDict, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -89,18 +89,22 @@ PolicyLike = np.ndarray | TabularAgent | Policy | RecurrentPolicy | SB3Model | C
 from a batch of observations to (N, A) probabilities or (N,) actions, or one that keeps a state besides."""
 
 
-def policy_function(policy: PolicyLike) -> Callable[[Any], Any]:
+def policy_function(policy: PolicyLike, *, masked: bool = False) -> Callable[..., Any]:
     """A policy over observations as a function of a batch of them.
 
+    Args:
+        masked: whether the function takes (N, A) masks as well.
     Raises:
-        ParameterError: it is none, or has a memory.
+        ParameterError: it is none, has a memory, or takes masks where there are none, or the other way round.
     """
     if isinstance(policy, RecurrentPolicy) and not isinstance(policy, Policy | SB3Model):
         raise _remembers(policy)
+    if isinstance(policy, SB3Model) and not isinstance(policy, Policy):
+        return DeepPolicy(policy, masked=masked).action_probabilities
+    if masked and not getattr(policy, "masked", False):
+        raise _takes_no_masks(policy)
     if isinstance(policy, Policy):
         return policy.action_probabilities
-    if isinstance(policy, SB3Model):
-        return DeepPolicy(policy).action_probabilities
     if callable(policy):
         return policy
     raise ParameterError(
@@ -116,22 +120,31 @@ class DeepPolicy:
 
     Args:
         deterministic: the most probable action of a distribution, instead of the distribution.
+        masked: whether the model was trained under action masks (MaskablePPO), which come with the observations then.
     Raises:
-        ParameterError: the policy has a memory, so that its probabilities do not belong to observations.
+        ParameterError: the policy has a memory, so that its probabilities do not belong to observations; it needs masks
+            and there are none, or takes none; or the VecNormalize that it was trained behind is missing.
     """
 
-    def __init__(self, model: SB3Model, *, deterministic: bool = False):
+    def __init__(self, model: SB3Model, *, deterministic: bool = False, masked: bool = False):
         if _has_memory(model):
             raise _remembers(model)
-        self.model, self.deterministic = model, deterministic
+        if masked != takes_masks(model):
+            raise _takes_no_masks(model) if masked else _needs_masks(model)
+        check_normalizer(model)
+        self.model, self.deterministic, self.masked = model, deterministic, masked
 
-    def action_probabilities(self, observations: Observations) -> np.ndarray:
-        """(N, A) probabilities for a batch of observations as the environment gives them."""
+    def action_probabilities(self, observations: Observations, masks: np.ndarray | None = None) -> np.ndarray:
+        """(N, A) probabilities for a batch of observations as the environment gives them.
+
+        Args:
+            masks: (N, A) bool, the actions that may be chosen, of a model that was trained under masks.
+        """
         import torch
 
         policy = self.model.policy
         policy.set_training_mode(False)
-        batch = _as_policy_sees(observations, policy.observation_space)
+        batch = _as_policy_sees(_normalized(self.model, observations), policy.observation_space)
         with torch.no_grad():
             tensor, _ = policy.obs_to_tensor(batch)
             q_net: Callable[..., torch.Tensor] | None = getattr(policy, "q_net", None)
@@ -140,7 +153,8 @@ class DeepPolicy:
                 return np.eye(scores.shape[1])[scores.argmax(axis=1)]
             distribution_of: Callable[..., CategoricalDistribution] | None = getattr(policy, "get_distribution", None)
             if distribution_of is not None:
-                probabilities = distribution_of(tensor).distribution.probs.numpy().astype(np.float64)
+                given = {} if masks is None else {"action_masks": masks}
+                probabilities = distribution_of(tensor, **given).distribution.probs.numpy().astype(np.float64)
                 if self.deterministic:
                     return np.eye(probabilities.shape[1])[probabilities.argmax(axis=1)]
                 return probabilities
@@ -155,6 +169,7 @@ class RecurrentDeepPolicy:
     """
 
     def __init__(self, model: RecurrentModel):
+        check_normalizer(model)
         self.model = model
 
     def initial_state(self, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -171,7 +186,8 @@ class RecurrentDeepPolicy:
         policy = self.model.policy
         policy.set_training_mode(False)
         with torch.no_grad():
-            tensor, _ = policy.obs_to_tensor(_as_policy_sees(observations, policy.observation_space))
+            batch = _as_policy_sees(_normalized(self.model, observations), policy.observation_space)
+            tensor, _ = policy.obs_to_tensor(batch)
             hidden, cell = (torch.from_numpy(part.swapaxes(0, 1).copy()) for part in state)
             begins = torch.from_numpy(starts.astype(np.float32))
             distribution_of: Callable[..., tuple] = policy.get_distribution
@@ -180,14 +196,79 @@ class RecurrentDeepPolicy:
         return distribution.distribution.probs.numpy().astype(np.float64), after
 
 
-def deep_policy(model: SB3Model) -> "DeepPolicy | RecurrentDeepPolicy":
-    """The policy of a model of Stable-Baselines3 or sb3-contrib, with a memory or without."""
-    return RecurrentDeepPolicy(model) if _has_memory(model) else DeepPolicy(model)
+def deep_policy(model: SB3Model, *, masked: bool = False) -> "DeepPolicy | RecurrentDeepPolicy":
+    """The policy of a model of Stable-Baselines3 or sb3-contrib, with a memory or without.
+
+    Args:
+        masked: as for `DeepPolicy`.
+    """
+    return RecurrentDeepPolicy(model) if _has_memory(model) and not masked else DeepPolicy(model, masked=masked)
 
 
 def _has_memory(model: SB3Model) -> TypeGuard["RecurrentModel"]:
+    return _distribution_takes(model, "lstm_states")
+
+
+def takes_masks(model: SB3Model) -> bool:
+    """Whether a model was trained under action masks, as MaskablePPO of sb3-contrib."""
+    return _distribution_takes(model, "action_masks")
+
+
+def _distribution_takes(model: SB3Model, name: str) -> bool:
     distribution = getattr(model.policy, "get_distribution", None)
-    return distribution is not None and "lstm_states" in inspect.signature(distribution).parameters
+    return distribution is not None and name in inspect.signature(distribution).parameters
+
+
+def _needs_masks(model: object) -> ParameterError:
+    return ParameterError(
+        f"{type(model).__name__}: was trained under action masks, without which it is another policy; give masks=, "
+        f"(S, A) bool or a function of states, to pharos.evaluate_policy or training.evaluate_agent"
+    )
+
+
+def _takes_no_masks(policy: object) -> ParameterError:
+    return ParameterError(
+        f"{type(policy).__name__}: takes no action masks; leave masks= out, or give a model that was trained under "
+        f"masks, such as MaskablePPO"
+    )
+
+
+# Stable-Baselines3's VecNormalize, which stands between environment and network and is no part of the model's file
+
+
+def check_normalizer(model: object) -> None:
+    """ParameterError if a model was trained behind a VecNormalize that is not with it, or that cannot be applied."""
+    normalizer = _normalizer(model)
+    name = type(model).__name__
+    if normalizer is None:
+        if getattr(model, "_last_original_obs", None) is None:
+            return
+        raise ParameterError(
+            f"{name}: was trained behind a VecNormalize, which is not with it; load it with "
+            f"env=VecNormalize.load(FILE, venv) of the file that was saved beside it"
+        )
+    if not normalizer.norm_obs:
+        return
+    own, expected = (getattr(each, "observation_space", None) for each in (normalizer, model))
+    between = space_difference(expected, own, is_dtype_compared=False)
+    if between is not None:
+        raise ParameterError(
+            f"{name}: something changes observations between its VecNormalize and its network ({between}), so they "
+            f"cannot be normalised; train it with VecNormalize as the last wrapper"
+        )
+
+
+def _normalizer(model: object) -> Any:
+    of: Callable[[], object] | None = getattr(model, "get_vec_normalize_env", None)
+    return None if of is None else of()
+
+
+def _normalized(model: object, observations: Observations) -> Observations:
+    """Observations as the VecNormalize of a model gives them, whose statistics stay as they are."""
+    normalizer = _normalizer(model)
+    if normalizer is None or not normalizer.norm_obs:
+        return observations
+    return normalizer.normalize_obs(_as_policy_sees(observations, normalizer.observation_space))
 
 
 def _remembers(policy: object) -> ParameterError:
@@ -253,6 +334,39 @@ class Observer:
     def frames(self) -> int:
         """Number of states that are seen at once, the last ones of the episode."""
         return self.observe.observation.frames
+
+
+class Numbers:
+    """Numbers of the states of an MDP that is given as a table, in the place of a state space and its observation."""
+
+    frames, irrelevant = 1, 0
+
+    def __init__(self, count: int):
+        from gymnasium.spaces import Discrete
+
+        self.space, self.observation = Discrete(count), self
+
+    def states(self, indices: np.ndarray) -> np.ndarray:
+        """(N, 1) the states."""
+        return np.asarray(indices)[:, None]
+
+    def __call__(self, states: np.ndarray, *_: object) -> np.ndarray:
+        return states[:, 0]
+
+
+class NumberObserver(Observer):
+    """The numbers of states as a policy sees them that was trained on the source of a table."""
+
+    @staticmethod
+    def of(count: int) -> "NumberObserver":
+        """The observer of `count` states."""
+        numbers: Any = Numbers(count)
+        return NumberObserver(numbers, numbers, "number")
+
+    @property
+    def observe(self) -> Any:
+        """Function from a batch of states (N, 1) to their numbers."""
+        return self.space
 
 
 class ReachableRows(NamedTuple):
@@ -471,19 +585,87 @@ def reachable_rows(
     return ReachableRows(answers.rows.copy(), is_whole)
 
 
+MasksLike: TypeAlias = ArrayLike | Callable[[np.ndarray], ArrayLike]
+
+
+class AnswerOptions(TypedDict, total=False):
+    """Options of `PolicyAnswers`."""
+
+    deterministic: bool
+    masks: MasksLike | None
+
+
+class ActionMasks:
+    """Actions that may be chosen in each state.
+
+    Args:
+        masks: (S, A) bool by the states of the MDP; or a function from states (N, D), as a state space gives them, to
+            (N, A) bool.
+    Raises:
+        ParameterError: they have another shape or type, or a state that is not terminal has no action.
+    """
+
+    def __init__(self, masks: MasksLike, mdp: TabularMDP, observer: "Observer"):
+        self._function = masks if callable(masks) else None
+        self._observer, self._num_actions = observer, mdp.num_actions
+        if self._function is None:
+            self._table = self._checked(masks, mdp.num_states)  # type: ignore[arg-type]  # no function
+            self._check_rows(self._table | np.asarray(mdp.terminal)[:, None], np.arange(mdp.num_states))
+
+    def of(self, states: np.ndarray) -> np.ndarray:
+        """(N, A) bool, of states by their index (N,)."""
+        if self._function is None:
+            return self._table[states]
+        masks = self._checked(self._function(self._observer.space.states(states)), len(states))
+        self._check_rows(masks, states)
+        return masks
+
+    def _checked(self, masks: ArrayLike, count: int) -> np.ndarray:
+        try:
+            array = np.asarray(masks)
+        except ValueError:  # rows of several lengths
+            array = np.empty(0)
+        is_truth = array.dtype == bool or (array.dtype.kind in "iu" and bool(np.isin(array, (0, 1)).all()))
+        if array.shape != (count, self._num_actions) or not is_truth:
+            raise ParameterError(
+                f"masks have shape {array.shape} and type {array.dtype}; expected ({count}, {self._num_actions}) bool: "
+                f"for each state, whether an action may be chosen"
+            )
+        return array.astype(bool)
+
+    def _check_rows(self, masks: np.ndarray, states: np.ndarray) -> None:
+        without = np.flatnonzero(~masks.any(axis=1))
+        if without.size:
+            raise ParameterError(
+                f"masks allow no action in state {states[without[0]]}; expected one or more in every state that is not "
+                f"terminal"
+            )
+
+
 class PolicyAnswers(QueriedPolicy):
     """Answers of a policy that sees observations.
 
     Args:
         policy: as `policy_function` takes it.
         deterministic: whether the most probable action is taken.
+        masks: the actions that a model trained under masks may choose, as `ActionMasks` takes them.
     Raises:
-        ParameterError: it is no policy, or was trained on other observations.
+        ParameterError: it is no policy, was trained on other observations, or masks are missing or do not fit.
     """
 
-    def __init__(self, policy: PolicyLike, mdp: TabularMDP, observer: Observer, *, deterministic: bool = False):
+    def __init__(
+        self,
+        policy: PolicyLike,
+        mdp: TabularMDP,
+        observer: Observer,
+        *,
+        deterministic: bool = False,
+        masks: MasksLike | None = None,
+    ):
         super().__init__(mdp, sees_previous_action=observer.previous_action)
-        self.policy, self.observer, self.deterministic = policy_function(policy), observer, deterministic
+        self.masks = None if masks is None else ActionMasks(masks, mdp, observer)
+        self.policy = policy_function(policy, masked=masks is not None)
+        self.observer, self.deterministic = observer, deterministic
         check_observation(policy, observer.observe.space, observer.observation)
 
     @cached_property
@@ -513,16 +695,19 @@ class PolicyAnswers(QueriedPolicy):
         context = self.observer.space.states(states), previous, np.zeros(len(rows), np.int64)
         irrelevant = self.observer.observe.observation.irrelevant
         if not irrelevant:
-            return self.answer(self.observer.observe(*context), len(rows))
+            return self.answer(self.observer.observe(*context), len(rows), states)
         total = np.zeros((len(rows), self.num_actions))  # coins are fair and thrown anew at each step
         for coins in np.ndindex(*(2,) * irrelevant):
             thrown = np.tile(np.array(coins, np.float32), (len(rows), 1))
-            total += self.answer(self.observer.observe(*context, coins=thrown), len(rows))
+            total += self.answer(self.observer.observe(*context, coins=thrown), len(rows), states)
         return total / 2**irrelevant
 
-    def answer(self, observations: Observations, count: int = 1) -> np.ndarray:
-        """(N, A) probabilities for a batch of `count` observations."""
-        return self.checked(self.policy(observations), count)
+    def answer(self, observations: Observations, count: int = 1, states: np.ndarray | None = None) -> np.ndarray:
+        """(N, A) probabilities for a batch of `count` observations, of these states (N,) where masks need them."""
+        if self.masks is None:
+            return self.checked(self.policy(observations), count)
+        assert states is not None
+        return self.checked(self.policy(observations, self.masks.of(states)), count)
 
     def checked(self, answer: ArrayLike, count: int) -> np.ndarray:
         """(N, A) probabilities of an answer to `count` observations; ParameterError for any other."""
@@ -590,13 +775,69 @@ class TableAnswers(QueriedPolicy):
 
 
 def check_observation(policy: object, space: "Space", name: object) -> None:
-    """ParameterError where a model was trained on observations of another shape."""
-    model = getattr(policy, "model", policy)
-    expected = getattr(getattr(model, "observation_space", None), "shape", None)
-    shape = space.shape
-    if expected is None or shape is None or expected in (shape, shape[2:] + shape[:2]):
-        return
-    raise ParameterError(
-        f"the model was trained on observations of shape {expected}; {name!r} gives {shape}: "
-        f"name the observation it was trained on"
-    )
+    """ParameterError where a model was trained on observations of another kind or size, or with other numbers."""
+    model, name = getattr(policy, "model", policy), getattr(name, "name", name)
+    normalizer = _normalizer(model)
+    own = model if normalizer is None or not normalizer.norm_obs else normalizer.venv
+    expected = getattr(own, "observation_space", None)
+    found = None if expected is None else space_difference(expected, space)
+    if found is not None:
+        remedy = "; 'number' is the numbering of Gymnasium" if hasattr(expected, "n") and name != "number" else ""
+        raise ParameterError(
+            f"the model was trained on observations of {found.replace(' beside ', f'; {name!r} gives ')}: name the "
+            f"observation it was trained on{remedy}"
+        )
+    is_number = type(expected).__name__ == "Discrete"
+    source = _numbering_of(model) if is_number else None
+    if is_number and ((name == "index" != source) or (name == "number" and source == "index")):
+        raise ParameterError(
+            f"the model was trained on numbers of states, {source or 'of an environment that is not with it'}; "
+            f"{name!r} numbers them as {NUMBERINGS[name]}: name the numbering it was trained on, 'index' or 'number', "
+            f"or load it with env= the environment it was trained on"
+        )
+
+
+NUMBERINGS = {"index": "the search found them", "number": "the source does"}
+
+
+def _numbering_of(model: object) -> str | None:
+    """Numbering that a model was trained on, by the environment that is attached to it.
+
+    An observation of pharos, or "those of CLASS" for other environments; None if there is no environment.
+    """
+    env: Any = getattr(model, "env", None)
+    while hasattr(env, "venv"):
+        env = env.venv
+    env = env.envs[0] if getattr(env, "envs", None) else getattr(env, "env", env)
+    env = getattr(env, "unwrapped", env)
+    simulator = getattr(env, "simulator", None)
+    if simulator is not None:
+        return str(simulator.context.observation.name)
+    return None if env is None or type(env).__name__ == "SubprocVecEnv" else f"those of {type(env).__name__}"
+
+
+def space_difference(expected: object, found: object, *, is_dtype_compared: bool = True) -> str | None:
+    """How two spaces of observations differ in kind or size, "shape (3,) beside (4,)"; None if a network sees the same.
+
+    Images may have their channels first in `expected`. Bounds are not compared.
+    """
+    kinds = type(expected).__name__, type(found).__name__
+    if kinds[0] != kinds[1]:
+        return f"{expected} beside {found}".replace("\n", " ")
+    if isinstance(found, Mapping) and isinstance(expected, Mapping):
+        if set(expected) != set(found):
+            return f"parts {', '.join(expected)} beside {', '.join(found)}"
+        parts = (space_difference(expected[name], found[name], is_dtype_compared=is_dtype_compared) for name in found)
+        return next((part for part in parts if part is not None), None)
+    if kinds[0] != "Box":
+        sizes = [[getattr(each, name, None) for name in ("n", "start", "nvec")] for each in (expected, found)]
+        same = all(np.array_equal(one, other) for one, other in zip(*sizes, strict=True))
+        return None if same else f"{expected} beside {found}"
+    shapes = [tuple(getattr(each, "shape", ())) for each in (expected, found)]
+    if shapes[0] not in (shapes[1], shapes[1][2:] + shapes[1][:2]):
+        return f"shape {shapes[0]} beside {shapes[1]}"
+    dtypes = [np.dtype(getattr(each, "dtype", np.float32)) for each in (expected, found)]
+    is_image = is_dtype_compared and len(shapes[1]) == 3
+    if is_image and (dtypes[0] == np.uint8) != (dtypes[1] == np.uint8):  # integers are divided by 255 first
+        return f"type {dtypes[0]} beside {dtypes[1]}"
+    return None

@@ -22,7 +22,10 @@ from pharos.errors import DivergenceError, ParameterError
 from pharos.kernels.stepping import execute_choices
 from pharos.mdp import PolicyTable, Rewards, Table, TabularMDP, require_mdp
 from pharos.policies.policy import (
+    AnswerOptions,
     Arrays,
+    MasksLike,
+    NumberObserver,
     Observer,
     Policy,
     PolicyAnswers,
@@ -39,6 +42,7 @@ from pharos.policies.policy import (
 from pharos.solvers import Solution
 from pharos.state_space import load
 from pharos.system.arrays import as_array
+from pharos.system.mdp_files import is_folder
 
 # Histories whose frames are drawn at once
 BATCH = 512
@@ -51,10 +55,10 @@ class QueriedHistories(PolicyAnswers):
     without its first state and with the next state behind. So the value of the policy is exact where they are few.
     """
 
-    def __init__(self, policy: PolicyLike, mdp: TabularMDP, observer: Observer, *, deterministic: bool = False):
+    def __init__(self, policy: PolicyLike, mdp: TabularMDP, observer: Observer, **options: Unpack[AnswerOptions]):
         if observer.previous_action:
             raise ParameterError("the policy sees several frames and the previous action; expected one or the other")
-        super().__init__(policy, mdp, observer, deterministic=deterministic)
+        super().__init__(policy, mdp, observer, **options)
         self._name_rows()
 
     def _name_rows(self) -> None:
@@ -124,7 +128,7 @@ class QueriedHistories(PolicyAnswers):
             count, frames = histories.shape
             states = self.observer.space.states(histories.ravel()).reshape(count, frames, -1)
             observations = context.observation.of_histories(states)
-            answers.append(self.answer(observations, count))
+            answers.append(self.answer(observations, count, histories[:, -1]))
         return np.concatenate(answers)
 
     def _numbers(self, histories: list[tuple[int, ...]]) -> np.ndarray:
@@ -154,6 +158,7 @@ class QueriedMemories(QueriedHistories):
             besides = "several frames" if observation.frames > 1 else "irrelevant entries"
             raise ParameterError(f"the policy has a memory and sees {besides}; expected one or the other")
         QueriedPolicy.__init__(self, mdp)
+        self.masks = None
         self.recurrent, self.observer, self.deterministic = policy, observer, deterministic
         check_observation(policy, observer.observe.space, observer.observation)
         self._name_rows()
@@ -249,15 +254,16 @@ def _packed(tree: Arrays, count: int) -> list[bytes]:
 
 
 def answers_of(
-    policy: PolicyLike, mdp: TabularMDP, observer: Observer, *, deterministic: bool = False
+    policy: PolicyLike, mdp: TabularMDP, observer: Observer, **options: Unpack[AnswerOptions]
 ) -> PolicyAnswers:
     """Answers of a policy that sees observations: of the state alone, of the last frames, or with a memory."""
+    masked = options.get("masks") is not None
     if isinstance(policy, SB3Model) and not isinstance(policy, Policy):
-        policy = deep_policy(policy)
-    if isinstance(policy, RecurrentPolicy) and not isinstance(policy, Policy):
-        return QueriedMemories(policy, mdp, observer, deterministic=deterministic)
+        policy = deep_policy(policy, masked=masked)
+    if isinstance(policy, RecurrentPolicy) and not isinstance(policy, Policy) and not masked:
+        return QueriedMemories(policy, mdp, observer, deterministic=options.get("deterministic", False))
     kind = QueriedHistories if observer.frames > 1 else PolicyAnswers
-    return kind(policy, mdp, observer, deterministic=deterministic)
+    return kind(policy, mdp, observer, **options)
 
 
 # Values ---------------------------------------------------------------------------------------------------------------
@@ -298,6 +304,7 @@ def policy_value(
     return_range: Callable[[], tuple[float, float]],
     *,
     deterministic: bool = False,
+    masks: MasksLike | None = None,
     max_states: int = 100_000,
     episodes: int = 2_000,
     seed: int = 0,
@@ -308,7 +315,7 @@ def policy_value(
     Args:
         observer: gives what the policy sees; called for policies over observations alone.
         return_range: gives the lowest and the highest return of an episode; called where the value is estimated.
-        deterministic, max_states, episodes, seed: as for `training.evaluate_agent`.
+        deterministic, masks, max_states, episodes, seed: as for `training.evaluate_agent`.
         reach: (rows at most, steps) -> the rows that every policy of positive probabilities reaches, where more than
             one policy is evaluated: such policies are queried in all of them at once. Changes no value.
     """
@@ -316,13 +323,15 @@ def policy_value(
         policy = policy.policy_table()
     answers: QueriedPolicy
     if isinstance(policy, np.ndarray):
+        if masks is not None:
+            raise ParameterError("masks given for a policy that is a table; expected a model trained under masks")
         table = policy.argmax(axis=-1) if deterministic and policy.dtype.kind == "f" else policy
         if mdp.num_states <= max_states:
             solution = solvers.evaluate_policy(mdp, table)
             return Evaluation(solution.value_at_start, True, solution.error_bound, mdp.num_states)
         answers = TableAnswers(table, mdp)
     else:
-        answers = answers_of(policy, mdp, observer(), deterministic=deterministic)
+        answers = answers_of(policy, mdp, observer(), deterministic=deterministic, masks=masks)
     steps, error = steps_that_matter(mdp)
     is_whole = None if reach is None else answers.query_all(lambda: reach(max_states, steps))
     if answers.reach(max_states, steps) if is_whole is None else is_whole:
@@ -338,6 +347,7 @@ class ObserverOptions(TypedDict, total=False):
     observation_options: Mapping[str, object] | None
     previous_action: bool
     deterministic: bool
+    masks: MasksLike | None
 
 
 @require_mdp
@@ -368,13 +378,15 @@ def evaluate_policy(
         processes: that share the work, for policies over states; see `pharos.value_iteration`.
         observer_options: further options of policies that see observations: `observation_options`, a dictionary;
             `previous_action`, whether they see it, under sticky actions; `deterministic`, whether the most probable
-            action is taken.
+            action is taken; `masks`, the actions that a model trained under masks (MaskablePPO) may choose, (S, A) bool
+            or a function from states (N, D), as `StateSpace.states` gives them, to (N, A) bool.
     Returns:
         A Solution of kind "policy", see `pharos.solvers.evaluate_policy`. A policy that sees observations is asked only
         in the states that it reaches from the start; values elsewhere are NaN.
     Raises:
         ParameterError: the policy has the wrong shape, or its rows are not probabilities; or it sees observations, and
-            the MDP was not made from a state space.
+            the MDP was not made from a state space (the observation "number" is of any table); or a model was trained
+            on other observations, behind a VecNormalize that is not with it, or under masks that are not given.
         DivergenceError: gamma is 1, there is no horizon, and the value is or may be infinite.
     Source: Puterman (1994), section 6.1.
     """
@@ -419,6 +431,7 @@ def _solution_of_reached(
     observation_options: Mapping[str, object] | None = None,
     previous_action: bool = False,
     deterministic: bool = False,
+    masks: MasksLike | None = None,
 ) -> ReachedSolution:
     """Values of a policy that sees observations; `training.evaluate_agent` also gives estimates.
 
@@ -436,21 +449,13 @@ def _solution_of_reached(
         raise ParameterError(
             "the policy sees the previous action, so its values belong to no state; use training.evaluate_agent"
         )
-    space = None if mdp.folder is None else load(mdp.folder, verify=False, environment=mdp.environment)
-    if space is None or space.environment is None:
-        raise ParameterError(
-            f"{mdp}: is not of a state space whose environment is known, so there is nothing to observe; "
-            f"give the policy as a table"
-        )
-    observer = Observer(
-        space, space.environment, observation, dict(observation_options or {}), previous_action, mdp.horizon
-    )
+    observer = _observer_of(mdp, observation, dict(observation_options or {}), previous_action)
     if observer.frames > 1:
         raise ParameterError(
             "the policy sees several frames, so its values belong to no state; use `pharos evaluate`, or "
             "training.evaluate_agent"
         )
-    answers = PolicyAnswers(policy, mdp, observer, deterministic=deterministic)
+    answers = PolicyAnswers(policy, mdp, observer, deterministic=deterministic, masks=masks)
     answers.reach()
     sub, reached_policy = answers.reached_mdp()
     solution = solvers.evaluate_policy(sub, reached_policy, tolerance)
@@ -469,6 +474,22 @@ def _solution_of_reached(
         start=solution.value_at_start,
         states_reached=len(answers.reached_states()),
     )
+
+
+def _observer_of(mdp: TabularMDP, observation: object, options: dict[str, object], previous_action: bool) -> Observer:
+    """Observer of the states of an MDP; ParameterError if there is nothing to observe."""
+    is_table = mdp.folder is None or is_folder(mdp.folder)
+    if is_table and observation == "number" and mdp.environment is None and mdp.is_numbered:
+        if options or previous_action:
+            raise ParameterError("the numbers of states of a table take no options, and no previous action besides")
+        return NumberObserver.of(mdp.num_states)
+    space = None if is_table or not mdp.folder else load(mdp.folder, verify=False, environment=mdp.environment)
+    if space is None or space.environment is None:
+        raise ParameterError(
+            f"{mdp}: is not of a state space whose environment is known, so there is nothing to observe but the number "
+            f"of a state in its table: observation='number'; or give the policy as a table"
+        )
+    return Observer(space, space.environment, observation, options, previous_action, mdp.horizon)
 
 
 def _on_all_states(answers: QueriedPolicy, x: np.ndarray) -> np.ndarray:

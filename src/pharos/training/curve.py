@@ -15,6 +15,7 @@ import numpy as np
 from pharos.errors import ParameterError, PharosError
 from pharos.policies import (
     Evaluation,
+    MasksLike,
     PolicyAnswers,
     PolicyLike,
     is_small_table,
@@ -40,6 +41,7 @@ def evaluate_agent(
     task: Task,
     *,
     deterministic: bool = False,
+    masks: MasksLike | None = None,
     max_states: int = 100_000,
     episodes: int = 2_000,
     seed: int = 0,
@@ -54,6 +56,8 @@ def evaluate_agent(
             memory: `initial_state(n)` and `(observations, state, starts)` -> (probabilities or actions, next state),
             the state an array or nested tuples of arrays whose first axis is n. It is asked in histories.
         deterministic: whether the most probable action is taken (the first among equals) instead of one at random.
+        masks: the actions that a model trained under masks (MaskablePPO) may choose, (S, A) bool by the states of
+            `task.space`, or a function from states (N, D) to (N, A) bool.
         max_states: how many states (pairs, where previous actions matter; histories, of a memory) the policy may
             reach for an exact value.
         episodes, seed: of the estimate beyond that.
@@ -61,7 +65,8 @@ def evaluate_agent(
             Policies of vectors under chance are then asked in blocks about all states that any policy reaches, where
             these are few enough, else about those that they reach, step by step.
     Raises:
-        ParameterError: the agent is none of these, or its answers are no probabilities.
+        ParameterError: the agent is none of these, its answers are no probabilities, or it was trained on other
+            observations, behind a VecNormalize that is not with it, or under masks that are not given.
     Cost: one answer of the policy for each state reached, then horizon x states reached.
     Source: exact policy evaluation, Puterman (1994), section 6.1; reached states: a closed class of an MDP has the same
         values alone; Maurer and Pontil (2009), theorem 4.
@@ -72,6 +77,7 @@ def evaluate_agent(
         lambda: task.observer,
         lambda: task.return_range,
         deterministic=deterministic,
+        masks=masks,
         max_states=max_states,
         episodes=episodes,
         seed=seed,

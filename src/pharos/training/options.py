@@ -58,7 +58,7 @@ class TrainingOptions:
 
     Attributes:
         agent: q_learning, dqn, ppo, a2c, or module:Class for Stable-Baselines3. A file of one's own is `file.py:Class`.
-        observation: vector, simple_image, complex_image, one_hot, index, hash, recorded, or your own. That is
+        observation: vector, simple_image, complex_image, one_hot, index, number, hash, recorded, or your own. That is
             `module:name` or `file.py:name`; tables see the index of the state.
         observation_options: option of the observation, such as size=natural.
         chance: of acting, and in how rewards are paid. Values, returns and regret are of what is earned.

@@ -36,6 +36,7 @@ class CliffWalking(Environment):
     name = "cliff_walking"
     actions = ("up", "right", "down", "left")
     version = 1
+    numbered_by = ("row", "column")
     layers = {
         "cliff": Layer("x", (96, 66, 58)),
         "goal": Layer("G", (236, 236, 236)),

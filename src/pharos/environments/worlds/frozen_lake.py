@@ -54,6 +54,7 @@ class FrozenLake(Environment):
     name = "frozen_lake"
     actions = ("left", "down", "right", "up")
     version = 1
+    numbered_by = ("row", "column")
     layers = {
         "holes": Layer("O", (110, 110, 110)),
         "goal": Layer("G", (236, 236, 236)),

@@ -66,6 +66,7 @@ class Taxi(Environment):
     name = "taxi"
     actions = ("down", "up", "right", "left", "pick up", "set down")
     version = 1
+    numbered_by = ("row", "column", "passenger", "destination")
     layers = {
         "walls": Layer("|", (150, 150, 150), ("..####..",) * 8),
         "landmarks": Layer(tuple("RGYBCPOMW"), PLACES),
