@@ -548,7 +548,7 @@ class Environment:
 
     @property
     def num_numbered(self) -> int:
-        """How many states the source numbers by `numbered_by`, in the observation `number`."""
+        """Number of states that the source numbers by `numbered_by`, in the observation `number`."""
         variables, size = self.components.variables, self.components.size
         return math.prod(int(size[variables[name]].prod()) for name in self.numbered_by)
 

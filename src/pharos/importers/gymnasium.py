@@ -307,22 +307,22 @@ def _start(env: object, inner: object, states: int, is_stepped: bool) -> np.ndar
         return np.eye(states)[0] if start is None else start
     least, most = SAMPLED_RESETS
     count = least if start is None else min(most, max(least, 20 * int((start > 0).sum())))
-    layers, seen = Layers(env), np.zeros(states, np.int64)
+    layers, counts = Layers(env), np.zeros(states, np.int64)
     for i in range(count):
         layers.reset(0 if i == 0 else None)
         state = _state_number(layers.bottom.observation, states, first_number(inner, "observation"))
         if state is not None:
-            seen[state] += 1
-    found = np.flatnonzero(seen)
-    if start is None and len(found) == 1 and seen.sum() == count:
-        return np.eye(states)[found[0]]
-    if start is not None and (not len(found) or (not seen[start == 0].any() and not _is_unlikely(seen, start))):
+            counts[state] += 1
+    starts = np.flatnonzero(counts)
+    if start is None and len(starts) == 1 and counts.sum() == count:
+        return np.eye(states)[starts[0]]
+    if start is not None and (not len(starts) or (not counts[start == 0].any() and not _is_unlikely(counts, start))):
         return start
-    listed = ", ".join(map(str, found[:5])) + (", ..." if len(found) > 5 else "") if len(found) else "no state's number"
+    listed = ", ".join([*map(str, starts[:5]), *(["..."] if len(starts) > 5 else [])]) or "no state's number"
     says = "it has no initial_state_distrib" if start is None else f"its {name} says otherwise"
     raise FileFormatError(
-        f"{name_of(env)}: its resets start in {listed}, and {says}; give initial=, the states that are equally likely or (S,) "
-        f"probabilities"
+        f"{name_of(env)}: its resets start in {listed}, and {says}; give initial=, the states that are equally likely "
+        f"or (S,) probabilities"
     )
 
 

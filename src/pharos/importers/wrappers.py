@@ -16,7 +16,7 @@ from pharos.errors import ParameterError, PharosError
 Stepped: TypeAlias = Any
 """An environment or wrapper with Gymnasium's interface, or old gym's."""
 Returned: TypeAlias = Any
-"""What it returns: an observation, alone or with what comes with it."""
+"""Answer of one: an observation, alone or with what comes with it."""
 
 LIBRARIES = ("gymnasium", "minigrid", "stable_baselines3")
 SILENT = frozenset(["HumanRendering", "Monitor", "RecordVideo", "RenderCollection"])
@@ -47,7 +47,7 @@ OWN = "import env.unwrapped"
 
 
 class Call(NamedTuple):
-    """What passed a recorder.
+    """A call that passed a recorder.
 
     Attributes:
         action: None for a reset.
@@ -153,14 +153,14 @@ def wrappers_of(env: Stepped) -> list[Stepped]:
     Raises:
         ParameterError: they cannot be walked.
     """
-    inner, found = getattr(env, "unwrapped", env), list[Stepped]()
+    inner, chain = getattr(env, "unwrapped", env), list[Stepped]()
     while env is not inner:
         below = getattr(env, "env", None)
-        if below is None or len(found) > 100:
+        if below is None or len(chain) > 100:
             raise ParameterError(f"{named(env)}: has no attribute env, the environment that it wraps; {OWN}")
-        found.append(env)
+        chain.append(env)
         env = below
-    return found
+    return chain
 
 
 def named(env: object) -> str:
@@ -199,8 +199,8 @@ class Layers:
         chain = wrappers_of(env)
         inner = chain[-1].env if chain else env
         if copied:
-            kept = [wrapper for wrapper in chain if named(wrapper) not in SILENT or not changes_nothing(wrapper)]
-            chain, inner = _copied(kept if len(kept) < len(chain) else chain, inner)
+            loud = [wrapper for wrapper in chain if named(wrapper) not in SILENT or not changes_nothing(wrapper)]
+            chain, inner = _copied(loud, inner)
         else:
             chain = [copy.copy(wrapper) for wrapper in chain if not changes_nothing(wrapper)]
         self.top = self.bottom = Recorder(inner)

@@ -1,7 +1,7 @@
 """Policies, as tables or as functions of observations: queried in the states that they reach, and evaluated."""
 
+from pharos.policies.models import DeepPolicy, SB3Model, deep_policy
 from pharos.policies.policy import (
-    DeepPolicy,
     MasksLike,
     Observer,
     Policy,
@@ -10,10 +10,8 @@ from pharos.policies.policy import (
     QueriedPolicy,
     ReachableRows,
     RecurrentPolicy,
-    SB3Model,
     TableAnswers,
     TabularAgent,
-    deep_policy,
     policy_function,
     reachable_rows,
 )

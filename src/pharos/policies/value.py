@@ -21,6 +21,7 @@ from pharos import solvers
 from pharos.errors import DivergenceError, ParameterError
 from pharos.kernels.stepping import execute_choices
 from pharos.mdp import PolicyTable, Rewards, Table, TabularMDP, require_mdp
+from pharos.policies.models import SB3Model, check_observation, deep_policy
 from pharos.policies.policy import (
     AnswerOptions,
     Arrays,
@@ -33,11 +34,8 @@ from pharos.policies.policy import (
     QueriedPolicy,
     ReachableRows,
     RecurrentPolicy,
-    SB3Model,
     TableAnswers,
     TabularAgent,
-    check_observation,
-    deep_policy,
 )
 from pharos.solvers import Solution
 from pharos.state_space import load
