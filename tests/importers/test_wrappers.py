@@ -81,6 +81,20 @@ class Impatient(gymnasium.Wrapper):
         return observation, reward, terminated, truncated or observation == 8, info
 
 
+class Hesitant(gymnasium.Wrapper):
+    """Repeats the action before, so that nothing happens in the first step of an episode."""
+
+    last = None
+
+    def reset(self, **options):
+        self.last = None
+        return self.env.reset(**options)
+
+    def step(self, action):
+        before, self.last = self.last, action
+        return self.env.step(action if before is None else before)
+
+
 class FewerActions(gymnasium.ActionWrapper):
     def __init__(self, env):
         super().__init__(env)
@@ -143,6 +157,7 @@ def test_wrappers_that_change_nothing_pass(wrap):
         (Teleport, "Teleport", "in place of|moves the environment"),
         (Softly, "Softly", "does not end the episode in state"),
         (Impatient, "Impatient", "cuts the episode off in state"),
+        (lambda env: wrappers.TimeLimit(Hesitant(env), 1), "Hesitant", "executes action . in place of .;"),
         (FewerActions, "FewerActions", "has 2 actions, the environment 4"),
         (Unlucky, "Unlucky", "cannot be compared .*KeyError"),
     ],
