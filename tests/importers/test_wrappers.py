@@ -11,7 +11,7 @@ from gymnasium import wrappers
 
 import pharos
 from pharos import importers
-from pharos.errors import FileFormatError, ParameterError
+from pharos.errors import FileFormatError, ParameterError, RuleError
 from pharos.importers.gymnasium import _is_unlikely
 from refusals import refusal
 
@@ -209,6 +209,69 @@ def test_rewards_of_outcomes_are_exchanged_with_their_means(tmp_path):
     )
 
 
+def test_rewards_in_place_of_the_table_count_in_what_the_sums_of_rows_leave_open():
+    """A row of one state lacks 1e-7 and pays 8 in place of 1: apart by at most 8e-7, and divided by its sum."""
+    short = {0: {0: [(0.5, 0, 1.0, False), (0.5 - 1e-7, 0, 1.0, True)]}}
+    mdp = importers.gymnasium(short, gamma=0.9, rewards=lambda s, a, t, r: 8 * r)
+    assert mdp.rewards == pytest.approx(8.0, abs=1e-12)
+    assert mdp.residual == pytest.approx((1e-7, 8e-7), rel=1e-6)
+    assert mdp.residual.rewards == pytest.approx(8 * importers.gymnasium(short).residual.rewards)
+    outcomes = importers.gymnasium_outcomes(short, rewards=lambda s, a, t, r: 8.0 if a else r)
+    assert outcomes is None  # all of the row pay the same
+
+
+@pytest.mark.parametrize(
+    ("rewards", "text"),
+    [
+        (lambda s, a, t, r: math.nan, "rewards: nan in state 0, action 0, to 0; expected a finite number"),
+        (lambda s, a, t, r: None, "rewards: None in state 0, action 0, to 0; expected a finite number"),
+        ([[math.inf]], "rewards: inf in state 0, action 0, to 0; expected a finite number"),
+    ],
+)
+def test_rewards_that_are_no_finite_numbers_are_refused(rewards, text):
+    table = {0: {0: [(1.0, 0, 1.0, False)]}}
+    for importer in (importers.gymnasium, importers.gymnasium_outcomes):
+        assert refusal(ParameterError, importer, table, rewards=rewards) == text
+        wrong = {0: {0: [(1.0, "0", 1.0, False)]}}  # the table is looked at first
+        assert "P[0][0] has (1.0, '0', 1.0, False)" in refusal(FileFormatError, importer, wrong, rewards=rewards)
+
+
+class FromTwo(gymnasium.Env):
+    """A ring of three states that shows them from 1 on, and has actions from 2 on."""
+
+    P = {s: {a: [(1.0, (s + 1 + a) % 3, float(s), False)] for a in range(2)} for s in range(3)}
+    observation_space, action_space = gymnasium.spaces.Discrete(3, start=1), gymnasium.spaces.Discrete(2, start=2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = 1
+        return 2, {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        _, self.s, reward, ended = self.P[self.s][int(action) - 2][0]
+        return self.s + 1, reward, ended, False, {}
+
+
+class Checking(gymnasium.Wrapper):
+    """Looks at what passes."""
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        observation, *rest = self.env.step(action)
+        assert self.observation_space.contains(observation)
+        return observation, *rest
+
+
+def test_wrappers_and_starts_of_spaces_that_do_not_begin_with_0():
+    for env in (FromTwo(), Checking(FromTwo())):
+        mdp = importers.gymnasium(env, gamma=0.9)
+        assert mdp.next_states.tolist() == [[1, 2], [2, 0], [0, 1]]
+        assert mdp.start_states.tolist() == [1]
+    said = refusal(ParameterError, importers.gymnasium, Cost(FromTwo()))
+    assert re.match(r"Cost: pays \S+ in state [012], action [23], in place of [012]; import env.unwrapped", said)
+
+
 def test_what_is_stepped_for_comparison_is_a_copy_and_writes_nothing(tmp_path):
     from stable_baselines3.common.monitor import Monitor
 
@@ -345,6 +408,15 @@ def test_no_death_of_minigrid_is_taken_over():
     assert pharos.solvers.uniform_value(mdp, 1e-9).value_at_start == pytest.approx(v[0], abs=1e-8)
     plain = importers.minigrid(env, gamma=0.9, horizon=None)
     assert pharos.solvers.uniform_value(plain).value_at_start > 0 > v[0]
+
+
+@pytest.mark.slow
+def test_a_payment_of_no_death_that_shrinks_with_time_is_refused():
+    env, package = lava()
+    wrapped = package.NoDeath(env, ("lava",), death_cost=-0.5)
+    wrapped.no_death_types = ("goal",)
+    said = refusal(RuleError, importers.minigrid, wrapped)
+    assert "expected what does not depend on the number of steps" in said and "pays 0.49" in said
 
 
 @pytest.mark.slow

@@ -76,7 +76,7 @@ def test_a_table_of_outcomes_with_one_each_is_a_table_of_next_states(kind):
         mdp = TabularMDP.from_outcomes(table[..., None], np.ones((*table.shape, 1)), plain.rewards, **setting)
     else:
         P = np.eye(len(table) + 1)[table][..., :-1]
-        mdp = TabularMDP.from_matrices(P, plain.rewards, **setting)
+        mdp = TabularMDP.from_matrices(P, plain.rewards, ends=True, **setting)
     tables = list(np.random.default_rng(2).integers(mdp.num_actions, size=(5, mdp.num_states)))
     alone = [solvers.evaluate_policy(mdp, table) for table in tables]
     wanted = [Evaluation(each.value_at_start, True, each.error_bound, mdp.num_states) for each in alone]
