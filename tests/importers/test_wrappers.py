@@ -115,6 +115,7 @@ def monitored(env):
     return Monitor(env)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrap",
     [

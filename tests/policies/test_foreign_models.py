@@ -15,6 +15,7 @@ from pharos.training import Task
 from refusals import refusal
 
 sb3 = pytest.importorskip("stable_baselines3")
+pytestmark = pytest.mark.slow
 
 LAKE = "frozen_lake/4x4"
 PAGE = Path(__file__).parents[2] / "docs/agents-from-gymnasium.md"
@@ -332,7 +333,6 @@ def test_imported_worlds_show_the_number_in_their_folder(tmp_path):
 # The page ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_the_page_gives_exact_values_of_the_models_that_it_trains():
     code = "\n".join(re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL))
     assert "learn(30_000)" in code
