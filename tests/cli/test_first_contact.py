@@ -1,9 +1,7 @@
 """A newcomer's first minutes: what is compiled is told apart from work, kept, and done beforehand; shells complete."""
 
-import io
 import json
 import re
-import sys
 import time
 from pathlib import Path
 
@@ -42,35 +40,6 @@ def test_seconds_of_compiling_are_not_seconds_of_work():
     time.sleep(0.05)
     function(3)
     assert watch.compiling == compiled and watch.seconds >= 0.05
-
-
-class Stream(io.StringIO):
-    def __init__(self, is_terminal):
-        super().__init__()
-        self.isatty = lambda: is_terminal
-
-
-@pytest.mark.parametrize("is_terminal", [True, False])
-def test_a_terminal_is_told_once_that_pharos_compiles(is_terminal, monkeypatch):
-    import pharos.kernels.gaps  # noqa: F401  (which listens)
-
-    stream = Stream(is_terminal)
-    monkeypatch.setattr(sys, "stderr", stream)
-    monkeypatch.setattr(compiling, "is_told", False)
-
-    def compiled(module):
-        def same(x):
-            return x
-
-        same.__module__ = module
-        numba.njit(same)(1)
-
-    compiled("of_somebody_else")
-    assert stream.getvalue() == ""
-    compiled("pharos.first")
-    compiled("pharos.second")
-    told = "pharos: compiling, some seconds; kept for the next time\n"
-    assert stream.getvalue() == (told if is_terminal else "")
 
 
 @pytest.mark.long

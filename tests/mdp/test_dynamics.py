@@ -357,8 +357,8 @@ def test_what_a_row_lacks_to_1_by_rounding_leads_nowhere():
     assert (dynamics.leads_to(0).tolist(), dynamics.leads_to(1).tolist()) == ([[True]], [[False]])
 
 
-def test_what_a_row_lacks_beyond_rounding_is_an_end():
-    dynamics = TabularMDP.from_matrices(np.full((1, 1, 1), 1 - 1e-12), [[0.0]]).dynamics
+def test_an_end_beyond_rounding_is_an_outcome():
+    dynamics = TabularMDP.from_matrices(np.full((1, 1, 1), 1 - 1e-12), [[0.0]], ends=[[1e-12]]).dynamics
     assert dynamics.has_ends and dynamics.leads_to(1).tolist() == [[True]]
     outcomes = dynamics.outcomes(np.array([0]), np.array([0]))
     assert outcomes.states.tolist() == [0, 1] and outcomes.probabilities[1] == pytest.approx(1e-12, rel=1e-3)

@@ -143,7 +143,7 @@ def means_as_given(draw):
     else:
         P, R = np.zeros((*shape, shape[0])), np.zeros((*shape, shape[0]))
         P[..., :2], R[..., :2] = chances, paid
-        mdp = TabularMDP.from_matrices(P, R, gamma=gamma)
+        mdp = TabularMDP.from_matrices(P, R, gamma=gamma, axes="SAS")
     means = (naive_exact.exact(chances) * naive_exact.exact(paid)).sum(axis=2)
     return mdp, naive_exact.AsGiven(mdp, means)
 
