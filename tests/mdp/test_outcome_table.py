@@ -7,6 +7,7 @@ import pytest
 
 from naive import exact
 from pharos.errors import ParameterError
+from pharos.kernels import outcomes as kernels
 from pharos.mdp import OutcomeTable, TabularMDP
 from pharos.solvers import evaluate_policy, value_iteration
 from strategies import LAYOUTS, outcome_table
@@ -178,7 +179,8 @@ def test_arrays_that_are_no_outcome_table_are_told(changes, message):
         dynamics.check()
 
 
-def test_memory_maps_are_not_copied(tmp_path):
+def test_memory_maps_are_not_copied(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernels, "UNROLLED_FROM", 0)  # as if states were many
     arrays = hostile()
     maps = {}
     for name, array in arrays.items():

@@ -311,6 +311,8 @@ def _palette(vectors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray | N
 
 # Executions whose outcomes NumPy lists sooner than a kernel is compiled.
 _FEW = 1 << 14
+# Outcomes, at most, that are copied for kernels.
+_COPIED = 1 << 20
 
 
 class OutcomeTable(OutcomeRows, Dynamics):
@@ -365,7 +367,14 @@ class OutcomeTable(OutcomeRows, Dynamics):
         return 0 if self.is_deterministic else 2 * self.num_outcomes  # 1 times a number is exact
 
     @cached_property
-    def for_kernels(self) -> tuple[object, ...]:  # type: ignore[override]
+    def for_kernels(self) -> tuple[Any, ...]:  # type: ignore[override]
+        size = self.num_states * self.num_actions
+        if not kernels.is_unrolled(self.num_states) and size * self.num_outcomes <= _COPIED:
+            # few: a copy in one form, whatever they are stored in, so that kernels are compiled once
+            which, successors, probabilities = self.possible(np.arange(size))
+            offsets = np.append(0, np.cumsum(np.bincount(which, minlength=size)))
+            copies = np.asarray(successors, np.int32), offsets, None, np.asarray(probabilities, np.float64)
+            return (*map(read_only, copies), (self.num_states, self.num_actions), self.num_outcomes)
         codes, weights = self.codes, self.palette
         if self.probabilities is not None:
             weights = self.probabilities.reshape(-1)
@@ -375,7 +384,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
 
     def for_kernels_with(self, values: np.ndarray) -> tuple[object, ...]:
         """`for_kernels` with other values, (N,) of all possible outcomes in order, in the place of the successors."""
-        if len(values) < self.successors.size:  # padding
+        if len(values) < len(self.for_kernels[0]):  # padding
             rows = np.arange(self.num_states * self.num_actions)
             which = self.possible(rows)[0]
             counts = np.bincount(which, minlength=len(rows))
