@@ -44,7 +44,7 @@ from pharos.environments import DeepSea
 pathlib.Path(__file__).with_name("executed").mkdir(exist_ok=True)
 
 class Evil(DeepSea):
-    name = "evil_sea"
+    name, instances = "evil_sea", {}  # none is listed in this process
 """
 
 

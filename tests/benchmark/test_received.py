@@ -30,7 +30,7 @@ from pharos.environments import DeepSea
 pathlib.Path(__file__).with_name("mark").touch()
 
 class Evil(DeepSea):
-    name = "evil_sea"
+    name, instances = "evil_sea", {}  # none is listed in this process
 
 seen = (lambda env, states: states.astype(np.float32), spaces.Box(0, 99, (2,), np.float32))
 """
