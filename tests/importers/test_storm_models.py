@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 from types import SimpleNamespace
 
 import numpy as np
@@ -192,7 +193,9 @@ def test_what_cannot_be_imported_is_one_line(tmp_path):
     assert "nothing says what is paid" in refusal(ParameterError, importers.storm, models.jani_dtmc_die, constants="")
     with pytest.raises(FileFormatError, match="expected an MDP or a DTMC"):
         importers.storm(models.prism_pomdp_maze, target="goal")
-    assert "no such file" in refusal(ParameterError, importers.storm, tmp_path / "nothing.nm")
+    assert "No such file" in refusal(ParameterError, importers.storm, tmp_path / "nothing.nm")
+    os.mkfifo(tmp_path / "pipe.prism")
+    assert "pipe.prism: it is no regular file" in refusal(ParameterError, importers.storm, tmp_path / "pipe.prism")
     words = (models.prism_mdp_coin_2_2, "--target", "finished", "--reward", "steps", "--out", tmp_path / "coin")
     assert json.loads(run("import", "prism", *words, "--json").stdout)["num_states"] == 272
     assert pharos.make(str(tmp_path / "coin")).has_chance

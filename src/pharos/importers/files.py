@@ -325,8 +325,10 @@ def _model(path: Path, constants: str) -> tuple[Any, str]:
         raise MissingExtra("importing PRISM, JANI and DRN models", "stormpy", "storm") from None
     if path.suffix not in SUFFIXES:
         raise ParameterError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
-    if not path.is_file():
-        raise ParameterError(f"{path}: no such file")
+    try:
+        storage.check_regular(path)
+    except OSError as error:
+        raise ParameterError(f"{path}: {error.strerror}; expected a file of a model") from None
     refusal = ""
     with _storms_output() as printed:
         try:
