@@ -3,6 +3,7 @@
 import json
 import pickle
 import re
+from fractions import Fraction
 from pathlib import Path
 
 import gymnasium
@@ -503,3 +504,15 @@ def test_commands_that_need_an_environment_say_what_to_do_with_a_file(verb, tmp_
     assert "pharos import bridge" in done.stderr or verb == ["play"]  # which needs a terminal first
     assert "delete" not in done.stderr and "Traceback" not in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("other", [0, 1])
+def test_means_of_rewards_that_nearly_cancel_are_within_their_bound(other):
+    """Of a table of Gymnasium, whose products and sums float64 rounds; both outcomes end in one state, or in two."""
+    row = [(0.3, 0, 7e6, True), (0.7, other, -3e6, True)]
+    mdp = importers.gymnasium({0: {0: row}, 1: {0: [(1.0, 1, 0.0, True)]}}, gamma=0.9)
+    truth = sum(Fraction(p) * Fraction(reward) for p, _, reward, _ in row)
+    solution = pharos.value_iteration(mdp)
+    assert 0 < abs(Fraction(float(solution.v[0])) - truth) <= Fraction(solution.error_bound)
+    exact = importers.gymnasium({0: {0: [(1.0, 0, 7e6, True)]}}, gamma=0.9)
+    assert exact.reward_table.rounding == 0 and pharos.value_iteration(exact).v[0] == 7e6

@@ -23,7 +23,7 @@ from pharos.errors import FileFormatError, MissingExtra, ParameterError, RuleErr
 from pharos.importers.files import MINIGRID_STEPS
 from pharos.importers.folder import ImportedOutcomes
 from pharos.importers.wrappers import Layers, as_integer, check_wrappers, first_number, parts_of, reset
-from pharos.mdp import Residual, TabularMDP, normalized_rows
+from pharos.mdp import Residual, Rewards, TabularMDP, normalized_rows, rounding_of_mean
 from pharos.system.wording import capped
 
 SAMPLED_STEPS = 10_000
@@ -92,11 +92,11 @@ def gymnasium(
         start = _start(env, inner, states, is_stepped)
         initial = int(start.argmax()) if start.max() == 1 else start / start.sum()
     if probabilities is None:
-        mdp = TabularMDP.from_arrays(next_states, means, gamma=gamma, initial=initial, horizon=horizon)
+        mdp = TabularMDP.from_arrays(next_states, means.array, gamma=gamma, initial=initial, horizon=horizon)
     else:
         setting: dict[str, Any] = {"gamma": gamma, "initial": initial, "horizon": horizon, "ends": ends}
-        mdp = TabularMDP.from_matrices(probabilities, means, **setting)
-    return replace(mdp, residual=residual)
+        mdp = TabularMDP.from_matrices(probabilities, means.array, **setting)
+    return replace(mdp, residual=residual, reward_table=means)
 
 
 def gymnasium_outcomes(env: object, *, rewards: OutcomeRewards | None = None) -> ImportedOutcomes | None:
@@ -130,8 +130,8 @@ def gymnasium_outcomes(env: object, *, rewards: OutcomeRewards | None = None) ->
     return ImportedOutcomes(offsets, next_states.astype(np.int64), probabilities, rewards)
 
 
-def _table(env: object, rows: list[list[list]]) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any, Residual]:
-    """(next states (S, A), -1 for the end; rewards (S, A); chance of an end (S, A); (S A, S) sparse probabilities, None
+def _table(env: object, rows: list[list[list]]) -> tuple[np.ndarray, Rewards, np.ndarray, Any, Residual]:
+    """(next states (S, A), -1 for the end; rewards; chance of an end (S, A); (S A, S) sparse probabilities, None
     if each action has one outcome; residual) of the rows of a table."""
     states, actions = len(rows), len(rows[0])
     shape, count = (states, actions), states * actions
@@ -142,9 +142,12 @@ def _table(env: object, rows: list[list[list]]) -> tuple[np.ndarray, np.ndarray,
     p, residuals = normalized_rows(p, of, count, partial(_wrong_sum, env, actions))
     # Rewards of rows that were divided are divided as well
     sums = np.where(residuals > 0, np.bincount(of, [x[0] for each in merged for x in each.values()], count), 1.0)
-    rewards = (np.bincount(of, shares, count) / sums).reshape(shape)
     most = np.zeros(count)
     np.maximum.at(most, of, largest)
+    terms = max(map(len, itertools.chain.from_iterable(rows)))
+    is_exact = terms == 1 and bool((p == 1).all())
+    rounding = 0.0 if is_exact else rounding_of_mean(2 * terms, float(most.max()))  # of products, sums and quotients
+    rewards = Rewards.from_array((np.bincount(of, shares, count) / sums).reshape(shape), rounding)
     residual = Residual.of(residuals, most)
     next_states, ended = np.full(count, -1, np.int64), successors < 0
     next_states[of] = successors

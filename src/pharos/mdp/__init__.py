@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         rewards_of_outcomes,
         rewards_of_space,
         rewards_of_staying,
+        rounding_of_mean,
     )
     from pharos.mdp.row_sums import Residual, normalized_rows
     from pharos.mdp.table import Lazy, Matrices, OutcomeTable, Table
