@@ -173,7 +173,8 @@ def check_normalizer(model: object) -> None:
     normalizer = _normalizer(model)
     name = type(model).__name__
     if normalizer is None:
-        if getattr(model, "_last_original_obs", None) is None:
+        # algorithms with a replay buffer keep the last observation whatever they were trained behind
+        if getattr(model, "_last_original_obs", None) is None or hasattr(model, "replay_buffer"):
             return
         raise ParameterError(
             f"{name}: was trained behind a VecNormalize, which is not with it; load it with "
