@@ -263,9 +263,10 @@ def test_folders_and_environments_keep_what_the_rows_leave_open(tmp_path):
     folder = importers.save(mdp, tmp_path / "chain", outcomes=importers.gymnasium_outcomes(chain(0.3333333)))
     again = importers.load(folder)
     assert again.residual == mdp.residual and pharos.value_iteration(again).error_bound == bound
+    assert again.reward_table.rounding == mdp.reward_table.rounding > 0
     space = pharos.build(importers.environment(mdp), progress=False)
     built = space.mdp(gamma=0.9)
-    assert built.residual == mdp.residual
+    assert built.residual == (mdp.residual.probabilities, mdp.residual.rewards + mdp.reward_table.rounding)
     assert pharos.value_iteration(built).error_bound == pytest.approx(bound, rel=1e-3)
     seen = pharos.evaluate_policy(built, lambda seen: np.zeros(len(seen), int), observation="index")
     assert seen.error_bound > 1e-6

@@ -88,9 +88,14 @@ class ImportedWorld(Environment):
 
     @cached_property
     def residual(self) -> tuple[float, float]:  # type: ignore[override]
-        """Distances that the sums of the source's rows leave open, in probability and in reward."""
+        """Distances that the sums of the source's rows leave open, in probability and in reward.
+
+        The rounding of rewards that are means counts as a distance, unless the rules know the reward of each outcome.
+        """
         try:
-            return mdp_files.residual_of(self.manifest)
+            probabilities, rewards = mdp_files.residual_of(self.manifest)
+            knows_outcomes = set(mdp_files.PAID) <= set(self.manifest["arrays"])
+            return probabilities, rewards + (0.0 if knows_outcomes else mdp_files.rounding_of(self.manifest))
         except ValueError as error:
             raise FileFormatError(f"{self.folder}: {error}; {mdp_files.AGAIN}") from None
 

@@ -107,6 +107,7 @@ def save(
             "arrays": checksums,
             **description,
             **({mdp_files.RESIDUAL: list(mdp.residual)} if any(mdp.residual) else {}),
+            **({mdp_files.ROUNDING: mdp.reward_table.rounding} if mdp.reward_table.rounding else {}),
         }
         storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
         (folder / storage.LOCK).unlink()  # whoever waits for it replaces what is whole
@@ -184,6 +185,7 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
     parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
     contents = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon, str(mdp.chance), sorted(parts.items())]
     contents += [*mdp.residual] if any(mdp.residual) else []
+    contents += [mdp_files.ROUNDING, mdp.reward_table.rounding] if mdp.reward_table.rounding else []
     folder = place / storage.digest_of_json(contents)
     return make("imported", folder=os.fspath(folder if is_folder(folder) else save(mdp, folder)))
 
@@ -216,12 +218,13 @@ def load(folder: str | os.PathLike) -> TabularMDP:
     try:
         mdp = _mdp(manifest, mdp_files.read_arrays(folder, manifest))
         residual = mdp.residual.plus(Residual(*mdp_files.residual_of(manifest)))
+        rewards = replace(mdp.reward_table, rounding=mdp_files.rounding_of(manifest))
     except FileFormatError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, MemoryError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise FileFormatError(f"{folder}: the imported MDP is damaged: {reason}; {AGAIN}") from None
-    return replace(mdp, folder=folder, residual=residual)
+    return replace(mdp, folder=folder, residual=residual, reward_table=rewards)
 
 
 def _mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> TabularMDP:

@@ -32,6 +32,8 @@ OBSERVATIONS = "observations"
 PAID = ("outcome_offsets", "outcome_states", "outcome_probabilities", "outcome_rewards")
 RESIDUAL = "residual"
 """Entry of the manifest: what the sums of given rows leave open, in probability and in reward; absent where nothing."""
+ROUNDING = "rounding"
+"""Entry of the manifest: a bound on the error of rewards that are means; absent if rewards are exact."""
 AGAIN = "import it again"
 
 
@@ -102,6 +104,18 @@ def residual_of(manifest: Mapping[str, Any]) -> tuple[float, float]:
     if not is_pair or not all(0 <= each < math.inf for each in pair):
         raise ValueError(f"{RESIDUAL} is {pair!r}; expected two numbers from 0 on")
     return float(pair[0]), float(pair[1])
+
+
+def rounding_of(manifest: Mapping[str, Any]) -> float:
+    """A bound on the rounding error of each reward.
+
+    Raises:
+        ValueError: the entry is no number from 0 on.
+    """
+    rounding = manifest.get(ROUNDING, 0.0)
+    if type(rounding) not in (int, float) or not 0 <= rounding < math.inf:
+        raise ValueError(f"{ROUNDING} is {rounding!r}; expected a number from 0 on")
+    return float(rounding)
 
 
 def read_array(folder: str | os.PathLike, manifest: Mapping[str, Any], name: str) -> np.ndarray:
