@@ -1,13 +1,16 @@
 """Values in files: the same as in memory, to the last bit, with bounds that hold from whatever a file holds."""
 
+import dataclasses
 import errno
 import importlib
+import inspect
 import io
 import itertools
 import os
 import signal
 import sys
 import tempfile
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,12 +19,10 @@ from hypothesis import strategies as st
 import pharos
 from children import exit_code
 from naive import exact as naive_exact
-from pharos import hardness
+from pharos import hardness, solvers
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PrecisionError
-from pharos.mdp import BEST, TabularMDP
-from pharos.solvers import uniform_value, value_iteration
-from pharos.solvers.fixed_point import Backup, largest_of
-from pharos.solvers.values import blocked_fixed_point
+from pharos.mdp import TabularMDP
+from pharos.solvers import Solving, uniform_value, value_iteration, worst_value
 from pharos.system import memory
 from refusals import failing, refusal
 from strategies import examples, small_mdps
@@ -110,15 +111,14 @@ def test_large_values_are_swept_in_memory_and_end_in_their_file(tmp_path, monkey
 def test_transitions_that_memory_has_no_room_for_are_read_by_pieces(tmp_path, monkeypatch):
     space = pharos.build(pharos.make("breakout", height=6, columns=2), tmp_path / "space", progress=False)
     mdp = space.mdp(gamma=0.99)
-    expected = [value_iteration(mdp, blocks=blocks) for blocks in (1, 3)]
-    reads = []
+    expected, reads = value_iteration(mdp), []
     monkeypatch.setattr(memory, "PIECE", 7)
     monkeypatch.setattr(memory, "available_memory", lambda: 100 * mdp.num_actions * 4)
     whole = memory._UncachedFile.read
     monkeypatch.setattr(memory._UncachedFile, "read", lambda *words: reads.append(words[1:3]) or whole(*words))
-    for blocks, each in zip((1, 3), expected, strict=True):
-        found = value_iteration(mdp, blocks=blocks)
-        assert (found.x == each.x).all() and (found.sweeps, found.error_bound) == (each.sweeps, each.error_bound)
+    again = value_iteration(mdp)
+    assert (again.x == expected.x).all()
+    assert (again.sweeps, again.error_bound) == (expected.sweeps, expected.error_bound)
     assert max(stop for _, stop in reads) == mdp.num_states and min(reads)[0] == 100 * 3 // 4 - 4 * 7
 
 
@@ -291,53 +291,49 @@ def test_values_of_32_bits_are_for_one_process_and_no_horizon():
 
 
 @pytest.mark.long
-@examples(150, small_mdps(), st.integers(2, 7), st.sampled_from(("float64", "float32")), st.integers(1, 3))
-def test_bounds_hold_whatever_the_blocks(mdp, blocks, dtype, threads):
+@examples(150, small_mdps(), st.sampled_from(("float64", "float32")), st.integers(1, 3))
+def test_bounds_hold_whatever_the_options(mdp, dtype, threads):
     tolerance = 1e-6 if dtype == "float64" else 1e-6 / (1 - mdp.gamma) ** 2
-    solution = value_iteration(mdp, tolerance, blocks=blocks, dtype=dtype, threads=threads)
+    solution = value_iteration(mdp, Solving(tolerance=tolerance, dtype=dtype, threads=threads))
     truth = naive_exact.extreme_values(mdp)
     assert naive_exact.largest_error(solution.v, truth) <= solution.error_bound <= tolerance
 
 
-@pytest.mark.long
-def test_the_largest_residual_proves_the_bound_of_blocks(tmp_path):
-    mdp, bounds = ring(3000, 0.999), []
-
-    def look(rounds, bound):
-        bounds.append(bound)
-
-    solution = value_iteration(mdp, 1e-3, blocks=5, progress=look, values=tmp_path / "values.npy")
-    x = solution.x[:, 0].copy()
-    residual = np.abs((mdp.rewards + mdp.gamma * x[mdp.next_states]).max(axis=1) - x[:-1]).max()
-    assert residual / (1 - mdp.gamma) <= solution.error_bound == bounds[-1] <= 1e-3 < bounds[-2]
-    del solution
-    assert value_iteration(mdp, 1e-3, blocks=5, values=tmp_path / "values.npy").sweeps == 1
+def test_one_object_of_options_is_the_same_as_keywords(tmp_path):
+    mdp, solving = ring(), Solving(tolerance=1e-3)
+    for solver in (value_iteration, worst_value, uniform_value, partial(pharos.evaluate_policy, policy=[0] * 400)):
+        one, other = solver(mdp, tolerance=solving), solver(mdp, tolerance=1e-3)
+        assert (one.x == other.x).all() and one.error_bound == other.error_bound
+    assert value_iteration(mdp, solving, horizon=4).horizon == 4
+    stored = solvers.evaluate_policy(mdp, [0] * 400, solving, values=tmp_path / "values.npy", dtype="float32")
+    assert stored.x.dtype == np.float32 and stored.error_bound <= 1e-3
+    expected = solvers.evaluate_policy(mdp, [0] * 400)
+    assert np.abs(stored.v - expected.v).max() <= stored.error_bound + expected.error_bound
 
 
-class Recorded(Backup):
-    """A backup that knows how much its sweeps have changed."""
-
-    changes: tuple = ()
-
-    def sweep(self, x, part=None):
-        self.changes = (*self.changes, super().sweep(x, part))
-        return self.changes[-1]
+def test_fields_and_keywords_of_solving_are_the_same():
+    fields = {each.name for each in dataclasses.fields(Solving)}
+    assert fields == {"tolerance", *solvers.SolvingOptions.__annotations__}
+    assert fields <= {*inspect.signature(value_iteration).parameters}
 
 
-@pytest.mark.long
-def test_the_bound_of_one_block_is_that_of_its_last_sweep():
-    """(rho d + e) / (1 - rho), with one margin for rounding, and not two."""
-    backup = Recorded(ring(), BEST)
-    x, bound, _ = blocked_fixed_point(backup, 1e-3, 1)
-    change = backup.changes[-1]
-    assert bound == backup.bound(change, backup.rounding(largest_of(x) + change))
-    assert bound <= (0.99 * change + backup.rounding(largest_of(x) + change)) / 0.01 * (1 + 2.0**-39)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tolerance": 0.0}, "expected a positive number"),
+        ({"horizon": 3, "values": "x.npy"}, "a file keeps values without a horizon; found 3 steps"),
+        ({"processes": "mpi", "values": "x.npy"}, "several processes keep theirs in a folder"),
+        ({"processes": "mpi", "keep_all": True}, "several processes keep the last step alone"),
+        ({"dtype": "float32", "horizon": 3}, "one process and no horizon"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused_before_any_mdp(options, message):
+    assert message in refusal(ParameterError, Solving, **options)
 
 
-def test_a_number_of_blocks_that_cannot_be_is_one_line():
-    for wrong in (0, -1, 1.5, 5000, None):
-        with pytest.raises(ParameterError, match="expected a whole number from 1 to 4096"):
-            value_iteration(ring(), blocks=wrong)
+def test_a_file_of_values_is_refused_if_the_mdp_has_a_horizon(tmp_path):
+    message = refusal(ParameterError, value_iteration, ring().with_horizon(5), values=tmp_path / "x.npy")
+    assert "found 5 steps" in message and not (tmp_path / "x.npy").exists()
 
 
 def test_rows_that_fill_memory_are_all_swept_and_stay_what_they_are(tmp_path, monkeypatch, no_memory):

@@ -20,7 +20,7 @@ from patience import PATIENCE
 from pharos.errors import ParameterError, PrecisionError
 from pharos.mdp import BEST, WORST, PolicyTable, TabularMDP
 from pharos.ranks import RankFailed
-from pharos.solvers import evaluate_policy, ranked, uniform_value, value_iteration
+from pharos.solvers import Solving, evaluate_policy, ranked, uniform_value, value_iteration
 from pharos.solvers.ranked import shared_solution
 from rank_threads import Killed, fails_at, out_of_order, threads
 from refusals import failing, refusal
@@ -41,11 +41,12 @@ def chain(num_states=300, gamma=0.9):
 
 
 def solved(mdp, size, *, select=BEST, tolerance=1e-6, horizon=None, disturb=lambda rank: None, cuts=None, **options):
-    options = {"processes": "mpi", "checkpoint": None} | options
+    seconds = {name: options.pop(name) for name in ("checkpoint_seconds",) if name in options}
+    solving = Solving(**{"tolerance": tolerance, "horizon": horizon, "processes": "mpi"} | options)
     with threads(ranked, size, disturb), pytest.MonkeyPatch.context() as patch:
         if cuts is not None:
             patch.setattr(ranked, "cuts_of", lambda num_rows, ranks: np.array(cuts))
-        return shared_solution(mdp, select, tolerance, horizon, **options)
+        return shared_solution(mdp, select, solving, **seconds)
 
 
 # The same values ------------------------------------------------------------------------------------------------------
@@ -283,7 +284,7 @@ SOLVE = """
 import os, pathlib, signal, sys
 import numpy as np
 from pharos.mdp import BEST
-from pharos.solvers import ranked
+from pharos.solvers import Solving, ranked
 from test_ranked_values import chain
 folder, last, sweeps, first = pathlib.Path(sys.argv[1]), int(sys.argv[2]), [], []
 sweep, ranked._SHARE = ranked.RankedBackup.plain_sweep, 0
@@ -293,9 +294,10 @@ def dies(backup):
         os.kill(os.getpid(), signal.SIGKILL)
     return sweep(backup)
 ranked.RankedBackup.plain_sweep = dies
-solution = ranked.shared_solution(
-    chain(20_000), BEST, 1e-6, 80, "mpi", folder / "values", lambda sweeps, _: first.append(sweeps), -1.0
+solving = Solving(
+    horizon=80, processes="mpi", checkpoint=folder / "values", progress=lambda sweeps, _: first.append(sweeps)
 )
+solution = ranked.shared_solution(chain(20_000), BEST, solving, -1.0)
 if solution is not None:
     np.save(folder / "x.npy", solution.x)
     (folder / "first.txt").write_text(str(first[0]))

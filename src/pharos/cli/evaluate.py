@@ -16,7 +16,6 @@ from pharos.cli.answers import Answer, compiling_fact, describe_discount, progre
 from pharos.cli.options import (
     Building,
     Chance,
-    Count,
     Gamma,
     Horizon,
     SharedBuilding,
@@ -26,6 +25,7 @@ from pharos.cli.options import (
     file_ending,
 )
 from pharos.errors import FileFormatError, ParameterError, UnknownName
+from pharos.solvers import Solving
 from pharos.system import compiling
 from pharos.system.wording import pluralize
 
@@ -42,21 +42,15 @@ def solve(
     gamma: Gamma = None,
     horizon: Horizon = None,
     chance: Chance,
-    tolerance: Tolerance = 1e-6,
+    solving: Annotated[Solving, "tolerance threads dtype"],
     out: Annotated[Path | None, file_ending(".npz", ".npy")] = None,
     values: Path | None = None,
-    threads: Count = 1,
-    dtype: str = "float64",
-    blocks: Count = 1,
 ) -> Answer | None:
     """Find the optimal values and policy, with a proven error bound. With --processes the same command resumes.
 
     Args:
         out: FILE.npz for the arrays v and policy, FILE.npy for the policy alone.
         values: Folder for the values, in place of memory where that has no room; a solve that was ended goes on.
-        threads: Of a sweep; beyond one, last digits may differ, within the error.
-        dtype: Of values: float64; or float32, half the memory, and a bound that counts it.
-        blocks: Ranges of states that are swept one after another: fewer reads of a disk.
     """
     ranks, processes = building.ranks, building.processes
     with termination():
@@ -65,16 +59,17 @@ def solve(
     from pharos.system import storage
 
     checkpoint = (values or storage.cache_directory() / "values") if ranks != 1 else None
-    suffix = ".npy" if dtype == "float64" else f"-{dtype}.npy"
+    suffix = ".npy" if solving.dtype == "float64" else f"-{solving.dtype}.npy"
     with progress_line("solving") as report, termination():
 
         def solution_by(solver: "Callable[..., Solution]", name: str, policy: str) -> "Solution":
             return solver(
                 mdp,
-                tolerance,
+                solving,
                 progress=lambda sweeps, bound: report(f"{policy}sweep {sweeps}, error at most {bound:.2g}"),
                 values=None if values is None or ranks != 1 else values / f"{name}{suffix}",
-                **{"threads": threads, "processes": ranks, "checkpoint": checkpoint, "dtype": dtype, "blocks": blocks},
+                processes=ranks,
+                checkpoint=checkpoint,
             )
 
         solution = solution_by(value_iteration, "optimal", "")
@@ -94,8 +89,8 @@ def solve(
         "gamma": solution.gamma,
         "horizon": solution.horizon,
         **{name: getattr(chance, name) for name in ACTING},
-        "tolerance": tolerance,
-        "dtype": dtype,
+        "tolerance": solving.tolerance,
+        "dtype": solving.dtype,
         "processes": int(processes) if processes.isdigit() and processes != "1" else ranks,
         "uniform_error_bound": uniform.error_bound,
         "uniform_seconds": uniform.seconds,

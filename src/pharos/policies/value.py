@@ -352,7 +352,7 @@ class ObserverOptions(TypedDict, total=False):
 def evaluate_policy(
     mdp: TabularMDP,
     policy: PolicyLike,
-    tolerance: float = 1e-6,
+    tolerance: float | solvers.Solving = 1e-6,
     *,
     horizon: int | None = None,
     observation: object = None,
@@ -370,7 +370,7 @@ def evaluate_policy(
             function from an array of state indices to either. Or a policy that sees observations: a model of
             Stable-Baselines3, or, with `observation`, a function of a batch of observations that returns (N, A)
             probabilities or (N,) actions. One with a memory has no values of states, see `training.evaluate_agent`.
-        tolerance: every value is within this of the true one, proven.
+        tolerance: every value is within this of the true one, proven. Or the options of `pharos.solvers.Solving`.
         horizon: number of steps to go, instead of the MDP's own.
         observation: what the policy sees, a name or an Observation; of models "vector" when not given.
         processes: that share the work, for policies over states; see `pharos.value_iteration`.
@@ -390,16 +390,18 @@ def evaluate_policy(
     """
     if isinstance(policy, TabularAgent):
         policy = policy.policy_table()
+    options: solvers.SolvingOptions = {} if horizon is None else {"horizon": horizon}
+    solving = solvers.Solving.of(mdp, tolerance, options if processes == 1 else {**options, "processes": processes})
     if observation is not None or isinstance(policy, Policy | RecurrentPolicy | SB3Model):
-        if processes != 1:
+        if solving.is_distributed:
             raise ParameterError("a policy that sees observations is evaluated by one process; expected processes=1")
-        timed = mdp if horizon is None else mdp.with_horizon(horizon)
-        return _solution_of_reached(timed, policy, tolerance, observation=observation or "vector", **observer_options)
+        timed = mdp.with_horizon(solving.horizon)
+        return _solution_of_reached(timed, policy, solving, observation=observation or "vector", **observer_options)
     if observer_options:
         raise ParameterError(
             f"{', '.join(observer_options)} given for a policy that sees no observations; name the observation"
         )
-    return solvers.evaluate_policy(mdp, policy, tolerance, horizon=horizon, processes=processes)
+    return solvers.evaluate_policy(mdp, policy, solving)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -423,7 +425,7 @@ class ReachedSolution(Solution):
 def _solution_of_reached(
     mdp: TabularMDP,
     policy: PolicyLike,
-    tolerance: float = 1e-6,
+    tolerance: float | solvers.Solving = 1e-6,
     *,
     observation: object = "vector",
     observation_options: Mapping[str, object] | None = None,

@@ -1,20 +1,29 @@
 """Solving: optimal values and values of given policies, each with an error bound that is proven and met."""
 
-from pharos.solvers.policy_iteration import chain
-from pharos.solvers.solution import ReferenceValues, Solution, cumulative_expected_regret, regret, regret_scale
-from pharos.solvers.values import (
-    TablePolicy,
-    evaluate_parts,
-    evaluate_policy,
-    uniform_policy,
-    uniform_value,
-    value_iteration,
-    worst_value,
-)
+from typing import TYPE_CHECKING
+
+from pharos.system import lazy
+
+if TYPE_CHECKING:
+    from pharos.solvers.options import Solving, SolvingOptions
+    from pharos.solvers.policy_iteration import chain
+    from pharos.solvers.solution import ReferenceValues, Solution, cumulative_expected_regret, regret, regret_scale
+    from pharos.solvers.values import (
+        TablePolicy,
+        evaluate_parts,
+        evaluate_policy,
+        uniform_policy,
+        uniform_value,
+        value_iteration,
+        worst_value,
+    )
 
 __all__ = [
     "Solution",
+    "Solving",
     "evaluate_policy",
     "uniform_value",
     "value_iteration",
 ]
+
+__getattr__ = lazy.attributes(__name__)

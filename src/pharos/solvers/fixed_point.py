@@ -158,26 +158,20 @@ class Backup(Generic[M]):
 
 
 def fixed_point(
-    mdp: TabularMDP,
-    select: Selection,
+    backup: Backup[TabularMDP],
     tolerance: float,
     progress: Callable[[int, float], None] | None = None,
     x: np.ndarray | None = None,
-    threads: int = 1,
-    dtype: DTypeLike = np.float64,
 ) -> FixedPoint:
     """Sweep until the proven bound is at most the tolerance.
 
     Args:
-        x: (S + 1, W) of `dtype`, where to sweep, from any finite values; None: from zeros.
-        threads: of a sweep.
-        dtype: float64; or float32, values that are swept and nothing else.
-
+        x: (S + 1, W) of the backup's dtype, where to sweep, from any finite values; None: from zeros.
     Raises:
         DivergenceError: gamma is 1, and a state can be visited again, so that the value may be infinite.
         PrecisionError: floats cannot reach the tolerance.
     """
-    backup = Backup(mdp, select, threads, dtype)
+    mdp, select = backup.mdp, backup.select
     if mdp.gamma == 1.0 or mdp.age is not None:
         return _in_one_pass(backup, tolerance, progress, x)
     convergence = Convergence(mdp, backup, tolerance, progress)
@@ -214,7 +208,8 @@ def _in_single(backup: Backup[TabularMDP], convergence: Convergence, x: np.ndarr
         if convergence.is_met(backup.bound(change, backup.rounding(backup.size(largest + change)))):
             return FixedPoint(x, convergence.bound, convergence.sweeps)
         if convergence.is_endless():
-            result = fixed_point(backup.mdp, backup.select, tolerance, convergence.progress, None, backup.threads)
+            double = Backup(backup.mdp, backup.select, backup.threads)
+            result = fixed_point(double, tolerance, convergence.progress)
             with np.errstate(over="ignore"):
                 x[:] = result.x
             bound = (result.bound + backup.stored(largest_of(result.x))) * MARGIN

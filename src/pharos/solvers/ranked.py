@@ -23,7 +23,6 @@ All ranks run the same loop and see the same numbers, so they stop after the sam
 """
 
 import contextlib
-import os
 import time
 import warnings
 from collections.abc import Callable
@@ -38,6 +37,7 @@ from pharos.mdp import Part, Selection, TabularMDP, runs_between, runs_of, share
 from pharos.ranks import Halo, Rank, check_processes, check_ranks, cuts_of, run_spmd
 from pharos.solvers.convergence import Convergence
 from pharos.solvers.fixed_point import Backup, bound_of_steps, largest_of, within_residual
+from pharos.solvers.options import Solving
 from pharos.solvers.solution import Solution
 from pharos.system import storage
 from pharos.system.compiling import Stopwatch
@@ -332,23 +332,18 @@ def ranked_induction(
 def shared_solution(
     mdp: TabularMDP,
     select: Selection,
-    tolerance: float,
-    horizon: int | None,
-    processes: int | str,
-    checkpoint: str | os.PathLike | None,
-    progress: Callable[[int, float], None] | None = None,
+    solving: Solving,
     checkpoint_seconds: float = SECONDS,
 ) -> Solution:
     """Solution of an MDP under a selection of actions, by several processes; under MPI the others get None.
 
     Args:
-        processes: 1; or "mpi": those that `mpiexec` has started, all of which make the call.
-        checkpoint: a folder for the values so far; None to keep none.
-        checkpoint_seconds: between two of them.
+        checkpoint_seconds: between two checkpoints.
     """
-    check_processes(processes)
+    check_processes(solving.processes)
     watch = Stopwatch()
-    folder = None if checkpoint is None else Path(checkpoint)
+    horizon, progress = solving.horizon, solving.progress
+    folder = None if solving.checkpoint is None else Path(solving.checkpoint)
     if folder is not None and folder.exists() and not folder.is_dir():
         raise ParameterError(f"checkpoint {folder}: is a file; expected a folder")
 
@@ -357,7 +352,7 @@ def shared_solution(
         file = SolverCheckpoint(folder, question, checkpoint_seconds)
         backup = RankedBackup(mdp, select, rank)
         if horizon is None:
-            bound, sweeps = ranked_fixed_point(backup, tolerance, file, progress)
+            bound, sweeps = ranked_fixed_point(backup, solving.tolerance, file, progress)
             next_x = x = backup.gathered(backup.x)
         else:
             sweeps = horizon
@@ -366,7 +361,7 @@ def shared_solution(
         file.finish(backup)
         return None if x is None or next_x is None else (bound, sweeps, x, next_x)
 
-    answer = run_spmd(processes, program)
+    answer = run_spmd(solving.processes, program)
     if answer is None:
         return cast(Any, None)
     bound, sweeps, x, next_x = answer

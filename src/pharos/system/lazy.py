@@ -25,7 +25,8 @@ def attributes(package: str) -> Callable[[str], object]:
 
     @functools.cache
     def places() -> dict[str, tuple[str, str]]:
-        tree = ast.parse(Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8"))
+        module = sys.modules[package]
+        tree = ast.parse(module.__loader__.get_source(package))  # type: ignore[union-attr]  # also inside of a zip
         blocks = [node for node in tree.body if isinstance(node, ast.If)]
         imports = [node for block in blocks for node in block.body if isinstance(node, ast.ImportFrom)]
         return {alias.asname or alias.name: (str(node.module), alias.name) for node in imports for alias in node.names}
