@@ -42,6 +42,8 @@ TESTED_BY = {  # path in src/pharos: weight of its faults (kernels compile again
     "mdp/actions.py": (1.0, "test_mdp test_dynamics test_q_learning test_solvers test_policies"),
     "mdp/rewards.py": (1.0, "test_mdp test_solvers"),
     "mdp/tabular.py": (1.0, "test_mdp test_natural_arguments test_dynamics"),
+    "mdp/construction.py": (1.0, "test_mdp test_natural_arguments"),
+    "mdp/reachability.py": (1.0, "test_mdp test_dynamics"),
     "mdp/arguments.py": (1.0, "test_mdp test_natural_arguments test_dynamics"),
     "solvers/fixed_point.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/policy_iteration.py": (1.0, "test_error_bounds test_solvers"),

@@ -13,7 +13,12 @@ import pharos
 from naive.mdp import absorbing, augmented, is_over
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.mdp import TabularMDP, random_actions, sticky_actions
+from pharos.mdp import (
+    TabularMDP,
+    random_actions,
+    states_within,
+    sticky_actions,
+)
 from refusals import refusal
 from strategies import examples, small_mdps
 
@@ -208,7 +213,7 @@ def test_the_action_gap_is_as_regular_as_all_gaps_say(mdp, zeta):
     solution = pharos.value_iteration(mdp, 1e-9)
     found = hardness.action_gap_regularity(mdp, solution, zeta=zeta)
     gaps = []
-    reached = mdp.states_within()
+    reached = states_within(mdp)
     if not mdp.is_sticky:
         for s in range(mdp.num_states):
             if reached[s] and not mdp.terminal[s]:

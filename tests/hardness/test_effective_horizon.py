@@ -15,7 +15,13 @@ from pharos import hardness
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.effective_horizon import LargeHorizon, SmallHorizon, parts_of
 from pharos.hardness.steps import TIE
-from pharos.mdp import TabularMDP, random_actions, sticky_actions
+from pharos.mdp import (
+    TabularMDP,
+    mdp_within,
+    random_actions,
+    states_within,
+    sticky_actions,
+)
 from refusals import refusal
 from strategies import FEW, deterministic_mdps, examples, general_mdps, outcome_mdps
 
@@ -196,11 +202,11 @@ def test_a_report_with_a_horizon_has_it_and_one_without_says_what_is_missing():
 )
 def test_states_that_no_episode_meets_do_not_matter(mdp, chance, steps):
     mdp = random_actions(sticky_actions(mdp, chance.get("sticky", 0.0)), chance.get("random", 0.0))
-    whole, part = (parts_of(SmallHorizon(each, steps)) for each in (mdp, mdp.within(steps)))
+    whole, part = (parts_of(SmallHorizon(each, steps)) for each in (mdp, mdp_within(mdp, steps)))
     for name in whole:
         assert part[name] == pytest.approx(whole[name], rel=1e-9, abs=1e-12), name
     if not chance and mdp.next_states is not None:
-        whole, part = (parts_of(LargeHorizon(each, steps, TIE)) for each in (mdp, mdp.within(steps)))
+        whole, part = (parts_of(LargeHorizon(each, steps, TIE)) for each in (mdp, mdp_within(mdp, steps)))
         assert part == whole
 
 
@@ -213,7 +219,7 @@ def test_the_limit_of_memory_is_what_is_free_in_the_container(monkeypatch):
 @pytest.mark.slow
 def test_a_freeway_is_analysed_for_the_states_that_an_episode_meets():
     mdp = pharos.build(pharos.make("freeway", num_cars=8, lane_length=7)).mdp(gamma=1.0)
-    met = int(mdp.states_within(99).sum())
+    met = int(states_within(mdp, 99).sum())
     found = hardness.effective_horizon(mdp, horizon=100)
     assert found.num_states == met < mdp.num_states / 5
     assert found.optimal_return == pharos.value_iteration(mdp.with_horizon(100)).value_at_start

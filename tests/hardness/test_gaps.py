@@ -13,7 +13,12 @@ from naive.gaps import naive_gaps
 from pharos import hardness
 from pharos.errors import ParameterError, PrecisionError
 from pharos.hardness.gaps import resolved_gaps, same_outcomes
-from pharos.mdp import TabularMDP, random_actions, sticky_actions
+from pharos.mdp import (
+    TabularMDP,
+    random_actions,
+    states_within,
+    sticky_actions,
+)
 from strategies import deterministic_mdps, examples, small_mdps
 
 TOLERANCE = 1e-7
@@ -144,7 +149,7 @@ def exact_gaps(mdp):
         if better == policy:
             break
         policy = better
-    reached = np.flatnonzero(mdp.states_within() & ~mdp.terminal)
+    reached = np.flatnonzero(states_within(mdp) & ~mdp.terminal)
     return [max(q[s]) - each for s in reached for each in q[s]]
 
 

@@ -23,6 +23,7 @@ from pharos.mdp import (
     TabularMDP,
     chosen_mass,
     lazy_actions,
+    pairs_within,
     random_actions,
     runs_of,
     sticky_actions,
@@ -285,12 +286,12 @@ def test_pairs_that_can_be_met_are_those_of_the_explicit_matrices(mdp):
         later |= following
         reached = reached | following
     expected = later[:-1].reshape(mdp.num_states, mdp.num_actions + 1)[:, :-1]
-    assert (mdp.pairs_within() == expected).all()
+    assert (pairs_within(mdp) == expected).all()
 
 
 def test_where_every_action_is_repeated_only_first_actions_go_on():
     mdp = sticky_actions(TabularMDP.from_arrays([[1, 2], [2, 0], [0, 1]], np.zeros((3, 2))), 1.0)
-    assert mdp.pairs_within().all()
+    assert pairs_within(mdp).all()
 
 
 @pytest.mark.parametrize(
@@ -307,7 +308,7 @@ def test_where_every_action_is_repeated_only_first_actions_go_on():
 )
 def test_pairs_within_some_steps_end_with_those_of_the_last_step(sticky, steps, pairs):
     one_way = TabularMDP.from_arrays([[1, 3], [2, 0], [2, 2], [3, 3]], np.zeros((4, 2)))
-    assert sticky_actions(one_way, sticky).pairs_within(steps).tolist() == pairs
+    assert pairs_within(sticky_actions(one_way, sticky), steps).tolist() == pairs
 
 
 @examples(80, probabilities, probabilities, st.integers(0, 2**32))

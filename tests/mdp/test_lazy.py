@@ -13,7 +13,16 @@ from naive import mdp as naive_mdp
 from pharos import exporters, hardness, importers, study
 from pharos.errors import ParameterError, UnknownName
 from pharos.interaction import GymEnv, make_vec
-from pharos.mdp import Lazy, TabularMDP, lazy_actions, minimize, random_actions, sticky_actions
+from pharos.mdp import (
+    Lazy,
+    TabularMDP,
+    lazy_actions,
+    mdp_within,
+    minimize,
+    random_actions,
+    states_within,
+    sticky_actions,
+)
 from pharos.rules.stepping import InterpretedStepping
 from pharos.solvers import evaluate_policy, value_iteration, worst_value
 from pharos.training import ChanceSetting, Task
@@ -97,8 +106,8 @@ def test_the_rules_say_what_staying_pays(grid):
     stays = np.array([[env.reward(state, a, state) for a in range(env.num_actions)] for state in states])
     assert (stays != mdp.rewards).any()
     np.testing.assert_allclose(lazy_actions(mdp, p).rewards, (1 - p) * mdp.rewards + p * stays, rtol=0, atol=1e-15)
-    near = mdp.within(2)
-    kept = np.flatnonzero(mdp.states_within(2))
+    near = mdp_within(mdp, 2)
+    kept = np.flatnonzero(states_within(mdp, 2))
     np.testing.assert_array_equal(lazy_actions(near, p).rewards, lazy_actions(mdp, p).rewards[kept])
     doubled = grid.mdp(rewards=lambda self, state, action, next_state: 2.0 * (next_state[0] == state[0]))
     assert (lazy_actions(doubled, p).rewards == (1 - p) * doubled.rewards + p * 2.0).all()

@@ -11,7 +11,14 @@ from scipy import sparse
 import pharos
 from naive import mdp as naive_mdp
 from pharos.errors import ParameterError
-from pharos.mdp import Rewards, TabularMDP, random_actions, sticky_actions
+from pharos.mdp import (
+    Rewards,
+    TabularMDP,
+    mdp_within,
+    random_actions,
+    states_within,
+    sticky_actions,
+)
 from pharos.mdp.rewards import RewardsCollector
 from pharos.solvers import uniform_value, value_iteration, worst_value
 from refusals import refusal
@@ -184,14 +191,14 @@ def test_a_state_space_becomes_an_mdp_with_its_own_or_other_rewards(tmp_path):
 @pytest.mark.slow
 @examples(100, small_mdps(), st.integers(1, 6))
 def test_states_that_an_episode_cannot_meet_do_not_matter_to_it(mdp, steps):
-    found = mdp.within(steps)
+    found = mdp_within(mdp, steps)
     met = {int(s) for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True) if p > 0}
     frontier = set(met)
     for _ in range(steps):
         pairs = [(s, a) for s in frontier for a in range(mdp.num_actions)]
         frontier = {t for s, a in pairs for t, p in naive_mdp.outcomes(mdp, s, a) if t >= 0 and p > 0} - met
         met |= frontier
-    assert set(np.flatnonzero(mdp.states_within(steps))) == met
+    assert set(np.flatnonzero(states_within(mdp, steps))) == met
     assert found.num_states == len(met | set(mdp.start_states.tolist()))
     for solve in (value_iteration, uniform_value, worst_value):
         whole, part = (solve(each.with_gamma(1.0).with_horizon(steps)) for each in (mdp, found))
@@ -200,9 +207,9 @@ def test_states_that_an_episode_cannot_meet_do_not_matter_to_it(mdp, steps):
 
 def test_an_mdp_whose_states_are_all_met_stays_itself_and_a_smaller_one_has_other_numbers():
     line = TabularMDP.from_arrays([[1], [2], [3], [3]], [[0.0], [0.0], [1.0], [0.0]], initial=1)
-    assert line.with_initial(0).within(3).num_states == 4
+    assert mdp_within(line.with_initial(0), 3).num_states == 4
     mdp = line.with_initial(0)
-    assert mdp.within(3) is mdp
-    part = line.within(1)
+    assert mdp_within(mdp, 3) is mdp
+    part = mdp_within(line, 1)
     assert part.next_states.tolist() == [[1], [1]] and part.rewards.tolist() == [[0.0], [1.0]] and part.initial == 0
     assert part.folder is None and not part.terminal.any()

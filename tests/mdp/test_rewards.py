@@ -16,7 +16,14 @@ import pharos
 from naive import exact as naive_exact
 from pharos import hardness
 from pharos.errors import PrecisionError
-from pharos.mdp import Part, TabularMDP, lazy_actions, minimize, ranged_rewards
+from pharos.mdp import (
+    Part,
+    TabularMDP,
+    lazy_actions,
+    mdp_within,
+    minimize,
+    ranged_rewards,
+)
 from pharos.mdp.rewards import Rewards
 from pharos.policies import TableAnswers, table_values, walk_values
 from pharos.solvers import evaluate_policy, value_iteration, worst_value
@@ -120,7 +127,7 @@ def test_a_hundred_small_chances_of_staying_that_round_to_none_are_counted():
     solution = value_iteration(mdp)
     error = abs(Fraction(float(solution.v[0])) - (-1 + truth - (1 - truth)))
     assert 90 * Fraction(2.0**-53) < error <= Fraction(solution.error_bound)
-    near = mdp.within(2)
+    near = mdp_within(mdp, 2)
     assert near is mdp and mdp.dynamics.restricted_to(np.arange(2)).operations == mdp.dynamics.operations
     assert Part.of(mdp, 0, 2).dynamics.operations == mdp.dynamics.operations
 
@@ -214,7 +221,7 @@ def test_every_mdp_made_of_another_keeps_the_rounding_of_its_rewards():
     assert rounding > 0
     answers = TableAnswers(np.ones((2, 1)), mdp)
     answers.reach(None, mdp.horizon)
-    made = [mdp.within(1), minimize(mdp).mdp, answers.reached_mdp()[0], Part.of(mdp, 0, 1), lazy_actions(mdp, 0.5)]
+    made = [mdp_within(mdp, 1), minimize(mdp).mdp, answers.reached_mdp()[0], Part.of(mdp, 0, 1), lazy_actions(mdp, 0.5)]
     assert [each.reward_table.rounding for each in made] == [rounding] * len(made)
     assert Backup(mdp, value_iteration(mdp).select).rounding(0.0) >= rounding
     assert table_values(mdp, [np.zeros(2, int)])[0].error_bound >= 5 * 0.9**4 * rounding

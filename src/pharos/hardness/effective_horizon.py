@@ -29,7 +29,15 @@ from pharos.hardness.gaps import optimal_solution, solved
 from pharos.hardness.gorp import gorp_bound
 from pharos.hardness.interval import fields_of
 from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
-from pharos.mdp import STEPS, ExpandedMDP, TabularMDP, require_mdp, whole_number
+from pharos.mdp import (
+    STEPS,
+    ExpandedMDP,
+    TabularMDP,
+    mdp_within,
+    require_mdp,
+    states_within,
+    whole_number,
+)
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
 from pharos.system import memory
 
@@ -115,7 +123,7 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
     """
     steps = steps_of("effective_horizon", mdp, horizon)
     check_returns("effective_horizon", mdp, steps)
-    mdp = mdp.within(steps)
+    mdp = mdp_within(mdp, steps)
     compiled = applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > COMPILED
     parts = parts_of(LargeHorizon(mdp, steps, TIE) if compiled else SmallHorizon(mdp, steps))
     bound = gorp_bound(mdp, horizon=steps, max_k=tight).value if tight else None
@@ -312,7 +320,7 @@ class LargeHorizon:
         small = np.int32 if states < 2**31 else np.int64
         self.nodes = (np.empty(states, small), np.empty(states, small))
         self.is_visited = np.zeros(states, np.bool_)
-        self.num_visitable = int(mdp.states_within(steps - 1).sum())
+        self.num_visitable = int(states_within(mdp, steps - 1).sum())
 
     def _at_start(self, values: np.ndarray) -> float:
         return float(sum(p * values[s] for s, p in self.starts))

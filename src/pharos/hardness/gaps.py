@@ -26,7 +26,15 @@ import numpy as np
 from pharos.errors import ParameterError, PrecisionError
 from pharos.hardness.interval import Certified, fields_of
 from pharos.kernels import gaps as kernels
-from pharos.mdp import BEST, BellmanEquation, TabularMDP, require_mdp
+from pharos.mdp import (
+    BEST,
+    BellmanEquation,
+    TabularMDP,
+    lone_starts,
+    nodes_after,
+    nodes_within,
+    require_mdp,
+)
 from pharos.solvers import Solution, value_iteration
 from pharos.system.memory import large_zeros
 
@@ -105,9 +113,9 @@ def steps_of(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
     later (S,): 1 for a reachable state, under sticky actions the number of actions by which it can be
     reached; first (S,) bool: start states, which count once more under sticky actions, without a previous action.
     """
-    lone = mdp.lone_starts
+    lone = lone_starts(mdp)
     if solution.horizon is None:
-        yield Step(solution.x, solution.x, mdp.nodes_within().sum(axis=1), lone)
+        yield Step(solution.x, solution.x, nodes_within(mdp).sum(axis=1), lone)
         return
     all_steps = _all_steps(mdp, solution)
     nodes = np.zeros((mdp.num_states, mdp.width), np.bool_)
@@ -116,7 +124,7 @@ def steps_of(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
         to_go = solution.horizon - step + 1
         own, next_x = (_with_end(all_steps[n]) for n in (to_go, to_go - 1))
         yield Step(own, next_x, nodes.sum(axis=1), lone)
-        nodes, lone = mdp.nodes_after(nodes, lone), np.zeros_like(lone)
+        nodes, lone = nodes_after(mdp, nodes, lone), np.zeros_like(lone)
 
 
 def _all_steps(mdp: TabularMDP, solution: Solution) -> np.ndarray:

@@ -16,7 +16,12 @@ from numpy.typing import ArrayLike
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.visitation import Propagation, drawn, standard_occupancy
-from pharos.mdp import TabularMDP, whole_number
+from pharos.mdp import (
+    TabularMDP,
+    mdp_within,
+    states_within,
+    whole_number,
+)
 from pharos.solvers import Solution, chain, evaluate_policy, regret_scale, uniform_value, value_iteration
 
 MOST_EXACT = 4096
@@ -446,10 +451,10 @@ class IdealisedLearner:
         if math.isnan(self.spread):
             raise UndefinedMeasure(f"{self.measure}: uniform play is optimal, so that there is no regret to speak of")
         self.whole = self.mdp = mdp
-        is_reachable = mdp.states_within(episode)
+        is_reachable = states_within(mdp, episode)
         is_reachable[mdp.start_states] = True
         if mdp.horizon is not None and mdp.horizon == episode and not is_reachable.all():
-            self.mdp, numbers = mdp.within(episode), np.flatnonzero(is_reachable)
+            self.mdp, numbers = mdp_within(mdp, episode), np.flatnonzero(is_reachable)
             self.states = np.flatnonzero(~np.asarray(self.mdp.terminal))
             self.numbers = numbers[self.states]
         else:

@@ -12,7 +12,13 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.hardness.gaps import gaps_of_states, optimal_solution
 from pharos.hardness.interval import Certified
-from pharos.mdp import Chance, TabularMDP, require_mdp
+from pharos.mdp import (
+    Chance,
+    TabularMDP,
+    lone_starts,
+    nodes_within,
+    require_mdp,
+)
 from pharos.solvers import Solution
 
 # States at once: values of all their outcomes are in memory.
@@ -53,7 +59,7 @@ def certified_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> C
     if mdp.is_deterministic:
         return Certified(0.0, 0.0, 0.0, True)
     live = ~np.asarray(mdp.terminal)
-    nodes, lone = mdp.nodes_within(), mdp.lone_starts
+    nodes, lone = nodes_within(mdp), lone_starts(mdp)
     states, largest = np.flatnonzero((lone | nodes.any(axis=1)) & live), 0.0
     size = float(np.abs(solution.x).max(initial=0.0))
     scale = 2.0 ** math.frexp(size)[1] if 0 < size < math.inf else 1.0  # squares of 1e160 and 1e-170 are no floats

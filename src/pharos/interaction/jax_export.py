@@ -9,7 +9,7 @@ from pharos.environments import Environment
 from pharos.errors import MissingExtra, ParameterError
 from pharos.mdp import TabularMDP
 from pharos.observations import observe
-from pharos.state_space import StateSpace, load
+from pharos.state_space import StateSpace
 
 if TYPE_CHECKING:
     from pharos.interaction.gymnax_env import GymnaxEnv
@@ -52,13 +52,7 @@ def to_gymnax(
     mdp = source.mdp(gamma=1.0) if isinstance(source, StateSpace) else source
     if not isinstance(mdp, TabularMDP):
         raise ParameterError(f"to_gymnax: found {source!r}; expected a StateSpace or a TabularMDP")
-    space = (
-        source
-        if isinstance(source, StateSpace)
-        else None
-        if mdp.folder is None
-        else load(mdp.folder, verify=False, environment=mdp.environment)
-    )
+    space = mdp.space
     env = None if space is None else space.environment
     limit = time_limit or mdp.horizon or (env.max_episode_steps if env is not None else None)
     if limit is None:

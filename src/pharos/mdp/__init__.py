@@ -36,6 +36,15 @@ if TYPE_CHECKING:
     )
     from pharos.mdp.expanded import ExpandedMDP, executed_actions, mean_of_actions, nodes_of_outcomes, outcomes_of
     from pharos.mdp.matrices import lacking
+    from pharos.mdp.reachability import (
+        Part,
+        lone_starts,
+        mdp_within,
+        nodes_after,
+        nodes_within,
+        pairs_within,
+        states_within,
+    )
     from pharos.mdp.rewards import (
         PaidOutcomes,
         Rewards,
@@ -48,7 +57,7 @@ if TYPE_CHECKING:
     )
     from pharos.mdp.row_sums import Residual, normalized_rows
     from pharos.mdp.table import Lazy, Matrices, OutcomeTable, Table
-    from pharos.mdp.tabular import Part, TabularMDP
+    from pharos.mdp.tabular import TabularMDP
 
 __all__ = [
     "Chance",

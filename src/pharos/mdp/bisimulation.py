@@ -128,7 +128,7 @@ def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -
         reward_table=Rewards.from_array(mdp.reward_table.rows(representatives), mdp.reward_table.rounding),
         terminal=np.asarray(mdp.terminal)[representatives],
         folder=None,
-        environment=None,
+        space=None,
         is_numbered=False,
         age=None,
         staying=None if mdp.staying is None else _lost,

@@ -429,12 +429,8 @@ def paid_outcomes(mdp: "TabularMDP") -> PaidOutcomes:
 
 def _outcomes_of_environment(mdp: "TabularMDP") -> PaidOutcomes | None:
     """Outcomes with rewards by the rules, where the MDP has chance and is of an environment; else None."""
-    from pharos.state_space import load
-
-    if mdp.folder is None or mdp.dynamics.is_deterministic:
-        return None
-    space = load(mdp.folder, verify=False, environment=mdp.environment)
-    if space.environment is None:
+    space = mdp.space
+    if space is None or space.environment is None or mdp.dynamics.is_deterministic:
         return None
     rows, stays = np.arange(space.num_states * space.num_actions), mdp.laziness
     if space.has_chance:

@@ -1,7 +1,4 @@
-"""TabularMDP: next states, rewards, discount, start distribution, and chance that stays implicit.
-
-Also the states of an MDP that can be reached from its start, and the pairs of a state and the action before.
-"""
+"""TabularMDP: next states, rewards, discount, start distribution, and chance that stays implicit."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -14,25 +11,18 @@ import numpy.typing as npt
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.mdp.actions import Chance, PolicyTable, Selection
+from pharos.mdp import construction
+from pharos.mdp.actions import Chance
 from pharos.mdp.arguments import (
     check_gamma,
     check_horizon,
-    checked_next_states,
     start_of,
-    terminal_states,
 )
 from pharos.mdp.dynamics import Dynamics, TopologicalOrder
-from pharos.mdp.matrices import expected_rewards, transitions_of
-from pharos.mdp.rewards import Rewards, expected_over_outcomes, rewards_of_shape
+from pharos.mdp.rewards import Rewards, rewards_of_shape
 from pharos.mdp.row_sums import Residual
 from pharos.mdp.table import (
     Lazy,
-    Matrices,
-    OutcomeTable,
-    Table,
-    checked_outcomes,
-    compact_outcomes,
 )
 from pharos.system.arrays import Indices
 
@@ -58,8 +48,8 @@ class TabularMDP:
         horizon: number of steps T after which an episode ends, or None.
         start_states, start_probabilities: the start distribution.
         chance: weights of the chosen, the previously executed and a uniform action.
-        folder: of the state space, where there is one.
-        environment: the one that the states are of, where it is known.
+        folder: of the state space, or of an imported table; None: in no folder.
+        space: the state space that the states are of, if there is one.
         is_numbered: whether states have the numbers that they were given with; not after some were merged.
         age: (S,) integers that each transition out of a state that is not terminal makes larger; None where they are
             not known. Solvers take the states in this order then, once.
@@ -78,7 +68,7 @@ class TabularMDP:
     folder: Path | None = None
     age: np.ndarray | None = None
     staying: Callable[[], Rewards] | None = None
-    environment: Environment | None = None
+    space: "StateSpace | None" = None
     residual: Residual = field(default_factory=Residual)
     is_numbered: bool = True
 
@@ -97,160 +87,17 @@ class TabularMDP:
 
     # Making one -------------------------------------------------------------------------------------------------------
 
-    @staticmethod
-    def from_arrays(
-        next_states: npt.ArrayLike,
-        rewards: npt.ArrayLike,
-        *,
-        gamma: float = 0.99,
-        initial: npt.ArrayLike = 0,
-        horizon: int | None = None,
-        terminal: npt.ArrayLike | None = None,
-    ) -> "TabularMDP":
-        """A deterministic MDP from arrays.
-
-        Args:
-            next_states: (S, A) integers in [-1, S); -1 ends the episode after the transition's reward.
-            rewards: (S, A) finite numbers.
-            gamma: discount, in [0, 1].
-            initial: a start state, a sequence of equally likely ones (fewer than S), or (S,) probabilities.
-            horizon: number of steps of an episode, or None.
-            terminal: (S,) bool, the terminal states, whose rows must lead to themselves (or be -1) with reward 0; None:
-                the states whose whole row is -1 with reward 0.
-        Raises:
-            ParameterError: a shape, an index, a reward, gamma or the start distribution is wrong; the first such entry
-                is named.
-        """
-        table = checked_next_states(next_states)
-        reward_table = rewards_of_shape(rewards, table.shape)
-        silent = (reward_table.array == 0).all(axis=1)
-        own = np.arange(len(table), dtype=table.dtype)[:, None]
-        stays = ((table == own) | (table == -1)).all(axis=1)
-        mask = terminal_states(terminal, (table == -1).all(axis=1) & silent, stays & silent)
-        states, probabilities = start_of(initial, len(table))
-        return TabularMDP(Table(table), reward_table, mask, gamma, horizon, states, probabilities)
-
-    @staticmethod
-    def from_outcomes(
-        successors: npt.ArrayLike,
-        probabilities: npt.ArrayLike,
-        rewards: npt.ArrayLike,
-        *,
-        gamma: float = 0.99,
-        initial: npt.ArrayLike = 0,
-        horizon: int | None = None,
-        terminal: npt.ArrayLike | None = None,
-    ) -> "TabularMDP":
-        """An MDP in which each action has up to K outcomes, from arrays.
-
-        Args:
-            successors: (S, A, K) integers in [-1, S); -1 ends the episode after the transition's reward. Entries of
-                probability 0 count for nothing.
-            probabilities: (S, A, K) of the outcomes; each row sums to 1 within 1e-6, and is divided by its sum unless
-                that is 1 up to rounding.
-            rewards: (S, A) expected rewards; or (S, A, K), averaged.
-            gamma, initial, horizon, terminal: as in `from_arrays`.
-        Raises:
-            ParameterError: as in `from_arrays`, or a probability is not in [0, 1] or a row does not sum to 1.
-        """
-        table, chances, residuals = checked_outcomes(successors, probabilities)
-        means, largest = expected_over_outcomes(rewards, chances)
-        mdp = TabularMDP.from_outcome_table(
-            OutcomeTable(**compact_outcomes(table, chances)),
-            means,
-            gamma=gamma,
-            initial=initial,
-            horizon=horizon,
-            terminal=terminal,
-        )
-        return replace(mdp, residual=Residual.of(residuals, largest))
-
-    @staticmethod
-    def from_outcome_table(
-        dynamics: OutcomeTable,
-        rewards: npt.ArrayLike | Rewards,
-        *,
-        gamma: float = 0.99,
-        initial: npt.ArrayLike = 0,
-        horizon: int | None = None,
-        terminal: npt.ArrayLike | None = None,
-    ) -> "TabularMDP":
-        """An MDP on an existing table of outcomes, with expected rewards (S, A); see `from_outcomes`."""
-        num_states = dynamics.num_states
-        reward_table = rewards_of_shape(rewards, (num_states, dynamics.num_actions))
-        silent = (reward_table.array == 0).all(axis=1)
-        ends, stays = dynamics.ends_and_stays()
-        mask = terminal_states(terminal, ends & silent, stays & silent)
-        states, probabilities = start_of(initial, num_states)
-        return TabularMDP(dynamics, reward_table, mask, gamma, horizon, states, probabilities)
-
-    @staticmethod
-    def from_matrices(
-        P: object,
-        R: npt.ArrayLike,
-        *,
-        gamma: float = 0.99,
-        initial: npt.ArrayLike = 0,
-        horizon: int | None = None,
-        axes: str | None = None,
-        ends: npt.ArrayLike = False,
-    ) -> "TabularMDP":
-        """A general MDP from transition probabilities.
-
-        Args:
-            P: a list of A matrices (S, S), dense or sparse, one an action; or an array (S, A, S) of probabilities
-                P[s, a, t]; or a sparse (S A, S) matrix with rows s A + a. A row that sums to 1 within 1e-6 is divided
-                by its sum unless that is 1 up to rounding; `residual` has what that may change, and error bounds of
-                values count it.
-            R: expected rewards (S, A); or (S,) for every action alike; or one for each transition, in any form of P,
-                averaged over P.
-            gamma, initial, horizon: as in `from_arrays`.
-            axes: of arrays with three axes, "SAS" or "ASS" (also "SAS" of a list with one (A, S) matrix a state). It
-                must be given for an array with as many actions as states, which has the shape of both.
-            ends: whether a row that sums to less than 1 - 1e-6 ends the episode with the rest; or (S, A) probabilities
-                of ending, which are then part of the sums of rows.
-        Raises:
-            ParameterError: shapes do not fit, or a probability or reward is out of range; or a row does not sum to 1:
-                the message names the first one, and the likely reason.
-        """
-        matrix, num_actions, residuals = transitions_of(P, axes, ends)
-        dynamics = Matrices(matrix, num_actions)
-        shape = (dynamics.num_states, num_actions)
-        means, residual = expected_rewards(matrix, R, axes, num_actions, residuals)
-        reward_table = rewards_of_shape(means, shape)
-        ended = np.asarray(matrix.sum(axis=1)).reshape(shape) <= 1e-12
-        terminal = ended.all(axis=1) & (reward_table.array == 0).all(axis=1)
-        states, probabilities = start_of(initial, dynamics.num_states)
-        return TabularMDP(dynamics, reward_table, terminal, gamma, horizon, states, probabilities, residual=residual)
-
-    @staticmethod
-    def from_space(
-        space: "StateSpace", rewards: Rewards, gamma: float = 0.99, staying: Callable[[], Rewards] | None = None
-    ) -> "TabularMDP":
-        """The MDP on the states of a state space, with their ages where the class declares one.
-
-        `StateSpace.mdp` computes the rewards, and says how to compute those of staying.
-
-        Raises:
-            ParameterError: a transition leads to a state that is not older.
-        """
-        mdp = TabularMDP(
-            space.dynamics,
-            rewards,
-            space.terminal,
-            gamma,
-            None,
-            space.start_states,
-            space.start_probabilities,
-            folder=space.folder,
-            staying=staying,
-            environment=space.environment,
-            residual=Residual() if space.environment is None else Residual(*space.environment.residual),
-        )
-        has_age = space.environment is not None and space.environment.has_age
-        return mdp.with_age(space.ages) if has_age else mdp
+    from_arrays = classmethod(construction.from_arrays)
+    from_outcomes = classmethod(construction.from_outcomes)
+    from_outcome_table = classmethod(construction.from_outcome_table)
+    from_matrices = classmethod(construction.from_matrices)
 
     # What it is -------------------------------------------------------------------------------------------------------
+
+    @property
+    def environment(self) -> Environment | None:
+        """The environment that the states are of, if it is known."""
+        return None if self.space is None else self.space.environment
 
     @property
     def num_states(self) -> int:
@@ -338,61 +185,10 @@ class TabularMDP:
         """Whether some transition ends the episode without a next state."""
         return self.dynamics.has_ends
 
-    # Reachable states -------------------------------------------------------------------------------------------------
-
     @property
     def starts(self) -> np.ndarray:
         """(K,) the states that an episode may start in, ascending."""
         return np.unique(self.start_states[self.start_probabilities > 0])
-
-    def states_within(self, steps: int | None = None) -> np.ndarray:
-        """(S,) bool: the states that some actions lead to within `steps` steps (None: any number) from a start."""
-        return self.dynamics.reachable(self.starts, steps)
-
-    def pairs_within(self, steps: int | None = None) -> np.ndarray:
-        """(S, A) bool: pairs (state, previously executed action) that can be reached within `steps` steps of a start.
-
-        Chance decides which actions can be executed after which: where every action is a repetition, that of the first
-        step is executed always. Start states without a previous action are not among them.
-        """
-        is_reached = now = np.zeros((self.num_states, self.num_actions), np.bool_)
-        if self.chance.executes_any:
-            return (
-                is_reached if steps == 0 else self._arrivals(self.states_within(None if steps is None else steps - 1))
-            )
-        lone, level = np.zeros(self.num_states, np.bool_), 0
-        lone[self.starts] = True
-        while (lone.any() or now.any()) and (steps is None or level < steps):
-            now = self.nodes_after(now, lone) & ~is_reached
-            is_reached, lone, level = is_reached | now, np.zeros_like(lone), level + 1
-        return is_reached
-
-    def nodes_within(self, steps: int | None = None) -> np.ndarray:
-        """(S, W) bool: the nodes of values that can be reached within `steps` steps from a start: `pairs_within` under
-        sticky actions, else `states_within`. Start states without a previous action are not among them."""
-        return self.pairs_within(steps) if self.is_sticky else self.states_within(steps)[:, None]
-
-    def nodes_after(self, nodes: np.ndarray, lone: np.ndarray) -> np.ndarray:
-        """(S, W) bool: the nodes one step after nodes (S, W), or after start states `lone` (S,) with no action."""
-        if nodes.shape[1] < self.num_actions or self.chance.executes_any:
-            after = self._arrivals(nodes.any(axis=1) | lone)
-            return after if nodes.shape[1] == self.num_actions else np.asarray(after.any(axis=1, keepdims=True))
-        states, actions = np.nonzero(nodes & ~np.asarray(self.terminal)[:, None])  # every action is a repetition
-        outcomes = self.dynamics.outcomes(states, actions)
-        after = np.vstack([self._arrivals(lone), np.zeros_like(nodes[:1])])
-        after[outcomes.states, actions[outcomes.which]] = True
-        return after[:-1]
-
-    def _arrivals(self, is_visited: np.ndarray) -> np.ndarray:
-        """(S, A) bool: the pairs (state, executed action) one step after some states (S,) bool."""
-        return self.dynamics.arrivals(np.flatnonzero(is_visited & ~np.asarray(self.terminal)))
-
-    @property
-    def lone_starts(self) -> np.ndarray:
-        """(S,) bool: under sticky actions the start states, nodes of their own without a previous action."""
-        lone = np.zeros(self.num_states, np.bool_)
-        lone[self.starts] = self.is_sticky
-        return lone
 
     # Variants ---------------------------------------------------------------------------------------------------------
 
@@ -459,22 +255,6 @@ class TabularMDP:
             age = age[states]
         return TopologicalOrder(states, int(np.count_nonzero(age[1:] != age[:-1])))
 
-    def within(self, steps: int) -> "TabularMDP":
-        """The same MDP with only those states that can be reached within `steps` steps from a start, in their order.
-
-        Both agree on every episode of at most `steps` steps from the start: values there, returns, effective horizon.
-        Transitions of states that take all the steps to reach may be wrong: those that leave the set are replaced.
-
-        Returns:
-            This MDP where all of its states are reached; else one without a folder, as its states have other numbers.
-        Cost: one read of each transition of the reached states, and a copy of them.
-        """
-        is_reached = self.states_within(steps)
-        is_reached[self.start_states] = True
-        if is_reached.all():
-            return self
-        return restricted_to(self, np.flatnonzero(is_reached))
-
     def __repr__(self) -> str:
         kind = "" if self.dynamics.is_deterministic else "general, "
         chance = "" if self.chance == Chance() else f", {self.chance}"
@@ -487,86 +267,3 @@ class TabularMDP:
 
 def _as_is(rewards: Rewards) -> Rewards:
     return rewards
-
-
-def restricted_to(mdp: "TabularMDP", states: np.ndarray) -> "TabularMDP":
-    """The MDP of some states, ascending, the start states among them; they are numbered anew."""
-    number = np.full(mdp.num_states, -1, np.int64)
-    number[states] = np.arange(len(states))
-    return replace(
-        mdp,
-        dynamics=mdp.dynamics.restricted_to(states),
-        reward_table=mdp.reward_table.of(states),
-        staying=None if mdp.staying is None else partial(_some, mdp.staying, states),
-        terminal=np.asarray(mdp.terminal[states]),
-        start_states=number[mdp.start_states],
-        folder=None,
-        environment=None,
-        age=None,
-    )
-
-
-def _some(rewards: Callable[[], Rewards], states: np.ndarray) -> Rewards:
-    return rewards().of(states)
-
-
-# Parts ----------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """A part of an MDP: a contiguous range of its states, [start, stop), and the outside states whose values it needs.
-
-    Numbers of breadth-first search are local, so a range leads to few states outside of it, its *halo*: with 16 ranges
-    9 % of a range's rows on a Breakout of 2.4 million states, 0.03 % on a Freeway. Ranges are what several processes
-    sweep together (solvers/ranked.py).
-
-    Inside a part its own states have the numbers 0 .. n - 1, in order, and those of the halo n .. n + H - 1, ascending;
-    -1 is the end. Arrays of values have n + H + 1 rows, so the compiled sweeps run over parts as they are.
-
-    Attributes:
-        halo: (H,) int64, ascending: the states outside that these may lead to.
-        dynamics: of n states, whose next states may be in the halo. reward_table: (n, A).
-        gamma, chance: of the MDP.
-    """
-
-    start: int
-    stop: int
-    halo: np.ndarray
-    dynamics: Dynamics
-    reward_table: Rewards
-    gamma: float
-    chance: Chance
-
-    @staticmethod
-    def of(mdp: TabularMDP, start: int, stop: int) -> "Part":
-        """The states [start, stop) of an MDP. Copies their next states, renumbered."""
-        dynamics, halo = mdp.dynamics.part(start, stop)
-        rewards = mdp.reward_table.of(slice(start, stop))
-        return Part(start, stop, halo, dynamics, rewards, mdp.gamma, mdp.chance)
-
-    def __len__(self) -> int:
-        return self.stop - self.start
-
-    @property
-    def num_states(self) -> int:
-        """n."""
-        return len(self)
-
-    @property
-    def num_actions(self) -> int:
-        """A."""
-        return self.dynamics.num_actions
-
-    @property
-    def width(self) -> int:
-        """W: A previous actions under sticky actions, else 1."""
-        return self.chance.width(self.num_actions)
-
-    def zeros(self) -> np.ndarray:
-        """(n + H + 1, W) values: of its states, of the halo, of the end."""
-        return np.zeros((len(self) + len(self.halo) + 1, self.width))
-
-    def selection(self, select: Selection) -> Selection:
-        """The selection of actions in the states of this part, of a selection in the whole MDP."""
-        return select.of_states(slice(self.start, self.stop)) if isinstance(select, PolicyTable) else select

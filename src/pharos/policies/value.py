@@ -38,9 +38,7 @@ from pharos.policies.policy import (
     TabularAgent,
 )
 from pharos.solvers import Solution
-from pharos.state_space import load
 from pharos.system.arrays import as_array
-from pharos.system.mdp_files import is_folder
 
 # Histories whose frames are drawn at once
 BATCH = 512
@@ -478,12 +476,11 @@ def _solution_of_reached(
 
 def _observer_of(mdp: TabularMDP, observation: object, options: dict[str, object], previous_action: bool) -> Observer:
     """Observer of the states of an MDP; ParameterError if there is nothing to observe."""
-    is_table = mdp.folder is None or is_folder(mdp.folder)
-    if is_table and observation == "number" and mdp.environment is None and mdp.is_numbered:
+    space = mdp.space
+    if space is None and observation == "number" and mdp.is_numbered:
         if options or previous_action:
             raise ParameterError("the numbers of states of a table take no options, and no previous action besides")
         return NumberObserver.of(mdp.num_states)
-    space = None if is_table or not mdp.folder else load(mdp.folder, verify=False, environment=mdp.environment)
     if space is None or space.environment is None:
         raise ParameterError(
             f"{mdp}: is not of a state space whose environment is known, so there is nothing to observe but the number "

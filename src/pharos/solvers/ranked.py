@@ -1,6 +1,6 @@
 """Values by several processes: each sweeps a range of the states, and gets the values of its halo from the others.
 
-Each rank has a `Part` (mdp/tabular.py). A sweep goes in place over its own states, from the last to the first, with the
+Each rank has a `Part` (mdp/reachability.py). A sweep goes in place over its own states, from the last to the first, with the
 values that the halo had after the sweep before; messages bring those after it, and a reduction the largest change. So
 every new entry is a backup of entries that are old or already new, which is all that the error bound of fixed_point.py
 asks for: it holds with the largest change of all. Values cross the border of a range once a sweep, so there are more
@@ -154,7 +154,7 @@ class RankedBackup:
 
     Attributes:
         part: the states of this rank. backup: T on them; its factor and its rounding are those of the whole MDP.
-        x: (n + H + 1, W) values, see mdp/tabular.py. previous: those before the last sweep of a horizon.
+        x: (n + H + 1, W) values, see mdp/reachability.py. previous: those before the last sweep of a horizon.
         first: (R, 2) runs of its states that sweeps of a horizon begin with: those that others read, short gaps filled.
     """
 

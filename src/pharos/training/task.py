@@ -19,7 +19,11 @@ import numpy as np
 from pharos.agents import BATCHED, agent_kind, agent_source, is_known
 from pharos.environments import Environment, as_tuples, class_called, class_of, make, source_of
 from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
-from pharos.mdp import ChanceSetting, TabularMDP
+from pharos.mdp import (
+    ChanceSetting,
+    TabularMDP,
+    mdp_within,
+)
 from pharos.observations import OwnObservation, observation_of, registered
 from pharos.policies import Observer, ReachableRows, reachable_rows
 from pharos.solvers import ReferenceValues, Solution, uniform_value, value_iteration, worst_value
@@ -220,7 +224,7 @@ class Task:
 
     def _episodes(self, mdp: TabularMDP) -> TabularMDP:
         """The MDP of the states that an episode can visit: of a Freeway of a million states, some thousand."""
-        return mdp if self.horizon_steps is None else mdp.within(self.horizon_steps)
+        return mdp if self.horizon_steps is None else mdp_within(mdp, self.horizon_steps)
 
 
 def _range_of_returns(mdp: TabularMDP) -> tuple[float, float]:

@@ -1,0 +1,167 @@
+"""The states of an MDP that can be reached from its start, and MDPs of some of the states.
+
+A node is what a value belongs to: a state, or under sticky actions a pair of a state and the action executed before.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from pharos.mdp.actions import Chance, PolicyTable, Selection
+from pharos.mdp.dynamics import Dynamics
+from pharos.mdp.rewards import Rewards
+from pharos.mdp.tabular import TabularMDP
+
+
+def states_within(mdp: TabularMDP, steps: int | None = None) -> np.ndarray:
+    """(S,) bool: the states that some actions lead to within `steps` steps (None: any number) from a start."""
+    return mdp.dynamics.reachable(mdp.starts, steps)
+
+
+def pairs_within(mdp: TabularMDP, steps: int | None = None) -> np.ndarray:
+    """(S, A) bool: pairs (state, previously executed action) that can be reached within `steps` steps of a start.
+
+    Chance decides which actions can be executed after which: where every action is a repetition, that of the first
+    step is executed always. Start states without a previous action are not among them.
+    """
+    is_reached = now = np.zeros((mdp.num_states, mdp.num_actions), np.bool_)
+    if mdp.chance.executes_any:
+        return is_reached if steps == 0 else _arrivals(mdp, states_within(mdp, None if steps is None else steps - 1))
+    lone, level = np.zeros(mdp.num_states, np.bool_), 0
+    lone[mdp.starts] = True
+    while (lone.any() or now.any()) and (steps is None or level < steps):
+        now = nodes_after(mdp, now, lone) & ~is_reached
+        is_reached, lone, level = is_reached | now, np.zeros_like(lone), level + 1
+    return is_reached
+
+
+def nodes_within(mdp: TabularMDP, steps: int | None = None) -> np.ndarray:
+    """(S, W) bool: the nodes of values that can be reached within `steps` steps from a start: `pairs_within` under
+    sticky actions, else `states_within`. Start states without a previous action are not among them."""
+    return pairs_within(mdp, steps) if mdp.is_sticky else states_within(mdp, steps)[:, None]
+
+
+def nodes_after(mdp: TabularMDP, nodes: np.ndarray, lone: np.ndarray) -> np.ndarray:
+    """(S, W) bool: the nodes one step after nodes (S, W), or after start states `lone` (S,) with no action."""
+    if nodes.shape[1] < mdp.num_actions or mdp.chance.executes_any:
+        after = _arrivals(mdp, nodes.any(axis=1) | lone)
+        return after if nodes.shape[1] == mdp.num_actions else np.asarray(after.any(axis=1, keepdims=True))
+    states, actions = np.nonzero(nodes & ~np.asarray(mdp.terminal)[:, None])  # every action is a repetition
+    outcomes = mdp.dynamics.outcomes(states, actions)
+    after = np.vstack([_arrivals(mdp, lone), np.zeros_like(nodes[:1])])
+    after[outcomes.states, actions[outcomes.which]] = True
+    return after[:-1]
+
+
+def _arrivals(mdp: TabularMDP, is_visited: np.ndarray) -> np.ndarray:
+    """(S, A) bool: the pairs (state, executed action) one step after some states (S,) bool."""
+    return mdp.dynamics.arrivals(np.flatnonzero(is_visited & ~np.asarray(mdp.terminal)))
+
+
+def lone_starts(mdp: TabularMDP) -> np.ndarray:
+    """(S,) bool: under sticky actions the start states, nodes of their own without a previous action."""
+    lone = np.zeros(mdp.num_states, np.bool_)
+    lone[mdp.starts] = mdp.is_sticky
+    return lone
+
+
+def mdp_within(mdp: TabularMDP, steps: int) -> TabularMDP:
+    """The same MDP with only those states that can be reached within `steps` steps from a start, in their order.
+
+    Both agree on every episode of at most `steps` steps from the start: values there, returns, effective horizon.
+    Transitions of states that take all the steps to reach may be wrong: those that leave the set are replaced.
+
+    Returns:
+        This MDP where all of its states are reached; else one without a folder, as its states have other numbers.
+    Cost: one read of each transition of the reached states, and a copy of them.
+    """
+    is_reached = states_within(mdp, steps)
+    is_reached[mdp.start_states] = True
+    if is_reached.all():
+        return mdp
+    return restricted_to(mdp, np.flatnonzero(is_reached))
+
+
+def restricted_to(mdp: TabularMDP, states: np.ndarray) -> TabularMDP:
+    """The MDP of some states, ascending, the start states among them; they are numbered anew."""
+    number = np.full(mdp.num_states, -1, np.int64)
+    number[states] = np.arange(len(states))
+    return replace(
+        mdp,
+        dynamics=mdp.dynamics.restricted_to(states),
+        reward_table=mdp.reward_table.of(states),
+        staying=None if mdp.staying is None else partial(_some, mdp.staying, states),
+        terminal=np.asarray(mdp.terminal[states]),
+        start_states=number[mdp.start_states],
+        folder=None,
+        space=None,
+        age=None,
+    )
+
+
+def _some(rewards: Callable[[], Rewards], states: np.ndarray) -> Rewards:
+    return rewards().of(states)
+
+
+# Parts ----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part of an MDP: a contiguous range of its states, [start, stop), and the outside states whose values it needs.
+
+    Numbers of breadth-first search are local, so a range leads to few states outside of it, its *halo*: with 16 ranges
+    9 % of a range's rows on a Breakout of 2.4 million states, 0.03 % on a Freeway. Ranges are what several processes
+    sweep together (solvers/ranked.py).
+
+    Inside a part its own states have the numbers 0 .. n - 1, in order, and those of the halo n .. n + H - 1, ascending;
+    -1 is the end. Arrays of values have n + H + 1 rows, so the compiled sweeps run over parts as they are.
+
+    Attributes:
+        halo: (H,) int64, ascending: the states outside that these may lead to.
+        dynamics: of n states, whose next states may be in the halo. reward_table: (n, A).
+        gamma, chance: of the MDP.
+    """
+
+    start: int
+    stop: int
+    halo: np.ndarray
+    dynamics: Dynamics
+    reward_table: Rewards
+    gamma: float
+    chance: Chance
+
+    @staticmethod
+    def of(mdp: TabularMDP, start: int, stop: int) -> "Part":
+        """The states [start, stop) of an MDP. Copies their next states, renumbered."""
+        dynamics, halo = mdp.dynamics.part(start, stop)
+        rewards = mdp.reward_table.of(slice(start, stop))
+        return Part(start, stop, halo, dynamics, rewards, mdp.gamma, mdp.chance)
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    @property
+    def num_states(self) -> int:
+        """n."""
+        return len(self)
+
+    @property
+    def num_actions(self) -> int:
+        """A."""
+        return self.dynamics.num_actions
+
+    @property
+    def width(self) -> int:
+        """W: A previous actions under sticky actions, else 1."""
+        return self.chance.width(self.num_actions)
+
+    def zeros(self) -> np.ndarray:
+        """(n + H + 1, W) values: of its states, of the halo, of the end."""
+        return np.zeros((len(self) + len(self.halo) + 1, self.width))
+
+    def selection(self, select: Selection) -> Selection:
+        """The selection of actions in the states of this part, of a selection in the whole MDP."""
+        return select.of_states(slice(self.start, self.stop)) if isinstance(select, PolicyTable) else select
