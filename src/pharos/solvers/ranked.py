@@ -1,10 +1,11 @@
 """Values by several processes: each sweeps a range of the states, and gets the values of its halo from the others.
 
 Each rank has a `Part` (mdp/reachability.py). A sweep goes in place over its own states, from the last to the first,
-with the values that the halo had after the sweep before; messages bring those after it, and a reduction the largest change. So
-every new entry is a backup of entries that are old or already new, which is all that the error bound of fixed_point.py
-asks for: it holds with the largest change of all. Values cross the border of a range once a sweep, so there are more
-sweeps than in one process: a Breakout of 2.4 million states takes 33 in one, 38 in two, 55 in four, 111 in sixteen.
+with the values that the halo had after the sweep before; messages bring those after it, and a reduction the largest
+change. So every new entry is a backup of entries that are old or already new, which is all that the error bound of
+fixed_point.py asks for: it holds with the largest change of all. Values cross the border of a range once a sweep, so
+there are more sweeps than in one process: a Breakout of 2.4 million states takes 33 in one, 38 in two, 55 in four, 111
+in sixteen.
 
 Sweeps of a horizon are not in place, and the same to the last bit whatever the number of ranks: each state is backed up
 by one rank, from the same values in the same order.
