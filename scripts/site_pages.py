@@ -95,7 +95,6 @@ PACKAGES = {  # page of the reference -> (title, module)
     "agents": ("pharos.agents", "pharos.agents"),
     "training": ("pharos.training", "pharos.training"),
     "benchmark": ("pharos.benchmark", "pharos.benchmark"),
-    "leaderboard": ("pharos.leaderboard", "pharos.leaderboard"),
     "study": ("pharos.study", "pharos.study"),
     "validation": ("pharos.validation", "pharos.validation"),
     "plots": ("pharos.plots", "pharos.plots"),

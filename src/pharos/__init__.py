@@ -81,6 +81,7 @@ _HOMES = {
 _MODULES = {
     "bisimulation": "pharos.bisimulation",
     "experiments": "pharos.experiments",
+    "leaderboard": "pharos.leaderboard",
     "sb3_env": "pharos.sb3_env",
 }
 _PACKAGES = (
@@ -99,7 +100,6 @@ _PACKAGES = (
     "agents",
     "training",
     "validation",
-    "leaderboard",
     "plots",
     "study",
     "benchmark",

@@ -20,6 +20,7 @@ CONTRACT = (
     ("pharos", "make list_environments check_environment Environment build load StateSpace"),
     ("pharos", "TabularMDP sticky_actions random_actions value_iteration evaluate_policy Solution"),
     ("pharos.hardness", "diameter Interval"),
+    ("pharos.leaderboard", "submit verify board read"),  # as pharos.benchmark was called for single runs
     ("pharos.experiments", "RunConfig evaluate_agent train_configs"),  # as pharos.training was called
 )
 
@@ -41,10 +42,10 @@ ORDER = (
     *(
         "experiments",
         "validation",
-        "leaderboard",
         "plots",
         "study",
         "benchmark",
+        "leaderboard",
         "sb3_env",
         "bisimulation",
         "explorer",
