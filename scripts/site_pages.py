@@ -96,7 +96,7 @@ PACKAGES = {  # page of the reference -> (title, module)
     "training": ("pharos.training", "pharos.training"),
     "benchmark": ("pharos.benchmark", "pharos.benchmark"),
     "study": ("pharos.study", "pharos.study"),
-    "validation": ("pharos.validation", "pharos.validation"),
+    "prediction": ("pharos.prediction", "pharos.prediction"),
     "plots": ("pharos.plots", "pharos.plots"),
     "importers": ("pharos.importers", "pharos.importers"),
     "exporters": ("pharos.exporters", "pharos.exporters"),

@@ -73,7 +73,7 @@ _HOMES = {
     "to_gymnax": "pharos.interaction",
     "train": "pharos.training",
     "train_many": "pharos.training",
-    "predict": "pharos.validation",
+    "predict": "pharos.prediction",
     "explore": "pharos.explorer",
     "PharosError": "pharos.errors",
 }
@@ -83,6 +83,7 @@ _MODULES = {
     "experiments": "pharos.experiments",
     "leaderboard": "pharos.leaderboard",
     "sb3_env": "pharos.sb3_env",
+    "validation": "pharos.validation",
 }
 _PACKAGES = (
     "errors",
@@ -99,7 +100,7 @@ _PACKAGES = (
     "policies",
     "agents",
     "training",
-    "validation",
+    "prediction",
     "plots",
     "study",
     "benchmark",
