@@ -17,7 +17,7 @@ from pharos.benchmark.scores import score
 from pharos.benchmark.submission import WHAT, Submission, submit
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite, digest_of_suite, frozen, write_suite
 from pharos.benchmark.verification import verify
-from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
+from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, TimeLimit
 from pharos.system.sealed import read_sealed, write_sealed
 from refusals import refusal
 
@@ -124,6 +124,12 @@ def test_what_is_better_than_optimal_and_what_is_no_policy_is_refused(suite, hon
     replace(read, results=replace(read.results, curves=curves), policies=policies).write(tmp_path / "no.safetensors")
     verdict = verify(tmp_path / "no.safetensors", suite)
     assert not verdict.holds and {*verdict.refused} >= {"sea", "catch/0", "catch/1", "catch/2"}
+
+
+def test_a_task_of_a_suite_has_a_limit_of_time(suite, honest):
+    assert "it.safetensors: task catch takes more than" in refusal(
+        TimeLimit, verify, honest[1], suite, max_seconds=1e-6
+    )
 
 
 def test_another_suite_is_refused(suite, honest):

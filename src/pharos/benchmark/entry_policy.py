@@ -50,16 +50,27 @@ def policy_of(entry: Entry, task: Task, *, trust: bool = False) -> PolicyLike:
 def _table(entry: Entry, task: Task) -> np.ndarray:
     if set(entry.arrays) != {POLICY}:
         raise FileFormatError(f"a table has the array {POLICY!r} alone; found {', '.join(entry.arrays)}")
-    table, mdp = entry.arrays[POLICY], task.mdp
-    states, actions = mdp.num_states, mdp.num_actions
+    states, actions = task.mdp.num_states, task.mdp.num_actions
+    return checked_table(entry.arrays[POLICY], (states, actions + 1, actions))
+
+
+def checked_table(table: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Table of a file as int64 actions (S,), or as float64 probabilities of a shape (S, ..., A).
+
+    Raises:
+        FileFormatError: it has another shape, or names actions that are not there.
+    """
+    states, num_actions = shape[0], shape[-1]
     if table.shape == (states,) and table.dtype.kind in "iu":
-        if states and not (int(table.min()) >= 0 and int(table.max()) < actions):
-            raise FileFormatError(f"its table names actions from {table.min()} to {table.max()}; there are {actions}")
+        if states and not (int(table.min()) >= 0 and int(table.max()) < num_actions):
+            raise FileFormatError(
+                f"its table names actions from {table.min()} to {table.max()}; there are {num_actions}"
+            )
         return table.astype(np.int64)
-    if table.shape == (states, actions + 1, actions):
+    if table.shape == shape:
         return table.astype(np.float64)
     raise FileFormatError(
-        f"its table has shape {table.shape}; expected ({states},) or ({states}, {actions + 1}, {actions})"
+        f"its table has shape {table.shape}, {table.dtype}; expected ({states},) actions or {shape} probabilities"
     )
 
 

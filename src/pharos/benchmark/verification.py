@@ -19,12 +19,12 @@ import numpy as np
 
 from pharos.benchmark.agents import sha256
 from pharos.benchmark.entry import Claim, Entry
-from pharos.benchmark.entry_policy import policy_of, task_of
+from pharos.benchmark.entry_policy import checked_table, policy_of, task_of
 from pharos.benchmark.limits import Limits
 from pharos.benchmark.scores import check_suite
 from pharos.benchmark.submission import ProgressCallback, Submission, read
 from pharos.benchmark.suite import BenchmarkTask, Suite, load_suite
-from pharos.errors import FileFormatError, ParameterError, PharosError, StateSpaceTooLarge, TimeLimit, UntrustedCode
+from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, TimeLimit, UntrustedCode
 from pharos.policies import Evaluation
 from pharos.system.memory import available_memory
 from pharos.system.records import takes
@@ -269,19 +269,20 @@ def _verify_submission(
         if curve.min() < -limits.tolerance:
             refused[name] = f"its normalised regret is {curve.min():.6g}, better than the optimal policy"
         entry = suite.task(name)
-        with _time_limit(limits.max_seconds), _memory_limit():
-            task = entry.check(suite.protocol)
-            for seed, claimed in zip(results.seeds, curve[:, -1], strict=True):
-                run, policy = f"{name}/{seed}", submission.policies.get((name, seed))
-                if policy is None:
-                    missing.append(run)
-                    continue
-                try:
-                    checks.append(Check(run, float(claimed), _regret(policy, task, entry), limits.tolerance))
-                except TimeLimit:
-                    raise
-                except PharosError as error:
-                    refused[run] = str(error)
+        try:
+            with _time_limit(limits.max_seconds), _memory_limit():
+                task = entry.check(suite.protocol)
+                for seed, claimed in zip(results.seeds, curve[:, -1], strict=True):
+                    run, policy = f"{name}/{seed}", submission.policies.get((name, seed))
+                    if policy is None:
+                        missing.append(run)
+                        continue
+                    try:
+                        checks.append(Check(run, float(claimed), _regret(policy, task, entry), limits.tolerance))
+                    except (FileFormatError, ParameterError) as error:
+                        refused[run] = str(error)
+        except TimeLimit as error:
+            raise TimeLimit(f"{path}: task {name} {error}") from None
     scores = {check.name: _final(check.found) for check in checks}
     runs = [scores.get(f"{task.name}/{seed}", 0.0) for task in suite.core for seed in results.seeds]
     return SubmissionVerdict(
@@ -298,16 +299,8 @@ def _verify_submission(
 
 def _regret(policy: np.ndarray, task: Task, entry: BenchmarkTask) -> float:
     """Normalised regret of a table."""
-    states, actions = task.mdp.num_states, task.mdp.num_actions
-    is_choice = policy.shape == (states,) and policy.dtype.kind in "iu"
-    if not is_choice and not (policy.shape == (states, actions) and policy.dtype.kind == "f"):
-        raise FileFormatError(
-            f"its policy has shape {policy.shape} and type {policy.dtype}; expected ({states},) actions or ({states}, "
-            f"{actions}) probabilities"
-        )
-    if is_choice and states and not (int(policy.min()) >= 0 and int(policy.max()) < actions):
-        raise FileFormatError(f"its policy names an action beyond 0 to {actions - 1}")
-    value = evaluate_agent(policy.astype(np.int64 if is_choice else np.float64), task, max_states=states).value
+    table = checked_table(policy, (task.mdp.num_states, task.mdp.num_actions))
+    value = evaluate_agent(table, task, max_states=task.mdp.num_states).value
     return (entry.value_optimal - value) / (entry.value_optimal - entry.value_uniform)
 
 
