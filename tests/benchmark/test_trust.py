@@ -259,6 +259,9 @@ def test_one_verifier_and_one_board_take_a_run_of_one_task_and_runs_of_a_suite(s
     assert said["verified"] == 2 and {*said["final_scores"]} == {"run.safetensors", "suite.safetensors"}
     of_suite, of_task = Tables(page.read_text()).tables
     assert "final score" in of_suite[0] and of_task[1][of_task[0].index("entry")] == "mine"
+    (tmp_path / "run.safetensors").write_bytes(b"another file of the same name")
+    made = board([tmp_path / "run.safetensors", files], page, [suite])
+    assert [*made.refused] == [str(tmp_path / "run.safetensors")] and len(made.final_scores) == 2
 
 
 def test_a_label_of_a_suite_is_the_one_that_was_submitted(suite, honest, tmp_path):

@@ -11,6 +11,7 @@ import base64
 import hashlib
 import math
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -141,12 +142,14 @@ def board(
 
 def _listed(files: Sequence[str | os.PathLike]) -> Iterator[tuple[str, Path]]:
     """Yield name on the page and path of each file; of a folder, the files in it and below."""
+    paths = []
     for each in map(Path, files):
-        if each.is_dir():
-            inside = sorted(path for path in each.rglob(f"*{SUFFIX}") if path.is_file())
-            yield from ((path.relative_to(each).as_posix(), path) for path in inside)
-        else:
-            yield each.name, each
+        inside = sorted(path for path in each.rglob(f"*{SUFFIX}") if path.is_file())
+        paths += (
+            [(path.relative_to(each).as_posix(), path) for path in inside] if each.is_dir() else [(each.name, each)]
+        )
+    counts = Counter(name for name, _ in paths)
+    yield from ((name if counts[name] == 1 else str(path), path) for name, path in paths)
 
 
 def _write_page(result: Board, title: str) -> None:
