@@ -141,7 +141,7 @@ def kept(entry, axis, protocol, freeze, level=None):
 def predicted_entry(entry, settings, protocol):
     """The entry of a task with its predicted regret: of idealised agents with these hyperparameters, and of a table."""
     from pharos.errors import PharosError
-    from pharos.validation import predict
+    from pharos.prediction import predict
 
     values = {}
     for agent, hyperparameters in settings.items():
@@ -302,7 +302,7 @@ def name_of(environment, parameters, view, chance):
 
 def predicted_row(name, environment, parameters, view, chance, settings):
     """The row of a candidate, of idealised learners; None where states are not told apart."""
-    from pharos.validation import predicted
+    from pharos.prediction import predicted
 
     options = {"observation_options": OBSERVATIONS.get(view, {}), "chance": ChanceSetting(**chance)}
     learnt = Task(pharos.make(environment, **parameters), observation=view, **options)

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from pharos import study
-from pharos.validation import PRIMARY
-from pharos.validation.cross_validation import spearman
-from pharos.validation.leave_one_class_out import Pairs
+from pharos.prediction import PRIMARY
+from pharos.prediction.pairs import Pairs
+from pharos.study.cross_validation import spearman
 
 CLEAR = 0.02
 PREDICTORS = ("kernel_regret", "kernel_regret_played", "adam_regret", "adam_regret_played", "kernel_learning_time")

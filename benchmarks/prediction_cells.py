@@ -27,11 +27,11 @@ import numpy as np
 import pandas as pd
 
 from pharos import study
+from pharos.prediction import PRIMARY, Published
+from pharos.prediction.learners import primary_regret
+from pharos.prediction.prediction import FILE
 from pharos.study.tables import CELL
 from pharos.training import RunConfig
-from pharos.validation import PRIMARY, Published
-from pharos.validation.learners import primary_regret
-from pharos.validation.prediction import FILE
 
 STUDIES = Path(__file__).parents[1] / "docs" / "studies"
 DEV = STUDIES / "hardness-dev"

@@ -18,11 +18,10 @@ import pandas as pd
 
 from pharos import study
 from pharos.plots import save_for_page, unseen_figures
+from pharos.prediction import PRIMARY, published
+from pharos.study import PredictedCells
+from pharos.study.leave_one_class_out import PERMUTATIONS
 from pharos.training import CELL
-from pharos.validation import PredictedCells
-from pharos.validation.learners import PRIMARY
-from pharos.validation.leave_one_class_out import PERMUTATIONS
-from pharos.validation.prediction import published
 
 OUTCOMES = ("greedy", "played")
 

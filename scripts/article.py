@@ -18,13 +18,13 @@ import pyarrow.parquet as pq
 from scipy import stats
 
 from pharos import study
+from pharos.prediction.pairs import Pairs
+from pharos.prediction.prediction import FILE
 from pharos.study.blocks import Run
+from pharos.study.cross_validation import class_predictions, holm, r_squared, resampled_classes, spearman
 from pharos.study.specification import parse
 from pharos.study.tables import row_of
 from pharos.training import CELL, RunConfig
-from pharos.validation.cross_validation import class_predictions, holm, r_squared, resampled_classes, spearman
-from pharos.validation.leave_one_class_out import Pairs
-from pharos.validation.prediction import FILE
 
 ROOT = Path(__file__).parents[1]
 STUDIES = ROOT / "docs" / "studies"

@@ -73,7 +73,7 @@ _HOMES = {
     "to_gymnax": "pharos.interaction",
     "train": "pharos.training",
     "train_many": "pharos.training",
-    "predict": "pharos.validation",
+    "predict": "pharos.prediction",
     "explore": "pharos.explorer",
     "PharosError": "pharos.errors",
 }
@@ -81,7 +81,9 @@ _HOMES = {
 _MODULES = {
     "bisimulation": "pharos.bisimulation",
     "experiments": "pharos.experiments",
+    "leaderboard": "pharos.leaderboard",
     "sb3_env": "pharos.sb3_env",
+    "validation": "pharos.validation",
 }
 _PACKAGES = (
     "errors",
@@ -98,8 +100,7 @@ _PACKAGES = (
     "policies",
     "agents",
     "training",
-    "validation",
-    "leaderboard",
+    "prediction",
     "plots",
     "study",
     "benchmark",

@@ -12,7 +12,7 @@ import yaml
 
 import pharos
 from attacks.damage import Attack, Tally, command, entry_changed, flipped, outcome
-from pharos import exporters, hardness, importers, leaderboard, study
+from pharos import benchmark, exporters, hardness, importers, study
 from pharos.mdp import TabularMDP
 
 pytestmark = pytest.mark.long
@@ -365,7 +365,7 @@ def test_searches(attack, tmp_path):
     attack("searches", 30, tmp_path / "search", names, read, fewer=2)
 
 
-# Entries of leaderboards ---------------------------------------------------------------------------------------------
+# Submissions of single runs -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["q_learning", "ppo"])
@@ -373,10 +373,10 @@ def test_entries(name, attack, tmp_path):
     for seed in range(2):
         train(name, tmp_path / f"run{seed}", seed)
         (tmp_path / f"{seed}").mkdir()
-        leaderboard.submit(tmp_path / f"run{seed}", tmp_path / f"{seed}" / "mine.safetensors")
+        benchmark.submit(tmp_path / f"run{seed}", tmp_path / f"{seed}" / "mine.safetensors")
 
     def read(folder):
-        verdict = leaderboard.verify(folder / "mine.safetensors")
+        verdict = benchmark.verify(folder / "mine.safetensors")
         return verdict.holds, verdict.value, verdict.entry.claim
 
     attack(f"entries ({name})", 12, tmp_path / "0", ("mine.safetensors",), read)

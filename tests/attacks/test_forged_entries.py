@@ -1,4 +1,4 @@
-"""Entries of a leaderboard, forged from honest ones: none is believed that is not true, none stops the others.
+"""Submissions of single runs, forged from honest ones: none is believed that is not true, none stops the others.
 
 A forgery changes one thing of an honest entry, with digests that fit. Where its claim is said to hold, a slow twin
 computes from the rules what is true: values by backward induction over explicit matrices.
@@ -28,7 +28,7 @@ import pytest
 import pharos
 from attacks.damage import Payload, Tally, outcome
 from naive.mdp import augmented
-from pharos import leaderboard
+from pharos import benchmark
 from pharos.system import storage
 from pharos.training import run_id
 
@@ -98,7 +98,7 @@ def honest(tmp_path_factory):
     place, files = tmp_path_factory.mktemp("honest"), {}
     for kind in (grid, river, network):
         kind(place / kind.__name__)
-        files[kind.__name__] = leaderboard.submit(place / kind.__name__, place / f"{kind.__name__}.safetensors")
+        files[kind.__name__] = benchmark.submit(place / kind.__name__, place / f"{kind.__name__}.safetensors")
     return files
 
 
@@ -403,9 +403,9 @@ def is_true(claim: dict[str, Any], value: float, best: float, uniform: float) ->
     )
 
 
-def judgement(file: Path, kind: str, honest: leaderboard.Verdict) -> str:
+def judgement(file: Path, kind: str, honest: benchmark.EntryVerdict) -> str:
     """What `verify` says of an entry, and whether that is true."""
-    verdict = leaderboard.verify(file, **LIMITS)
+    verdict = benchmark.verify(file, **LIMITS)
     if not verdict.holds:
         return "does not hold"
     claim = vars(verdict.entry.claim)
@@ -436,7 +436,7 @@ def forgeries(request, honest, tmp_path):
 def test_no_forged_entry_is_believed_or_stops_another(forgeries, honest, tmp_path, count, monkeypatch):
     monkeypatch.setattr("attacks.damage.MORE_MEMORY", 2 << 30)
     kind, folder, names = forgeries
-    verdict, tally, said = leaderboard.verify(honest[kind]), Tally(), Counter()
+    verdict, tally, said = benchmark.verify(honest[kind]), Tally(), Counter()
 
     def judge(file):
         answer = judgement(file, kind, verdict)
@@ -451,7 +451,7 @@ def test_no_forged_entry_is_believed_or_stops_another(forgeries, honest, tmp_pat
     tally.check()
 
     (folder / "honest.safetensors").write_bytes(honest[kind].read_bytes())
-    made = leaderboard.board(folder, tmp_path / "board.html", **LIMITS)
+    made = benchmark.board(folder, tmp_path / "board.html", **LIMITS)
     listed = {path.name for path in folder.iterdir() if path.is_file()}
     verified = {each.file.name for each in made.verified}
     assert "honest.safetensors" in verified and listed == {*verified, *made.refused}

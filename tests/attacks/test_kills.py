@@ -70,7 +70,7 @@ CASES = {
     "export": Case("export frozen_lake/4x4 --out game_20_fs1.npz"),
     "import": Case("import bridge game_20_fs1.npz --out mdp", ("export frozen_lake/4x4 --out game_20_fs1.npz",), 10, 1),
     "import with chance": Case("import gymnasium FrozenLake-v1 --out mdp", changes=6, moments=2),
-    "submit": Case("submit run --out mine.safetensors", ("train frozen_lake/4x4 --steps 20 --out run",)),
+    "submit": Case("benchmark submit run --out mine.safetensors", ("train frozen_lake/4x4 --steps 20 --out run",)),
     "solve, no cache": Case("solve frozen_lake/4x4"),
     "cache clear": Case("cache clear", ("solve frozen_lake/4x4", "solve frozen_lake/8x8")),
 }

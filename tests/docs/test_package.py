@@ -182,7 +182,8 @@ def test_commands_run_in_an_installation_that_is_mounted_to_be_read(tmp_path):
     )
     for words in (
         *(f"solve {lake}", f"hardness {lake} --measures diameter", f"train {lake} --steps 100 --out run"),
-        *(f"evaluate {lake} --policy run", "submit run --out entry.safetensors", "verify entry.safetensors"),
+        *(f"evaluate {lake} --policy run", "benchmark submit run --out it.safetensors"),
+        "benchmark verify it.safetensors",
         *("study run own.yaml --workers 1", "study status own.yaml"),
     ):
         command = [*mounted, sys.executable, "-m", "pharos", *words.split()]

@@ -114,7 +114,7 @@ BEFORE = {
     "benchmark.md": "from pharos import benchmark\ntask = benchmark.load_suite().core[0].name\n"
     "benchmark.run('random', out='results/mine', seeds=[0], tasks=[task])\n",
     "importing.md": "import numpy as np\nimport pharos\nP, R = [np.eye(2), np.eye(2)[[1, 0]]], np.eye(2)\n",
-    "leaderboard.md": "import pharos\npharos.train('q_learning', 'frozen_lake/4x4', steps=200, out='runs/lake')\n",
+    "submissions.md": "import pharos\npharos.train('q_learning', 'frozen_lake/4x4', steps=200, out='runs/lake')\n",
     "regret.md": "import pharos\npharos.train('dqn', 'frozen_lake/4x4', steps=200, random=0.1, out='runs/dqn-0')\n",
 }
 

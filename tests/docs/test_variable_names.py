@@ -17,6 +17,7 @@ PARTICIPLES |= {"paid", "reached", "said", "seeing", "seen", "taken", "together"
 # Keywords and fields that callers write, and rules, whose variables are part of the fingerprint of their state spaces.
 LICENSED = {
     "agents/hyperparameters.py": {"given"},
+    "benchmark/verification.py": {"found"},
     "environments/base.py": {"likely"},
     "environments/imported.py": {"likely", "paid"},
     "environments/worlds/game_2048.py": {"found", "likely", "paid"},
@@ -24,7 +25,6 @@ LICENSED = {
     "errors.py": {"found", "known"},
     "exporters.py": {"chosen"},
     "hardness/report.py": {"kept"},
-    "leaderboard/verification.py": {"found"},
     "mdp/actions.py": {"chosen"},
     "observations/context.py": {"seen"},
 }

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import command_line
 import pharos
-from pharos import hardness, leaderboard, study
+from pharos import benchmark, hardness, study
 from pharos.errors import FileFormatError, ParameterError, UndefinedMeasure
 from pharos.hardness import representation
 from pharos.mdp import TabularMDP
@@ -222,7 +222,7 @@ def last_policy_by_place(run, world, words):
     """Normalised regret of a run's last policy, wherever the library says it; None where it has no scale."""
     record, curve, task = read_record(run), read_curve(run), Task.of(world)
     value, values = record["result"]["final_value"], RegretCurve.read(run).values
-    entry = leaderboard.submit(run, run / "entry.safetensors")
+    entry = benchmark.submit(run, run / "entry.safetensors")
     try:
         alone = representation.Representation.of_matrix(np.eye(task.mdp.num_states))
         of_learner = representation.IdealisedLearner(task.mdp, alone, hardness.Schedule(steps=10), 4).regret(value)
@@ -233,7 +233,7 @@ def last_policy_by_place(run, world, words):
         "curve read back": regret(value, values, normalized_by="uniform"),
         "reference of the task": regret(value, task.reference, normalized_by="uniform"),
         "pharos evaluate": command_line.answer("evaluate", *words, "--policy", run, "--trust")["normalized_regret"],
-        "leaderboard": leaderboard.verify(entry, trust=True).normalized_regret,
+        "benchmark": benchmark.verify(entry, trust=True).normalized_regret,
         "learner of hardness": of_learner,
     }
 

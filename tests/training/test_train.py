@@ -388,11 +388,11 @@ try:
     pharos.train("q_learning", "frozen_lake/4x4", steps=200, hyperparameters="own.yaml")
 except pharos.errors.MissingExtra as error:
     print(error)
-from pharos import leaderboard
-file = leaderboard.submit({str(tmp_path / "run")!r}, {str(tmp_path / "entry.safetensors")!r})
-print(leaderboard.verify(file).holds)
+from pharos import benchmark
+file = benchmark.submit({str(tmp_path / "run")!r}, {str(tmp_path / "entry.safetensors")!r})
+print(benchmark.verify(file).holds)
 try:
-    leaderboard.submit({str(tmp_path / "here")!r}, {str(tmp_path / "other.safetensors")!r})
+    benchmark.submit({str(tmp_path / "here")!r}, {str(tmp_path / "other.safetensors")!r})
 except pharos.errors.MissingExtra as error:
     print(error)
 """

@@ -8,15 +8,18 @@ from typing import TYPE_CHECKING
 from pharos.system import lazy
 
 if TYPE_CHECKING:
-    from pharos.benchmark.board import benchmark_board
     from pharos.benchmark.budget import BudgetSpent
     from pharos.benchmark.comparison import AxisComparison, Comparison, Difference, Power, compare, power
+    from pharos.benchmark.entry import Claim, Entry
     from pharos.benchmark.execution import run
+    from pharos.benchmark.limits import Limits
     from pharos.benchmark.page import report
+    from pharos.benchmark.ranking import Board, board, reason
     from pharos.benchmark.results import AgentResults, baselines, read_results
     from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, score
-    from pharos.benchmark.submission import Submission, submit, verify
+    from pharos.benchmark.submission import Submission, read, submit
     from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite, frozen, load_suite, write_suite
+    from pharos.benchmark.verification import EntryVerdict, SubmissionVerdict, verify
 
 __all__ = [
     "AgentResults",
@@ -31,10 +34,12 @@ __all__ = [
     "Submission",
     "Suite",
     "baselines",
+    "board",
     "compare",
     "frozen",
     "load_suite",
     "power",
+    "read",
     "read_results",
     "report",
     "run",

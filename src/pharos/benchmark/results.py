@@ -1,7 +1,7 @@
 """Results of an agent in a benchmark: a curve of normalised regret for each task and seed, in one small file.
 
-The file has the layout of an entry of the leaderboard (`leaderboard/entry.py`): the record as JSON, and under the name
-of each task a float64 array (seeds, evaluations), with digests of all. The same results give the same bytes.
+The layout is that of `system/sealed.py`: the record as JSON, and under the name of each task a float64 array (seeds,
+evaluations), with digests of all. The same results give the same bytes.
 """
 
 import os
@@ -14,9 +14,8 @@ import numpy as np
 
 from pharos.benchmark.suite import EARLIER
 from pharos.errors import FileFormatError, ParameterError
-from pharos.leaderboard import check_values, in_file, read_sealed, write_sealed
+from pharos.system.sealed import check_values, read_sealed, write_sealed
 
-FORMAT = 1
 FILE = "results.safetensors"
 WHAT = "result of a benchmark"
 BASELINES = Path(__file__).parent / "baselines"
@@ -93,13 +92,12 @@ class AgentResults:
                 f"{source}: no results; expected the folder of a run, its {FILE}, or a baseline: "
                 f"{', '.join(baselines()) or 'none is shipped'}"
             )
-        record, arrays = read_sealed(path, WHAT)
-        return in_file(path, lambda: _results(record, arrays))
+        return read_sealed(path, WHAT, _results)
 
     def write(self, file: str | os.PathLike) -> None:
         """Replace a file by these results, in one step; the same results give the same bytes."""
         own = {"agent": self.agent, "suite": self.suite, "suite_digest": self.digest, "seeds": list(self.seeds)}
-        write_sealed(file, {"format": FORMAT, **own, "record": dict(self.record)}, self.curves, WHAT)
+        write_sealed(file, {**own, "record": dict(self.record)}, self.curves, WHAT)
 
 
 def baselines(suite: str = "v1") -> tuple[str, ...]:

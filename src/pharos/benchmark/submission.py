@@ -1,39 +1,35 @@
-"""Submissions: curves and final policies in one file, which `verify` checks by computing regret again.
+"""Submissions: what an agent has learnt and what it claims, in one file, which `verify` checks by computing it again.
 
-The file has the layout of an entry of the leaderboard (`leaderboard/entry.py`): a record as JSON, and arrays
+`submit` packs the folder of one training run (`entry.py`) or of runs of a suite; a file has the layout of
+`system/sealed.py`. The arrays of a suite's runs are
 
     curve/TASK        (seeds, evaluations) float64, normalised regret
     policy/TASK/SEED  what the agent plays at the end: (S,) actions, or (S, A) probabilities, by state
 
-with digests of all. Nothing in it is executed. `verify` solves each task and evaluates each policy: V*, the value of
-uniform play and the last point of each curve hold or do not. All else is claimed: the points before cannot be seen from
-policies, and an exact solver has the best policies without any learning.
+Nothing in a file is executed. V*, the value of uniform play and the last point of each curve hold or do not. All else
+is claimed: the points before cannot be seen from policies, and an exact solver has the best policies without any
+learning.
 """
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pharos.benchmark.agents import sha256
 from pharos.benchmark.budget import Snapshots
+from pharos.benchmark.entry import WHAT, Entry, stored_table
 from pharos.benchmark.results import AgentResults, entries_of
 from pharos.benchmark.scores import check_suite
-from pharos.benchmark.suite import BenchmarkTask, Suite
-from pharos.errors import FileFormatError, PharosError
-from pharos.leaderboard import Check, check_ending, in_file, read_sealed, stored_table, write_checked, write_sealed
-from pharos.training import Task, check_agent, evaluate_agent, load_agent
+from pharos.benchmark.suite import Suite, load_suite
+from pharos.errors import FileFormatError, ParameterError
+from pharos.system.sealed import SUFFIX, read_sealed, write_sealed
+from pharos.training import Task, check_agent, load_agent
 
-FORMAT = 1
-WHAT = "submission to a benchmark"
-TOLERANCE = 1e-6
-"""Of normalised regret: processors round sums of values in another way."""
-
-Tell = Callable[[int, int, str], None]
-"""tell(done, all, what is next)."""
+ProgressCallback = Callable[[int, int, str], None]
+"""Called with how many are done, how many there are, and the next one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +50,6 @@ class Submission:
         """Write the submission to a file, replacing it atomically; the same submission gives the same bytes."""
         results = self.results
         record = {
-            "format": FORMAT,
             "name": results.agent,
             "author": self.author,
             "note": self.note,
@@ -69,72 +64,120 @@ class Submission:
 
     @staticmethod
     def read(file: str | os.PathLike) -> "Submission":
-        """Read a submission that `write` wrote; executes nothing, and checks sizes against the file before allocating.
+        """Read runs of a suite; raises as `pharos.benchmark.read`, also for the run of one task."""
+        return read_sealed(file, WHAT, Submission.of_record)
 
-        Raises:
-            ParameterError: there is no such file. FileFormatError: it is no submission.
-            ResultCorrupted: it was changed.
-        """
-        record, arrays = read_sealed(Path(file), WHAT)
-        return in_file(Path(file), lambda: _submission(record, arrays))
+    @staticmethod
+    def of_record(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Submission":
+        """Submission of the record and the arrays of a file; FileFormatError or ValueError if they are damaged."""
+        kinds = {"name": str, "author": str, "note": str, "suite": str, "suite_digest": str, "seeds": list}
+        values = entries_of(record, {**kinds, "record": dict}, WHAT)
+        name, author, note, suite, digest, seeds, provenance = values
+        curves, policies = {}, {}
+        for key, array in arrays.items():
+            kind, *words = key.split("/")
+            if kind == "curve" and len(words) == 1:
+                curves[words[0]] = array
+            elif kind == "policy" and len(words) == 2 and words[1] in map(str, seeds):
+                policies[words[0], int(words[1])] = array
+            else:
+                raise FileFormatError(f"its array {key!r} is neither a curve nor a policy of one of its seeds")
+        results = AgentResults(name, suite, digest, tuple(seeds), curves, provenance)
+        if {task for task, _ in policies} - {*results.curves}:
+            raise FileFormatError("it has policies of tasks without a curve")
+        return Submission(results, policies, author, note)
+
+    @staticmethod
+    def of_folder(
+        folder: Path, suite: Suite, *, trust: bool = False, progress: ProgressCallback | None = None
+    ) -> "Submission":
+        """Results in the folder of `benchmark.run` and the final policies of its runs; raises as `submit`."""
+        results = AgentResults.read(folder)
+        check_suite(results, suite, str(folder))
+        policies: dict[tuple[str, int], np.ndarray] = {}
+        runs = [(task, seed) for task in results.curves for seed in results.seeds]
+        for done, (name, seed) in enumerate(runs):
+            if progress is not None:
+                progress(done, len(runs), name)
+            task = suite.task(name).training_task(suite.protocol)
+            policy = final_policy(folder / "runs" / name / f"seed-{seed}", task, trust=trust)
+            if policy is not None:
+                policies[name, seed] = policy
+        return Submission(results, policies)
 
 
-def _submission(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Submission:
-    kinds = {"name": str, "author": str, "note": str, "suite": str, "suite_digest": str, "seeds": list, "record": dict}
-    name, author, note, suite, digest, seeds, provenance = entries_of(record, kinds, WHAT)
-    curves, policies = {}, {}
-    for key, array in arrays.items():
-        kind, *words = key.split("/")
-        if kind == "curve" and len(words) == 1:
-            curves[words[0]] = array
-        elif kind == "policy" and len(words) == 2 and words[1] in map(str, seeds):
-            policies[words[0], int(words[1])] = array
-        else:
-            raise FileFormatError(f"its array {key!r} is neither a curve nor a policy of one of its seeds")
-    results = AgentResults(name, suite, digest, tuple(seeds), curves, provenance)
-    if {task for task, _ in policies} - {*results.curves}:
-        raise FileFormatError("it has policies of tasks without a curve")
-    return Submission(results, policies, author, note)
+def read(file: str | os.PathLike) -> Entry | Submission:
+    """Read a submission: the run of one task, or runs of a suite.
+
+    Nothing is executed, and nothing is allocated before sizes in the file were compared with the size of the file.
+
+    Raises:
+        ParameterError: there is no such file. FileFormatError: it is no submission, or of another format.
+        ResultCorrupted: it was cut short, or changed after it was written.
+    """
+
+    def content(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Entry | Submission:
+        return (Submission if "suite" in record else Entry).of_record(record, arrays)
+
+    return read_sealed(file, WHAT, content)
 
 
 def submit(
     folder: str | os.PathLike,
-    file: str | os.PathLike,
-    suite: Suite,
+    file: str | os.PathLike | None = None,
+    suite: Suite | None = None,
     *,
+    name: str = "",
     author: str = "",
     note: str = "",
     trust: bool = False,
-    progress: Tell | None = None,
-) -> Submission:
-    """Pack the results of a folder and the final policies of its runs into one file, which `verify` reads.
+    progress: ProgressCallback | None = None,
+) -> Path:
+    """Pack what a finished run, or the runs of a suite, have learnt and claim into one file; return the file.
 
-    Nothing is trained. A network is asked about every state once; policies that see more than the state have none.
+    Nothing is trained: values and regret are those of the runs' evaluations. The same folder and texts give the same
+    bytes. A network of a suite is asked about every state once; policies that see more than the state have no table.
 
     Args:
-        folder: of `benchmark.run`.
-        file: ends in .safetensors.
-        suite: that the runs are of.
-        trust: whether code that the run.json of a run names, the class of an agent, may be imported.
+        folder: of a run, or of `benchmark.run`.
+        file: ends in .safetensors; None: in the current directory ID.safetensors, ID that of the run, or the name of
+            the folder of a suite's runs.
+        suite: that the runs are of; None: v1. Not needed for one run.
+        name: label; that of the agent when not given.
+        author, note: texts to show beside it.
+        trust: whether code that the run.json of a suite's run names, the class of an agent, may be imported.
     Raises:
-        ParameterError: the folder holds no results, or of another suite; a text cannot be printed.
-        FileFormatError: a run is damaged, or its files are not the ones that its run.json has checksums of.
-        UntrustedCode: a run names code, and is not trusted.
+        ParameterError: the folder holds no results, or of another suite; the environment of a run is an imported MDP,
+            which others do not have; a text cannot be printed.
+        FileFormatError: a run is damaged or not finished. ResultCorrupted: files are not the ones that its run.json has
+            checksums of. UntrustedCode: a run names code, and is not trusted.
+        MissingExtra: a run is of a network, and PyTorch is not installed.
     """
-    folder, target = Path(folder), check_ending(Path(file))
-    results = AgentResults.read(folder)
-    check_suite(results, suite, str(folder))
-    policies: dict[tuple[str, int], np.ndarray] = {}
-    runs = [(task, seed) for task in results.curves for seed in results.seeds]
-    for place, (name, seed) in enumerate(runs):
-        if progress is not None:
-            progress(place, len(runs), name)
-        task = suite.task(name).training_task(suite.protocol)
-        policy = final_policy(folder / "runs" / name / f"seed-{seed}", task, trust=trust)
-        if policy is not None:
-            policies[name, seed] = policy
-    submission = Submission(results, policies, author, note)
-    return write_checked(target, lambda: submission.write(target), lambda: Submission.read(target))
+    folder = Path(folder)
+    target = None if file is None else _checked_ending(Path(file))
+    content: Entry | Submission
+    if (folder / "run.json").exists():
+        content = Entry.of_run(folder, name=name, author=author, note=note)
+        target = target or Path(f"{content.id}{SUFFIX}")
+    else:
+        packed = Submission.of_folder(folder, load_suite() if suite is None else suite, trust=trust, progress=progress)
+        results = replace(packed.results, agent=name or packed.results.agent)
+        content = replace(packed, results=results, author=author, note=note)
+        target = target or Path(f"{folder.absolute().name}{SUFFIX}")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    content.write(target)
+    try:
+        read(target)
+    except FileFormatError as error:  # of a text
+        target.unlink()
+        raise ParameterError(str(error)) from None
+    return target
+
+
+def _checked_ending(target: Path) -> Path:
+    if target.suffix.lower() != SUFFIX:
+        raise ParameterError(f"{target}: expected a file name that ends in {SUFFIX}")
+    return target
 
 
 def final_policy(run: Path, task: Task, *, trust: bool = False) -> np.ndarray | None:
@@ -162,95 +205,3 @@ def final_policy(run: Path, task: Task, *, trust: bool = False) -> np.ndarray | 
     if table.ndim == 2 and ((table == 0) | (table == 1)).all():
         table = table.argmax(axis=1)
     return table.astype(np.float64) if table.ndim == 2 else table.astype(np.min_scalar_type(int(table.max(initial=0))))
-
-
-@dataclass(frozen=True, eq=False)
-class SubmissionVerdict:
-    """Result of verifying a submission.
-
-    Attributes:
-        file, submission: what was verified. sha256: of the file.
-        checks: normalised regret of each policy beside the last point of its curve; their names are TASK/SEED.
-        missing: runs without a policy, of which nothing was computed: all that is said of them is claimed.
-        final: score of the core that the policies have at the end, computed: 1 less normalised regret, clipped to
-            [0, 1], mean over the seeds of a task, then over tasks; a run without a policy counts as 0.
-        refused: name of a task or run -> why its policy is none.
-    """
-
-    file: Path
-    submission: Submission
-    sha256: str
-    checks: tuple[Check, ...]
-    missing: tuple[str, ...]
-    final: float
-    refused: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def wrong(self) -> tuple[Check, ...]:
-        """Checks that do not hold."""
-        return tuple(check for check in self.checks if not check.holds)
-
-    @property
-    def holds(self) -> bool:
-        """Whether all that can be computed is as claimed; the rest stays claimed."""
-        return not self.refused and not self.wrong
-
-
-def verify(
-    file: str | os.PathLike, suite: Suite, *, tolerance: float = TOLERANCE, progress: Tell | None = None
-) -> SubmissionVerdict:
-    """Solve the tasks of a submission, and evaluate its final policies again.
-
-    Of the file only numbers and names are used. What cannot be true of a curve is refused too: a policy better than the
-    optimal one.
-
-    Args:
-        suite: that it is of; its tasks are the ones on this installation, not those of the file.
-        tolerance: of normalised regret.
-    Raises:
-        ParameterError: there is no such file, or it is of another suite, or a task is another one on this installation.
-        FileFormatError: it is no submission. ResultCorrupted: it was cut short or changed.
-    Cost: as solving each task, and evaluating each policy.
-    """
-    path = Path(file)
-    submission = Submission.read(path)
-    results = submission.results
-    check_suite(results, suite, str(path))
-    checks, missing, refused = [], [], {}
-    for place, (name, curve) in enumerate(results.curves.items()):
-        if progress is not None:
-            progress(place, len(results.curves), name)
-        entry = suite.task(name)
-        task = entry.check(suite.protocol)
-        if curve.min() < -tolerance:
-            refused[name] = f"its normalised regret is {curve.min():.6g}, better than the optimal policy"
-        for seed, claimed in zip(results.seeds, curve[:, -1], strict=True):
-            run, policy = f"{name}/{seed}", submission.policies.get((name, seed))
-            if policy is None:
-                missing.append(run)
-                continue
-            try:
-                computed = _regret(policy, task, entry)
-            except PharosError as error:
-                refused[run] = str(error)
-                continue
-            checks.append(Check(run, float(claimed), computed, tolerance))
-    scores = {check.name: 1.0 - min(max(check.found, 0.0), 1.0) for check in checks}
-    runs = [scores.get(f"{task.name}/{seed}", 0.0) for task in suite.core for seed in results.seeds]
-    final = sum(runs) / max(1, len(runs))
-    return SubmissionVerdict(path, submission, sha256(path), tuple(checks), tuple(missing), final, refused)
-
-
-def _regret(policy: np.ndarray, task: Task, entry: BenchmarkTask) -> float:
-    """Normalised regret of a table."""
-    states, actions = task.mdp.num_states, task.mdp.num_actions
-    is_choice = policy.shape == (states,) and policy.dtype.kind in "iu"
-    if not is_choice and not (policy.shape == (states, actions) and policy.dtype.kind == "f"):
-        raise FileFormatError(
-            f"its policy has shape {policy.shape} and type {policy.dtype}; expected ({states},) actions or ({states}, "
-            f"{actions}) probabilities"
-        )
-    if is_choice and states and not (int(policy.min()) >= 0 and int(policy.max()) < actions):
-        raise FileFormatError(f"its policy names an action beyond 0 to {actions - 1}")
-    value = evaluate_agent(policy.astype(np.int64 if is_choice else np.float64), task, max_states=states).value
-    return (entry.value_optimal - value) / (entry.value_optimal - entry.value_uniform)

@@ -16,7 +16,6 @@ from pharos.cli import (
     evaluate,
     hardness,
     import_,
-    leaderboard,
     observations,
     plot,
     render,
@@ -36,6 +35,9 @@ EXIT_FAILED, EXIT_USAGE = 1, 2
 # Options and commands that went, by the command that had them, and what it says of them
 AUDITS = "is gone: only final policies can be proven; `pharos benchmark verify FILE` computes them again"
 REMOVED = {
+    **{
+        f"pharos {name}": f"{name} is gone: `pharos benchmark {name}` does it" for name in ("submit", "verify", "board")
+    },
     **{f"pharos benchmark {name}": f"{name} {AUDITS}" for name in ("audit", "commit")},
     "pharos benchmark seal": "seal is gone: pharos.benchmark.write_suite makes a suite of your own, of any seeds",
     "pharos benchmark submit --commitment": f"--commitment {AUDITS}",
@@ -182,9 +184,6 @@ app.command("play")(render.play)
 app.command("explore")(plot.explore)
 app.command("train")(train.train)
 app.command("tune")(train.tune)
-app.command("submit")(leaderboard.submit)
-app.command("verify")(leaderboard.verify)
-app.command("board")(leaderboard.board)
 app.command("warm")(cache.warm)
 app.add_typer(plot.app, name="plot")
 app.add_typer(study.app, name="study")

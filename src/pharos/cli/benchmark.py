@@ -1,5 +1,6 @@
 """pharos benchmark: agents on frozen tasks whose every state is known, and scores with units."""
 
+import time
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,19 +8,41 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, complain, console, counted_bar, print_table, progress_bar, termination
+from pharos.benchmark import Limits
+from pharos.cli.answers import (
+    Answer,
+    complain,
+    console,
+    counted_bar,
+    print_facts,
+    print_table,
+    progress_bar,
+    size_text,
+    termination,
+)
 from pharos.cli.command import Commands
 from pharos.cli.options import Count, Trust, file_ending, parse_seeds
 from pharos.errors import AllRunsFailed, ParameterError
-from pharos.system.wording import pluralize
+from pharos.system.wording import in_words, pluralize
 
 if TYPE_CHECKING:
-    from pharos.benchmark import BenchmarkTask, Comparison, Difference, Power, Suite
+    from pharos.benchmark import (
+        BenchmarkTask,
+        Comparison,
+        Difference,
+        Entry,
+        EntryVerdict,
+        Power,
+        SubmissionVerdict,
+        Suite,
+    )
 
 app = Commands(no_args_is_help=True, help="Run agents on a frozen suite of solved tasks, and compare them.")
 
 SuiteName = Annotated[str, typer.Argument(metavar="[SUITE]", help="Name of a suite, or FILE.yaml.")]
-SuiteFile = Annotated[str, typer.Option("--suite", metavar="NAME|FILE")]
+SuiteFile = Annotated[
+    str | None, typer.Option("--suite", metavar="NAME|FILE", help="That the runs are of; v1 when not given.")
+]
 CLAIMED = [
     "curves while learning",
     "core scores and intervals",
@@ -29,6 +52,11 @@ CLAIMED = [
     "that policies were learnt",
 ]
 """What a submission says and nobody can compute from it."""
+COMPUTED = (
+    *("value", "regret", "normalized_regret", "value_optimal", "value_uniform", "exact", "error_bound"),
+    *("states", "episodes"),
+)
+"""Numbers of one task."""
 
 
 @app.command("show")
@@ -149,92 +177,179 @@ def report(
 
 @app.command("submit")
 def submit(
-    results: Annotated[Path, "DIR"],
+    folder: Annotated[Path, "DIR"],
     *,
     out: Path | None = None,
-    suite: SuiteFile = "v1",
+    suite: SuiteFile = None,
+    name: str = "",
     author: str = "",
     note: str = "",
     trust: Trust = False,
 ) -> Answer:
-    """Pack curves and final policies of a run into one file; anybody can compute the policies' values again.
+    """Pack what a run, or the runs of a suite, have learnt and claim into one file; anybody can compute it again.
 
     Args:
-        results: Folder of `benchmark run`.
-        out: FILE.safetensors; AGENT.safetensors when not given.
-        suite: That it is of.
+        folder: Of one finished run, or of `benchmark run`.
+        out: FILE.safetensors; ID.safetensors of a run, DIR.safetensors of a suite, when not given.
+        name: Label; the agent's own when not given.
         author: Who submits it.
         note: Shown beside it.
     """
     from pharos import benchmark
 
-    file = out or Path(f"{results.name}.safetensors")
-    loaded = benchmark.load_suite(suite, trust=trust)
-    texts = {"author": author, "note": note}
+    texts = {"name": name, "author": author, "note": note}
     with counted_bar("policies") as tell:
-        submission = benchmark.submit(results, file, loaded, **texts, trust=trust, progress=tell)
-    runs, policies = sum(map(len, submission.results.curves.values())), len(submission.policies)
-    facts = [("runs", f"{runs:,}"), ("policies", f"{policies:,}")]
-    return Answer({"file": file, "runs": runs, "policies": policies}, (str(file), facts))
+        file = benchmark.submit(folder, out, _loaded(suite, trust), **texts, trust=trust, progress=tell)
+    content, size = benchmark.read(file), file.stat().st_size
+    if isinstance(content, benchmark.Entry):
+        claim, more = content.claim, {"id": content.id, "claim": content.claim}
+        runs = policies = 1
+        kind = "exact" if claim.exact else f"estimated, ± {claim.error_bound:.2g}"
+        facts = [
+            ("entry", _title(content)),
+            ("value", f"{claim.value:.8g} ({kind})"),
+            ("regret", f"{claim.regret:.8g}"),
+        ]
+        if content.config.sources:
+            facts.append(("code", "others verify it with --trust alone: it names code of your own"))
+    else:
+        runs, policies, more = sum(map(len, content.results.curves.values())), len(content.policies), {}
+        facts = [("runs", f"{runs:,}"), ("policies", f"{policies:,}")]
+    answer = {"file": file, "bytes": size, "runs": runs, "policies": policies, **more}
+    return Answer(answer, (str(file), [*facts, ("size", size_text(size))]))
 
 
 @app.command("verify")
-def verify(file: Annotated[Path, "FILE"], *, suite: SuiteFile = "v1", trust: Trust = False) -> Answer:
-    """Solve the tasks of a submission and evaluate its final policies again; exit code 1 where one is not as claimed.
+def verify(
+    files: Annotated[list[Path], "FILE..."],
+    *,
+    suite: SuiteFile = None,
+    limits: Limits,
+    trust: Trust = False,
+) -> Answer:
+    """Solve the tasks of submissions and evaluate their policies again; exit code 1 if one is not as claimed.
 
     Args:
-        file: That `benchmark submit` wrote.
-        suite: That it is of.
+        files: That `benchmark submit` wrote.
     """
     from pharos import benchmark
 
-    loaded = benchmark.load_suite(suite, trust=trust)
-    with counted_bar("verifying") as tell:
-        verdict = benchmark.verify(file, loaded, progress=tell)
+    loaded, verdicts, answers = _loaded(suite, trust), [], []
+    for file in files:
+        began = time.perf_counter()
+        try:
+            with counted_bar(f"verifying {file}") as tell:
+                verdict = benchmark.verify(file, loaded, trust=trust, progress=tell, **vars(limits))
+        except Exception as error:
+            if len(files) == 1:
+                raise
+            reason = benchmark.reason(error)
+            complain(reason if str(file) in reason else f"{file}: {reason}")
+            answers.append({"file": file, "holds": False, "error": reason})
+            continue
+        verdicts.append(verdict)
+        answers.append({**_answer(verdict), "seconds": time.perf_counter() - began, "limits": limits.to_dict()})
+
+    def text() -> None:
+        for verdict in verdicts:
+            if isinstance(verdict, benchmark.EntryVerdict):
+                _print_entry(verdict)
+            else:
+                _print_submission(verdict)
+
+    holds = all(each["holds"] for each in answers)
+    return Answer(answers[0] if len(files) == 1 else {"entries": answers, "holds": holds}, text, not holds)
+
+
+def _answer(verdict: "EntryVerdict | SubmissionVerdict") -> dict[str, Any]:
     wrong = {each.name: {"claimed": each.claimed, "computed": each.found} for each in verdict.wrong}
-    answer = {"holds": verdict.holds, "sha256": verdict.sha256, "verified": len(verdict.checks) - len(wrong)}
-    answer |= {"wrong": wrong, "refused": verdict.refused, "missing": verdict.missing}
-    answer |= {"final_score": verdict.final, "claimed": CLAIMED}
-    facts = [
+    answer = {"file": verdict.file, "holds": verdict.holds, "sha256": verdict.sha256}
+    answer |= {"verified": len(verdict.checks) - len(wrong), "wrong": wrong, "refused": verdict.refused}
+    answer |= {"missing": verdict.missing, "final_score": verdict.final, "claimed": CLAIMED}
+    if (entry := getattr(verdict, "entry", None)) is not None:
+        checks = {
+            each.name: {"claimed": each.claimed, "found": each.found, "within": each.within, "holds": each.holds}
+            for each in verdict.checks
+        }
+        answer |= {"id": entry.id, "checks": checks} | {name: getattr(verdict, name) for name in COMPUTED}
+    return answer
+
+
+def _title(entry: "Entry") -> str:
+    return f"{entry.name}: {entry.config.agent} on {entry.config.environment}, {entry.config.steps:,} steps"
+
+
+def _print_entry(verdict: "EntryVerdict") -> None:
+    if verdict.exact:
+        how = f"exact: evaluated in {pluralize(verdict.states, 'state')}, error at most {verdict.error_bound:.1e}"
+    else:
+        how = (
+            f"estimated from {verdict.episodes:,} episodes: {verdict.value:.6g} ± {verdict.error_bound:.2g} (99 %); "
+            f"the policy reaches more than {verdict.states:,} states (--max-reached)"
+        )
+    print_table(
+        f"{verdict.file}  {_title(verdict.entry)}",
+        ("", ">claimed", ">computed", ">may differ by", ""),
         (
-            "policies",
-            f"{len(verdict.checks) - len(wrong):,} as claimed, {len(wrong):,} not, {len(verdict.missing):,} missing",
+            (
+                in_words(each.name),
+                *(f"{number:.8g}" for number in (each.claimed, each.found)),
+                f"{each.within:.1e}",
+                "holds" if each.holds else "FAILS",
+            )
+            for each in verdict.checks
         ),
-        *((name, f"regret {each['computed']:.6g}, claimed {each['claimed']:.6g}") for name, each in wrong.items()),
+        notes=[how, *verdict.refused.values()],
+    )
+    print("the claim holds" if verdict.holds else "the claim does not hold")
+
+
+def _print_submission(verdict: "SubmissionVerdict") -> None:
+    wrong = verdict.wrong
+    verified = f"{len(verdict.checks) - len(wrong):,} as claimed, {len(wrong):,} not, {len(verdict.missing):,} missing"
+    facts = [
+        ("policies", verified),
+        *((each.name, f"regret {each.found:.6g}, claimed {each.claimed:.6g}") for each in wrong),
         *verdict.refused.items(),
         ("final score", f"{verdict.final:.3f}, computed; a run without a policy counts as 0"),
         ("claimed", ", ".join(CLAIMED)),
     ]
-    title = f"{file}: {'final policies are as claimed' if verdict.holds else 'does not hold'}"
-    return Answer(answer, (title, facts), not verdict.holds)
+    print_facts(f"{verdict.file}: {'final policies are as claimed' if verdict.holds else 'does not hold'}", facts)
 
 
 @app.command("board")
 def board(
-    files: Annotated[list[Path], "FILE..."],
+    files: Annotated[list[Path], "FILE|DIR..."],
     *,
-    out: Path = Path("board.html"),
+    out: Annotated[Path, file_ending(".html", ".htm")] = Path("board.html"),
     suite: Annotated[list[str] | None, "NAME|FILE"] = None,
     title: str = "Benchmark",
+    limits: Limits,
     trust: Trust = False,
 ) -> Answer:
-    """Verify submissions, and write a page that ranks them by their final policies; all else on it is claimed.
+    """Verify submissions, and write a page that ranks them by what was computed; all else on it is claimed.
 
     Args:
-        files: Submissions.
+        files: Submissions, and folders with some in them and below.
         out: FILE.html.
         suite: That they may be of; several times for more; v1 when not given.
         title: Of the page.
     """
     from pharos import benchmark
 
-    suites = [benchmark.load_suite(each, trust=trust) for each in suite or ["v1"]]
+    suites = [benchmark.load_suite(each, trust=trust) for each in suite or ()]
     with counted_bar("verifying") as tell:
-        page = benchmark.benchmark_board(files, out, suites, title=title, progress=tell)
-    facts = [("verified", f"{len(page.verified):,}"), ("refused", f"{len(page.refused):,}"), *page.refused.items()]
-    scores = {each.file.name: each.final for each in page.verified}
-    answer = {"file": out, "verified": len(page.verified), "refused": page.refused}
-    return Answer({**answer, "final_scores": scores, "claimed": CLAIMED}, (str(out), facts))
+        page = benchmark.board(files, out, suites, title=title, trust=trust, progress=tell, **vars(limits))
+    verified = len(page.verified)
+    facts = [("verified", f"{verified:,}"), ("refused", f"{len(page.refused):,}"), *page.refused.items()]
+    answer = {"file": out, "verified": verified, "refused": page.refused, "final_scores": page.final_scores}
+    return Answer({**answer, "claimed": CLAIMED}, (str(out), facts))
+
+
+def _loaded(suite: str | None, trust: bool) -> "Suite | None":
+    from pharos.benchmark import load_suite
+
+    return None if suite is None else load_suite(suite, trust=trust)
 
 
 def _entry(task: "BenchmarkTask") -> dict[str, Any]:

@@ -20,7 +20,7 @@ from pharos.training import TrainingOptions
 if TYPE_CHECKING:
     from pharos.hardness import Report, Representation
     from pharos.mdp import TabularMDP
-    from pharos.validation import Prediction
+    from pharos.prediction import Prediction
 
 
 # What the column "exact" says of each kind of certificate.
@@ -211,7 +211,7 @@ def predict(
         plot: Draw the bars into a PNG, PDF or SVG.
     """
     env = target.found_environment()
-    from pharos.validation import predict as foretell
+    from pharos.prediction import predict as foretell
 
     with progress_line("predicting") as tell:
         prediction = foretell(

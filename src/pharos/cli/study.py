@@ -235,7 +235,7 @@ def predict(
         primary: Only the predictor that stands for each agent, in a small part of the time.
     """
     from pharos import study
-    from pharos.validation import PRIMARY
+    from pharos.prediction import PRIMARY
 
     opened, place = source.opened()
     with progress_line("predicting", logged=True) as tell:

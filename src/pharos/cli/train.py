@@ -252,7 +252,7 @@ def tune(
 
     kinds, predicted = _chances(chance), None
     if shortlist_by_prediction > 1:
-        from pharos.validation import regret_predictor
+        from pharos.prediction import regret_predictor
 
         predicted = regret_predictor(
             training.agent,

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pharos.validation import Prediction
+    from pharos.prediction import Prediction
 
 
 # The class of imported MDPs, which has no parameters but its folder
@@ -247,7 +247,7 @@ def unseen_figures(
 
 def predicted_by_class(part: "pd.DataFrame", predictor: str | None = None) -> "Figure | None":
     """A panel for each class: regret against the prediction by a line through the other classes."""
-    from pharos.validation import Cells, class_predictions
+    from pharos.study import Cells, class_predictions
 
     predictor = predictor or _learner(part)
     cells = Cells.of(part, [predictor], "greedy")

@@ -30,8 +30,10 @@ from pharos.system import lazy
 from pharos.training import run_id
 
 if TYPE_CHECKING:  # loaded where they are asked for
-    from pharos.validation import outcomes, read_predictions, write_predictions
-    from pharos.validation import unseen_classes as validation
+    from pharos.study.cross_validation import class_predictions
+    from pharos.study.leave_one_class_out import OUTCOMES, Cells, outcomes
+    from pharos.study.leave_one_class_out import unseen_classes as validation
+    from pharos.study.predictions import PredictedCells, Predictions, read_predictions, write_predictions
 
 __all__ = [
     "Models",

@@ -409,7 +409,7 @@ def predict(
         source, folder: as for `run`; no run is looked at.
         blocks, agents, observations: a part of the study: numbers of blocks from 1, names of agents, and of
             observations without their options; None: all.
-        primary: only the predictor that stands for each agent (`pharos.validation.PRIMARY`) with its table; other
+        primary: only the predictor that stands for each agent (`pharos.prediction.PRIMARY`) with its table; other
             columns are NaN, and `estimated_error` is that of this predictor. A small part of the time.
         progress: called with what is being done.
     Returns:
@@ -425,7 +425,7 @@ def predict(
     """
     import pandas as pd
 
-    from pharos.validation import POLICY_CURVES, predicted
+    from pharos.prediction import POLICY_CURVES, predicted
 
     study, _ = opened(source, folder)
     rows: dict[tuple[str, ...], dict[str, Any]] = {}

@@ -145,7 +145,7 @@ def tune(  # noqa: PLR0913
         search_seed: of the search.
         engine: "sb3": the runs of a trial one after the other; "batched": at once.
         shortlist, predicted: of so many proposals the one is tried whose hyperparameters this function gives the least
-            number, such as `pharos.validation.regret_predictor`; the first trial is what the table says.
+            number, such as `pharos.prediction.regret_predictor`; the first trial is what the table says.
         out: folder; a search there goes on. None: nothing is written.
         progress: called after each trial with trials done, trials in all, and the best score so far.
     Raises:

@@ -19,7 +19,7 @@ from pharos.system.storage import inside, replace_file
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pharos.validation import Predictions
+    from pharos.study.predictions import Predictions
 
 MODELS = "Hardness and regret"
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
@@ -65,7 +65,7 @@ def report(
             cell was predicted twice.
     Cost: the measures of hardness of what has finished runs, once, each at most its budget; then seconds.
     """
-    from pharos.validation import PredictedCells
+    from pharos.study.predictions import PredictedCells
 
     tell = progress or (lambda _: None)
     predicted = PredictedCells.of(predictions)

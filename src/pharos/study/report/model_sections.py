@@ -17,7 +17,7 @@ from pharos.system.wording import in_words, pluralize
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pharos.validation import PredictedCells
+    from pharos.study.predictions import PredictedCells
 
 
 def models_section(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
@@ -134,7 +134,7 @@ def judged(results: Results, predictions: "PredictedCells | None") -> "tuple[pd.
     Raises:
         ParameterError: there are predictions, but of other cells, or of fewer than three classes.
     """
-    from pharos.validation import outcomes, unseen_classes
+    from pharos.study.leave_one_class_out import outcomes, unseen_classes
 
     cells = outcomes(results.runs, results.points)
     if predictions is not None:
@@ -222,7 +222,7 @@ def doubts(results: Results, predictions: "PredictedCells") -> list[str]:
 
 
 def _part(agent: str, outcome: str, rows: "pd.DataFrame", figures: Figures) -> dict[str, Any]:
-    from pharos.validation import OUTCOMES
+    from pharos.study.leave_one_class_out import OUTCOMES
 
     images = []
     if outcome == "greedy":

@@ -1,38 +1,27 @@
-"""Verifying an entry: value and regret of its policy, computed again from the rules and held against its claim.
+"""Task and policy of an entry, made of the numbers and names in its file.
 
 What it has learnt is checked before anything of its size is made, and never executed.
 """
 
-import contextlib
-import errno
 import inspect
 import itertools
 import math
-import os
-import signal
-import threading
-import time
 from collections.abc import Iterator, Mapping, MutableMapping
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pharos.agents import AGENTS, algorithm, extractor, make_model
+from pharos.benchmark.entry import POLICY, Entry
 from pharos.environments import BUILT_IN
-from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, TimeLimit, UntrustedCode
-from pharos.leaderboard.entry import LARGEST_FILE, LONGEST_TEXT, POLICY, Claim, Entry, read
-from pharos.leaderboard.limits import Limits
+from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, UntrustedCode
 from pharos.observations import names as observation_names
 from pharos.observations import observe
 from pharos.policies import PolicyLike, deep_policy
 from pharos.state_space import build
 from pharos.system import storage
-from pharos.system.memory import available_memory
-from pharos.system.records import takes
 from pharos.system.sources import is_reference
-from pharos.training import ReferenceValues, RunConfig, Task, TaskValues, evaluate_agent, regret
+from pharos.training import RunConfig, Task, TaskValues
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -43,6 +32,7 @@ NETWORK_OPTIONS = ("net_arch", "normalize_images", "ortho_init", "features_extra
 """What `policy_kwargs` of an entry may say."""
 SMALLEST = ({"buffer_size": 1}, {"n_steps": 2, "batch_size": 2})
 """What takes memory, and does not matter to a policy that learns no more: of replay, or of rollouts."""
+SMALLEST_CHANCE = 1e-12
 
 
 def policy_of(entry: Entry, task: Task, *, trust: bool = False) -> PolicyLike:
@@ -60,16 +50,27 @@ def policy_of(entry: Entry, task: Task, *, trust: bool = False) -> PolicyLike:
 def _table(entry: Entry, task: Task) -> np.ndarray:
     if set(entry.arrays) != {POLICY}:
         raise FileFormatError(f"a table has the array {POLICY!r} alone; found {', '.join(entry.arrays)}")
-    table, mdp = entry.arrays[POLICY], task.mdp
-    states, actions = mdp.num_states, mdp.num_actions
+    states, actions = task.mdp.num_states, task.mdp.num_actions
+    return checked_table(entry.arrays[POLICY], (states, actions + 1, actions))
+
+
+def checked_table(table: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Table of a file as int64 actions (S,), or as float64 probabilities of a shape (S, ..., A).
+
+    Raises:
+        FileFormatError: it has another shape, or names actions that are not there.
+    """
+    states, num_actions = shape[0], shape[-1]
     if table.shape == (states,) and table.dtype.kind in "iu":
-        if states and not (int(table.min()) >= 0 and int(table.max()) < actions):
-            raise FileFormatError(f"its table names actions from {table.min()} to {table.max()}; there are {actions}")
+        if states and not (int(table.min()) >= 0 and int(table.max()) < num_actions):
+            raise FileFormatError(
+                f"its table names actions from {table.min()} to {table.max()}; there are {num_actions}"
+            )
         return table.astype(np.int64)
-    if table.shape == (states, actions + 1, actions):
+    if table.shape == shape:
         return table.astype(np.float64)
     raise FileFormatError(
-        f"its table has shape {table.shape}; expected ({states},) or ({states}, {actions + 1}, {actions})"
+        f"its table has shape {table.shape}, {table.dtype}; expected ({states},) actions or {shape} probabilities"
     )
 
 
@@ -182,221 +183,10 @@ def _check_arrays(entry: Entry, env: "VecEnv", hyperparameters: dict[str, Any]) 
             raise FileFormatError(f"its weights {name!r} are not finite")
 
 
-# Verification ---------------------------------------------------------------------------------------------------------
+# The task ------------------------------------------------------------------------------------------------------------
 
 
-SMALLEST_CHANCE = 1e-12
-SHARE_OF_MEMORY = 0.9
-SEED = 1
-"""Of estimates; another one than that of runs, so that an estimate is not compared with itself."""
-
-
-@dataclass(frozen=True)
-class Check:
-    """A claimed number beside the computed one.
-
-    Attributes:
-        name: "value", "regret", "value_optimal" or "value_uniform".
-        claimed, found: the two numbers.
-        within: how far apart they may be.
-    """
-
-    name: str
-    claimed: float
-    found: float
-    within: float
-
-    @property
-    def holds(self) -> bool:
-        """Whether claimed and computed number differ by at most `within`."""
-        return abs(self.claimed - self.found) <= self.within
-
-
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """Result of verifying an entry.
-
-    Attributes:
-        file, entry: what was verified.
-        value, regret: of the policy, as they were computed.
-        normalized_regret: regret / (V* - U); NaN where V* = U.
-        value_optimal, value_uniform: V* and U, computed.
-        exact: whether the value is computed; else it is estimated from episodes.
-        error_bound: how far the value may be off; of an estimate half the width of a 99 % interval.
-        states: in which the policy was asked; episodes: behind an estimate.
-        checks: the claim, number by number.
-        objections: what cannot be true of the claim, whatever was computed; sentences.
-        seconds: that it took.
-        limits: under which it was computed: the largest "states", "reached", "horizon", "seconds" and "bytes".
-    """
-
-    file: Path
-    entry: Entry
-    value: float
-    regret: float
-    normalized_regret: float
-    value_optimal: float
-    value_uniform: float
-    exact: bool
-    error_bound: float
-    states: int
-    episodes: int
-    checks: tuple[Check, ...]
-    seconds: float
-    objections: tuple[str, ...] = ()
-    limits: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def holds(self) -> bool:
-        """Whether all that can be computed is as claimed, possible, and not claimed to be exact where it is not."""
-        return all(check.holds for check in self.checks) and not self.claims_too_much and not self.objections
-
-    @property
-    def claims_too_much(self) -> bool:
-        """Whether the entry says that a value is exact which is only estimated here."""
-        return self.entry.claim.exact and not self.exact
-
-
-@takes(Limits)
-def verify(
-    file: str | os.PathLike,
-    *,
-    trust: bool = False,
-    values: MutableMapping[str, TaskValues] | None = None,
-    **options: Any,
-) -> Verdict:
-    """Compute the value and the regret of an entry's policy again, and compare them with its claim.
-
-    The states are enumerated from pharos' own rules, solved, and the policy is evaluated on them; of the file only
-    numbers and names are used. A claim holds where its interval (its error bound) and the one found here meet, where it
-    is not above V*, and where its interval is narrower than V* - U. A value that can only be estimated is estimated
-    from other episodes than the run's own.
-
-    Args:
-        trust: whether code that the entry names may be imported: an environment, observation or agent that is no part
-            of pharos or Stable-Baselines3. It comes from this machine; no file of an entry holds any.
-        values: filled with the values of each task, for the entries that follow.
-        options: of `Limits`: tolerance; beyond max_states, max_horizon or max_seconds an entry is refused, and beyond
-            max_reached states that its policy reaches the value is estimated.
-    Raises:
-        ParameterError: there is no such file. FileFormatError: it is no entry, or not one of this version of the rules.
-        ResultCorrupted: it was cut short or changed. UntrustedCode: it names code, and is not trusted.
-        StateSpaceTooLarge: it has more states. TimeLimit: it takes longer.
-    """
-    began, path, limits = time.perf_counter(), Path(file), Limits(**options)
-    entry = read(path)
-    for name, steps in (("horizon", entry.config.horizon or 0), ("reward_delay", entry.config.chance.reward_delay)):
-        if steps > limits.max_horizon:
-            raise FileFormatError(f"{path}: its {name} is {steps:,} steps; expected at most {limits.max_horizon:,}")
-    # Value of the policy and reference values, computed again within limits of time and memory
-    try:
-        with _time_limit(limits.max_seconds), _memory_limit():
-            task = _task(entry, trust, limits.max_states, values)
-            policy = policy_of(entry, task, trust=trust)
-            evaluation = evaluate_agent(policy, task, max_states=limits.max_reached, seed=SEED)
-            reference, range_of_returns = task.reference, task.return_range
-    except (TimeLimit, UntrustedCode, StateSpaceTooLarge) as error:
-        raise type(error)(f"{path}: {str(error)[:LONGEST_TEXT]}") from None
-    except (ParameterError, FileFormatError) as error:
-        raise FileFormatError(f"{path}: {str(error)[:LONGEST_TEXT]}") from None
-    except (MemoryError, OSError) as error:
-        if isinstance(error, OSError) and error.errno != errno.ENOMEM:
-            raise
-        raise FileFormatError(f"{path}: asks for more memory than there is: {error}") from None
-    # Each claimed number beside the computed one
-    claim = entry.claim
-    slack = limits.tolerance * max(1.0, abs(reference.optimal)) + reference.error_bound
-    apart = slack + evaluation.error_bound + (min(claim.error_bound, slack) if claim.exact else claim.error_bound)
-    lost, spread = regret(evaluation.value, reference), reference.spread()
-    checks = (
-        Check("value", claim.value, evaluation.value, apart),
-        Check("regret", claim.regret, lost, apart + slack),
-        Check("value_optimal", claim.value_optimal, reference.optimal, slack),
-        Check("value_uniform", claim.value_uniform, reference.uniform, slack),
-    )
-    return Verdict(
-        path,
-        entry,
-        evaluation.value,
-        lost,
-        regret(evaluation.value, reference, normalized_by="uniform"),
-        reference.optimal,
-        reference.uniform,
-        evaluation.exact,
-        evaluation.error_bound,
-        evaluation.states,
-        evaluation.episodes,
-        checks,
-        time.perf_counter() - began,
-        _objections(claim, reference, spread if math.isfinite(spread) else float(np.ptp(range_of_returns)), slack),
-        {name: getattr(limits, f"max_{name}") for name in ("states", "reached", "horizon", "seconds")}
-        | {"bytes": LARGEST_FILE},
-    )
-
-
-def _objections(claim: Claim, reference: ReferenceValues, spread: float, slack: float) -> tuple[str, ...]:
-    """Sentences on parts of a claim that cannot be true."""
-    objections = []
-    bound = min(claim.error_bound, slack) if claim.exact else claim.error_bound
-    if claim.value - bound > reference.optimal + slack:
-        objections.append(
-            f"the value claimed, {claim.value:.8g}, is above that of the optimal policy, {reference.optimal:.8g}"
-        )
-    if claim.error_bound > spread + slack:
-        objections.append(
-            f"the error bound claimed, {claim.error_bound:.3g}, is larger than the values of policies are apart, "
-            f"{spread:.3g}"
-        )
-    return tuple(objections)
-
-
-@contextlib.contextmanager
-def _time_limit(seconds: float) -> Iterator[None]:
-    """Raise TimeLimit in the block after that many seconds of wall-clock time, and every second until the block ends.
-
-    A compiled kernel is not interrupted; it raises when it returns. Only the main thread can be stopped, by SIGALRM:
-    elsewhere, and on Windows, there is no limit.
-    """
-    able = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
-    if not able or not seconds < math.inf:
-        yield
-        return
-
-    def stop(*_: object) -> None:
-        raise TimeLimit(f"takes more than {seconds:g} s")
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-6), 1.0)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-
-
-@contextlib.contextmanager
-def _memory_limit() -> Iterator[None]:
-    """Raise MemoryError if the block requests more memory than is free, before the system kills the process.
-
-    On Linux, by RLIMIT_DATA of the whole process; elsewhere there is no limit.
-    """
-    statistics = Path("/proc/self/statm")
-    if not statistics.exists():
-        yield
-        return
-    import resource
-
-    used = int(statistics.read_text().split()[5]) * resource.getpagesize()
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    limits = [int(used + SHARE_OF_MEMORY * available_memory()), *(each for each in before if each >= 0)]
-    resource.setrlimit(resource.RLIMIT_DATA, (min(limits), before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, before)
-
-
-def _task(entry: Entry, trust: bool, max_states: int, values: MutableMapping[str, TaskValues] | None) -> Task:
+def task_of(entry: Entry, trust: bool, max_states: int, values: MutableMapping[str, TaskValues] | None) -> Task:
     """The task of an entry, its state space built, within limits that hold before it is."""
     config = entry.config
     _check_code(config, trust)

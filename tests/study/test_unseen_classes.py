@@ -7,11 +7,12 @@ from scipy.stats import rankdata
 
 from pharos import study
 from pharos.errors import ParameterError
+from pharos.prediction.pairs import Pairs
+from pharos.study import PredictedCells, leave_one_class_out
+from pharos.study import cross_validation as held_out
+from pharos.study.predictions import late
 from pharos.study.specification import specification
 from pharos.training import CELL
-from pharos.validation import PredictedCells, leave_one_class_out
-from pharos.validation import cross_validation as held_out
-from pharos.validation import prediction as _prediction
 
 
 def design(classes=5, instances=3, predictors=2, seed=0):
@@ -147,7 +148,7 @@ def test_pairs_of_observations_of_one_mdp_are_compared():
             if mdps[i] == mdps[j] and abs(y[i] - y[j]) > 0.05:
                 number += 1
                 right += (x[i] > x[j]) == (y[i] > y[j])
-    pairs = leave_one_class_out.Pairs.of(y, mdps)
+    pairs = Pairs.of(y, mdps)
     assert (len(pairs.first), pairs.agreement(x)) == (number, right / number)
     assert pairs.agreement(np.zeros(24)) == 0.5
 
@@ -155,7 +156,7 @@ def test_pairs_of_observations_of_one_mdp_are_compared():
 def test_predictions_that_differ_by_rounding_are_alike():
     """As for ranks: a difference within a billionth of the spread counts one half, one that is larger orders a pair."""
     y, mdps = np.array([0.0, 1.0, 0.0, 1.0]), np.array([0, 0, 1, 1])
-    pairs = leave_one_class_out.Pairs.of(y, mdps)
+    pairs = Pairs.of(y, mdps)
     for scale in (1e-6, 1.0, 1e12):
         x = scale * np.array([0.7, 0.7 + 5e-10, 0.2, 1.2])
         assert pairs.right(x).tolist() == [0.5, 1.0]
@@ -171,7 +172,7 @@ def test_the_ceiling_of_agreement_is_that_of_a_predictor_that_knows_expectations
     truth, noise = rng.uniform(0, 5, 8000), rng.uniform(0.2, 1.5, 8000)
     y = truth + rng.normal(size=8000) * np.sqrt(noise)
     signs = np.sign(y[::2] - y[1::2])
-    some = leave_one_class_out.Pairs(np.arange(0, 8000, 2), np.arange(1, 8000, 2), signs)
+    some = Pairs(np.arange(0, 8000, 2), np.arange(1, 8000, 2), signs)
     assert 0.7 < some.agreement(truth) < 0.9
     assert some.ceiling(y, noise) == pytest.approx(some.agreement(truth), abs=0.04)
     assert some.ceiling(y, np.zeros(8000)) == 1.0
@@ -182,7 +183,7 @@ def test_a_class_whose_instances_agree_counts_once():
     """One class, two observations: whatever the number of its instances, two names for them, so p is never small."""
     mdps = np.repeat(np.arange(20), 2)
     x = np.tile([0.0, 1.0], 20)
-    pairs = leave_one_class_out.Pairs.of(x, mdps)
+    pairs = Pairs.of(x, mdps)
     shuffled = pairs.permuted(x, np.zeros(40, int), mdps, ["vector", "image"] * 20, 200, 0)
     assert set(shuffled) == {0.0, 1.0}
     assert 0.4 < held_out.p_of(pairs.agreement(x), shuffled) < 0.6
@@ -257,7 +258,7 @@ def test_seeds_without_an_outcome_do_not_count_for_its_noise():
 
 def test_runs_that_had_begun_are_told():
     runs = pd.DataFrame({"id": [*"abc"], "began": ["2026-01-01T00:00:00Z", "2026-01-02T00:00:01Z", ""]})
-    assert _prediction.late(runs, {"date": "2026-01-02T00:00:00Z"}) == (1, 1)
+    assert late(runs, {"date": "2026-01-02T00:00:00Z"}) == (1, 1)
 
 
 def test_predictions_that_came_after_runs_are_no_predictions():

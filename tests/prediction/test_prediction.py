@@ -13,8 +13,8 @@ from command_line import run
 from pharos import hardness, importers
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.observations import representation
-from pharos.validation import PRIMARY, Published, prediction, published
-from pharos.validation.prediction import PairOrder
+from pharos.prediction import PRIMARY, Published, prediction, published
+from pharos.prediction.prediction import PairOrder
 
 CHOICES = Path(__file__).parents[2] / "docs" / "studies" / "choices"
 

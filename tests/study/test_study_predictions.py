@@ -13,18 +13,9 @@ from pharos import hardness, study
 from pharos.agents import hyperparameters
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.hardness import registry
-from pharos.study import specification
+from pharos.prediction import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS, learners
+from pharos.study import predictions, read_predictions, specification, validation, write_predictions
 from pharos.study.report.model_sections import winners
-from pharos.validation import (
-    POLICY_PREDICTORS,
-    PREDICTORS,
-    SAMPLED_PREDICTORS,
-    learners,
-    prediction,
-    read_predictions,
-    write_predictions,
-)
-from pharos.validation import unseen_classes as validation
 from refusals import failing, refusal
 
 SPEC = {
@@ -82,7 +73,7 @@ def test_the_primary_predictor_of_an_agent_that_has_none_is_a_note(tmp_path):
 
 
 def test_only_the_blocks_that_are_asked_for_are_predicted(tmp_path, monkeypatch):
-    monkeypatch.setattr("pharos.validation.predicted", lambda _, primary: {})
+    monkeypatch.setattr("pharos.prediction.predicted", lambda _, primary: {})
     block = {"environments": ["frozen_lake/4x4"], "agents": ["dqn"]}
     two = study.specification({"name": "two", "blocks": [block, {**block, "environments": ["frozen_lake/8x8"]}]})
     assert study.predict(two, tmp_path, blocks=[2])["instance"].tolist() == ["frozen_lake/8x8"]
@@ -165,7 +156,7 @@ def test_predictions_stay_where_others_cannot_be_written(predicted, tmp_path, mo
     file, spec = tmp_path / "p.parquet", specification(SPEC)
     write_predictions(spec, predicted, file)
     before = file.read_bytes()
-    monkeypatch.setattr(prediction.training, "write_table", failing(errno.ENOSPC))
+    monkeypatch.setattr(predictions.training, "write_table", failing(errno.ENOSPC))
     assert "No space left" in refusal(OSError, write_predictions, spec, predicted.assign(kernel_regret=1.0), file)
     assert file.read_bytes() == before and list(tmp_path.iterdir()) == [file]
 

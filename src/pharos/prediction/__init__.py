@@ -1,0 +1,20 @@
+"""Regret of agents predicted before they train, with intervals from published runs."""
+
+from pharos.prediction.learners import (
+    POLICY_CURVES,
+    POLICY_PREDICTORS,
+    PREDICTORS,
+    PRIMARY,
+    SAMPLED_PREDICTORS,
+    predicted,
+)
+from pharos.prediction.pairs import Pairs
+from pharos.prediction.prediction import PredictedRegret, Prediction, Published, predict, published, regret_predictor
+
+__all__ = [
+    "Prediction",
+    "Published",
+    "predict",
+    "published",
+    "regret_predictor",
+]
