@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from pharos import study
+from pharos.statistics import spearman
 from pharos.validation import PRIMARY
-from pharos.validation.cross_validation import spearman
 from pharos.validation.leave_one_class_out import Pairs
 
 CLEAR = 0.02

@@ -30,6 +30,7 @@ ORDER = (
     *(
         "errors",
         "system",
+        "statistics",
         "ranks",
         "kernels",
         "environments",

@@ -32,8 +32,9 @@ from pharos.plots.style import (
     styled,
     thousands,
 )
+from pharos.statistics import bootstrap_interval
 from pharos.system.wording import in_words
-from pharos.training import CELL, bootstrap_interval, read_curve, read_record
+from pharos.training import CELL, read_curve, read_record
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pharos.errors import ParameterError
+from pharos.statistics import TIE_TOLERANCE, holm, percentiles, permutation_p_value, r_squared, spearman
 from pharos.training import CELL
 from pharos.validation import cross_validation
-from pharos.validation.cross_validation import BLOCK, percentiles
+from pharos.validation.cross_validation import BLOCK
 from pharos.validation.learners import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS
 
 if TYPE_CHECKING:
@@ -191,7 +192,7 @@ def _corrected(table: "pd.DataFrame") -> "pd.DataFrame":
         return table
     p = table[list(P_VALUES)].to_numpy(float)
     table["tests"] = int(np.isfinite(p).sum())
-    corrected = cross_validation.holm(p.ravel()).reshape(p.shape)
+    corrected = holm(p.ravel()).reshape(p.shape)
     for i, name in enumerate(P_VALUES):
         table[f"{name}_holm"] = corrected[:, i]
     return table
@@ -280,7 +281,7 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
     if permutations and x.shape[1] and count >= 3:
         shuffled = cross_validation.permuted_classes(x, y, classes, cells.places, permutations, seed)
         floors = [float(percentiles(each[1:], 95)[0]) for each in shuffled]
-        p = cross_validation.p_of(shuffled[1][0], shuffled[1][1:])
+        p = permutation_p_value(shuffled[1][0], shuffled[1][1:])
     return {
         "r_squared": scores[0],
         "r_squared_lower": ends[0, 0],
@@ -291,7 +292,7 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
         "floor_r_squared": floors[0],
         "floor_rho": floors[1],
         "p_rho": p,
-        "r_squared_mdp": cross_validation.r_squared(y, by_mdp, classes) if cells.instances.max() else np.nan,
+        "r_squared_mdp": r_squared(y, y - by_mdp, classes) if cells.instances.max() else np.nan,
         "calibration": slope if x.shape[1] else np.nan,
         "calibration_offset": offset if x.shape[1] else np.nan,
         "ceiling": np.nan if noise is None else cross_validation.ceiling(y, noise, classes),
@@ -314,7 +315,7 @@ def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[st
         return row
     x, y, classes = cells.x[:, 0], cells.y, cells.classes
     # Rank correlation within classes
-    within = [cross_validation.spearman(x[classes == each], y[classes == each]) for each in range(classes.max() + 1)]
+    within = [spearman(x[classes == each], y[classes == each]) for each in range(classes.max() + 1)]
     if np.isfinite(within).any():
         row["rho_within"] = float(np.nanmean(within))
     # Pairs of observations: all, then those of an image and a vector
@@ -336,7 +337,7 @@ def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[st
     row["agreement_lower"], row["agreement_upper"] = pairs.interval(x, classes, drawn)
     if permutations:
         shuffled = pairs.permuted(x, classes, cells.mdps, names, permutations, seed)
-        row["p_agreement"] = cross_validation.p_of(pairs.agreement(x), shuffled)
+        row["p_agreement"] = permutation_p_value(pairs.agreement(x), shuffled)
     return row
 
 
@@ -458,14 +459,14 @@ class Pairs:
     def right(self, x: np.ndarray) -> np.ndarray:
         """(M,) 1 where x (N,) orders the pair as the outcome does, 1/2 where it says that both are alike, else 0.
 
-        Alike is what differs by at most TIED of the spread of x: rounding, as for ranks.
+        Alike is what differs by at most TIE_TOLERANCE of the spread of x: rounding, as for ranks.
         """
         return self._right(x, x)
 
     def _right(self, values: np.ndarray, x: np.ndarray) -> np.ndarray:
         """(..., M) of values (..., N) of x in other places; NaN where one of a pair is."""
         difference = values[..., self.first] - values[..., self.second]
-        is_rounding = np.abs(difference) <= cross_validation.TIED * (x.max(initial=-np.inf) - x.min(initial=np.inf))
+        is_rounding = np.abs(difference) <= TIE_TOLERANCE * (x.max(initial=-np.inf) - x.min(initial=np.inf))
         return 0.5 + 0.5 * np.where(is_rounding, 0.0, np.sign(difference)) * self.sign
 
     def agreement(self, x: np.ndarray) -> float:
