@@ -10,7 +10,8 @@ import numpy as np
 
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.errors import PharosError
-from pharos.observations import Aliasing, aliasing
+from pharos.hardness import Aliasing
+from pharos.observations import aliasing
 from pharos.system.storage import ResultCache
 
 if TYPE_CHECKING:
