@@ -17,7 +17,8 @@ import numpy as np
 import pandas as pd
 
 from pharos import study
-from pharos.plots import save_for_page, unseen_figures
+from pharos.plots import save_for_page
+from pharos.study.prediction_figures import unseen_figures
 from pharos.training import CELL
 from pharos.validation import PredictedCells
 from pharos.validation.learners import PRIMARY
