@@ -29,6 +29,7 @@ import pandas as pd
 from scipy import stats
 
 from pharos import study
+from pharos.statistics import holm
 
 MARGIN, POWER, RESERVE = 0.03, 0.8, 1.2
 PILOT = 32
@@ -189,15 +190,6 @@ def compared(sb3, batched):
         table["equivalent"] = table["p_tost"] < 0.05
         table["differs"] = table["p_ks_holm"] < 0.05
     return table
-
-
-def holm(p):
-    """Holm's correction: the k-th smallest of n p-values times n - k + 1, not decreasing, at most 1."""
-    order = np.argsort(p)
-    corrected = np.minimum(1.0, np.maximum.accumulate(p[order] * (len(p) - np.arange(len(p)))))
-    result = np.empty(len(p))
-    result[order] = corrected
-    return result
 
 
 def printed(table):

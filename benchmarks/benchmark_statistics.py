@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from pharos.benchmark import AgentResults, compare, load_suite, score
 from pharos.benchmark.scores import run_scores
 from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite
-from pharos.training import bootstrap_interval
+from pharos.statistics import bootstrap_interval, mean_of_means
 
 STUDY = Path(__file__).parents[1] / "docs/studies/hardness-dev/runs.parquet"
 MANY = 20_000
@@ -141,12 +141,8 @@ def _add_percentiles(percentile, suite, results, pairs):
     for name, tasks in families.items():
         own = [runs[task.name] for task in tasks if task.name in runs]
         if own:
-            low, high = bootstrap_interval(own, _mean, resamples=500)
+            low, high = bootstrap_interval(own, mean_of_means, resamples=500)
             percentile[name].append(low - 1e-9 <= pairs[name][1].value <= high + 1e-9)
-
-
-def _mean(*tasks, axis=-1):
-    return np.mean([task.mean(axis=axis) for task in tasks], axis=0)
 
 
 def main():

@@ -17,7 +17,7 @@ import numpy as np
 from pharos import study
 from pharos.prediction import PRIMARY
 from pharos.prediction.pairs import Pairs
-from pharos.study.cross_validation import spearman
+from pharos.statistics import spearman
 
 CLEAR = 0.02
 PREDICTORS = ("kernel_regret", "kernel_regret_played", "adam_regret", "adam_regret_played", "kernel_learning_time")

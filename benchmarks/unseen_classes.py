@@ -17,10 +17,11 @@ import numpy as np
 import pandas as pd
 
 from pharos import study
-from pharos.plots import save_for_page, unseen_figures
+from pharos.plots import save_for_page
 from pharos.prediction import PRIMARY, published
 from pharos.study import PredictedCells
 from pharos.study.leave_one_class_out import PERMUTATIONS
+from pharos.study.prediction_figures import unseen_figures
 from pharos.training import CELL
 
 OUTCOMES = ("greedy", "played")

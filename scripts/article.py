@@ -20,8 +20,9 @@ from scipy import stats
 from pharos import study
 from pharos.prediction.pairs import Pairs
 from pharos.prediction.prediction import FILE
+from pharos.statistics import holm, r_squared, spearman
 from pharos.study.blocks import Run
-from pharos.study.cross_validation import class_predictions, holm, r_squared, resampled_classes, spearman
+from pharos.study.cross_validation import class_predictions, resampled_classes
 from pharos.study.specification import parse
 from pharos.study.tables import row_of
 from pharos.training import CELL, RunConfig
@@ -285,6 +286,12 @@ def left_out(cells, predictor):
     return regret, class_predictions(cells[[predictor]].to_numpy(float), regret, classes, classes), classes
 
 
+def left_out_r_squared(cells, predictor):
+    """R2 of the predictions of `left_out`, classes weighing alike."""
+    regret, prediction, classes = left_out(cells, predictor)
+    return r_squared(regret, regret - prediction, classes)
+
+
 def misses(agent, predictor):
     """Class -> mean of observed less predicted regret, each class predicted by a line through the others."""
     regret, prediction, _ = left_out(joined(agent), predictor)
@@ -295,7 +302,7 @@ def without_one_class(agent):
     """Class -> R2 of the agent's measure on the sealed test without that class."""
     cells = joined(agent)
     names = sorted(cells["environment"].unique())
-    return {name: r_squared(*left_out(cells[cells["environment"] != name], PRIMARY[agent])) for name in names}
+    return {name: left_out_r_squared(cells[cells["environment"] != name], PRIMARY[agent]) for name in names}
 
 
 def facts():
@@ -416,7 +423,7 @@ def facts_of_the_sealed_test():
     is_hanoi = (dqn["instance"] == "games.py:Hanoi(discs=3)") & (dqn["observation"].map(kind) == "simple_image")
     if dqn["greedy"].idxmax() != dqn.index[is_hanoi][0]:
         raise ValueError("another cell than Hanoi's image has the largest regret")
-    said.append(f"without this cell R² is {r_squared(*left_out(dqn[~is_hanoi], 'kernel_regret')):.2f} with a line")
+    said.append(f"without this cell R² is {left_out_r_squared(dqn[~is_hanoi], 'kernel_regret'):.2f} with a line")
     said.append(f"without one cell DQN's is {share_of_observations(dqn[~is_hanoi])[0]:.2f}")
     said.append(f"its R² ({judged()['dqn', 'kernel_regret']['r_squared']:.3f}) passes by one cell")
     return said
@@ -467,7 +474,7 @@ def judged_large(agent, predictor):
     classes, instances = (np.unique(cells[name], return_inverse=True)[1] for name in ("environment", "instance"))
     pairs = Pairs.of(regret, instances)
     in_order = pairs.right(predicted).sum()
-    return r_squared(regret, predicted, classes), spearman(predicted, regret), in_order, len(pairs.first)
+    return r_squared(regret, regret - predicted, classes), spearman(predicted, regret), in_order, len(pairs.first)
 
 
 def facts_of_large_instances():

@@ -6,14 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 
 from command_line import run
 from naive import benchmark as naive
 from pharos.benchmark import AgentResults, compare, load_suite, power
-from pharos.benchmark.comparison import frontier_difference, holm, least_difference
+from pharos.benchmark.comparison import frontier_difference, least_difference
 from pharos.benchmark.scores import ConfidenceInterval
 from pharos.errors import ParameterError
 from small_benchmark import CORE, RUNGS, constant, drawn, small_suite
@@ -101,15 +99,6 @@ def test_tasks_that_one_lacks_are_left_out_and_said():
 def test_results_of_another_suite_are_refused_by_name():
     with pytest.raises(ParameterError, match="results of theirs are of suite small with digest cdcdcdcdcdcd"):
         compared(drawn(), drawn(agent="theirs", digest="cd" * 32))
-
-
-@given(st.lists(st.floats(0, 1), min_size=1, max_size=6))
-def test_holm_is_that_of_plain_python(p_values):
-    assert holm(p_values) == pytest.approx(naive.holm(p_values))
-
-
-def test_holm_passes_over_what_is_not_a_number():
-    assert holm([0.02, math.nan, 0.03]) == pytest.approx([0.04, math.nan, 0.04], nan_ok=True)
 
 
 def test_differences_of_frontiers_beyond_the_ladder():

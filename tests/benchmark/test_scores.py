@@ -10,7 +10,7 @@ from scipy import stats
 
 from naive import benchmark as naive
 from pharos.benchmark import score
-from pharos.benchmark.scores import ConfidenceInterval, frontier, interquartile_interval, mean_interval
+from pharos.benchmark.scores import ConfidenceInterval, frontier
 from pharos.errors import ParameterError
 from small_benchmark import CORE, LEVELS, RUNGS, constant, drawn, results, small_suite
 from strategies import examples
@@ -58,17 +58,6 @@ def test_scores_are_those_of_plain_python(seed):
     assert (edge.value, edge.censored) == (pytest.approx(level), censored)
     assert edge.low == pytest.approx(naive.crossing_of_limit(LEVELS, regrets, 1), abs=4 / 256)
     assert edge.high == pytest.approx(naive.crossing_of_limit(LEVELS, regrets, -1), abs=4 / 256)
-
-
-def test_interquartile_mean_is_the_trimmed_mean_and_its_error_that_of_resamples():
-    rng = np.random.default_rng(0)
-    tasks = [rng.beta(*shape, 40) for shape in ((2, 5), (5, 1), (0.5, 0.5), (9, 9))]
-    found = interquartile_interval(tasks)
-    assert found.value == pytest.approx(stats.trim_mean(np.concatenate(tasks), 0.25))
-    resampled = [
-        stats.trim_mean(np.concatenate([rng.choice(task, len(task)) for task in tasks]), 0.25) for _ in range(2000)
-    ]
-    assert (found.high - found.low) / (2 * 1.98) == pytest.approx(np.std(resampled), rel=0.12)
 
 
 def test_the_mean_over_the_run_is_clipped_as_a_whole():
@@ -174,14 +163,3 @@ def test_results_of_another_suite_are_refused_by_name():
 def test_what_is_not_a_number_is_refused():
     with pytest.raises(ParameterError, match="core-a"):
         drawn(worse=math.nan)
-
-
-@pytest.mark.slow
-def test_intervals_of_ten_skewed_runs_cover_the_mean():
-    rng = np.random.default_rng(0)
-    failing = [
-        np.where(rng.random(20_000) < share, 0.0, rng.beta(10, 2, 20_000)) for share in (0.0, 0.1, 0.3, 0.5, 0.9)
-    ]
-    truth = np.mean([runs.mean() for runs in failing])
-    found = [mean_interval([rng.choice(runs, 10) for runs in failing]) for _ in range(2000)]
-    assert 0.93 <= np.mean([each.low <= truth <= each.high for each in found]) <= 0.97

@@ -12,10 +12,10 @@ from command_line import run, usage_error
 from naive.mdp import executed, matrix_of
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness import Representation, Schedule, kernel_regret
-from pharos.hardness.representation import return_on_graph
+from pharos.hardness import Network, Representation, Schedule, kernel_regret, tangent_kernel
+from pharos.hardness.representation.learning import return_on_graph
 from pharos.mdp import TabularMDP, lazy_actions
-from pharos.observations import Network, representation, tangent_kernel
+from pharos.observations import representation
 from refusals import failing, refusal
 from strategies import FEW, deterministic_mdps, examples, outcome_mdps, with_chance
 
@@ -262,7 +262,7 @@ def test_landmarks_are_exact_where_there_are_enough_of_them_and_say_so_where_not
 
 def test_gradient_steps_in_a_series_are_those_made_one_by_one():
     """Of all three operators, with 300 observations and rows of more than one block."""
-    from pharos.hardness.representation import Exact, Identity, Landmarks
+    from pharos.hardness.representation.learning import Exact, Identity, Landmarks
 
     rng = np.random.default_rng(2)
     kernel, states = kernel_of(300), np.arange(300)
@@ -288,7 +288,7 @@ def test_gradient_steps_in_a_series_are_those_made_one_by_one():
 
 def test_adams_kernel_has_the_square_roots_of_eigenvalues():
     """Under the weights; by landmarks that are all observations as exactly."""
-    from pharos.hardness.representation import Exact, Landmarks
+    from pharos.hardness.representation.learning import Exact, Landmarks
 
     kernel, states, weights = kernel_of(9), np.arange(9), np.random.default_rng(1).dirichlet(np.ones(9))
 
@@ -352,7 +352,7 @@ def test_learning_time_of_one_eigenvalue_is_a_logarithm():
 
 def test_sample_complexity_is_that_of_regression_by_simulation():
     """Kernel regression of a fixed function on random samples: the predicted number leaves about a tenth."""
-    spectra = importlib.import_module("pharos.hardness.kernel_regret")
+    spectra = importlib.import_module("pharos.hardness.representation.kernel_regret")
 
     rng = np.random.default_rng(0)
     features = rng.normal(size=(400, 60)) * np.arange(1, 61) ** -1.0
@@ -429,7 +429,7 @@ def test_what_does_not_exist_says_so():
 
 def test_a_kernel_that_does_not_fit_is_told_before_anything_is_learnt(grid, monkeypatch):
     monkeypatch.setattr(
-        "pharos.hardness.representation.IdealisedLearner.curve", failing(AssertionError("learnt first"))
+        "pharos.hardness.representation.learning.IdealisedLearner.curve", failing(AssertionError("learnt first"))
     )
     with pytest.raises(ParameterError, match="landmarks is 1; expected at least 2"):
         representation(grid, "vector", "mlp16", landmarks=1)

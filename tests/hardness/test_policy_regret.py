@@ -10,9 +10,17 @@ import pharos
 from naive.mdp import executed, matrix_of
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness import Representation, Rollouts, Schedule, kernel_policy_regret, kernel_regret, representation
+from pharos.hardness import (
+    Network,
+    Representation,
+    Rollouts,
+    Schedule,
+    kernel_policy_regret,
+    kernel_regret,
+    tangent_kernel,
+)
+from pharos.hardness.representation import learning
 from pharos.mdp import TabularMDP, lazy_actions
-from pharos.observations import Network, tangent_kernel
 
 ROLLOUTS = Rollouts(steps=100, gradient_steps=5, gae_lambda=0.8)
 NAME = "kernel_policy_regret"
@@ -104,9 +112,7 @@ def test_clipping_is_what_its_definition_says(sticky, clip_range):
         np.testing.assert_allclose(found.curve.played, played, atol=1e-3)
         without = kernel_policy_regret(mdp, seen, schedule=SHORT, rollouts=ROLLOUTS)
         assert np.abs(found.curve.played - without.curve.played).max() > 0.01
-        assert found.to_dict()["evaluated"] == pytest.approx(
-            np.minimum(played, representation.WORST_GREEDY).mean(), abs=1e-3
-        )
+        assert found.to_dict()["evaluated"] == pytest.approx(np.minimum(played, learning.WORST_GREEDY).mean(), abs=1e-3)
         assert found.conventions["rollouts"]["clip_range"] == clip_range
 
 
@@ -224,9 +230,9 @@ def test_wide_networks_trained_by_exact_gradients_have_the_curve():
 
 
 def test_a_learner_walks_once_for_a_policy_that_has_settled(monkeypatch):
-    asked, visits_of = [], representation.visits_of
+    asked, visits_of = [], learning.visits_of
     monkeypatch.setattr(
-        representation, "visits_of", lambda mdp, policy, *of: asked.append(policy) or visits_of(mdp, policy, *of)
+        learning, "visits_of", lambda mdp, policy, *of: asked.append(policy) or visits_of(mdp, policy, *of)
     )
     long = Schedule(steps=20_000, learning_starts=0, exploration_fraction=0.1)
     found = kernel_regret(chain(4), Representation.of_matrix(np.eye(4)), schedule=long).curve

@@ -12,8 +12,8 @@ from naive import learning as naive_learning
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness import Representation, Sampling, Schedule, sampled_regret
-from pharos.hardness.representation import Exact, Identity, Landmarks
-from pharos.hardness.sampled_regret import SampledLearner
+from pharos.hardness.representation.learning import Exact, Identity, Landmarks
+from pharos.hardness.representation.sampled_regret import SampledLearner
 from pharos.mdp import TabularMDP, lazy_actions, paid_outcomes, random_actions, sticky_actions
 
 SHORT = Schedule(steps=700, period=50, gradient_steps=13, learning_starts=60, gamma=0.9)

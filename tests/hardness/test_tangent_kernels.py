@@ -9,7 +9,8 @@ from gymnasium import spaces
 
 import pharos
 from pharos.errors import ParameterError, UnknownName
-from pharos.observations import Network, default_network, empirical_ntk, network_inputs, ntk, observe, tangent_kernel
+from pharos.hardness import Network, default_network, empirical_ntk, tangent_kernel
+from pharos.observations import network_inputs, ntk, observe
 from refusals import refusal
 
 RNG = np.random.default_rng(0)
@@ -109,7 +110,7 @@ def test_blocks_give_the_same_kernel_as_one_by_one(name, monkeypatch):
     whole = tangent_kernel(network, x)
     assert (whole == whole.T).all()
     np.testing.assert_allclose(tangent_kernel(network, x[:2], x[2:]), whole[:2, 2:], rtol=1e-6)
-    monkeypatch.setattr("pharos.observations.networks.BLOCK", 4)
+    monkeypatch.setattr("pharos.hardness.representation.networks.BLOCK", 4)
     np.testing.assert_allclose(tangent_kernel(network, x), whole, rtol=1e-6)
     assert np.linalg.eigvalsh(whole.astype(float)).min() > 0
 

@@ -13,7 +13,7 @@ import command_line
 import pharos
 from pharos import benchmark, hardness, study
 from pharos.errors import FileFormatError, ParameterError, UndefinedMeasure
-from pharos.hardness import representation
+from pharos.hardness.representation import learning
 from pharos.mdp import TabularMDP
 from pharos.solvers import regret_scale, uniform_value, value_iteration, worst_value
 from pharos.training import (
@@ -224,8 +224,8 @@ def last_policy_by_place(run, world, words):
     value, values = record["result"]["final_value"], RegretCurve.read(run).values
     entry = benchmark.submit(run, run / "entry.safetensors")
     try:
-        alone = representation.Representation.of_matrix(np.eye(task.mdp.num_states))
-        of_learner = representation.IdealisedLearner(task.mdp, alone, hardness.Schedule(steps=10), 4).regret(value)
+        alone = learning.Representation.of_matrix(np.eye(task.mdp.num_states))
+        of_learner = learning.IdealisedLearner(task.mdp, alone, hardness.Schedule(steps=10), 4).regret(value)
     except UndefinedMeasure:
         of_learner = math.nan
     return {

@@ -3,20 +3,17 @@
 import numpy as np
 import pandas as pd
 import pytest
-from scipy import stats
 
 from pharos.errors import ParameterError
 from pharos.study import (
     aggregate_r_squared,
     fit,
     fit_models,
-    interquartile_mean,
     leave_one_class_out_r_squared,
     paper_regressions,
     paper_returns,
 )
-from pharos.study.statistics import THRESHOLDS, improvements, probability_of_improvement, profiles
-from pharos.training import bootstrap_interval
+from pharos.study.profiles import THRESHOLDS, improvements, profiles
 
 
 def study_table(noise: float, seed: int = 0, num_instances: int = 12) -> pd.DataFrame:
@@ -128,56 +125,6 @@ def test_too_few_rows_have_no_model_and_a_line_says_so():
     assert not fits and "the single model of all has 5 rows; needs at least" in notes[0]
 
 
-def interval(tasks, **options):
-    return bootstrap_interval(tasks, interquartile_mean, **options)
-
-
-def test_interquartile_mean_is_the_mean_of_the_middle_half():
-    assert interquartile_mean(np.arange(8.0)) == np.arange(2, 6).mean()
-
-
-def test_interval_contains_the_estimate_and_shrinks_with_more_runs():
-    rng = np.random.default_rng(1)
-    few = [rng.normal(size=5), rng.normal(size=5)]
-    (lower, upper), ends = interval(few), interval([rng.normal(size=80), rng.normal(size=80)])
-    assert lower <= interquartile_mean(*few) <= upper
-    assert ends[1] - ends[0] < upper - lower
-
-
-def test_an_interval_of_equal_results_is_a_point():
-    assert interval([np.full(5, 0.25), np.full(3, 0.25)]) == (0.25, 0.25)
-
-
-@pytest.mark.slow
-def test_the_interval_is_that_of_resampling_each_task_by_a_loop():
-    """The twin of the vectorised bootstrap; both ends within four standard errors of such a quantile."""
-    rng = np.random.default_rng(3)
-    tasks = [rng.normal(size=5), rng.normal(2, 3, size=4), np.array([7.0])]
-    draws = [interquartile_mean(*(rng.choice(task, len(task)) for task in tasks)) for _ in range(4000)]
-    for end, tail in zip(interval(tasks, resamples=4000), (0.025, 0.975), strict=True):
-        near = np.quantile(draws, [max(0, tail - 0.014), min(1, tail + 0.014)])
-        assert near[0] <= end <= near[1]
-
-
-def test_runs_are_drawn_whole_and_tasks_of_one_run_stay_as_they_are():
-    runs = np.random.default_rng(0).normal(size=(5, 3))
-    twice = np.concatenate([runs, runs], axis=1).T  # (6 points, 5 runs): points 3 to 5 repeat 0 to 2
-    lower, upper = bootstrap_interval([twice], lambda task, axis: task.mean(axis=axis), resamples=50)
-    assert (lower[:3] == lower[3:]).all() and (upper[:3] == upper[3:]).all() and (lower < upper).all()
-    lower, upper = bootstrap_interval(
-        [np.zeros((2, 4)), np.full((2, 1), 8.0)],
-        lambda *tasks, axis: np.mean([task.mean(axis=axis) for task in tasks], axis=0),
-    )
-    assert lower.tolist() == upper.tolist() == [4.0, 4.0]
-
-
-def test_a_bootstrap_of_nothing_and_of_what_is_not_finite_is_refused():
-    with pytest.raises(ParameterError, match="at least one run of each task"):
-        interval([np.arange(3.0), np.array([])])
-    with pytest.raises(ParameterError, match="finite"):
-        interval([np.array([0.0, np.nan])])
-
-
 def test_the_papers_tables_hold_every_printed_block():
     returns = paper_returns()
     assert len(returns) == 336
@@ -191,15 +138,6 @@ def test_a_performance_profile_is_the_share_of_runs_above_each_score():
     rows = [{**same, "instance": name, "normalized_regret": 1 - each} for name in scores for each in scores[name]]
     shares = [np.mean([(np.array(task) > tau).mean() for task in scores.values()]) for tau in THRESHOLDS]
     assert profiles(pd.DataFrame(rows), resamples=50)["share"].tolist() == pytest.approx(shares)
-
-
-def test_the_probability_of_improvement_is_that_of_mann_and_whitney():
-    rng = np.random.default_rng(0)
-    ours, theirs = ([rng.integers(0, 6, number).astype(float) for number in (5, 7)] for _ in range(2))
-    u = [stats.mannwhitneyu(x, y).statistic / (len(x) * len(y)) for x, y in zip(ours, theirs, strict=True)]
-    assert probability_of_improvement(ours, theirs) == pytest.approx(np.mean(u))
-    assert probability_of_improvement(theirs, ours) == pytest.approx(1 - np.mean(u))
-    assert probability_of_improvement(ours, ours) == 0.5
 
 
 def test_profiles_and_improvements_compare_what_has_runs_on_the_same_tasks():

@@ -4,10 +4,8 @@ All differences are of the first agent less the second. A p-value is that of Wel
 belongs to the interval: the interval excludes 0 where p < 0.05. Holm's correction covers the axes, and for themselves
 the tasks; the core is one question and stands alone.
 
-Sources: Welch (1947), The generalization of Student's problem when several different population variances are involved;
-Holm (1979), A simple sequentially rejective multiple test procedure; Mann and Whitney (1947), with the variance from
-placements of DeLong et al. (1988), for the probability of improvement of Agarwal et al. (2021); Newcombe (1998),
-Interval estimation for the difference between independent proportions, for differences of frontiers.
+Source: Newcombe (1998), Interval estimation for the difference between independent proportions, for differences of
+frontiers; of the others see `pharos.statistics`.
 """
 
 import math
@@ -19,17 +17,19 @@ from pathlib import Path
 import numpy as np
 
 from pharos.benchmark.results import AgentResults
-from pharos.benchmark.scores import (
-    CONFIDENCE,
-    ConfidenceInterval,
-    axis_score,
-    check_suite,
-    interval_around,
-    run_scores,
-    standard_error,
-)
+from pharos.benchmark.scores import ConfidenceInterval, axis_score, check_suite, run_scores
 from pharos.benchmark.suite import Suite, load_suite
 from pharos.errors import ParameterError
+from pharos.statistics import (
+    CONFIDENCE,
+    holm,
+    improvement_error,
+    mean_of_means,
+    probability_of_improvement,
+    standard_error,
+    student_interval,
+    welch_p_value,
+)
 
 SIGNIFICANCE = 1.0 - CONFIDENCE
 POWER = 0.8
@@ -208,17 +208,6 @@ def least_difference(variances: np.ndarray, seeds: int) -> float:
     )
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Return p-values after Holm's step-down correction; NaN (tasks with one seed) stays NaN and does not count."""
-    values = np.asarray(p_values, np.float64)
-    order = [index for index in np.argsort(values, kind="stable") if not np.isnan(values[index])]
-    adjusted, largest = values.copy(), 0.0
-    for rank, index in enumerate(order):
-        largest = max(largest, min(1.0, (len(order) - rank) * values[index]))
-        adjusted[index] = largest
-    return adjusted.tolist()
-
-
 def frontier_difference(ours: ConfidenceInterval, theirs: ConfidenceInterval) -> ConfidenceInterval:
     """Return the difference of two frontiers, with the interval that follows from theirs (Newcombe's, or MOVER).
 
@@ -236,25 +225,28 @@ def frontier_difference(ours: ConfidenceInterval, theirs: ConfidenceInterval) ->
 
 
 def _difference(x: Mapping[str, np.ndarray], y: Mapping[str, np.ndarray], names: Sequence[str]) -> Difference:
-    from scipy.special import stdtr
-
     one, other = [x[name] for name in names], [y[name] for name in names]
-    weights = [1.0 / len(names)] * (2 * len(names))
-    first, second = (float(np.mean([runs.mean() for runs in tasks])) for tasks in (one, other))
-    value = first - second
-    error, degrees = standard_error([*one, *other], weights)
-    p_value = float(2.0 * stdtr(degrees, -abs(value) / error)) if error else float(abs(value) < 1e-12)
-    pairs = [(mine[:, None] > their) + 0.5 * (mine[:, None] == their) for mine, their in zip(one, other, strict=True)]
-    placements = [pair.mean(axis=1) for pair in pairs] + [pair.mean(axis=0) for pair in pairs]
-    probability = float(np.mean([pair.mean() for pair in pairs]))
-    improvement = interval_around(probability, *standard_error(placements, weights), (0.0, 1.0))
-    return Difference(first, second, interval_around(value, error, degrees), improvement, p_value, p_value, UNDECIDED)
+    first, second = float(mean_of_means(*one)), float(mean_of_means(*other))
+    error, degrees = standard_error([*one, *other], [1.0 / len(names)] * (2 * len(names)))
+    p_value = welch_p_value(first - second, error, degrees)
+    probability = float(probability_of_improvement(one, other))
+    return Difference(
+        ours=first,
+        theirs=second,
+        interval=ConfidenceInterval(*student_interval(first - second, error, degrees)),
+        improvement=ConfidenceInterval(
+            *student_interval(probability, *improvement_error(one, other), bounds=(0.0, 1.0))
+        ),
+        p_value=p_value,
+        adjusted=p_value,
+        verdict=UNDECIDED,
+    )
 
 
 def _judged(differences: Mapping[str, Difference]) -> dict[str, Difference]:
     """The differences of one family, with Holm's correction and verdicts."""
     judged = {}
-    adjusted = holm([each.p_value for each in differences.values()])
+    adjusted = holm([each.p_value for each in differences.values()]).tolist()
     for (name, each), p in zip(differences.items(), adjusted, strict=True):
         shown = BETTER if each.interval.value > 0 else WORSE
         verdict = UNKNOWN if math.isnan(p) else shown if p < SIGNIFICANCE else UNDECIDED

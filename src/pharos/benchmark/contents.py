@@ -13,7 +13,7 @@ import numpy as np
 from pharos.benchmark.charts import ends, frontier_text
 from pharos.benchmark.comparison import Comparison, compare, results_of, suite_of_results
 from pharos.benchmark.results import FILE, AgentResults, baselines
-from pharos.benchmark.scores import BenchmarkScore, ConfidenceInterval, mean_interval, run_regrets, run_scores, score
+from pharos.benchmark.scores import BenchmarkScore, ConfidenceInterval, run_regrets, run_scores, score
 from pharos.benchmark.suite import BenchmarkTask, Suite
 from pharos.errors import ParameterError
 from pharos.plots import agent_name
@@ -213,7 +213,7 @@ def learning_curve(agent: Agent, names: Sequence[str]) -> list[ConfidenceInterva
     curves = [np.clip(agent.results.curves[name], 0.0, 1.0) for name in names if name in agent.results.curves]
     if len(curves) < len(names):
         return []
-    return [mean_interval([own[:, k] for own in curves], (0.0, 1.0)) for k in range(curves[0].shape[1])]
+    return [ConfidenceInterval.of_mean([own[:, k] for own in curves], (0.0, 1.0)) for k in range(curves[0].shape[1])]
 
 
 def learning_sentence(contents: Contents) -> str:
@@ -221,13 +221,14 @@ def learning_sentence(contents: Contents) -> str:
     own, curves = contents.agent.score, contents.agent.results.curves
     names = [task.name for task in contents.suite.core if task.name in curves]
     runs, finals = run_scores(contents.agent.results), run_scores(contents.agent.results, last=True)
-    gain = mean_interval([finals[name] - runs[name] for name in names])
+    gain = ConfidenceInterval.of_mean([finals[name] - runs[name] for name in names])
     word = ": it learns late" if gain.low > LATE else ": it ends worse than it was" if gain.high < -WORSE else ""
     text = f"Ends at a score of {own.final.value:.2f}, averages {own.core.value:.2f}{word}."
     evaluations = curves[names[0]].shape[1]
     third = max(1, evaluations // 3)
     early, late = (
-        sum(ends(mean_interval([curves[name][:, k - 1]]))[1] > 1 - 1e-6 for name in names) for k in (third, evaluations)
+        sum(ends(ConfidenceInterval.of_mean([curves[name][:, k - 1]]))[1] > 1 - 1e-6 for name in names)
+        for k in (third, evaluations)
     )
     if early or late:
         step = contents.suite.protocol.steps * third // evaluations

@@ -9,10 +9,8 @@ Satterthwaite. The percentile bootstrap of seeds within tasks is too narrow with
 sqrt(n / (n - 1)) and it has normal quantiles: it covers 89 to 94 % with 10 seeds, t 93 to 97 %, in
 docs/evidence/benchmark.md. No random numbers are drawn: equal results give equal intervals, to the last digit.
 
-Sources: Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice, for the
-interquartile mean, the optimality gap and the strata; Satterthwaite (1946), An approximate distribution of estimates of
-variance components; Tukey and McLaughlin (1963) for the standard error of a trimmed mean from winsorised values;
-Fieller (1954), Some problems in interval estimation, for the interval of a crossing.
+Source: Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice, for the
+interquartile mean, the optimality gap and the strata.
 """
 
 import math
@@ -22,16 +20,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pharos import statistics
 from pharos.errors import ParameterError
+from pharos.statistics import UNBOUNDED
 
 if TYPE_CHECKING:
     from pharos.benchmark.results import AgentResults
     from pharos.benchmark.suite import Ladder, Suite
 
-CONFIDENCE = 0.95
 CROSSING = 0.5  # normalised regret at the frontier
 ENOUGH_SEEDS = 10  # scores of fewer are preliminary
-GRID = 256  # points of a segment between two rungs, where the band is compared with the crossing
 
 
 @dataclass(frozen=True)
@@ -48,6 +46,11 @@ class ConfidenceInterval:
     low: float = math.nan
     high: float = math.nan
     censored: str = ""
+
+    @staticmethod
+    def of_mean(strata: Sequence[np.ndarray], bounds: tuple[float, float] = UNBOUNDED) -> "ConfidenceInterval":
+        """Mean over tasks of the mean over runs, with Student's interval clipped to `bounds`; NaN without tasks."""
+        return ConfidenceInterval(*statistics.mean_interval(strata, bounds))
 
     def text(self, *, ends: bool = True) -> str:
         """The value, and its interval where `ends` are wanted and there are some: `9.4 (8.3 to 10.8)`, `> 24 (19.2 or
@@ -132,14 +135,14 @@ def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
     core = sorted(task.name for task in suite.core if task.name in runs)
     names = sorted(task.name for task in suite.tasks if task.name in runs)
     missing = tuple(task.name for task in suite.tasks if task.name not in runs)
-    regret_intervals = {name: mean_interval([regrets[name]]) for name in names}
+    regret_intervals = {name: ConfidenceInterval.of_mean([regrets[name]]) for name in names}
     return BenchmarkScore(
-        core=mean_interval([runs[name] for name in core], (0.0, 1.0)),
-        final=mean_interval([finals[name] for name in core], (0.0, 1.0)),
-        iqm=interquartile_interval([runs[name] for name in core]),
-        optimality_gap=mean_interval([np.maximum(regrets[name], 0.0) for name in core], (0.0, math.inf)),
+        core=ConfidenceInterval.of_mean([runs[name] for name in core], (0.0, 1.0)),
+        final=ConfidenceInterval.of_mean([finals[name] for name in core], (0.0, 1.0)),
+        iqm=ConfidenceInterval(*statistics.interquartile_interval([runs[name] for name in core], (0.0, 1.0))),
+        optimality_gap=ConfidenceInterval.of_mean([np.maximum(regrets[name], 0.0) for name in core], (0.0, math.inf)),
         axes={ladder.axis: axis for ladder in suite.ladders if (axis := axis_score(ladder, runs)) is not None},
-        tasks={name: mean_interval([runs[name]], (0.0, 1.0)) for name in names},
+        tasks={name: ConfidenceInterval.of_mean([runs[name]], (0.0, 1.0)) for name in names},
         preliminary=len(results.seeds) < ENOUGH_SEEDS or bool(missing),
         below_random=tuple(name for name in names if regret_intervals[name].low > 1.0),
         missing=missing,
@@ -157,7 +160,9 @@ def axis_score(ladder: "Ladder", runs: Mapping[str, np.ndarray]) -> AxisScore | 
         return None
     own = [runs[task.name] for task in rungs]
     levels = np.array([task.level for task in rungs], np.float64)
-    return AxisScore(ladder.axis, ladder.unit, mean_interval(own, (0.0, 1.0)), frontier(levels, [1.0 - x for x in own]))
+    return AxisScore(
+        ladder.axis, ladder.unit, ConfidenceInterval.of_mean(own, (0.0, 1.0)), frontier(levels, [1.0 - x for x in own])
+    )
 
 
 def check_suite(results: "AgentResults", suite: "Suite", whose: str = "") -> None:
@@ -191,69 +196,6 @@ def run_scores(results: "AgentResults", *, last: bool = False) -> dict[str, np.n
     return {name: 1.0 - np.clip(regret, 0.0, 1.0) for name, regret in run_regrets(results, last=last).items()}
 
 
-# Intervals ------------------------------------------------------------------------------------------------------------
-
-
-def standard_error(strata: Sequence[np.ndarray], weights: Sequence[float]) -> tuple[float, float]:
-    """Return the standard error of a weighted sum of means, and its degrees of freedom (Welch, Satterthwaite).
-
-        se^2 = sum of v_t,  v_t = w_t^2 s_t^2 / n_t;   df = (sum of v_t)^2 / sum of v_t^2 / (n_t - 1)
-
-    Args:
-        strata: for each task the values of its runs.
-    Returns:
-        NaN and NaN where a stratum has one run; 0 and infinity where the runs of every one agree.
-    """
-    sizes = np.array([len(own) for own in strata])
-    if sizes.min() < 2:
-        return math.nan, math.nan
-    variances = np.array(
-        [weight**2 * np.var(own, ddof=1) / len(own) for own, weight in zip(strata, weights, strict=True)]
-    )
-    variances[variances < 1e-30] = 0.0  # equal numbers whose mean is rounded
-    total = variances.sum()
-    if total == 0.0:
-        return 0.0, math.inf
-    shares = variances / total
-    return math.sqrt(total), float(1.0 / (shares**2 / (sizes - 1)).sum())
-
-
-def interval_around(
-    value: float, error: float, degrees: float, bounds: tuple[float, float] = (-math.inf, math.inf)
-) -> ConfidenceInterval:
-    """Return value ± t error, its ends clipped to `bounds`."""
-    from scipy.special import stdtrit
-
-    half = error * float(stdtrit(degrees, (1.0 + CONFIDENCE) / 2.0)) if error else error
-    return ConfidenceInterval(value, max(value - half, bounds[0]), min(value + half, bounds[1]))
-
-
-def mean_interval(
-    strata: Sequence[np.ndarray], bounds: tuple[float, float] = (-math.inf, math.inf)
-) -> ConfidenceInterval:
-    """Return the mean over tasks of the mean over runs, with Student's interval; NaN without tasks."""
-    if not strata:
-        return ConfidenceInterval(math.nan)
-    value = float(np.mean([own.mean() for own in strata]))
-    return interval_around(value, *standard_error(strata, [1.0 / len(strata)] * len(strata)), bounds)
-
-
-def interquartile_interval(strata: Sequence[np.ndarray]) -> ConfidenceInterval:
-    """Return the interquartile mean of all runs of all tasks pooled, with Student's interval.
-
-    The standard error is that of twice the mean of runs winsorised at the pooled quartiles, over seeds within tasks.
-    NaN without tasks.
-    """
-    if not strata:
-        return ConfidenceInterval(math.nan)
-    pooled = np.sort(np.concatenate(strata))
-    cut = len(pooled) // 4
-    value = float(pooled[cut : len(pooled) - cut].mean())
-    inner = [np.clip(own, pooled[cut], pooled[-1 - cut]) for own in strata]
-    weights = [2.0 * len(own) / len(pooled) for own in strata]
-    return interval_around(value, *standard_error(inner, weights), (0.0, 1.0))
-
-
 # Frontier -------------------------------------------------------------------------------------------------------------
 
 
@@ -271,37 +213,14 @@ def frontier(levels: np.ndarray, regrets: Sequence[np.ndarray]) -> ConfidenceInt
         exceeds it; an end of the interval beyond the ladder is infinite.
     """
     from scipy.optimize import isotonic_regression
-    from scipy.special import stdtrit
 
     # The level where increasing means cross 0.5
     means = np.array([own.mean() for own in regrets])
     value, censored = _crossing(levels, isotonic_regression(means).x)
-    sizes = np.array([len(own) for own in regrets])
-    if sizes.min() < 2:
+    low, high = statistics.fieller_interval(levels, regrets, CROSSING)
+    if math.isnan(low):
         return ConfidenceInterval(value, censored=censored)
-    # Mean and half width of Student's interval on a fine grid of levels, interpolated between neighbouring rungs
-    variances = np.array([np.var(own, ddof=1) / len(own) for own in regrets])
-    variances[variances < 1e-30] = 0.0
-    grid, position = levels, np.arange(len(levels), dtype=np.float64)
-    if len(levels) > 1:
-        position = np.linspace(0.0, len(levels) - 1.0, GRID * (len(levels) - 1) + 1)
-        grid = np.interp(position, np.arange(len(levels)), levels)
-    left = np.minimum(position.astype(int), max(len(levels) - 2, 0))
-    right = np.minimum(left + 1, len(levels) - 1)
-    share = position - left
-    parts = np.stack([(1.0 - share) ** 2 * variances[left], share**2 * variances[right]])
-    total = parts.sum(axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        degrees = total**2 / (parts[0] ** 2 / (sizes[left] - 1) + parts[1] ** 2 / (sizes[right] - 1))
-        half = np.where(total > 0.0, stdtrit(degrees, (1.0 + CONFIDENCE) / 2.0) * np.sqrt(total), 0.0)
-    mean = (1.0 - share) * means[left] + share * means[right]
-    # Levels whose interval contains 0.5; open beyond the ends of the ladder
-    reaching, staying = np.flatnonzero(mean + half >= CROSSING), np.flatnonzero(mean - half <= CROSSING)
-    low = -math.inf if reaching.size and reaching[0] == 0 else grid[reaching[0]] if reaching.size else levels[-1]
-    high = (
-        math.inf if staying.size and staying[-1] == len(grid) - 1 else grid[staying[-1]] if staying.size else levels[0]
-    )
-    return ConfidenceInterval(value, min(float(low), value), max(float(high), value), censored)
+    return ConfidenceInterval(value, min(low, value), max(high, value), censored)
 
 
 def _crossing(levels: np.ndarray, regrets: np.ndarray) -> tuple[float, str]:

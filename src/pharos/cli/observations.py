@@ -88,7 +88,7 @@ class _Price:
             return {"lower": 0.0, "upper": 0.0, "exact": True}
         if classes is None or self.budget <= 0 or self.gamma >= 1 or self.space.num_states > MOST_SOLVED:
             return None
-        from pharos.observations import memoryless_loss
+        from pharos.hardness import memoryless_loss
 
         with progress_line("bounding what it costs"):
             mdp, optimal = self._solved
@@ -111,7 +111,8 @@ def _entry(space: "StateSpace", name: str, options: dict[str, Any], price: _Pric
     """
     import numpy as np
 
-    from pharos.observations import counted, history_aliasing, observation_classes, observe
+    from pharos.hardness import aliasing_of_classes
+    from pharos.observations import history_aliasing, observation_classes, observe
 
     entry: dict[str, Any] = {"observation": name, "options": options}
     env: Any = space.environment
@@ -126,7 +127,7 @@ def _entry(space: "StateSpace", name: str, options: dict[str, Any], price: _Pric
             classes, counts = None, history_aliasing(space, observer, progress=progress)
         else:
             classes = observation_classes(space, observer, progress=progress)
-            counts = counted(classes, np.asarray(space.terminal))
+            counts = aliasing_of_classes(classes, np.asarray(space.terminal))
     return entry | {
         "shape": list(observer.space.shape or ()),
         "dtype": str(observer.space.dtype),

@@ -5,6 +5,8 @@ Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation 
 `report`; `register` adds your own.
 """
 
+from typing import TYPE_CHECKING
+
 from pharos.hardness.diameter import (
     colosseum_diameter,
     diameter,
@@ -20,7 +22,9 @@ from pharos.hardness.effective_horizon import (
 from pharos.hardness.gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
 from pharos.hardness.gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
 from pharos.hardness.interval import Budget, Certificate, Certified, Interval, MeasureProgress
-from pharos.hardness.kernel_regret import (
+from pharos.hardness.registry import Measure, Problem, measures, register, selected_measures
+from pharos.hardness.report import Report, Result, report
+from pharos.hardness.representation.kernel_regret import (
     KernelRegret,
     Spectral,
     aliasing_floor,
@@ -29,10 +33,8 @@ from pharos.hardness.kernel_regret import (
     kernel_regret,
     kernel_sample_complexity,
 )
-from pharos.hardness.registry import Measure, Problem, measures, register, selected_measures
-from pharos.hardness.report import Report, Result, report
-from pharos.hardness.representation import LearningCurve, Representation, Rollouts, Schedule
-from pharos.hardness.sampled_regret import SampledRegret, Sampling, sampled_regret
+from pharos.hardness.representation.learning import LearningCurve, Representation, Rollouts, Schedule
+from pharos.hardness.representation.sampled_regret import SampledRegret, Sampling, sampled_regret
 from pharos.hardness.steps import ReturnDistribution, return_distribution
 from pharos.hardness.value_norm import ActionGapRegularity, action_gap_regularity, environmental_value_norm
 from pharos.hardness.visitation import (
@@ -47,6 +49,19 @@ from pharos.hardness.visitation import (
     mixing_time,
     occupancy,
 )
+from pharos.system import lazy
+
+if TYPE_CHECKING:
+    from pharos.hardness.representation.aliasing import Aliasing, aliasing_of_classes
+    from pharos.hardness.representation.empirical import empirical_ntk, kernel_of_module
+    from pharos.hardness.representation.memoryless import MemorylessLoss, memoryless_loss
+    from pharos.hardness.representation.networks import (
+        Network,
+        check_memory,
+        default_network,
+        is_channels_last,
+        tangent_kernel,
+    )
 
 __all__ = [
     "Certified",
@@ -87,3 +102,5 @@ __all__ = [
     "stationary_effective_horizon",
     "sum_of_reciprocal_gaps",
 ]
+
+__getattr__ = lazy.attributes(__name__)

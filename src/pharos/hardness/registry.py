@@ -13,15 +13,15 @@ from pharos.hardness.effective_horizon import effective_horizon, stationary_effe
 from pharos.hardness.gaps import Gaps, resolved_gaps, solved
 from pharos.hardness.gorp import gorp_bound
 from pharos.hardness.interval import Budget, Certified, MeasureProgress
-from pharos.hardness.kernel_regret import (
+from pharos.hardness.representation.kernel_regret import (
     aliasing_floor,
     kernel_learning_time,
     kernel_policy_regret,
     kernel_regret,
     kernel_sample_complexity,
 )
-from pharos.hardness.representation import Representation, Rollouts, Schedule
-from pharos.hardness.sampled_regret import Sampling, sampled_regret
+from pharos.hardness.representation.learning import Representation, Rollouts, Schedule
+from pharos.hardness.representation.sampled_regret import Sampling, sampled_regret
 from pharos.hardness.value_norm import action_gap_regularity, certified_value_norm
 from pharos.hardness.visitation import covering, distribution_mismatch, exploration_time, mixing_time
 from pharos.mdp import TabularMDP

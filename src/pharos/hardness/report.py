@@ -19,8 +19,8 @@ import xxhash
 from pharos.errors import PrecisionError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of, finite
 from pharos.hardness.registry import Measure, Problem, selected_measures
-from pharos.hardness.representation import Representation, Rollouts, Schedule
-from pharos.hardness.sampled_regret import Sampling
+from pharos.hardness.representation.learning import Representation, Rollouts, Schedule
+from pharos.hardness.representation.sampled_regret import Sampling
 from pharos.mdp import TabularMDP, check_horizon, require_mdp
 from pharos.system import storage
 from pharos.system.compiling import Stopwatch

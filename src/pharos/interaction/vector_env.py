@@ -30,9 +30,10 @@ from pharos.interaction.simulator import (
 from pharos.kernels import stepping
 from pharos.kernels.stepping import DISABLED, SAME_STEP, EnvironmentBatch, first_outside
 from pharos.mdp import OutcomeTable, rewards_of_outcomes, rewards_of_staying, whole_number
-from pharos.observations import NO_ACTION, Index, Seen, in_blocks
+from pharos.observations import NO_ACTION, Index, Seen
 from pharos.system.arrays import as_array
 from pharos.system.records import split
+from pharos.system.threads import in_blocks
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace

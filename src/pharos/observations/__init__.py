@@ -10,7 +10,6 @@ from pharos.observations.context import NO_ACTION, ObservationInContext, Seen
 from pharos.observations.observation import (
     FunctionObservation,
     Observation,
-    in_blocks,
     names,
     observe,
     register,
@@ -21,18 +20,11 @@ from pharos.observations.vector import Index, OneHot, Vector
 from pharos.system import lazy
 
 if TYPE_CHECKING:
+    from pharos.hardness import Network, empirical_ntk, memoryless_loss
+    from pharos.observations.classes import aliasing, history_aliasing, observation_classes
     from pharos.observations.images import RENDERERS, ComplexImage, SimpleImage, num_values, render, renderers
-    from pharos.observations.memoryless import MemorylessLoss, memoryless_loss
-    from pharos.observations.networks import Network, default_network, network_inputs, ntk, tangent_kernel
     from pharos.observations.observation import OwnObservation, imported, observation_of, own_observation
-    from pharos.observations.observation_aliasing import (
-        Aliasing,
-        aliasing,
-        counted,
-        history_aliasing,
-        observation_classes,
-    )
-    from pharos.observations.represented import empirical_ntk, representation
+    from pharos.observations.tangent import network_inputs, ntk, representation
     from pharos.observations.vector import Hash
 
 __all__ = [

@@ -27,7 +27,8 @@ from pharos.drawing import (
 from pharos.environments import Environment, Layer, Scenery
 from pharos.errors import ParameterError, UnknownName
 from pharos.mdp import whole_number
-from pharos.observations.observation import Observation, hidden_names, in_blocks, names, observe
+from pharos.observations.observation import Observation, hidden_names, names, observe
+from pharos.system.threads import in_blocks
 
 
 def num_values(layer: Layer) -> int:

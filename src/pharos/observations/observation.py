@@ -8,10 +8,7 @@ The name is that of an entry that the module registers, of a pair (function, Gym
 
 import importlib
 import inspect
-import itertools
-import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -350,30 +347,3 @@ def hidden_names(
         if name not in choices and name not in also:
             raise ParameterError(f"{what}: there is no {name!r} to hide; expected some of {', '.join(choices)}")
     return set(names)
-
-
-_pool: tuple[int, ThreadPoolExecutor] | None = None  # of this process: threads do not survive a fork
-
-
-def in_blocks(run: Callable[[int, int], None], number: int, block: int) -> None:
-    """run(first, last) over 0 .. number - 1; on all processors where there are at least two blocks."""
-    if number < 2 * block:
-        run(0, number)
-        return
-    from pharos.system.workers import usable_workers
-
-    workers = usable_workers(None)
-    if workers < 2:
-        run(0, number)
-        return
-    parts = min(4 * workers, number // block)
-    edges = [number * part // parts for part in range(parts + 1)]
-    for future in [_threads(workers).submit(run, *edge) for edge in itertools.pairwise(edges)]:
-        future.result()
-
-
-def _threads(workers: int) -> ThreadPoolExecutor:
-    global _pool
-    if _pool is None or _pool[0] != os.getpid():
-        _pool = os.getpid(), ThreadPoolExecutor(workers, thread_name_prefix="pharos-observations")
-    return _pool[1]

@@ -5,7 +5,7 @@ are told apart by colour-blind people (Okabe and Ito, 2008). Nothing opens a win
 """
 
 from pharos.plots.instances import growth, hardness_plane, policies, states_by_depth, value_map
-from pharos.plots.regret import predictions, regret, unseen_figures
+from pharos.plots.regret import predictions, regret
 from pharos.plots.style import (
     DIAGONAL,
     agent_name,

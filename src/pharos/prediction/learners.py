@@ -281,7 +281,8 @@ def _curve(regret: Mapping[str, Any], of: str = "greedy") -> str:
 
 def network_of(config: Mapping[str, Any], task: "Task") -> tuple[str, str]:
     """The name and the initialisation of the network of an agent of pharos."""
-    from pharos.observations import default_network, observe
+    from pharos.hardness import default_network
+    from pharos.observations import observe
 
     observation = observe(task.env, task.observation, state_space=task.space, **dict(task.observation_options))
     name, hidden = default_network(observation.space), _hidden_layers(config["hyperparameters"])

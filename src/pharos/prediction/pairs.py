@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pharos.statistics import TIE_TOLERANCE
+
 BLOCK = 250  # permutations at a time
-ROUNDING = 1e-9  # of the spread of predictions: those that differ by less are alike
 CLEAR = 0.05  # difference of an outcome between two observations of one MDP that counts
 
 
@@ -40,14 +41,14 @@ class Pairs:
     def right(self, x: np.ndarray) -> np.ndarray:
         """(M,) 1 where x (N,) orders the pair as the outcome does, 1/2 where it says that both are alike, else 0.
 
-        Alike is what differs by at most ROUNDING of the spread of x.
+        Alike is what differs by at most TIE_TOLERANCE of the spread of x.
         """
         return self._right(x, x)
 
     def _right(self, values: np.ndarray, x: np.ndarray) -> np.ndarray:
         """(..., M) of values (..., N) of x in other places; NaN where one of a pair is."""
         difference = values[..., self.first] - values[..., self.second]
-        is_rounding = np.abs(difference) <= ROUNDING * (x.max(initial=-np.inf) - x.min(initial=np.inf))
+        is_rounding = np.abs(difference) <= TIE_TOLERANCE * (x.max(initial=-np.inf) - x.min(initial=np.inf))
         return 0.5 + 0.5 * np.where(is_rounding, 0.0, np.sign(difference)) * self.sign
 
     def agreement(self, x: np.ndarray) -> float:

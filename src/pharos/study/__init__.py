@@ -24,7 +24,6 @@ from pharos.study.logs import LOGGERS, RunLog, log
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study.report import StudyReport, report
 from pharos.study.specification import presets, specification
-from pharos.study.statistics import interquartile_mean
 from pharos.study.tables import cells, curves, hardness_table, paper_instance, predict, table
 from pharos.system import lazy
 from pharos.training import run_id

@@ -12,6 +12,7 @@ import numpy as np
 
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.errors import ParameterError
+from pharos.statistics import bootstrap_interval, interquartile_mean, mean_of_means
 from pharos.study.blocks import Run
 from pharos.study.regression import (
     MEASURES,
@@ -21,9 +22,7 @@ from pharos.study.regression import (
     fit_models,
     leave_one_class_out_r_squared,
 )
-from pharos.study.statistics import interquartile_mean, mean_of_means
 from pharos.study.tables import paper_instance
-from pharos.training import bootstrap_interval
 
 if TYPE_CHECKING:
     import pandas as pd

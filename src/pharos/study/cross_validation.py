@@ -9,17 +9,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pharos.statistics import class_weights, ranks, spearman
+
 BLOCK = 250  # permutations at a time
 MOST_RANKED = 400
-TIED = 1e-9  # of the spread: what differs by less is rounding, and has one rank
 Counts = np.ndarray
 """(R, C) how often each class counts in each of R samples."""
-
-
-def class_weights(classes: np.ndarray) -> np.ndarray:
-    """(N,) weights that sum to 1, the same for each class."""
-    sizes = np.bincount(classes)
-    return 1.0 / sizes[classes] / len(sizes)
 
 
 def class_predictions(x: np.ndarray, y: np.ndarray, blocks: np.ndarray, classes: np.ndarray) -> np.ndarray:
@@ -37,13 +32,6 @@ def class_predictions(x: np.ndarray, y: np.ndarray, blocks: np.ndarray, classes:
     return estimates
 
 
-def r_squared(y: np.ndarray, predicted: np.ndarray, classes: np.ndarray) -> float:
-    """1 - squared error / variance, classes weighing alike."""
-    weights = class_weights(classes)
-    mean = float(weights @ y)
-    return 1 - float(weights @ (y - predicted) ** 2) / float(weights @ (y - mean) ** 2)
-
-
 def calibration(y: np.ndarray, predicted: np.ndarray, classes: np.ndarray) -> tuple[float, float]:
     """(slope, intercept) of y on what was predicted for left-out classes, classes weighing alike: (1, 0) is perfect."""
     weights = class_weights(classes)
@@ -51,28 +39,6 @@ def calibration(y: np.ndarray, predicted: np.ndarray, classes: np.ndarray) -> tu
     variance = float(weights @ centred**2)
     slope = float(weights @ (centred * y)) / variance if variance > 1e-15 else np.nan
     return slope, float(weights @ y) - slope * float(weights @ predicted)
-
-
-def ranks(values: np.ndarray) -> np.ndarray:
-    """(..., N) ranks from 1 along the last axis; ties, and what lies within 1e-9 of the spread of its neighbour,
-    share their mean rank. So equal predictors whose predictions differ in the last bits are ranked alike everywhere."""
-    from scipy.stats import rankdata
-
-    values = np.asarray(values, np.float64)
-    order = np.argsort(values, axis=-1, kind="stable")
-    ascending = np.take_along_axis(values, order, axis=-1)
-    is_new = np.diff(ascending, axis=-1) > TIED * np.ptp(ascending, axis=-1, keepdims=True)
-    levels = np.concatenate([np.zeros((*values.shape[:-1], 1)), np.cumsum(is_new, axis=-1)], axis=-1)
-    joined = np.empty_like(values)
-    np.put_along_axis(joined, order, levels, axis=-1)
-    return np.asarray(rankdata(joined, axis=-1))
-
-
-def spearman(x: np.ndarray, y: np.ndarray) -> float:
-    """Rank correlation by `ranks`; NaN for fewer than three rows, or where one of both is constant."""
-    if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
-        return np.nan
-    return float(np.corrcoef(ranks(x), ranks(y))[0, 1])
 
 
 def resampled_classes(count: int, resamples: int, seed: int) -> Counts:
@@ -173,20 +139,6 @@ def _exchanged(x: np.ndarray, y: np.ndarray, orders: np.ndarray) -> tuple[np.nda
     return scores, np.divide(of_predicted @ of_aims, lengths, out=np.full(len(orders), np.nan), where=lengths > 0)
 
 
-def percentiles(values: np.ndarray, *shares: float) -> np.ndarray:
-    """Percentiles of the values that are finite; NaN without any."""
-    finite = values[np.isfinite(values)]
-    return np.percentile(finite, shares) if len(finite) else np.full(len(shares), np.nan)
-
-
-def p_of(value: float, permuted: np.ndarray) -> float:
-    """P-value: the share of permutations that are as large, the observed order among them; NaN without any."""
-    finite = permuted[np.isfinite(permuted)]
-    if not np.isfinite(value) or len(finite) == 0:
-        return np.nan
-    return (1 + int((finite >= value - 1e-12).sum())) / (1 + len(finite))
-
-
 def ceiling(means: np.ndarray, noise: np.ndarray, classes: np.ndarray) -> float:
     """The largest R2 that a predictor can reach, as the mean of a cell's seeds is not its expectation.
 
@@ -218,16 +170,6 @@ def partial_correlation(
         lengths = np.linalg.norm(left, axis=0)
         correlations[r] = left[:, 0] @ left[:, 1] / lengths.prod() if (lengths > 1e-9).all() else np.nan
     return correlations
-
-
-def holm(p: np.ndarray) -> np.ndarray:
-    """p-values corrected for their number (Holm, 1979); NaN stays, and does not count."""
-    corrections = np.full(len(p), np.nan)
-    finite = np.flatnonzero(np.isfinite(p))
-    order = finite[np.argsort(p[finite], kind="stable")]
-    steps = (len(order) - np.arange(len(order))) * p[order]
-    corrections[order] = np.minimum(np.maximum.accumulate(steps), 1.0) if len(order) else steps
-    return corrections
 
 
 def _with_one(x: np.ndarray) -> np.ndarray:

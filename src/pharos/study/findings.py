@@ -9,10 +9,10 @@ import numpy as np
 from scipy.linalg import helmert
 
 from pharos.agents import TABULAR_OBSERVATION
+from pharos.statistics import bootstrap_interval, r_squared
 from pharos.study.analysis import IMAGE, VECTOR, Models, agreement, paper_agreement
-from pharos.study.regression import Fit, r_squared
+from pharos.study.regression import Fit
 from pharos.system.wording import in_words
-from pharos.training import bootstrap_interval
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,8 +15,8 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.prediction import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS, Pairs
+from pharos.statistics import holm, percentiles, permutation_p_value, r_squared, spearman
 from pharos.study import cross_validation
-from pharos.study.cross_validation import percentiles
 from pharos.training import CELL
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ def _corrected(table: "pd.DataFrame") -> "pd.DataFrame":
         return table
     p = table[list(P_VALUES)].to_numpy(float)
     table["tests"] = int(np.isfinite(p).sum())
-    corrected = cross_validation.holm(p.ravel()).reshape(p.shape)
+    corrected = holm(p.ravel()).reshape(p.shape)
     for i, name in enumerate(P_VALUES):
         table[f"{name}_holm"] = corrected[:, i]
     return table
@@ -278,7 +278,7 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
     if permutations and x.shape[1] and count >= 3:
         shuffled = cross_validation.permuted_classes(x, y, classes, cells.places, permutations, seed)
         floors = [float(percentiles(each[1:], 95)[0]) for each in shuffled]
-        p = cross_validation.p_of(shuffled[1][0], shuffled[1][1:])
+        p = permutation_p_value(shuffled[1][0], shuffled[1][1:])
     return {
         "r_squared": scores[0],
         "r_squared_lower": ends[0, 0],
@@ -289,7 +289,7 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
         "floor_r_squared": floors[0],
         "floor_rho": floors[1],
         "p_rho": p,
-        "r_squared_mdp": cross_validation.r_squared(y, by_mdp, classes) if cells.instances.max() else np.nan,
+        "r_squared_mdp": r_squared(y, y - by_mdp, classes) if cells.instances.max() else np.nan,
         "calibration": slope if x.shape[1] else np.nan,
         "calibration_offset": offset if x.shape[1] else np.nan,
         "ceiling": np.nan if noise is None else cross_validation.ceiling(y, noise, classes),
@@ -312,7 +312,7 @@ def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[st
         return row
     x, y, classes = cells.x[:, 0], cells.y, cells.classes
     # Rank correlation within classes
-    within = [cross_validation.spearman(x[classes == each], y[classes == each]) for each in range(classes.max() + 1)]
+    within = [spearman(x[classes == each], y[classes == each]) for each in range(classes.max() + 1)]
     if np.isfinite(within).any():
         row["rho_within"] = float(np.nanmean(within))
     # Pairs of observations: all, then those of an image and a vector
@@ -334,7 +334,7 @@ def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[st
     row["agreement_lower"], row["agreement_upper"] = pairs.interval(x, classes, drawn)
     if permutations:
         shuffled = pairs.permuted(x, classes, cells.mdps, names, permutations, seed)
-        row["p_agreement"] = cross_validation.p_of(pairs.agreement(x), shuffled)
+        row["p_agreement"] = permutation_p_value(pairs.agreement(x), shuffled)
     return row
 
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
+from pharos.statistics import r_squared
 from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
@@ -169,12 +170,6 @@ def _errors_without_the_task(design: np.ndarray, residuals: np.ndarray, tasks: S
             remainder = np.maximum(remainder, 1e-12)
         errors[rows] = np.linalg.lstsq(remainder, residuals[rows])[0]
     return errors
-
-
-def r_squared(actual: np.ndarray, errors: np.ndarray) -> float:
-    """1 - sum of squared errors / sum of squares about the mean; NaN where all values are the same."""
-    total = float(((actual - actual.mean()) ** 2).sum())
-    return 1 - float((errors**2).sum()) / total if total > 0 else float("nan")
 
 
 def aggregate_r_squared(fits: Sequence[Fit]) -> float:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from pharos.mdp import ChanceSetting
     from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
     from pharos.training.batch import TrainingProgress, check_device, train_configs
-    from pharos.training.curve import Curve, Evaluation, RegretCurve, bootstrap_interval, evaluate_agent
+    from pharos.training.curve import Curve, Evaluation, RegretCurve, evaluate_agent
     from pharos.training.learners import FailedRun, TaskCache
     from pharos.training.options import ENGINES, ExecutionOptions, Horizon, TrainingOptions
     from pharos.training.results import (

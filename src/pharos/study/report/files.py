@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pharos.plots import save_for_page, unseen_figures
+from pharos.plots import save_for_page
 from pharos.study.figures import all_curves, all_figures, tables_of
+from pharos.study.prediction_figures import unseen_figures
 from pharos.study.report.model_sections import doubts, judged, unseen_section
 from pharos.study.report.page import render
 from pharos.study.report.results import Results, coefficients, results_of

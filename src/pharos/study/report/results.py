@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pharos.agents import TABULAR_OBSERVATION
+from pharos.study.aliasing import aliasing_table, with_aliasing
 from pharos.study.analysis import REGRETS, Models, PaperComparison, compare, intervals, models
 from pharos.study.findings import findings
+from pharos.study.profiles import improvements, profiles
 from pharos.study.specification import Specification
-from pharos.study.statistics import aliasing_table, improvements, profiles, with_aliasing
 from pharos.study.status import Status, duration, status
 from pharos.study.tables import cells, finished_runs, hardness_cost, hardness_table, paper_instance
 

@@ -34,14 +34,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pharos.environments import Environment, make
 from pharos.errors import ParameterError
-from pharos.observations.observation import Observation, in_blocks, observe
+from pharos.system.threads import in_blocks
 
 if TYPE_CHECKING:
     import gymnasium
-
-    from pharos.state_space import StateSpace
 
 FEATURES = (128, 128)
 INITIALISATIONS = ("pytorch", "sb3")
@@ -146,54 +143,6 @@ TERMS, NODES = 48, 200  # of a power series of hyperbolic tangents; of a quadrat
 LEAST_VARIANCE = 1e-12  # of a hyperbolic tangent's pre-activations, in the place of 0: the limit in float64
 
 
-def ntk(
-    env: "Environment | StateSpace | str",
-    observation: object = "vector",
-    network: "Network | str | None" = None,
-    *,
-    initialisation: str = "pytorch",
-    states: Sequence[Sequence[int]] | np.ndarray | None = None,
-    others: Sequence[Sequence[int]] | np.ndarray | None = None,
-    **options: object,
-) -> np.ndarray:
-    """Return the tangent kernel of an agent's network on observations of an environment's states.
-
-    Args:
-        env: an environment, its name, or its state space.
-        observation: as for `observe`; `options` are its options.
-        network: a name such as "mlp128x2" or "cnn16", see `Network`; None: what the agents of pharos get.
-        initialisation: "pytorch" (DQN) or "sb3" (actor-critics), see `Network`.
-        states: (N, D) states; None: all reachable ones, in the order of the state space.
-        others: (M, D) states y; None: the same as `states`.
-    Returns:
-        (N, M) float32; symmetric where `others` is None. Sums are float64.
-    Raises:
-        ParameterError: the network has no closed form, does not fit the observation, or the kernel does not fit into
-            memory. UnknownName: no such environment or observation.
-    Cost: O(N M) times inputs; 4 bytes a pair. 1,500 states: 0.1 s with mlp128x2, 0.5 s with cnn16 on 8 x 8 cells.
-    Source: Jacot et al. (2018); Cho and Saul (2009) for ReLUs; Arora et al. (2019) for convolutions.
-    """
-    from pharos.state_space import StateSpace
-
-    space = env if isinstance(env, StateSpace) else None
-    world = space.environment if space is not None else make(env) if isinstance(env, str) else env
-    if world is None:
-        raise ParameterError(f"{env}: the class of its environment is not known; give the environment")
-    if space is None and (states is None or observation == "index"):
-        from pharos.state_space import build
-
-        space = build(world)  # type: ignore[arg-type]
-    observer = observe(world, observation, state_space=space, **options)  # type: ignore[arg-type]
-    net = Network.of(default_network(observer.space) if network is None else network, initialisation)
-    if states is None:
-        assert space is not None
-        check_memory(space.num_states, space.num_states if others is None else len(others), str(world))
-        states = space.states()
-    x = network_inputs(observer, np.asarray(states, np.int64))
-    y = None if others is None else network_inputs(observer, np.asarray(others, np.int64))
-    return tangent_kernel(net, x, y)
-
-
 def check_memory(rows: int, columns: int, what: str) -> None:
     """Refuse a kernel that would not fit.
 
@@ -209,35 +158,6 @@ def check_memory(rows: int, columns: int, what: str) -> None:
             f"{what}: the kernel of {rows:,} x {columns:,} states takes {4 * rows * columns / 2**30:.1f} GiB; "
             f"{fits:,} states fit into memory: give some of them as states, or measure with landmarks=..."
         )
-
-
-def network_inputs(observation: Observation, states: np.ndarray) -> np.ndarray:
-    """(N, ...) float32 input of the first layer of a network for states (N, D), as Stable-Baselines3 prepares it.
-
-    Pictures of bytes are (C, H, W) in [0, 1]; numbers of categories become ones among zeros.
-
-    Raises:
-        ParameterError: the space of the observation is none that networks take.
-    """
-    from gymnasium import spaces
-
-    space, values = observation.space, np.asarray(observation(states))
-    if isinstance(space, spaces.Discrete):
-        return (values[:, None] - int(space.start) == np.arange(int(space.n))).astype(np.float32)
-    if isinstance(space, spaces.MultiDiscrete):
-        columns = (values[:, i, None] == np.arange(n) for i, n in enumerate(space.nvec))
-        return np.concatenate([column.astype(np.float32) for column in columns], axis=1)
-    if isinstance(space, spaces.MultiBinary):
-        return values.astype(np.float32)
-    if not isinstance(space, spaces.Box):
-        raise ParameterError(
-            f"observation {observation.name!r}: its space is {space!r}; expected a Box, Discrete, MultiDiscrete or "
-            "MultiBinary of Gymnasium"
-        )
-    if values.ndim == 4 and values.dtype == np.uint8:
-        values = values.transpose(0, 3, 1, 2) if is_channels_last(values.shape[1:]) else values
-        return values.astype(np.float32) / np.float32(255)
-    return values.astype(np.float32)
 
 
 def tangent_kernel(network: Network, x: np.ndarray, y: np.ndarray | None = None) -> np.ndarray:

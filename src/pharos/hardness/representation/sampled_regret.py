@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.hardness.representation import (
+from pharos.hardness.representation.learning import (
     MARGIN,
     WORST_GREEDY,
     Grouped,

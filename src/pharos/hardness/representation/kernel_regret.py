@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import UndefinedMeasure
-from pharos.hardness.representation import (
+from pharos.hardness.representation.learning import (
     MARGIN,
     WORST_GREEDY,
     WORST_PLAYED,

@@ -1,12 +1,12 @@
-"""Aliasing: states that share an observation with other states, so that the agent cannot tell them apart."""
+"""Numbers of the different observations of a state space: which states, or histories, an agent cannot tell apart."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pharos.errors import ParameterError
+from pharos.hardness import Aliasing, aliasing_of_classes
 from pharos.observations.observation import Observation
 
 if TYPE_CHECKING:
@@ -19,29 +19,6 @@ AliasingCallback = Callable[[int, str], None]
 """Called with how many states are done, and a text."""
 
 
-@dataclass(frozen=True)
-class Aliasing:
-    """Number of reachable states that share their observation with another state.
-
-    Attributes:
-        num_states: reachable states, terminal ones included.
-        num_observations: different observations among them.
-        num_sharing: states whose observation another state has as well; terminal states count like others.
-        num_confused: states in which the agent acts, that is, not terminal, whose observation another such state has as
-            well. 0: for one who acts the observation tells the state, so it is Markov.
-    """
-
-    num_states: int
-    num_observations: int
-    num_sharing: int
-    num_confused: int
-
-    @property
-    def share(self) -> float:
-        """The part of the states that share their observation; 0 where the observation tells the state."""
-        return self.num_sharing / self.num_states
-
-
 def aliasing(space: "StateSpace", observation: Observation, *, progress: AliasingCallback | None = None) -> Aliasing:
     """Count the states of a state space that an observation does not tell apart.
 
@@ -51,7 +28,7 @@ def aliasing(space: "StateSpace", observation: Observation, *, progress: Aliasin
     """
     if observation.frames > 1:
         return history_aliasing(space, observation, progress=progress)
-    return counted(observation_classes(space, observation, progress=progress), np.asarray(space.terminal))
+    return aliasing_of_classes(observation_classes(space, observation, progress=progress), np.asarray(space.terminal))
 
 
 def observation_classes(
@@ -160,10 +137,3 @@ def _numbered(
     classes = np.empty(count, np.int64)
     classes[order] = np.cumsum(is_new)
     return classes
-
-
-def counted(classes: np.ndarray, terminal: np.ndarray) -> Aliasing:
-    """The counts of numbered observations (S,); terminal (S,) bool."""
-    counts = np.bincount(classes)
-    alive = np.bincount(classes[~terminal])
-    return Aliasing(len(classes), len(counts), int(counts[counts > 1].sum()), int(alive[alive > 1].sum()))

@@ -1,0 +1,96 @@
+"""Performance profiles of agents and observations in a study, and how probable one improves on another.
+
+The score of a run is 1 minus its normalised regret: 1 is optimal from the first episode on, 0 as bad as acting at
+random. A task is an instance under one kind of chance; runs are resampled within each task.
+
+Source: Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice, section 4 (the
+authors' library does not import beside pandas 3).
+"""
+
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.statistics import bootstrap_interval, mean_of_means, probability_of_improvement
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+THRESHOLDS = np.linspace(-0.25, 1.0, 51)
+GROUP = ["agent", "observation"]
+TASK = ["instance", "chance"]
+IMPROVEMENT_COLUMNS = ["environment", "ours", "theirs", "tasks", "probability", "lower", "upper"]
+
+
+def profiles(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame":
+    """The performance profile of each agent and observation on each class, with 95 % stratified bootstrap intervals.
+
+        F(tau) = mean over tasks of the share of the task's runs with a score above tau   (section 4.2)
+
+    Args:
+        runs: as from `table`.
+    Returns:
+        Columns `environment`, `agent`, `observation`, `score` (the threshold), `share` (of runs above it), `lower`,
+        `upper`, `tasks`. Tasks whose regret cannot be normalised are left out.
+    """
+    import pandas as pd
+
+    parts = []
+    for (environment, agent, observation), part in runs.groupby(["environment", *GROUP], sort=True):
+        tasks = list(_scores(part).values())
+        if not tasks:
+            continue
+        above = [task > THRESHOLDS[:, None] for task in tasks]
+        lower, upper = bootstrap_interval(above, mean_of_means, resamples=resamples)
+        parts.append(
+            pd.DataFrame(
+                {
+                    "environment": environment,
+                    "agent": agent,
+                    "observation": observation,
+                    "score": THRESHOLDS,
+                    "share": mean_of_means(*above),
+                    "lower": lower,
+                    "upper": upper,
+                    "tasks": len(tasks),
+                }
+            )
+        )
+    columns = ["environment", *GROUP, "score", "share", "lower", "upper", "tasks"]
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
+
+
+def improvements(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame":
+    """Probability that the first of two agents or observations scores higher, for each class and each two of them.
+
+    Args:
+        runs: as from `table`.
+    Returns:
+        Columns IMPROVEMENT_COLUMNS; `ours` and `theirs` are pairs "agent, observation" that have runs on the same
+        tasks; the interval is the 95 % stratified bootstrap's.
+    """
+    import pandas as pd
+
+    rows = []
+    for environment, part in runs.groupby("environment", sort=True):
+        groups = {key: _scores(own) for key, own in part.groupby(GROUP, sort=True)}
+        for (one, ours), (other, theirs) in combinations(groups.items(), 2):
+            tasks = [task for task in ours if task in theirs]
+            if not tasks:
+                continue
+            samples = [scores[task] for scores in (ours, theirs) for task in tasks]
+
+            def improvement(*drawn: np.ndarray, axis: int = -1, number: int = len(tasks)) -> np.ndarray:
+                return probability_of_improvement(drawn[:number], drawn[number:], axis)
+
+            lower, upper = bootstrap_interval(samples, improvement, resamples=resamples)
+            names = (", ".join(one), ", ".join(other))
+            rows.append((environment, *names, len(tasks), float(improvement(*samples)), float(lower), float(upper)))
+    return pd.DataFrame(rows, columns=IMPROVEMENT_COLUMNS)
+
+
+def _scores(part: "pd.DataFrame") -> dict[Any, np.ndarray]:
+    """Scores of the runs of each task."""
+    defined = part[np.isfinite(part["normalized_regret"].to_numpy(float))]
+    return {task: 1.0 - own["normalized_regret"].to_numpy(float) for task, own in defined.groupby(TASK, sort=True)}
