@@ -90,6 +90,13 @@ def test_measures_and_training_load_sparse_matrices_where_they_use_them():
     assert done.stdout.strip() == "False"
 
 
+def test_former_names_need_no_extra_that_they_did_not_need():
+    code = "import sys; sys.modules['yaml'] = None; from pharos.validation import predict\n"
+    code += "from pharos.leaderboard import verify, submit; print(predict.__name__, verify.__name__)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "predict verify"
+
+
 def test_every_part_has_its_place_in_the_order():
     parts = {path.stem for path in SOURCE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
     assert parts - set(ORDER) <= {"__init__"}
