@@ -31,6 +31,7 @@ ORDER = (
         "errors",
         "system",
         "statistics",
+        "regret",
         "ranks",
         "kernels",
         "environments",

@@ -1,7 +1,7 @@
 """Solving: optimal values and values of given policies, each with an error bound that is proven and met."""
 
 from pharos.solvers.policy_iteration import chain
-from pharos.solvers.solution import ReferenceValues, Solution, cumulative_expected_regret, regret, regret_scale
+from pharos.solvers.solution import Solution
 from pharos.solvers.values import (
     TablePolicy,
     evaluate_parts,
