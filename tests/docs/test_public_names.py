@@ -29,7 +29,7 @@ HEAVY = ("numba", "scipy", "pandas", "matplotlib", "torch", "rich", "typer", "st
 
 # A part imports only what stands before it, at the top of a file and inside of functions alike.
 ORDER = (
-    *("errors", "system", "statistics", "ranks", "kernels", "environments", "drawing", "rules"),
+    *("errors", "system", "statistics", "regret", "ranks", "kernels", "environments", "drawing", "rules"),
     *("state_space", "mdp", "solvers"),
     *("hardness", "importers", "exporters", "observations", "interaction", "policies", "agents", "training"),
     *("prediction", "plots", "sb3_env", "bisimulation", "explorer"),

@@ -15,7 +15,8 @@ from pharos import benchmark, hardness, study
 from pharos.errors import FileFormatError, ParameterError, UndefinedMeasure
 from pharos.hardness.representation import learning
 from pharos.mdp import TabularMDP
-from pharos.solvers import regret_scale, uniform_value, value_iteration, worst_value
+from pharos.regret import regret_scale
+from pharos.solvers import uniform_value, value_iteration, worst_value
 from pharos.training import (
     ReferenceValues,
     RegretCurve,

@@ -155,7 +155,8 @@ def counts_of(space: "StateSpace") -> dict[str, int]:
 
 def _has_regret(mdp: "TabularMDP") -> bool:
     """Whether some policy is better than uniform play."""
-    from pharos.solvers import regret_scale, uniform_value, value_iteration
+    from pharos.regret import regret_scale
+    from pharos.solvers import uniform_value, value_iteration
 
     optimal, uniform = value_iteration(mdp), uniform_value(mdp)
     error = max(optimal.error_bound, uniform.error_bound)

@@ -165,7 +165,7 @@ def evaluate(
     Args:
         policy: optimal, uniform, worst; FILE.npy: actions (S,), probabilities (S, A); or a finished run's folder.
     """
-    from pharos.solvers import ReferenceValues, regret
+    from pharos.regret import ReferenceValues, regret
 
     decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
     source = "given"

@@ -36,6 +36,7 @@ from pharos.explorer.states import (
 from pharos.hardness import discounted_visits, occupancy
 from pharos.mdp import TabularMDP
 from pharos.observations import num_values
+from pharos.policies import state_losses
 from pharos.solvers import Solution, uniform_value, value_iteration
 from pharos.state_space import StateSpace
 
@@ -64,28 +65,12 @@ class DiscountedVisits:
         return self._known[policy]
 
     def losses(self, policy: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(S,) each: loss in each state, discounted visits, and the action chosen most often.
-
-            loss(s) = sum over a of visits(s, a) gap(s, a), which sums to V* minus the value of the policy at the start
-
-        Source: the performance difference lemma, Kakade and Langford (2002).
-        """
-        world = self.exploration
-        mdp, pairs = world.mdp, self.pairs(policy)
-        states = np.flatnonzero(pairs.any(axis=1))
-        executed = world.solutions[OPTIMAL].q_of(states)
-        gaps = executed.max(axis=1, keepdims=True) - executed
-        lost = np.zeros(mdp.num_states)
-        lost[states] = mdp.chance.chosen * (pairs[states] * gaps).sum(axis=1)
-        if mdp.is_sticky:  # the first step, which has no action before
-            first = np.flatnonzero(mdp.start_probabilities > 0)
-            starts, weights = mdp.start_states[first], mdp.start_probabilities[first]
-            q = world.solutions[OPTIMAL].q_of(starts)
-            chances = world.chances(policy, starts, world.chosen_values(OPTIMAL, starts))
-            more = (mdp.chance.first_chosen - mdp.chance.chosen) * chances * (q.max(axis=1, keepdims=True) - q)
-            np.add.at(lost, starts, weights * more.sum(axis=1) * ~mdp.terminal[starts])
-        visits = pairs.sum(axis=1)
-        return lost, visits, pairs.argmax(axis=1)
+        """(S,) each: loss in each state (`policies.state_losses`), discounted visits, action chosen most often."""
+        world, pairs, first = self.exploration, self.pairs(policy), None
+        if world.mdp.is_sticky:
+            starts = world.mdp.start_states
+            first = world.chances(policy, starts, world.chosen_values(OPTIMAL, starts))
+        return state_losses(world.solutions[OPTIMAL], pairs, first), pairs.sum(axis=1), pairs.argmax(axis=1)
 
     def _table(self, policy: str) -> np.ndarray | None:
         """The policy as solvers take it; None for the uniform one. Uniform in states where it was not asked."""

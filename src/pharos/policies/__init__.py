@@ -1,5 +1,6 @@
 """Policies, as tables or as functions of observations: queried in the states that they reach, and evaluated."""
 
+from pharos.policies.losses import state_losses
 from pharos.policies.models import DeepPolicy, SB3Model, deep_policy
 from pharos.policies.policy import (
     MasksLike,

@@ -7,7 +7,7 @@ from pharos.system import lazy
 if TYPE_CHECKING:
     from pharos.solvers.options import Solving, SolvingOptions
     from pharos.solvers.policy_iteration import chain
-    from pharos.solvers.solution import ReferenceValues, Solution, cumulative_expected_regret, regret, regret_scale
+    from pharos.solvers.solution import Solution
     from pharos.solvers.values import (
         TablePolicy,
         evaluate_parts,

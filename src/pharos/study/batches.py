@@ -24,7 +24,7 @@ import numpy as np
 
 from pharos.agents.batched import lane_width
 from pharos.environments import Environment, start_distribution
-from pharos.solvers import ReferenceValues
+from pharos.regret import ReferenceValues
 from pharos.study.blocks import Run
 from pharos.study.worker import BATCHES
 from pharos.system import storage

@@ -20,7 +20,7 @@ from pharos import training
 from pharos.agents import agent_kind
 from pharos.environments import classes, make
 from pharos.errors import FileFormatError, ParameterError, UnknownName
-from pharos.solvers import regret_scale
+from pharos.regret import regret_scale
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
 from pharos.study.specification import Source

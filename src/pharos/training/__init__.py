@@ -9,7 +9,7 @@ from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.mdp import ChanceSetting
-    from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
+    from pharos.regret import ReferenceValues, cumulative_expected_regret, regret
     from pharos.training.batch import TrainingProgress, check_device, train_configs
     from pharos.training.curve import Curve, Evaluation, RegretCurve, evaluate_agent
     from pharos.training.learners import FailedRun, TaskCache

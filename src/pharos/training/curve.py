@@ -24,7 +24,7 @@ from pharos.policies import (
     table_values,
     walk_values,
 )
-from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
+from pharos.regret import ReferenceValues, cumulative_expected_regret, regret
 from pharos.training import results as _results
 from pharos.training.task import Task
 

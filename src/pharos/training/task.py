@@ -26,7 +26,8 @@ from pharos.mdp import (
 )
 from pharos.observations import OwnObservation, observation_of, registered
 from pharos.policies import Observer, ReachableRows, reachable_rows
-from pharos.solvers import ReferenceValues, Solution, uniform_value, value_iteration, worst_value
+from pharos.regret import ReferenceValues
+from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
 from pharos.system.records import flat, read
 from pharos.system.sources import Source, is_reference, resolve

@@ -16,13 +16,9 @@ from numpy.typing import ArrayLike
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.visitation import Propagation, drawn, standard_occupancy
-from pharos.mdp import (
-    TabularMDP,
-    mdp_within,
-    states_within,
-    whole_number,
-)
-from pharos.solvers import Solution, chain, evaluate_policy, regret_scale, uniform_value, value_iteration
+from pharos.mdp import TabularMDP, mdp_within, states_within, whole_number
+from pharos.regret import regret_scale
+from pharos.solvers import Solution, chain, evaluate_policy, uniform_value, value_iteration
 
 MOST_EXACT = 4096
 """Different observations up to which a kernel is used as it is; beyond, by landmarks."""
