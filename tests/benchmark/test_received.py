@@ -80,7 +80,7 @@ def test_a_received_suite_runs_code_only_if_it_is_trusted(named, suite, place):
         ("board", "it.safetensors", "--out", "board.html"),
     ):
         said = usage_error("benchmark", *words, "--suite", "received.yaml")
-        assert "received.yaml: task sea names code, 'evil" in said and "add --trust" in said
+        assert "received.yaml: task sea: 'evil" in said and "add --trust" in said
     assert "evil" in run("benchmark", "show", "received.yaml", "--json").stdout
     with pytest.raises(UntrustedCode):
         load_suite("received.yaml")

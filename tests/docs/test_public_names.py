@@ -55,7 +55,6 @@ STRANGERS = {
 # Imports that look ahead, each by name.
 LICENSED = {
     ("state_space/store.py", "mdp"): "StateSpace.mdp makes the MDP of a space",
-    ("plots/regret.py", "study"): "figures of a study, drawn with its statistics",
 }
 
 

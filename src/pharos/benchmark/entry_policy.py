@@ -20,7 +20,7 @@ from pharos.observations import observe
 from pharos.policies import PolicyLike, deep_policy
 from pharos.state_space import build
 from pharos.system import storage
-from pharos.system.sources import is_reference
+from pharos.system.sources import is_reference, untrusted_code
 from pharos.training import RunConfig, Task, TaskValues
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def _known_agent(name: str) -> str:
         cls = algorithm(name)
         if isinstance(cls, type) and issubclass(cls, BaseAlgorithm):
             return name
-    raise UntrustedCode(f"the agent {name!r} is code, which is executed only if you trust it: add --trust")
+    raise untrusted_code(f"the agent {name!r}")
 
 
 def _network_options(entry: Entry) -> dict[str, Any]:
@@ -239,10 +239,7 @@ def _check_code(config: RunConfig, trust: bool) -> None:
         return
     if config.sources:
         part, source = next(iter(config.sources.items()))
-        raise UntrustedCode(
-            f"the {part} {source.name!r} is code, which is executed only if you trust it: add --trust (in Python: "
-            f"trust=True)"
-        )
+        raise untrusted_code(f"the {part} {source.name!r}")
     if config.environment not in {entry.name for entry in BUILT_IN}:
         raise UntrustedCode(f"the environment {config.environment!r} is no part of pharos: add --trust if you trust it")
     if is_reference(config.observation) or config.observation not in observation_names():

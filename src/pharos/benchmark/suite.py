@@ -22,11 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName, UntrustedCode
+from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
 from pharos.mdp import ChanceSetting, TabularMDP
 from pharos.system import storage
 from pharos.system.records import read
-from pharos.system.sources import is_reference
+from pharos.system.sources import is_reference, untrusted_code
 from pharos.system.storage import check_name
 from pharos.training import Task
 
@@ -212,10 +212,7 @@ def load_suite(name_or_file: str | Path = "v1", *, trust: bool = False) -> Suite
     for task in suite.tasks:
         named = [name for name in (task.environment, task.observation) if is_reference(name)]
         if named and not trust:
-            raise UntrustedCode(
-                f"{path}: task {task.name} names code, {named[0]!r}, which is executed only if you trust it: add "
-                f"--trust (in Python: trust=True)"
-            )
+            raise untrusted_code(f"{path}: task {task.name}: {named[0]!r}")
     return suite
 
 

@@ -32,7 +32,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from pharos.agents import AGENTS, BATCHED, agent_source, is_known
-from pharos.errors import ParameterError, UnknownName, UntrustedCode
+from pharos.errors import ParameterError, UnknownName
 from pharos.study.blocks import (
     MOST_RUNS,
     Block,
@@ -42,7 +42,7 @@ from pharos.study.blocks import (
     Specification,
 )
 from pharos.system import mdp_files
-from pharos.system.sources import is_reference
+from pharos.system.sources import is_reference, untrusted_code
 from pharos.system.yaml_files import nodes_and_data, read_text
 
 Loc = tuple[int | str, ...]
@@ -155,9 +155,7 @@ def given_environments(file: str | os.PathLike, *, trust: bool = False) -> list[
         if isinstance(name, str) and mdp_files.is_folder(path.parent / name):
             entry = {**entry, "name": str((path.parent / name).absolute())}
         elif isinstance(name, str) and is_reference(name) and not trust:
-            raise UntrustedCode(
-                f"{path}: {name!r} is code, which is executed only if you trust it: add --trust (in Python: trust=True)"
-            )
+            raise untrusted_code(f"{path}: {name!r}")
         try:
             context = {"folder": path.absolute().parent}
             _ = EnvironmentEntry.model_validate(entry, context=context).instance
@@ -228,10 +226,8 @@ def _validated(
     references = [*_references(data)]
     if references and not trust:
         loc, reference = references[0]
-        raise UntrustedCode(
-            f"{where(name, root, loc)}: {reference!r} is code, which is executed only if you trust it: add --trust "
-            f"(in Python: trust=True), or name your own YAML file, which is no {STUDY_FILE} beside results"
-        )
+        alternative = f", or name your own YAML file, which is no {STUDY_FILE} beside results"
+        raise untrusted_code(f"{where(name, root, loc)}: {reference!r}", alternative)
     if references:
         written = data.get("folder")
         folder = (folder / written if isinstance(written, str) else folder).resolve()

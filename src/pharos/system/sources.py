@@ -123,6 +123,17 @@ def load(source: Source) -> Any:
     return target
 
 
+def untrusted_code(what: str, alternative: str = "") -> UntrustedCode:
+    """The error for code that something received names.
+
+    Args:
+        what: what names it, and its name. alternative: what else to try.
+    """
+    return UntrustedCode(
+        f"{what} is code, which is executed only if you trust it: add --trust (in Python: trust=True){alternative}"
+    )
+
+
 def resolve(source: Source, *, trust: bool = False, strict: bool = False) -> Any:
     """The class or function that the source in a stored configuration names.
 
@@ -139,10 +150,7 @@ def resolve(source: Source, *, trust: bool = False, strict: bool = False) -> Any
             _tell_change(source, loaded[0], strict)
         return loaded[1]
     if not trust:
-        raise UntrustedCode(
-            f"{source} is code, which is executed only if you trust it: add --trust (in Python: trust=True), "
-            f"or name it yourself"
-        )
+        raise untrusted_code(str(source), ", or name it yourself")
     now = source
     if not Path(source.file).is_file():
         if source.module is None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from pharos.agents import BATCHED, agent_kind, agent_source, is_known
 from pharos.environments import Environment, as_tuples, class_called, class_of, make, source_of
-from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
+from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.mdp import (
     ChanceSetting,
     TabularMDP,
@@ -30,7 +30,7 @@ from pharos.regret import ReferenceValues
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
 from pharos.system.records import flat, read
-from pharos.system.sources import Source, is_reference, resolve
+from pharos.system.sources import Source, is_reference, resolve, untrusted_code
 from pharos.training.options import ENGINES, Horizon, TrainingOptions
 
 TAIL = 1e-9  # part of a discounted return that is not looked at
@@ -435,10 +435,7 @@ class RunConfig(TrainingOptions):
     def _check_trust(self, part: str, trust: bool) -> None:
         name = getattr(self, part)
         if is_reference(name) and not trust:
-            raise UntrustedCode(
-                f"the {part} {name!r} is code, which is executed only if you trust it: "
-                f"add --trust (in Python: trust=True)"
-            )
+            raise untrusted_code(f"the {part} {name!r}")
 
 
 def run_id(config: Mapping[str, Any]) -> str:
