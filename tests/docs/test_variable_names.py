@@ -1,4 +1,4 @@
-"""Names: variables are nouns and not participles, a class name means one thing, docstrings say what is returned."""
+"""Names: variables are nouns and not participles, classes and functions mean one thing, docstrings name a result."""
 
 import ast
 import re
@@ -56,6 +56,23 @@ def test_no_variable_is_named_by_a_participle(nodes_of):
 def test_a_class_name_means_one_thing_in_the_whole_library(nodes_of):
     names = Counter(node.name for nodes in nodes_of.values() for node in nodes if isinstance(node, ast.ClassDef))
     assert [name for name, count in names.items() if count > 1] == []
+
+
+# Files and folders whose functions share their names with no function elsewhere, commands excepted.
+ONE_MEANING = ("statistics.py", "regret.py", "system/threads.py", "policies/losses.py", "hardness/representation/")
+ONE_MEANING += ("observations/classes.py", "observations/tangent.py")
+ONE_MEANING += ("study/aliasing.py", "study/prediction_figures.py", "study/profiles.py")
+DOCUMENTED = {"regret": {"regret.py", "plots/regret.py"}}  # of two packages, by the same word
+
+
+def test_a_function_name_means_one_thing(nodes_of):
+    files = {}
+    for file, (module, *_) in nodes_of.items():
+        for node in module.body:
+            if isinstance(node, ast.FunctionDef) and node.name[0] != "_" and not file.startswith("cli/"):
+                files.setdefault(node.name, set()).add(file)
+    shared = {name: own for name, own in files.items() if len(own) > 1 and any(f.startswith(ONE_MEANING) for f in own)}
+    assert shared == DOCUMENTED
 
 
 # "What a checkpoint keeps." is a predicate without a subject, and says nothing in an IDE's list.
