@@ -20,10 +20,9 @@ import pytest
 
 import pharos
 from patience import PATIENCE, wait_for
-from pharos.agents.deep import check_hyperparameters
+from pharos.agents.sb3 import Deep, check_hyperparameters
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UnknownName
 from pharos.training import read_curve, read_record, train, train_config
-from pharos.training.learners import Deep
 from pharos.training.results import COLUMNS
 from pharos.training.task import Task
 from refusals import refusal

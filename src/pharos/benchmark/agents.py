@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import AGENTS, BATCHED, batched, check_hyperparameters, is_known
-from pharos.agents import hyperparameters as hyperparameters_of
+from pharos.agents import agent_called, agents, batched, check_hyperparameters, is_known
 from pharos.benchmark.budget import Learn, generated_curve, uniform_policy
 from pharos.benchmark.jax_agents import LearnCompiled, compiled_curves
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
@@ -52,8 +51,6 @@ from pharos.training import (
 )
 
 EXACT = ("oracle", "random")
-# What only some classes of environments declare for an agent: with these, the setting is one for all tasks
-ALSO: Mapping[str, Mapping[str, Any]] = {"dqn": {"n_envs": 1, "n_steps": 1}}
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 Tell = Callable[[float, str], None]
@@ -135,14 +132,11 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
             return _function(code, source, setting)
         check_hyperparameters(code, setting)
         return TrainedForm(agent, "class", setting, source, sha256(source.file))
-    defaults = {**hyperparameters_of(agent, "", ""), **ALSO.get(agent, {})} if agent in AGENTS else {}
+    known = agent_called(agent)
+    defaults = {**known.defaults, **known.benchmark_defaults}
     values = {**defaults, **suite.hyperparameters.get(agent, {}), **setting}
-    lacking = batched.supports(agent, values) if agent in BATCHED else None
-    if lacking is not None:
-        raise ParameterError(f"the batched engine: {lacking}")
-    if agent not in AGENTS or not AGENTS[agent].is_tabular:
-        check_hyperparameters(agent, values, batched.OURS if agent in BATCHED else ())
-    return TrainedForm(agent, "engine" if agent in AGENTS else "class", values)
+    known.check(values, known.engines[-1])
+    return TrainedForm(agent, "engine" if agent in agents() else "class", values)
 
 
 def sha256(file: str | os.PathLike) -> str:
@@ -160,7 +154,7 @@ class TrainedForm(Form):
         configs = [self._config(job, protocol) for job in jobs]
         for job, config in zip(jobs, configs, strict=True):
             # Stable-Baselines3 goes on from a checkpoint, but not to the same bytes: a killed run is begun anew
-            if config.engine == "sb3" and not config.is_tabular:
+            if not agent_called(self.label).resumes_exactly(config.engine):
                 clear_run(job.folder)
         folders, parts = [job.folder for job in jobs], self._parts(jobs, configs, protocol, workers)
 
@@ -175,9 +169,9 @@ class TrainedForm(Form):
         train_configs(configs, folders, checkpoints=checkpoints, progress=progress, tasks=tasks)
 
     def _config(self, job: Job, protocol: Protocol) -> RunConfig:
-        task = job.task.training_task(protocol)
-        if self.label == "q_learning":
-            task = replace(task, observation="index", observation_options={})
+        task, agent = job.task.training_task(protocol), agent_called(self.label)
+        if agent.fixed_observation is not None:
+            task = replace(task, observation=agent.fixed_observation, observation_options={})
         return RunConfig.of_task(
             task,
             self.label,
@@ -185,7 +179,7 @@ class TrainedForm(Form):
             seed=job.seed,
             evaluation_interval=protocol.evaluation_interval,
             hyperparameters=self.hyperparameters,
-            engine="batched" if self.label in BATCHED else "sb3",
+            engine=agent.engines[-1],
         )
 
     def _parts(

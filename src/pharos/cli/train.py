@@ -59,13 +59,13 @@ def train(
         tensorboard: Write TensorBoard logs into --out.
     """
     env = target.found_environment()
-    from pharos.agents import agent_kind
+    from pharos.agents import agent_called
     from pharos.agents import hyperparameters as hyperparameters_of
     from pharos.training import train as learn
 
     agent, hyperparameters = training.agent, training.hyperparameters
     if table is not None:
-        sight = agent_kind(agent).observation(training.observation)
+        sight = agent_called(agent).observation(training.observation)
         hyperparameters = hyperparameters_of(agent, env.name, sight, hyperparameters, table=table)
     training = replace(
         training,

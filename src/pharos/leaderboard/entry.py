@@ -23,6 +23,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from pharos.agents import agent_called
 from pharos.environments import class_called
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.system import records, storage
@@ -321,7 +322,7 @@ def submit(
         rules_version=_rules_version(run, record, config),
         claim=claim,
         training={key: result.get(key) for key in TRAINING} | {"seconds": record.get("seconds")},
-        arrays={POLICY: stored_table(run)} if config.is_tabular else _network(run),
+        arrays={POLICY: stored_table(run)} if agent_called(config.agent).has_table else _network(run),
     )
     target = check_ending(Path(f"{config.id}{SUFFIX}" if file is None else file))
     write_checked(target, lambda: write(entry, target), lambda: read(target))

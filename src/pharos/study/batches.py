@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos.agents import agent_called
 from pharos.agents.batched import lane_width
 from pharos.environments import Environment, start_distribution
 from pharos.solvers import ReferenceValues
@@ -158,8 +159,8 @@ class Batches:
 
     def width(self, run: Run) -> int:
         """Largest number of runs in a batch with this one."""
-        is_image = not run.configuration.is_tabular and len(self._observation(run).shape) == 3
-        usual = TABLES if run.configuration.is_tabular else lane_width(is_image, self.device)
+        is_image = not agent_called(run.configuration.agent).has_table and len(self._observation(run).shape) == 3
+        usual = TABLES if agent_called(run.configuration.agent).has_table else lane_width(is_image, self.device)
         return min(usual, self.sizes.get(run.id, usual))
 
     def key(self, run: Run) -> Hashable:
@@ -172,7 +173,7 @@ class Batches:
         from pharos.agents.batched import group_key
 
         config = run.configuration
-        if config.is_tabular:
+        if agent_called(config.agent).has_table:
             return (config.agent, config.environment)
         try:
             env = config.make_environment(trust=True)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos import training
-from pharos.agents import agent_kind
+from pharos.agents import agent_called
 from pharos.environments import classes, make
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.solvers import regret_scale
@@ -409,7 +409,7 @@ def predict(
         source, folder: as for `run`; no run is looked at.
         blocks, agents, observations: a part of the study: numbers of blocks from 1, names of agents, and of
             observations without their options; None: all.
-        primary: only the predictor that stands for each agent (`pharos.validation.PRIMARY`) with its table; other
+        primary: only the predictor that stands for each agent (`pharos.agents.Idealised`) with its table; other
             columns are NaN, and `estimated_error` is that of this predictor. A small part of the time.
         progress: called with what is being done.
     Returns:
@@ -425,12 +425,13 @@ def predict(
     """
     import pandas as pd
 
-    from pharos.validation import POLICY_CURVES, predicted
+    from pharos.agents import POLICY_CURVES
+    from pharos.validation import predicted
 
     study, _ = opened(source, folder)
     rows: dict[tuple[str, ...], dict[str, Any]] = {}
     for run in _part_of(study, blocks, agents, observations):
-        if agent_kind(run.configuration.agent).is_tabular:
+        if agent_called(run.configuration.agent).has_table:
             continue
         key = tuple(run.cell.values())
         if key in rows:

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
     from pharos.training.batch import TrainingProgress, check_device, train_configs
     from pharos.training.curve import Curve, Evaluation, RegretCurve, bootstrap_interval, evaluate_agent
-    from pharos.training.learners import FailedRun, TaskCache
     from pharos.training.options import ENGINES, ExecutionOptions, Horizon, TrainingOptions
+    from pharos.training.prepared import FailedRun, TaskCache
     from pharos.training.results import (
         TrainingResult,
         check_agent,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     )
     from pharos.training.runs import train, train_config, train_many, train_parts
     from pharos.training.task import CELL, RunConfig, Task, TaskValues, run_id
-    from pharos.training.tuning import SPACES, TuningResult, tune
+    from pharos.training.tuning import TuningResult, tune
 
 __all__ = [
     "ChanceSetting",

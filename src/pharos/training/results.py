@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from pharos.agents import NETWORK, POLICY, agent_called
 from pharos.environments import class_called
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, ResultCorrupted, UntrustedCode
 from pharos.system import storage
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 
 FORMAT = 1
-RECORD, CURVE, POLICY, AGENT = "run.json", "curve.parquet", "policy.npy", "agent"
+RECORD, CURVE = "run.json", "curve.parquet"
 TEXT_CURVE = "curve.csv"
 AGAIN = "delete the folder and execute the run again"
 ANEW = "delete the folder to start anew"
@@ -308,7 +309,7 @@ def _checksums(folder: Path) -> dict[str, str]:
     if (curve := _curve_file(folder)).exists():
         columns = _read_text(curve) if curve.name == TEXT_CURVE else _columns_of(read_table(curve))
         checksums[curve.name] = _digest_of_columns(columns)
-    for path in (folder / POLICY, *sorted((folder / AGENT).rglob("*"))):
+    for path in (folder / POLICY, *sorted((folder / NETWORK).rglob("*"))):
         if path.is_file():
             storage.sync(path)
             checksums[path.relative_to(folder).as_posix()] = storage.digest_of_file(path)
@@ -325,14 +326,6 @@ def _expected_checksums(folder: Path) -> dict[str, str]:
 def write_policy(folder: Path, policy: object) -> None:
     """Replace policy.npy: the policy of a tabular agent, as `pharos evaluate --policy` takes it."""
     storage.replace_array(folder / POLICY, policy)
-
-
-def new_agent(folder: Path) -> Path:
-    """The empty folder of the agent of a run; an older one is removed, so that no link in it is written through."""
-    place = storage.inside(folder, AGENT)
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir(parents=True)
-    return place
 
 
 # Checkpoints and agents -----------------------------------------------------------------------------------------------
@@ -503,6 +496,8 @@ def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task,
         UntrustedCode: the run names code, and is not trusted.
         MissingExtra: Stable-Baselines3 is not installed.
     """
+    from pharos.training.prepared import PreparedRun, TaskCache
+
     folder = Path(folder)
     record = read_record(folder)
     if record.get("status") != "finished":
@@ -513,19 +508,13 @@ def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task,
     try:
         config = RunConfig.from_dict(record["config"])
         task = config.task(trust=trust)
-        agent = config.algorithm(trust=trust)
+        tasks = TaskCache(trust=trust)
+        tasks.adopt(config, task)
+        run = PreparedRun(None, config, None, tasks)
+        run.hyperparameters = record["hyperparameters"]
+        _ = run.algorithm  # or what is wrong with it
     except UntrustedCode as error:
         raise UntrustedCode(f"{folder / 'run.json'}: {error}") from error
     except FileFormatError as error:
         raise FileFormatError(f"{folder / 'run.json'}: {error}") from error
-    if config.is_tabular:
-        try:
-            check_regular(folder / "policy.npy")
-            return task, np.load(folder / "policy.npy", allow_pickle=False)
-        except Exception as error:  # the header is read as Python
-            raise FileFormatError(f"{folder / 'policy.npy'}: cannot be read: {error}") from error
-    from pharos.training.learners import Deep
-
-    learner = Deep(agent, task, record["hyperparameters"], config.steps, config.seed, None)
-    learner.load(folder / "agent")
-    return task, learner.agent
+    return task, agent_called(config.agent).load(folder, run)

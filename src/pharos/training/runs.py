@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pharos.agents import agent_kind
+from pharos.agents import agent_called
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.agents.batched import lane_width
 from pharos.environments import Environment
@@ -25,8 +25,8 @@ from pharos.system.records import split, takes
 from pharos.system.workers import Workers
 from pharos.training import results as _results
 from pharos.training.batch import ProgressCallback, TrainingJobs, TrainingProgress, train_configs
-from pharos.training.learners import FailedRun, TaskCache
 from pharos.training.options import TrainingOptions
+from pharos.training.prepared import FailedRun, TaskCache
 from pharos.training.results import TrainingResult, finished_result
 from pharos.training.task import RunConfig, Task, TaskValues
 
@@ -151,12 +151,11 @@ def _train(
     tensorboard: bool = False,
 ) -> TrainingResult:
     """Train a single run; its errors are raised."""
-    if tensorboard and config.engine == "batched":
-        raise ParameterError("TensorBoard's logs are those of Stable-Baselines3; expected the engine sb3, or none")
-    if tensorboard and (folder is None or config.is_tabular):
+    if tensorboard and (folder is None or not agent_called(config.agent).has_tensorboard(config.engine)):
         raise ParameterError(
-            f"TensorBoard's logs were asked for, with {config.agent} and {'a' if folder else 'no'} folder for results; "
-            f"expected an algorithm of Stable-Baselines3 and a folder (out)"
+            f"TensorBoard's logs were asked for, with {config.agent}, the engine {config.engine} and "
+            f"{'a' if folder else 'no'} folder for results; expected an algorithm of Stable-Baselines3, the engine sb3 "
+            f"and a folder (out)"
         )
 
     def tell(now: TrainingProgress) -> None:
@@ -179,7 +178,7 @@ def _runs(
     """The task, and the configuration of a run with each of the seeds; `options` as `train` takes them."""
     training, parameters = split(TrainingOptions, options)
     agent, hyperparameters, table = training.agent, training.hyperparameters, options.get("hyperparameters")
-    name = agent_kind(agent).observation(training.observation)
+    name = agent_called(agent).observation(training.observation)
     task = Task.of(
         environment,
         parameters,

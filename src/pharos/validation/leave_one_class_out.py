@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pharos.agents import POLICY_PREDICTORS, SAMPLED_PREDICTORS
 from pharos.errors import ParameterError
 from pharos.training import CELL
 from pharos.validation import cross_validation
 from pharos.validation.cross_validation import BLOCK, percentiles
-from pharos.validation.learners import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS
+from pharos.validation.learners import PREDICTORS
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -77,7 +77,7 @@ ONLY: dict[str, Any] = {
     "sde_sample_freq": -1,
     "clip_range_vf": None,
 }
-NATURE = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in deep.py
+NATURE = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in sb3.py
 MOST_REMEMBERED = 1 << 14  # states whose target values are kept
 BLOCK = 4096  # states that are observed at once
 

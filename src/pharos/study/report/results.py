@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pharos.agents import TABULAR_OBSERVATION
-from pharos.study.analysis import REGRETS, Models, PaperComparison, compare, intervals, models
+from pharos.study.analysis import PAPER_AGENTS, REGRETS, Models, PaperComparison, compare, intervals, models
 from pharos.study.findings import findings
 from pharos.study.specification import Specification
 from pharos.study.statistics import aliasing_table, improvements, profiles, with_aliasing
@@ -15,8 +15,6 @@ from pharos.study.tables import cells, finished_runs, hardness_cost, hardness_ta
 
 if TYPE_CHECKING:
     import pandas as pd
-
-PAPER_AGENTS = ("dqn", "ppo")
 
 
 @dataclass(frozen=True)
