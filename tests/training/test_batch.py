@@ -65,7 +65,7 @@ def test_each_run_leaves_what_a_run_leaves(engine, tmp_path):
         assert record["config"]["seed"] == seed and record["result"] == result.result
         assert record["batch"]["runs"] == 3 and record["seconds"] == pytest.approx(record["batch"]["seconds"] / 3)
         assert list(curve.columns) == list(COLUMNS) and curve["step"].tolist() == [0, 10, 20, 30, 40]
-        assert set(record["checksums"]) == {"curve.parquet", "agent/model.json", "agent/parameters.pt"}
+        assert set(record["checksums"]) == {"curve.csv", "agent/model.json", "agent/parameters.pt"}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["seed-0", "seed-1", "seed-2"]
 
 
@@ -200,7 +200,7 @@ def test_tables_of_many_seeds_are_those_of_single_runs(tmp_path):
     alone = pharos.train("q_learning", "simple_grid/4x4-plain", seed=1, out=tmp_path / "alone", **options)
     for name in ("q", "visits"):
         assert np.array_equal(getattr(results[1].agent, name), getattr(alone.agent, name))
-    for name in ("curve.parquet", "policy.npy"):
+    for name in ("curve.csv", "policy.npy"):
         assert (tmp_path / "alone" / name).read_bytes() == (tmp_path / "seed-1" / name).read_bytes()
     assert read_record(tmp_path / "alone")["id"] == read_record(tmp_path / "seed-1")["id"]
 
@@ -215,7 +215,7 @@ def test_tables_that_were_killed_go_on_together_to_the_same_bytes(tmp_path, monk
     results = many(tmp_path / "killed", **options)
     assert not (tmp_path / "killed" / "checkpoints").exists() and len(results) == 3
     whole, killed = (tmp_path / name / "seed-2" for name in ("whole", "killed"))
-    for name in ("curve.parquet", "policy.npy"):
+    for name in ("curve.csv", "policy.npy"):
         assert (whole / name).read_bytes() == (killed / name).read_bytes()
 
 

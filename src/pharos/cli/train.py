@@ -184,7 +184,7 @@ def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, ob
         ("cumulative regret", f"{learnt:.6g} of the learnt policies, {played:.6g} as played"),
         ("normalised regret", shown),
         ("mean return", f"{result['mean_return']:.6g} over {pluralize(result['episodes'], 'episode')}"),
-        ("values", "exact" if result["exact"] else "some are estimates, see exact in curve.parquet"),
+        ("values", "exact" if result["exact"] else "some are estimates, see exact in curve.csv"),
         ("chance", chance),
         ("seconds", f"{run.seconds:.1f} ({steps / run.seconds:,.0f} steps/s, evaluation included)"),
         *compiling_fact(),

@@ -109,7 +109,7 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
 
 
 def curves(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
-    """Table of the evaluations of finished runs, a row each: columns of curve.parquet, and of the run."""
+    """Table of the evaluations of finished runs, a row each: columns of curve.csv, and of the run."""
     return _warned(finished_runs(*opened(source, folder))).points
 
 

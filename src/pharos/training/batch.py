@@ -1,6 +1,6 @@
 """Training: runs that fit together learn under one loop, with the exact value of each policy at chosen steps.
 
-    FOLDER/                      of each run: run.json, curve.parquet, and what was learnt
+    FOLDER/                      of each run: run.json, curve.csv, and what was learnt
     FOLDER/checkpoint/           of a run that learns alone, while it is trained
     CHECKPOINTS/BATCH/           of runs that learn together: all of them, their configurations and curves
 

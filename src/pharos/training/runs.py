@@ -1,7 +1,7 @@
 """Training an agent on a task, with the exact regret of its policy at chosen steps; runs that are killed resume.
 
     FOLDER/run.json         configuration, versions, status, result
-    FOLDER/curve.parquet    a row for each evaluation (curve.csv where pyarrow is not installed)
+    FOLDER/curve.csv        a row for each evaluation
     FOLDER/checkpoint/      while it runs: what the next attempt goes on from; arrays, JSON and tensors, never code
 
 A run that is killed goes on from its last checkpoint when it is started again: at most the last interval between
