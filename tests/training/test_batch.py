@@ -29,7 +29,7 @@ from pharos.training import (
     tune,
 )
 from pharos.training.results import COLUMNS
-from pharos.training.runs import parts_of
+from pharos.training.schedule import plan
 from refusals import failing, refusal
 
 _results = importlib.import_module("pharos.training.results")
@@ -300,17 +300,17 @@ def test_a_trial_of_a_search_is_one_batch(engine, tmp_path):
 
 def test_whole_lanes_are_dealt_out_to_processes():
     runs = [config(seed) for seed in range(70)]
-    assert [len(part) for part in parts_of(runs, 2)] == [32 + 6, 32]
-    assert [len(part) for part in parts_of(runs, 9)] == [32, 32, 6]
-    assert sorted(place for part in parts_of(runs, 2) for place in part) == list(range(70))
-    assert len(parts_of(runs[:32], 2)) == len(parts_of(runs, 1)) == 1
-    assert len(parts_of([config(seed, engine="sb3") for seed in range(70)], 2)) == 1
-    assert len(parts_of([config(seed, observation="simple_image") for seed in range(9)], 2)) == 2
+    assert [len(part) for part in plan(runs, workers=2)] == [32 + 6, 32]
+    assert [len(part) for part in plan(runs, workers=9)] == [32, 32, 6]
+    assert sorted(place for part in plan(runs, workers=2) for place in part) == list(range(70))
+    assert len(plan(runs[:32], workers=2)) == len(plan(runs, workers=1)) == 1
+    assert len(plan([config(seed, engine="sb3") for seed in range(70)], workers=2)) == 2
+    assert len(plan([config(seed, observation="simple_image") for seed in range(9)], workers=2)) == 2
 
 
 @pytest.mark.long
 def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("pharos.training.runs"), "lane_width", lambda *_: 2)
+    monkeypatch.setattr(importlib.import_module("pharos.training.schedule").Shapes, "width", lambda *_: 2)
     small = {"learning_starts": 50, "buffer_size": 500, "optimize_memory_usage": False}
     options = {"seeds": (0, 1, 2), "steps": 200, "evaluation_interval": 100, "hyperparameters": small}
     done = []

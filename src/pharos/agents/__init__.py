@@ -9,6 +9,7 @@ from pharos.agents.agent import (
     TABULAR_OBSERVATION,
     WORLD,
     Learner,
+    RunShape,
     agents,
     joined_states,
     state_of,

@@ -28,6 +28,7 @@ POLICY, NETWORK = "policy.npy", "agent"
 """What was learnt, in the folder of a run: a table, or a folder with a network."""
 TABULAR_OBSERVATION = "index"
 """What tabular agents see."""
+TABLES = 16  # runs of one program that learn tables
 # Entries of a configuration that decide about rewards and states, and about observations
 WORLD = ("environment", "parameters", "gamma", "sources")
 OBSERVATIONS = ("environment", "parameters", "observation", "observation_options", "sources")
@@ -92,6 +93,42 @@ class LearningRun(Protocol):
 
     def shared(self, what: str, names: Sequence[str], make: Callable[[], T]) -> T:
         """Return what `make` returns, made once for all runs whose configurations have the same entries `names`."""
+
+
+@dataclass(frozen=True)
+class RunShape:
+    """Sizes of a run that decide which runs can share a program.
+
+    Attributes:
+        shape, dtype: of one observation.
+        is_image: whether it is an image: (C, H, W) or (H, W, C) uint8 from 0 to 255.
+        frames: k, how many states it shows.
+        num_actions: A.
+        num_states: S, or an upper bound if the states are not built.
+    """
+
+    shape: tuple[int, ...]
+    dtype: str
+    is_image: bool
+    frames: int
+    num_actions: int
+    num_states: float
+
+
+class PlannedRun(Protocol):
+    """A run of which the sizes alone are known, see `pharos.training.schedule`."""
+
+    @property
+    def config(self) -> Any: ...
+
+    @property
+    def hyperparameters(self) -> Mapping[str, Any]: ...
+
+    @property
+    def steps(self) -> int: ...
+
+    @property
+    def shape(self) -> RunShape: ...
 
 
 AtPoint = Callable[[int], Mapping[str, Any] | None]
@@ -194,8 +231,16 @@ class Agent:
     def check(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
         """Raise ParameterError or UnknownName for hyperparameters that the agent lacks, or whose values are wrong."""
 
+    def group_key(self, run: PlannedRun, device: str) -> Hashable | None:
+        """Key of a run before its states are built: only runs with equal keys may train together; None: it is alone."""
+        return None
+
+    def width(self, run: PlannedRun, device: str) -> int:
+        """Most runs that one program trains at full pace."""
+        return 1
+
     def prepare(self, run: LearningRun, device: str, *, is_single: bool) -> Hashable | None:
-        """Return the group key of a run: runs with equal keys train together, under one learner; None: it is alone.
+        """Return the exact group key of a run: runs with equal keys train under one learner; None: it is alone.
 
         Args:
             is_single: whether the run is the only one of its call, or has a checkpoint of its own.
@@ -276,6 +321,12 @@ class TableAgent(Agent):
 
     def engine(self, requested: str) -> str:
         return "sb3"
+
+    def group_key(self, run: PlannedRun, device: str) -> Hashable | None:
+        return self.name, run.config.environment
+
+    def width(self, run: PlannedRun, device: str) -> int:
+        return TABLES
 
     def prepare(self, run: LearningRun, device: str, *, is_single: bool) -> Hashable | None:
         if is_single or not is_small_table(run.task.mdp):

@@ -160,12 +160,12 @@ class QLearning:
             array[:] = state[name]
 
 
-def checked_options(given: Mapping[str, Any]) -> dict[str, Any]:
-    """All hyperparameters, those given and DEFAULTS. UnknownName, ParameterError: one is unknown or out of range."""
-    unknown = set(given) - set(DEFAULTS)
+def checked_options(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """All hyperparameters: DEFAULTS with changes. UnknownName, ParameterError: one is unknown or out of range."""
+    unknown = set(changes) - set(DEFAULTS)
     if unknown:
         raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], DEFAULTS)
-    options = {**DEFAULTS, **given}
+    options = {**DEFAULTS, **changes}
     ranges = {
         "learning_rate": (0.0, 1.0),
         "visits_exponent": (0.0, 1.0),

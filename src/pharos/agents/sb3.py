@@ -29,6 +29,7 @@ from pharos.agents.agent import (
     Learner,
     LearningRun,
     LearningTask,
+    PlannedRun,
     agents,
     new_agent,
     reading_checkpoint,
@@ -315,6 +316,18 @@ class BatchedAgent(DeepAgent):
         lacking = supports(self.name, hyperparameters)
         if lacking is not None:
             raise ParameterError(f"the batched engine: {lacking}; the engine sb3 has it")
+
+    def group_key(self, run: PlannedRun, device: str) -> Hashable | None:
+        from pharos.agents.batched import group_key
+
+        if run.config.engine == "sb3":
+            return None
+        return run.config.evaluation_interval, group_key(self.name, run, device)
+
+    def width(self, run: PlannedRun, device: str) -> int:
+        from pharos.agents.batched import lane_width
+
+        return 1 if run.config.engine == "sb3" else lane_width(run.shape.is_image, device)
 
     def prepare(self, run: LearningRun, device: str, *, is_single: bool) -> Hashable | None:
         from pharos.agents.batched import group_key

@@ -15,7 +15,7 @@ import inspect
 import multiprocessing
 import os
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import agent_called, agents, batched, check_hyperparameters, is_known
+from pharos.agents import agent_called, agents, check_hyperparameters, is_known
 from pharos.benchmark.budget import Learn, generated_curve, uniform_policy
 from pharos.benchmark.jax_agents import LearnCompiled, compiled_curves
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
@@ -39,6 +39,7 @@ from pharos.training import (
     check_agent,
     clear_run,
     evaluate_agent,
+    plan,
     read_record,
     read_rows,
     regret,
@@ -132,10 +133,10 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
             return _function(code, source, setting)
         check_hyperparameters(code, setting)
         return TrainedForm(agent, "class", setting, source, sha256(source.file))
-    known = agent_called(agent)
-    defaults = {**known.defaults, **known.benchmark_defaults}
+    engine_agent = agent_called(agent)
+    defaults = {**engine_agent.defaults, **engine_agent.benchmark_defaults}
     values = {**defaults, **suite.hyperparameters.get(agent, {}), **setting}
-    known.check(values, known.engines[-1])
+    engine_agent.check(values, engine_agent.engines[-1])
     return TrainedForm(agent, "engine" if agent in agents() else "class", values)
 
 
@@ -156,7 +157,8 @@ class TrainedForm(Form):
             # Stable-Baselines3 goes on from a checkpoint, but not to the same bytes: a killed run is begun anew
             if not agent_called(self.label).resumes_exactly(config.engine):
                 clear_run(job.folder)
-        folders, parts = [job.folder for job in jobs], self._parts(jobs, configs, protocol, workers)
+        folders, seconds = [job.folder for job in jobs], [job.task.seconds.get(self.label, 1.0) for job in jobs]
+        parts = plan(configs, workers=workers, seconds=seconds)
 
         def progress(now: Any) -> None:
             failures = f", {now.failed} failed" if now.failed else ""
@@ -181,33 +183,6 @@ class TrainedForm(Form):
             hyperparameters=self.hyperparameters,
             engine=agent.engines[-1],
         )
-
-    def _parts(
-        self, jobs: Sequence[Job], configs: Sequence[RunConfig], protocol: Protocol, workers: int
-    ) -> list[list[int]]:
-        """Indices of runs by process: lanes of runs that share a batch, longest first, to the least busy process."""
-        kinds: dict[str, Hashable] = {}
-        groups: dict[Hashable, list[int]] = defaultdict(list)
-        for place, (job, config) in enumerate(zip(jobs, configs, strict=True)):
-            if config.engine != "batched":
-                groups[place].append(place)
-                continue
-            if job.task.name not in kinds:
-                task = job.task.training_task(protocol)
-                kinds[job.task.name] = task.observer.observe.space.shape, task.env.num_actions
-            groups[kinds[job.task.name]].append(place)
-        lanes = []
-        for kind, group in groups.items():
-            width = batched.lane_width(isinstance(kind, tuple) and len(kind[0] or ()) == 3)
-            lanes += [group[first : first + width] for first in range(0, len(group), width)]
-        costs = [sum(jobs[place].task.seconds.get(self.label, 1.0) for place in lane) for lane in lanes]
-        parts: list[list[int]] = [[] for _ in range(min(workers, len(lanes)))]
-        busy = [0.0] * len(parts)
-        for i in sorted(range(len(lanes)), key=lambda i: -costs[i]):
-            least = busy.index(min(busy))
-            parts[least] += lanes[i]
-            busy[least] += costs[i]
-        return parts
 
 
 # Generators -----------------------------------------------------------------------------------------------------------

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         write_table,
     )
     from pharos.training.runs import train, train_config, train_many, train_parts
+    from pharos.training.schedule import Shapes, dealt, halves, lanes, plan
     from pharos.training.task import CELL, RunConfig, Task, TaskValues, run_id
     from pharos.training.tuning import TuningResult, tune
 

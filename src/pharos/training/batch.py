@@ -13,7 +13,6 @@ import contextlib
 import shutil
 import time
 import warnings
-from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +28,7 @@ from pharos.training import results as _results
 from pharos.training.curve import joint_values
 from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
 from pharos.training.results import Checkpoint, Record, TrainingResult, clear_run, finished_result
+from pharos.training.schedule import lanes
 from pharos.training.task import RunConfig
 
 
@@ -173,7 +173,7 @@ class TrainingJobs:
         """Yield runs that train alone; then batches restored from checkpoints, and the rest by what fits together."""
         alone: list[PreparedRun] = []
         waiting: dict[int, PreparedRun] = {}
-        keys: dict[int, Hashable] = {}
+        keys: dict[int | None, Hashable] = {}
         # Finished runs need no training; others train alone or wait for a batch
         for place, config in enumerate(self.configs):
             try:
@@ -202,13 +202,9 @@ class TrainingJobs:
         yield from ([run] for run in alone)
         yield from self._stored_groups(waiting)
         # Runs with equal keys, in lanes
-        groups: dict[Hashable, list[PreparedRun]] = defaultdict(list)
-        for place, run in waiting.items():
-            groups[keys[place]].append(run)
-        for group in groups.values():
-            width = self.lane or len(group)
-            for first in range(0, len(group), width):
-                yield group[first : first + width]
+        rest = list(waiting.values())
+        for lane in lanes([keys[run.place] for run in rest], [self.lane or len(rest)] * len(rest)):
+            yield [rest[i] for i in lane]
 
     def _stored_groups(self, waiting: dict[int, PreparedRun]) -> Iterator[list[PreparedRun]]:
         """Batches of checkpoints, with the runs that they had, which are taken from `waiting`."""

@@ -17,7 +17,6 @@ from typing import Any
 
 from pharos.agents import agent_called
 from pharos.agents import hyperparameters as hyperparameters_of
-from pharos.agents.batched import lane_width
 from pharos.environments import Environment
 from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, PharosError
 from pharos.observations import own_observation
@@ -28,6 +27,7 @@ from pharos.training.batch import ProgressCallback, TrainingJobs, TrainingProgre
 from pharos.training.options import TrainingOptions
 from pharos.training.prepared import FailedRun, TaskCache
 from pharos.training.results import TrainingResult, finished_result
+from pharos.training.schedule import Shapes, plan
 from pharos.training.task import RunConfig, Task, TaskValues
 
 RunProgress = Callable[[int, int, Mapping[str, Any]], None]
@@ -84,8 +84,8 @@ def train_many(
     Args:
         seeds: of the runs, each another.
         device: of the batched engine: "cpu" or "cuda".
-        workers: processes that share whole lanes of the batched engine, where there is a folder for results. Results do
-            not depend on it.
+        workers: processes that share the runs, lane by lane, where there is a folder for results; runs that train alone
+            stay in one. Results do not depend on it.
         out: a folder, in which each run has its own, seed-0 and so on; None: nothing is written. Finished runs there
             are returned, and what was killed goes on from its last checkpoint.
         progress: called after each evaluation.
@@ -103,7 +103,8 @@ def train_many(
     folder = None if out is None else Path(out)
     folders = None if folder is None else [folder / f"seed-{seed}" for seed in numbers]
     checkpoints = None if folder is None else folder / "checkpoints"
-    parts = parts_of(configs, workers, device)
+    is_alone = Shapes(device).key(configs[0]) is None
+    parts = plan(configs, workers=1 if is_alone else workers, device=device)
     if folders is not None and len(parts) > 1:
         results = train_parts(configs, folders, parts, checkpoints=checkpoints, device=device, progress=progress)
     else:
@@ -195,16 +196,6 @@ def _runs(
 
 
 # Processes: whole lanes of the batched engine each, and files as the only results -------------------------------------
-
-
-def parts_of(configs: Sequence[RunConfig], workers: int, device: str = "cpu") -> list[list[int]]:
-    """Places of the runs by process: whole lanes, dealt out in turn; one list where there is nothing to share."""
-    width = lane_width(any("image" in config.observation for config in configs), device)
-    lanes = [list(range(first, min(first + width, len(configs)))) for first in range(0, len(configs), width)]
-    number = min(workers, len(lanes))
-    if number < 2 or any(config.engine != "batched" for config in configs):
-        return [list(range(len(configs)))]
-    return [[place for lane in lanes[part::number] for place in lane] for part in range(number)]
 
 
 def train_parts(
