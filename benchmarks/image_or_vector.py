@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from pharos import study
-from pharos.prediction import PRIMARY
+from pharos.agents import primary_predictors
 from pharos.prediction.pairs import Pairs
 from pharos.statistics import spearman
 
@@ -37,7 +37,7 @@ def main():
         pairs = Pairs.of(regret, tasks, CLEAR)
         images = pairs.agreement((part["observation"] == "vector").to_numpy(float)) * len(pairs.first)
         counts = f"{len(pairs.first)} | {images:g}"
-        for predictor in (*PREDICTORS, PRIMARY[agent]):
+        for predictor in (*PREDICTORS, primary_predictors()[agent]):
             predicted = part[predictor].to_numpy(float)
             rho = spearman(predicted, regret)
             classes = part["environment"].to_numpy()

@@ -27,7 +27,8 @@ import numpy as np
 import pandas as pd
 
 from pharos import study
-from pharos.prediction import PRIMARY, Published
+from pharos.agents import primary_predictors
+from pharos.prediction import Published
 from pharos.prediction.learners import primary_regret
 from pharos.prediction.prediction import FILE
 from pharos.study.tables import CELL
@@ -100,7 +101,7 @@ def compute(out, blocks):
 def regret_of(run, cell, told):
     """The primary predictor of a cell, and its number of states."""
     known = {**cell, **(told or {})}
-    name = PRIMARY[run.config["agent"]]
+    name = primary_predictors()[run.config["agent"]]
     if name in known:
         return float(known[name]), known["num_states"]
     task = RunConfig.from_dict(run.config).task(trust=True, strict=True)
@@ -110,7 +111,7 @@ def regret_of(run, cell, told):
 def judge(file, resamples):
     frame = pd.read_csv(file)
     sealed = frame["study"] == "sealed-1"
-    for agent in PRIMARY:
+    for agent in primary_predictors():
         for name, chosen in (
             ("twelve of development", ~sealed),
             ("fourteen sealed", sealed),
@@ -147,7 +148,7 @@ def draw(file, picture):
     def by_agent():
         frame = pd.read_csv(file)
         drawn, axes = panels(2, 3.4, 3.3)
-        for axis, agent in zip(axes, PRIMARY, strict=True):
+        for axis, agent in zip(axes, primary_predictors(), strict=True):
             cells = frame[(frame["agent"] == agent) & (frame["study"] == "sealed-1")]
             axis.plot([0, 1.8], [0, 1.8], color=GRID, zorder=0)
             for number, (name, some) in enumerate(cells.groupby(cells["observation"].str.split("[(,]").str[0])):
@@ -183,7 +184,7 @@ print(f"{seconds:.1f} s, {(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - 
 def cost():
     print(f"| agent | states | {' | '.join(OBSERVATIONS)} |")
     print("|---|---|" + "---|" * len(OBSERVATIONS))
-    for agent in PRIMARY:
+    for agent in primary_predictors():
         for side in SIDES:
             with tempfile.TemporaryDirectory() as folder:
                 environment = {**os.environ, "PHAROS_CACHE_DIR": folder}

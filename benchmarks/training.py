@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import pharos
 from pharos.agents import QLearning, hyperparameters
-from pharos.agents.deep import make_model
+from pharos.agents.sb3 import make_model
 from pharos.training import Task
 
 INSTANCES = ("simple_grid/8x8-plain", "frozen_lake/8x8", "freeway/16x7-speed1", "breakout/12x8x1")

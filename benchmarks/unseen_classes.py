@@ -17,8 +17,9 @@ import numpy as np
 import pandas as pd
 
 from pharos import study
+from pharos.agents import primary_predictors
 from pharos.plots import save_for_page
-from pharos.prediction import PRIMARY, published
+from pharos.prediction import published
 from pharos.study import PredictedCells
 from pharos.study.leave_one_class_out import PERMUTATIONS
 from pharos.study.prediction_figures import unseen_figures
@@ -94,9 +95,10 @@ def _print_misses(predictions, cells, agent):
     kind = agent.split()[0]  # without the name of its setting
     both = predictions.merge(cells[[*CELL, "greedy"]], on=CELL)
     both = both[both["agent"] == agent]
-    if PRIMARY.get(kind) not in both:
+    primary = primary_predictors()
+    if primary.get(kind) not in both:
         return
-    miss, classes = both["greedy"] - both[PRIMARY[kind]], both["environment"]
+    miss, classes = both["greedy"] - both[primary[kind]], both["environment"]
     weights = 1 / classes.groupby(classes).transform("size")  # classes weigh alike
     middle = np.average(both["greedy"], weights=weights)
     unfitted = 1 - (weights * miss**2).sum() / (weights * (both["greedy"] - middle) ** 2).sum()
@@ -104,7 +106,7 @@ def _print_misses(predictions, cells, agent):
     held = miss.abs() <= width
     least = held.groupby(classes).mean()
     within = f"{held.mean():.2f} of {len(held)} cells within {width:.2f}, of {least.idxmin()} {least.min():.2f}"
-    print(f"`{PRIMARY[kind]}` without a line: R2 {unfitted:.2f}; {within}")
+    print(f"`{primary[kind]}` without a line: R2 {unfitted:.2f}; {within}")
 
 
 def _interval(row, name):

@@ -4,7 +4,7 @@
     python scripts/croissant.py --check    # exit status 1 where that is not the metadata of the files now
 
 One file object with its SHA-256 for each packed study, and a record set with its columns. Columns are described as
-docs/agents.md describes those of curve.parquet, the dataset as CITATION.cff does; types are those of the Parquet file.
+docs/agents.md describes those of curve.csv, the dataset as CITATION.cff does; types are those of the Parquet file.
 Source: the Croissant format, version 1.0, http://mlcommons.org/croissant/1.0.
 """
 
@@ -69,7 +69,7 @@ CONTEXT = {
 
 
 def descriptions():
-    """Column -> description: the rows of the table of curve.parquet in docs/agents.md; of two names in a row, both."""
+    """Column -> description: the rows of the table of curve.csv in docs/agents.md; of two names in a row, both."""
     page = (
         (ROOT / "docs" / "agents.md").read_text(encoding="utf-8").split("| column | meaning |", 1)[1].split("\n\n")[0]
     )

@@ -71,4 +71,4 @@ def kill_at(steps):
 
 
 def bytes_of(folder):
-    return [(folder / name).read_bytes() for name in ("curve.parquet", "agent/parameters.pt", "agent/model.json")]
+    return [(folder / name).read_bytes() for name in ("curve.csv", "agent/parameters.pt", "agent/model.json")]

@@ -4,6 +4,7 @@ MOST is how many runs memory has room for; a run with the learning rate BROKEN e
 """
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -39,13 +40,17 @@ class BatchRun:
     chance: Any = None
     staying: Any = None
 
+    @property
+    def shape(self):
+        return SimpleNamespace(shape=self.observe.shape)
+
 
 def supports(agent, hyperparameters):
     return "it has no hyperparameter 'optimize_memory_usage'" if "optimize_memory_usage" in hyperparameters else None
 
 
 def group_key(agent, run, device="cpu"):
-    return (run.observe.shape, run.hyperparameters["batch_size"])
+    return (run.shape.shape, run.hyperparameters["batch_size"])
 
 
 def make_batch(agent, runs, *, device="cpu", threads=None):

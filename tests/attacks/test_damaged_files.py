@@ -314,7 +314,7 @@ def test_packed_studies(studies, attack, tmp_path):
 def test_folders_of_studies(studies, attack):
     source = studies / "0"
     runs = sorted(path.name for path in (source / "runs").iterdir())[:2]
-    files = [f"runs/{run}/{file}" for run in runs for file in ("run.json", "curve.parquet")]
+    files = [f"runs/{run}/{file}" for run in runs for file in ("run.json", "curve.csv")]
     whole = study.table(source).set_index("id")
 
     def read(folder):

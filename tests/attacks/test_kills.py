@@ -21,8 +21,8 @@ BLOCK = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "chance"
 STUDY = {"name": "mine", "steps": 64, "evaluations": 4, "blocks": [BLOCK]}
 SEEDS = """\
 import pharos
-from pharos.training import runs
-runs.lane_width = lambda *_: 1  # so that three seeds are work for two processes
+from pharos.training.schedule import Shapes
+Shapes.width = lambda *_: 1  # so that three seeds are work for two processes
 small = {"n_steps": 16, "n_envs": 2, "batch_size": 16, "net_arch": [8]}
 options = {"steps": 128, "evaluation_interval": 32, "hyperparameters": small, "workers": 2, "out": "runs"}
 runs = pharos.train_many("ppo", "frozen_lake/4x4", seeds=range(3), **options)

@@ -83,6 +83,6 @@ def test_results_that_are_nowhere(tmp_path):
             AgentResults.read(source)
     run = tmp_path / "interrupted" / "runs" / "sea" / "seed-0"
     run.mkdir(parents=True)
-    (run / "curve.parquet").touch()
+    (run / "curve.csv").touch()
     assert "1 so far: the same command goes on" in refusal(ParameterError, AgentResults.read, tmp_path / "interrupted")
     assert baselines("no such suite") == ()

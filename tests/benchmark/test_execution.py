@@ -285,7 +285,7 @@ def test_a_file_runs_in_processes_to_the_same_bytes(suite, file, tmp_path):
 
 @pytest.mark.slow
 def test_a_full_disk_is_said_by_the_runs_of_a_generator(suite, tmp_path):
-    full = "raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), '/results/curve.parquet')"
+    full = "raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), '/results/curve.csv')"
     text = f"import errno, os\nfrom pharos.benchmark import agents\n\ndef write(*_):\n    {full}\n\n"
     text += "agents.write_curve = write\n"
     (tmp_path / "mine.py").write_text(text + LEARN)

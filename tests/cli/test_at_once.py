@@ -36,7 +36,7 @@ def test_one_of_several_trains_in_a_folder_and_the_others_say_so_in_a_line(tmp_p
         assert code in (0, 1) and "Traceback" not in said, said
         assert code == 0 or re.fullmatch(r"pharos: run: another process .*is training there; wait for it, .*\n", said)
     subprocess.run([sys.executable, "-m", "pharos", *command.split(), "alone"], cwd=tmp_path, check=True)
-    for name in ("curve.parquet", "policy.npy"):
+    for name in ("curve.csv", "policy.npy"):
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
     names = [sorted(path.name for path in (tmp_path / name).iterdir()) for name in ("run", "alone")]
     assert names[0] == names[1]

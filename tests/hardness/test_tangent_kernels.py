@@ -25,7 +25,7 @@ def agents_network(space, net_arch, policy):
     from stable_baselines3.common.torch_layers import create_mlp
     from torch import nn
 
-    from pharos.agents.deep import extractor
+    from pharos.agents.sb3 import extractor
 
     if policy == "pytorch":
         features = extractor(space)(space)

@@ -99,12 +99,12 @@ def be_endless(path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("become", [be_a_pipe, be_endless])
-@pytest.mark.parametrize("name", ["run.json", "curve.parquet", "policy.npy"])
+@pytest.mark.parametrize("name", ["run.json", "curve.csv", "policy.npy"])
 def test_pipes_and_devices_in_the_folder_of_a_run_are_refused(name, become, tmp_path, with_patience):
     pharos.train("q_learning", "frozen_lake/4x4", steps=50, out=tmp_path / "run")
     become(tmp_path / "run" / name)
     with pytest.raises(FileFormatError, match=rf"{name}: cannot be read.* it is no regular file"):
-        read_rows(tmp_path / "run") if name == "curve.parquet" else load_agent(tmp_path / "run")
+        read_rows(tmp_path / "run") if name == "curve.csv" else load_agent(tmp_path / "run")
 
 
 @pytest.mark.parametrize("become", [be_a_pipe, be_endless])

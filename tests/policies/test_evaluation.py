@@ -174,8 +174,7 @@ def test_steps_that_no_longer_matter_are_not_asked_about(chance, gamma):
 @pytest.mark.parametrize("name", ["dqn", "ppo"])
 @pytest.mark.parametrize("observation", ["vector", "simple_image"])
 def test_models_of_stable_baselines_are_policies(name, observation):
-    from pharos.agents.deep import make_model
-    from pharos.training.learners import vector_environment
+    from pharos.agents.sb3 import make_model, vector_environment
 
     task = Task.of("frozen_lake/4x4", random=0.1, observation=observation)
     model = make_model(name, vector_environment(task, 1, 0), {}, seed=0)

@@ -11,9 +11,10 @@ import pytest
 import pharos
 from command_line import run
 from pharos import hardness, importers
+from pharos.agents import primary_predictors
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.observations import representation
-from pharos.prediction import PRIMARY, Published, prediction, published
+from pharos.prediction import Published, prediction, published
 from pharos.prediction.prediction import PairOrder
 
 CHOICES = Path(__file__).parents[2] / "docs" / "studies" / "choices"
@@ -74,7 +75,7 @@ def test_orders_are_counted_among_clear_pairs_of_one_mdp():
     assert known.ordered(0.01) == (0, 0)
 
 
-@pytest.mark.parametrize("agent", PRIMARY)
+@pytest.mark.parametrize("agent", primary_predictors())
 def test_published_cells_are_of_many_classes_and_sets(agent):
     known = published(agent)
     assert len(set(known.classes)) == 26

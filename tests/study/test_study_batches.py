@@ -210,7 +210,7 @@ def test_a_run_with_kept_values_ends_with_the_same_files(config, tmp_path):
     _execution.prepare_instance(config)
     assert _batches.stored_values(config) is not None
     _execution.train(config, tmp_path / "prepared")
-    for name in ("curve.parquet", "policy.npy"):
+    for name in ("curve.csv", "policy.npy"):
         assert (tmp_path / "alone" / name).read_bytes() == (tmp_path / "prepared" / name).read_bytes()
     results = [json.loads((tmp_path / name / "run.json").read_text())["result"] for name in ("alone", "prepared")]
     assert results[0] == results[1]
@@ -263,4 +263,4 @@ def test_a_study_with_the_usual_runner_ends_with_the_results_of_training_alone(c
     assert study.run(spec, tmp_path / "study", workers=2).finished == 2
     train_config(config, tmp_path / "alone")
     there = tmp_path / "study" / "runs" / spec.runs[0].id
-    assert (there / "curve.parquet").read_bytes() == (tmp_path / "alone" / "curve.parquet").read_bytes()
+    assert (there / "curve.csv").read_bytes() == (tmp_path / "alone" / "curve.csv").read_bytes()

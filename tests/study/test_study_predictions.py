@@ -10,10 +10,10 @@ import pytest
 
 from command_line import run
 from pharos import hardness, study
-from pharos.agents import hyperparameters
+from pharos.agents import POLICY_PREDICTORS, SAMPLED_PREDICTORS, agent_called, hyperparameters
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.hardness import registry
-from pharos.prediction import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS, learners
+from pharos.prediction import PREDICTORS, learners
 from pharos.study import predictions, read_predictions, specification, validation, write_predictions
 from pharos.study.report.model_sections import winners
 from refusals import failing, refusal
@@ -91,7 +91,7 @@ def test_an_actor_critic_is_idealised_with_the_rollouts_and_the_lambda_of_its_ag
     monkeypatch.setattr(hardness, "report", report)
     for agent in ("ppo", "a2c"):  # A2C of Stable-Baselines3 has a lambda of 1
         own = hyperparameters(agent, "simple_grid", "vector")
-        learners._of_policy({"agent": agent, "steps": 1000, "hyperparameters": own}, None, {})
+        agent_called(agent).idealised.columns({"agent": agent, "steps": 1000, "hyperparameters": own}, None, {})
     assert rollouts == [
         hardness.Rollouts(steps=512, gradient_steps=16, gae_lambda=0.95),
         hardness.Rollouts(steps=512, gradient_steps=16, gae_lambda=0.95, clip_range=0.2),  # as A2C has not

@@ -222,7 +222,7 @@ def test_a_study_without_dqn_says_nothing_false_and_has_no_empty_section(tmp_pat
 def test_each_agent_that_sees_observations_has_models(tmp_path):
     report, page = report_of(tmp_path, agents=["ppo", "a2c"], chance=["plain", {"sticky": 0.25}])
     text = " ".join(page.text)
-    assert "Cumulative regret of PPO" in text and "Cumulative regret of a2c" in text
+    assert "Cumulative regret of PPO" in text and "Cumulative regret of A2C" in text
     assert {"representations_ppo", "representations_a2c"} <= {file.stem for file in report.figures}
     files = {file.name for file in report.tables}
     assert {"coefficients_cumulative_regret.csv", "coefficients_cumulative_regret_a2c.csv"} <= files

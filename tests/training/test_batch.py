@@ -29,7 +29,7 @@ from pharos.training import (
     tune,
 )
 from pharos.training.results import COLUMNS
-from pharos.training.runs import parts_of
+from pharos.training.schedule import plan
 from refusals import failing, refusal
 
 _results = importlib.import_module("pharos.training.results")
@@ -65,7 +65,7 @@ def test_each_run_leaves_what_a_run_leaves(engine, tmp_path):
         assert record["config"]["seed"] == seed and record["result"] == result.result
         assert record["batch"]["runs"] == 3 and record["seconds"] == pytest.approx(record["batch"]["seconds"] / 3)
         assert list(curve.columns) == list(COLUMNS) and curve["step"].tolist() == [0, 10, 20, 30, 40]
-        assert set(record["checksums"]) == {"curve.parquet", "agent/model.json", "agent/parameters.pt"}
+        assert set(record["checksums"]) == {"curve.csv", "agent/model.json", "agent/parameters.pt"}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["seed-0", "seed-1", "seed-2"]
 
 
@@ -200,7 +200,7 @@ def test_tables_of_many_seeds_are_those_of_single_runs(tmp_path):
     alone = pharos.train("q_learning", "simple_grid/4x4-plain", seed=1, out=tmp_path / "alone", **options)
     for name in ("q", "visits"):
         assert np.array_equal(getattr(results[1].agent, name), getattr(alone.agent, name))
-    for name in ("curve.parquet", "policy.npy"):
+    for name in ("curve.csv", "policy.npy"):
         assert (tmp_path / "alone" / name).read_bytes() == (tmp_path / "seed-1" / name).read_bytes()
     assert read_record(tmp_path / "alone")["id"] == read_record(tmp_path / "seed-1")["id"]
 
@@ -215,7 +215,7 @@ def test_tables_that_were_killed_go_on_together_to_the_same_bytes(tmp_path, monk
     results = many(tmp_path / "killed", **options)
     assert not (tmp_path / "killed" / "checkpoints").exists() and len(results) == 3
     whole, killed = (tmp_path / name / "seed-2" for name in ("whole", "killed"))
-    for name in ("curve.parquet", "policy.npy"):
+    for name in ("curve.csv", "policy.npy"):
         assert (whole / name).read_bytes() == (killed / name).read_bytes()
 
 
@@ -300,17 +300,17 @@ def test_a_trial_of_a_search_is_one_batch(engine, tmp_path):
 
 def test_whole_lanes_are_dealt_out_to_processes():
     runs = [config(seed) for seed in range(70)]
-    assert [len(part) for part in parts_of(runs, 2)] == [32 + 6, 32]
-    assert [len(part) for part in parts_of(runs, 9)] == [32, 32, 6]
-    assert sorted(place for part in parts_of(runs, 2) for place in part) == list(range(70))
-    assert len(parts_of(runs[:32], 2)) == len(parts_of(runs, 1)) == 1
-    assert len(parts_of([config(seed, engine="sb3") for seed in range(70)], 2)) == 1
-    assert len(parts_of([config(seed, observation="simple_image") for seed in range(9)], 2)) == 2
+    assert [len(part) for part in plan(runs, workers=2)] == [32 + 6, 32]
+    assert [len(part) for part in plan(runs, workers=9)] == [32, 32, 6]
+    assert sorted(place for part in plan(runs, workers=2) for place in part) == list(range(70))
+    assert len(plan(runs[:32], workers=2)) == len(plan(runs, workers=1)) == 1
+    assert len(plan([config(seed, engine="sb3") for seed in range(70)], workers=2)) == 2
+    assert len(plan([config(seed, observation="simple_image") for seed in range(9)], workers=2)) == 2
 
 
 @pytest.mark.long
 def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("pharos.training.runs"), "lane_width", lambda *_: 2)
+    monkeypatch.setattr(importlib.import_module("pharos.training.schedule").Shapes, "width", lambda *_: 2)
     small = {"learning_starts": 50, "buffer_size": 500, "optimize_memory_usage": False}
     options = {"seeds": (0, 1, 2), "steps": 200, "evaluation_interval": 100, "hyperparameters": small}
     done = []

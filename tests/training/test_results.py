@@ -16,7 +16,16 @@ from hypothesis import strategies as st
 from edits import flip
 from pharos.errors import FileFormatError, FolderLocked, ResultCorrupted
 from pharos.system import storage
-from pharos.training import evaluate_agent, load_agent, read_curve, read_record, run_id, train
+from pharos.training import (
+    evaluate_agent,
+    load_agent,
+    read_curve,
+    read_curve_table,
+    read_record,
+    read_rows,
+    run_id,
+    train,
+)
 from pharos.training import results as _results
 from refusals import refusal
 from strategies import examples
@@ -48,9 +57,9 @@ def test_an_identifier_depends_on_what_a_configuration_says_and_not_on_its_order
 def test_the_same_rows_give_the_same_bytes_and_come_back(tmp_path):
     rows = [{**ROW, "step": step, "mean_return": math.nan} for step in range(3)]
     _results.write_curve(tmp_path, rows)
-    first = (tmp_path / "curve.parquet").read_bytes()
+    first = (tmp_path / "curve.csv").read_bytes()
     _results.write_curve(tmp_path, rows)
-    assert (tmp_path / "curve.parquet").read_bytes() == first
+    assert (tmp_path / "curve.csv").read_bytes() == first
     curve = read_curve(tmp_path)
     assert curve["step"].tolist() == [0, 1, 2]
     assert curve["mean_return"].isna().all()
@@ -127,19 +136,19 @@ def test_two_processes_do_not_train_one_run(tmp_path):
             train("q_learning", "simple_grid/4x4-plain", out=tmp_path / "run", **options)
 
     train("q_learning", "simple_grid/4x4-plain", out=tmp_path / "run", progress=again, **options)
-    assert {path.name for path in (tmp_path / "run").iterdir()} == {"run.json", "curve.parquet", "policy.npy"}
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"run.json", "curve.csv", "policy.npy"}
 
 
 def test_files_that_a_killed_process_was_writing_go_with_the_next_run(tmp_path, monkeypatch):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     monkeypatch.setattr(os, "getpid", lambda: dead.pid)
-    for name in ("run.json", "curve.parquet", "policy.npy", "regret.png"):
+    for name in ("run.json", "curve.csv", "policy.npy", "regret.png"):
         storage.temporary_path(tmp_path / name).touch()
     monkeypatch.undo()
     assert len([*tmp_path.iterdir()]) == 4
     train("q_learning", "simple_grid/4x4-plain", out=tmp_path, steps=100)
-    assert {path.name for path in tmp_path.iterdir()} == {"run.json", "curve.parquet", "policy.npy"}
+    assert {path.name for path in tmp_path.iterdir()} == {"run.json", "curve.csv", "policy.npy"}
 
 
 @pytest.mark.slow
@@ -234,7 +243,7 @@ def test_every_digit_of_a_record_counts(copies):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
-@pytest.mark.parametrize("name", ["run.json", "curve.parquet"])
+@pytest.mark.parametrize("name", ["run.json", "curve.csv"])
 def test_a_file_that_was_cut_short_is_said_to_be(name, share, copies):
     file = copies[0] / name
     file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
@@ -255,14 +264,14 @@ def test_runs_that_were_exchanged_are_noticed(copies):
 
 
 def test_the_curve_of_another_run_is_noticed(copies):
-    shutil.copy(copies[1] / "curve.parquet", copies[0] / "curve.parquet")
+    shutil.copy(copies[1] / "curve.csv", copies[0] / "curve.csv")
     said = refusal(ResultCorrupted, read_curve, copies[0])
-    assert "does not match its checksum" in said and str(copies[0] / "curve.parquet") in said
+    assert "does not match its checksum" in said and str(copies[0] / "curve.csv") in said
 
 
 @pytest.mark.slow
 def test_no_bit_of_a_curve_changes_what_is_read(copies):
-    file = copies[0] / "curve.parquet"
+    file = copies[0] / "curve.csv"
     data, expected = file.read_bytes(), read_curve(copies[0])
     rng = np.random.default_rng(1)
     for bit in rng.choice(8 * len(data), 300, replace=False):
@@ -277,8 +286,27 @@ def test_no_bit_of_a_curve_changes_what_is_read(copies):
             assert found.equals(expected)
 
 
-def test_the_pages_of_a_curve_have_checksums(copies):
+def make_earlier(folder):
+    """Turn a run into one of an earlier pharos, whose curve was a Parquet file with the same digest."""
+    _results.write_table(folder / "curve.parquet", read_curve_table(folder))
+    (folder / "curve.csv").unlink()
+    record = json.loads((folder / "run.json").read_text())
+    record["checksums"]["curve.parquet"] = record["checksums"].pop("curve.csv")
+    storage.replace_json(folder / "run.json", storage.sealed(record))
+
+
+def test_the_parquet_file_of_an_earlier_curve_is_read(copies):
+    frame, rows = read_curve(copies[0]), read_rows(copies[0])
+    make_earlier(copies[0])
+    assert read_curve(copies[0]).equals(frame) and repr(read_rows(copies[0])) == repr(rows)  # nan is nan
+    make_earlier(copies[1])
+    shutil.copy(copies[1] / "curve.parquet", copies[0] / "curve.parquet")
+    assert "does not match its checksum" in refusal(ResultCorrupted, read_curve, copies[0])
+
+
+def test_the_pages_of_an_earlier_curve_have_checksums(copies):
     """So that a bit is noticed where no record says what the curve was."""
+    make_earlier(copies[0])
     file = copies[0] / "curve.parquet"
     (copies[0] / "run.json").unlink()
     flip(file, file.stat().st_size // 3)

@@ -12,9 +12,9 @@ from optuna.storages.journal import JournalFileBackend
 
 from command_line import run
 from patience import PATIENCE, wait_for
-from pharos.agents import hyperparameters
+from pharos.agents import agents, hyperparameters
 from pharos.errors import FileFormatError, ParameterError
-from pharos.training import SPACES, read_record, run_id, train, tune
+from pharos.training import read_record, run_id, train, tune
 
 LAKE = "frozen_lake/4x4"
 ONE = {"learning_rate": ("log", 0.001, 1.0)}
@@ -119,15 +119,15 @@ def test_the_first_trial_takes_from_the_agent_what_the_table_leaves_out():
     assert result.trials[0]["hyperparameters"] == {"exploration_schedule": "linear"}
 
 
-@pytest.mark.parametrize("agent", SPACES)
+@pytest.mark.parametrize("agent", agents())
 def test_every_space_holds_hyperparameters_that_the_agent_has(agent):
-    from pharos.agents.deep import algorithm
     from pharos.agents.q_learning import DEFAULTS
+    from pharos.agents.sb3 import algorithm
 
     if agent == "q_learning":
-        assert set(SPACES[agent]) <= set(DEFAULTS)
+        assert set(agents()[agent].space) <= set(DEFAULTS)
     else:
-        assert set(SPACES[agent]) <= set(algorithm(agent).__init__.__annotations__)
+        assert set(agents()[agent].space) <= set(algorithm(agent).__init__.__annotations__)
 
 
 @pytest.mark.parametrize(

@@ -3,24 +3,35 @@ trains them on a task.
 """
 
 from pharos.agents import batched
-from pharos.agents.deep import (
-    AGENTS,
-    BATCHED,
+from pharos.agents.agent import (
+    NETWORK,
+    POLICY,
     TABULAR_OBSERVATION,
-    AgentKind,
-    agent_kind,
+    WORLD,
+    Learner,
+    RunShape,
+    agents,
+    joined_states,
+    state_of,
+)
+from pharos.agents.hyperparameters import hyperparameters
+from pharos.agents.idealised import (
+    POLICY_CURVES,
+    POLICY_PREDICTORS,
+    SAMPLED_PREDICTORS,
+    Idealised,
+    curve_points,
+)
+from pharos.agents.q_learning import QLearning
+from pharos.agents.registry import agent_called, primary_predictors
+from pharos.agents.sb3 import (
     agent_source,
     algorithm,
     check_hyperparameters,
     extractor,
     is_known,
-    joined_states,
     make_model,
-    state_of,
 )
-from pharos.agents.hyperparameters import hyperparameters
-from pharos.agents.q_learning import DEFAULTS as Q_LEARNING_DEFAULTS
-from pharos.agents.q_learning import QLearning
 
 __all__ = [
     "QLearning",

@@ -1,13 +1,14 @@
 """Hyperparameters for every agent, class of environments and observation, in RL Zoo's convention.
 
-Those of each agent stand here, under the names of Stable-Baselines3 and of `QLearning`, `n_envs` beside them; a class
-of environments declares what suits it better (`Environment.hyperparameters`). A table of one's own, in YAML, has both.
+Each agent has defaults (`Agent.defaults`); a class of environments declares what suits it better
+(`Environment.hyperparameters`). A table of one's own, in YAML, has both.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pharos.agents.registry import agent_called
 from pharos.environments import class_called
 from pharos.errors import ParameterError
 
@@ -27,7 +28,7 @@ def hyperparameters(
     by_observation: Mapping[str, Any]
     if table is None:
         declaring = class_called(environment)
-        default = DEFAULTS.get(agent)
+        default: Mapping[str, Any] | None = agent_called(agent).defaults
         by_observation = declaring.hyperparameters.get(agent, {}) if declaring else {}
     else:
         entries = _read(table).get(agent) or {}
@@ -53,45 +54,3 @@ def _is_table(entry: object, levels: int) -> bool:
         return False
     below = entry.items() if levels > 1 else ()
     return all(part is None or _is_table(part, 1 if name == "default" else levels - 1) for name, part in below)
-
-
-# Defaults -------------------------------------------------------------------------------------------------------------
-
-
-DEFAULTS: dict[str, dict[str, Any]] = {
-    "q_learning": {
-        "learning_rate": 0.02,
-        "visits_exponent": 0.6,
-        "gamma": 0.99,
-        "initial_q": 1.0,  # optimistic: the largest return of grids and lakes
-        "exploration_initial_eps": 1.0,
-        "exploration_final_eps": 0.02,
-        "exploration_fraction": 0.3,
-    },
-    "dqn": {
-        "learning_rate": 0.0005,
-        "buffer_size": 50000,
-        "learning_starts": 1000,
-        "batch_size": 64,
-        "gamma": 0.99,
-        "train_freq": 4,
-        "gradient_steps": 1,
-        "target_update_interval": 500,
-        "exploration_initial_eps": 1.0,
-        "exploration_final_eps": 0.05,
-        "exploration_fraction": 0.3,
-        "max_grad_norm": 10,
-    },
-    "ppo": {
-        "n_envs": 8,
-        "n_steps": 64,
-        "batch_size": 128,
-        "n_epochs": 4,
-        "learning_rate": 0.0005,
-        "gamma": 0.99,
-        "gae_lambda": 0.95,
-        "ent_coef": 0.01,
-        "clip_range": 0.2,
-    },
-    "a2c": {"n_envs": 8, "n_steps": 5, "learning_rate": 0.0007, "gamma": 0.99, "ent_coef": 0.01},
-}

@@ -1,10 +1,13 @@
 """Tabular Q-learning. Source: Watkins (1989); Watkins and Dayan (1992)."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from pharos.agents.agent import LearningRun, TableAgent
+from pharos.agents.idealised import Idealised
 from pharos.errors import ParameterError, UnknownName
 from pharos.mdp import TabularMDP
 
@@ -61,13 +64,9 @@ class QLearning:
         **options: object,
     ):
         self._transitions = mdp.dynamics.for_steps
-        unknown = set(options) - set(DEFAULTS)
-        if unknown:
-            raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], DEFAULTS)
-        self.mdp, self.options, self.seed = mdp, {**DEFAULTS, **options}, int(seed)
+        self.mdp, self.options, self.seed = mdp, checked_options(options), int(seed)
         self.total_steps = int(total_steps)
         self.limit = time_limit or mdp.horizon or 2**62
-        _check(self.options)
         rows = mdp.num_states * ((mdp.num_actions + 1) if self.options["sees_previous_action"] else 1)
         self.q = np.full((rows, mdp.num_actions), float(self.options["initial_q"]))
         self.visits = np.zeros((rows, mdp.num_actions), np.int64)
@@ -161,7 +160,12 @@ class QLearning:
             array[:] = state[name]
 
 
-def _check(options: dict[str, Any]) -> None:
+def checked_options(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """All hyperparameters: DEFAULTS with changes. UnknownName, ParameterError: one is unknown or out of range."""
+    unknown = set(changes) - set(DEFAULTS)
+    if unknown:
+        raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], DEFAULTS)
+    options = {**DEFAULTS, **changes}
     ranges = {
         "learning_rate": (0.0, 1.0),
         "visits_exponent": (0.0, 1.0),
@@ -189,3 +193,50 @@ def _check(options: dict[str, Any]) -> None:
         raise ParameterError("q_learning: an exponential schedule needs both epsilons above 0")
     if not math.isfinite(options["initial_q"]):
         raise ParameterError(f"q_learning: initial_q is {options['initial_q']!r}; expected a finite number")
+    return options
+
+
+class QLearningAgent(TableAgent):
+    """Q-learning as an agent that has a name."""
+
+    def library_default(self, name: str) -> object:
+        return DEFAULTS.get(name)
+
+    def check(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
+        checked_options(hyperparameters)
+
+    def table(self, run: LearningRun) -> QLearning:
+        task, chance = run.task, run.task.chance
+        return QLearning(
+            task.mdp,
+            total_steps=run.config.steps,
+            seed=run.config.seed,
+            time_limit=task.time_limit,
+            reward_noise=chance.reward_noise,
+            reward_delay=chance.reward_delay,
+            **run.hyperparameters,
+        )
+
+
+Q_LEARNING = QLearningAgent(
+    name="q_learning",
+    title="tabular Q-learning",
+    defaults={
+        "learning_rate": 0.02,
+        "visits_exponent": 0.6,
+        "gamma": 0.99,
+        "initial_q": 1.0,  # optimistic: the largest return of grids and lakes
+        "exploration_initial_eps": 1.0,
+        "exploration_final_eps": 0.02,
+        "exploration_fraction": 0.3,
+    },
+    space={
+        "learning_rate": ("log", 0.01, 1.0),
+        "visits_exponent": ("one of", 0.0, 0.6, 0.8),
+        "gamma": ("one of", 0.95, 0.99, 0.999),
+        "initial_q": ("one of", 0.0, 0.5, 1.0, 2.0),
+        "exploration_final_eps": ("linear", 0.0, 0.1),
+        "exploration_fraction": ("linear", 0.01, 0.5),
+    },
+    idealised=Idealised(kind="table"),
+)

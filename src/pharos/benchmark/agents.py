@@ -15,7 +15,7 @@ import inspect
 import multiprocessing
 import os
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import AGENTS, BATCHED, batched, check_hyperparameters, is_known
-from pharos.agents import hyperparameters as hyperparameters_of
+from pharos.agents import agent_called, agents, check_hyperparameters, is_known
 from pharos.benchmark.budget import Learn, generated_curve, uniform_policy
 from pharos.benchmark.jax_agents import LearnCompiled, compiled_curves
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
@@ -40,6 +39,7 @@ from pharos.training import (
     check_agent,
     clear_run,
     evaluate_agent,
+    plan,
     read_record,
     read_rows,
     regret,
@@ -52,8 +52,6 @@ from pharos.training import (
 )
 
 EXACT = ("oracle", "random")
-# What only some classes of environments declare for an agent: with these, the setting is one for all tasks
-ALSO: Mapping[str, Mapping[str, Any]] = {"dqn": {"n_envs": 1, "n_steps": 1}}
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 Tell = Callable[[float, str], None]
@@ -135,14 +133,11 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
             return _function(code, source, setting)
         check_hyperparameters(code, setting)
         return TrainedForm(agent, "class", setting, source, sha256(source.file))
-    defaults = {**hyperparameters_of(agent, "", ""), **ALSO.get(agent, {})} if agent in AGENTS else {}
+    engine_agent = agent_called(agent)
+    defaults = {**engine_agent.defaults, **engine_agent.benchmark_defaults}
     values = {**defaults, **suite.hyperparameters.get(agent, {}), **setting}
-    lacking = batched.supports(agent, values) if agent in BATCHED else None
-    if lacking is not None:
-        raise ParameterError(f"the batched engine: {lacking}")
-    if agent not in AGENTS or not AGENTS[agent].is_tabular:
-        check_hyperparameters(agent, values, batched.OURS if agent in BATCHED else ())
-    return TrainedForm(agent, "engine" if agent in AGENTS else "class", values)
+    engine_agent.check(values, engine_agent.engines[-1])
+    return TrainedForm(agent, "engine" if agent in agents() else "class", values)
 
 
 def sha256(file: str | os.PathLike) -> str:
@@ -160,9 +155,10 @@ class TrainedForm(Form):
         configs = [self._config(job, protocol) for job in jobs]
         for job, config in zip(jobs, configs, strict=True):
             # Stable-Baselines3 goes on from a checkpoint, but not to the same bytes: a killed run is begun anew
-            if config.engine == "sb3" and not config.is_tabular:
+            if not agent_called(self.label).resumes_exactly(config.engine):
                 clear_run(job.folder)
-        folders, parts = [job.folder for job in jobs], self._parts(jobs, configs, protocol, workers)
+        folders, seconds = [job.folder for job in jobs], [job.task.seconds.get(self.label, 1.0) for job in jobs]
+        parts = plan(configs, workers=workers, seconds=seconds)
 
         def progress(now: Any) -> None:
             failures = f", {now.failed} failed" if now.failed else ""
@@ -175,9 +171,9 @@ class TrainedForm(Form):
         train_configs(configs, folders, checkpoints=checkpoints, progress=progress, tasks=tasks)
 
     def _config(self, job: Job, protocol: Protocol) -> RunConfig:
-        task = job.task.training_task(protocol)
-        if self.label == "q_learning":
-            task = replace(task, observation="index", observation_options={})
+        task, agent = job.task.training_task(protocol), agent_called(self.label)
+        if agent.fixed_observation is not None:
+            task = replace(task, observation=agent.fixed_observation, observation_options={})
         return RunConfig.of_task(
             task,
             self.label,
@@ -185,35 +181,8 @@ class TrainedForm(Form):
             seed=job.seed,
             evaluation_interval=protocol.evaluation_interval,
             hyperparameters=self.hyperparameters,
-            engine="batched" if self.label in BATCHED else "sb3",
+            engine=agent.engines[-1],
         )
-
-    def _parts(
-        self, jobs: Sequence[Job], configs: Sequence[RunConfig], protocol: Protocol, workers: int
-    ) -> list[list[int]]:
-        """Indices of runs by process: lanes of runs that share a batch, longest first, to the least busy process."""
-        kinds: dict[str, Hashable] = {}
-        groups: dict[Hashable, list[int]] = defaultdict(list)
-        for place, (job, config) in enumerate(zip(jobs, configs, strict=True)):
-            if config.engine != "batched":
-                groups[place].append(place)
-                continue
-            if job.task.name not in kinds:
-                task = job.task.training_task(protocol)
-                kinds[job.task.name] = task.observer.observe.space.shape, task.env.num_actions
-            groups[kinds[job.task.name]].append(place)
-        lanes = []
-        for kind, group in groups.items():
-            width = batched.lane_width(isinstance(kind, tuple) and len(kind[0] or ()) == 3)
-            lanes += [group[first : first + width] for first in range(0, len(group), width)]
-        costs = [sum(jobs[place].task.seconds.get(self.label, 1.0) for place in lane) for lane in lanes]
-        parts: list[list[int]] = [[] for _ in range(min(workers, len(lanes)))]
-        busy = [0.0] * len(parts)
-        for i in sorted(range(len(lanes)), key=lambda i: -costs[i]):
-            least = busy.index(min(busy))
-            parts[least] += lanes[i]
-            busy[least] += costs[i]
-        return parts
 
 
 # Generators -----------------------------------------------------------------------------------------------------------

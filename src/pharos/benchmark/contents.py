@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pharos.agents import agents
 from pharos.benchmark.charts import ends, frontier_text
 from pharos.benchmark.comparison import Comparison, compare, results_of, suite_of_results
 from pharos.benchmark.results import FILE, AgentResults, baselines
@@ -21,6 +22,7 @@ from pharos.system import storage
 from pharos.system.wording import pluralize
 
 BESIDE = ("dqn", "ppo", "q_learning")
+LEARNERS = ("dqn", "ppo")  # idealised, with networks
 RESIDUAL = 0.2
 LATE = 0.2  # of an agent that learns late, by which the final score exceeds the mean one, with its whole interval
 WORSE = 0.05  # the same of one that ends worse than it was, by which the final score is lower
@@ -39,8 +41,6 @@ PREDICTORS = {
     "table": "the idealised DQN with a table",
     "both": "the worse of the idealised DQN and PPO",
 }
-# Words in the name of an algorithm, and the idealised learner that it is a kind of; recurrent ones have none
-KINDS = {"recurrent": "none", "q_learning": "table", "dqn": "dqn", "ppo": "ppo", "a2c": "ppo", "trpo": "ppo"}
 
 Source = AgentResults | str | os.PathLike
 
@@ -78,7 +78,7 @@ class Contents:
     def predicted(self, task: BenchmarkTask) -> float | None:
         """Normalised regret of the idealised learner on a task; None without a prediction."""
         if self.predictor == "both":
-            pair = [task.predicted[name] for name in ("dqn", "ppo") if name in task.predicted]
+            pair = [task.predicted[name] for name in LEARNERS if name in task.predicted]
             return max(pair) if len(pair) == 2 else None
         return task.predicted.get(self.predictor)
 
@@ -114,7 +114,10 @@ def contents_of(
 def kind_of(results: AgentResults) -> str:
     """The idealised learner that an agent is a kind of, by its name and source; "both" if these do not tell."""
     names = f"{results.agent} {results.record.get('source')}".lower()
-    return next((kind for word, kind in KINDS.items() if word in names), "both")
+    if "recurrent" in names:  # no idealised learner has a memory
+        return "none"
+    kinds = {word: each.idealised.kind for each in agents().values() for word in (each.name, *each.relatives)}
+    return next((kind for word, kind in kinds.items() if word in names), "both")
 
 
 def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from pharos.agents import agent_called
 from pharos.environments import class_called
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, ResultCorrupted
 from pharos.system import records, storage
@@ -143,7 +144,7 @@ class Entry:
             rules_version=_rules_version(run, record, config),
             claim=claim,
             training={key: result.get(key) for key in TRAINING} | {"seconds": record.get("seconds")},
-            arrays={POLICY: stored_table(run)} if config.is_tabular else _network(run),
+            arrays={POLICY: stored_table(run)} if agent_called(config.agent).has_table else _network(run),
         )
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.agents import AGENTS, algorithm, extractor, make_model
+from pharos.agents import agent_called, agents, algorithm, extractor, make_model
 from pharos.benchmark.entry import POLICY, Entry
 from pharos.environments import BUILT_IN
 from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, UntrustedCode
@@ -44,7 +44,8 @@ def policy_of(entry: Entry, task: Task, *, trust: bool = False) -> PolicyLike:
         FileFormatError: what is in the file is no policy for this task. UntrustedCode: the agent is code.
         MissingExtra: Stable-Baselines3 is not installed.
     """
-    return _table(entry, task) if entry.config.is_tabular else _network(entry, task, trust)
+    has_table = agent_called(entry.config.agent).has_table
+    return _table(entry, task) if has_table else _network(entry, task, trust)
 
 
 def _table(entry: Entry, task: Task) -> np.ndarray:
@@ -106,7 +107,7 @@ def _network(entry: Entry, task: Task, trust: bool) -> PolicyLike:
 
 def _known_agent(name: str) -> str:
     """The name of an agent of pharos, or of a class that Stable-Baselines3 or sb3-contrib announce."""
-    if name in AGENTS:
+    if name in agents():
         return name
     module, _, attribute = name.partition(":")
     if module in LIBRARIES and attribute.isidentifier():
@@ -209,7 +210,8 @@ def task_of(entry: Entry, trust: bool, max_states: int, values: MutableMapping[s
             f"another MDP: train again, or verify with the pharos of then ({entry.versions.get('pharos', 'unknown')})"
         )
     table = entry.arrays.get(POLICY)
-    limit = len(table) if config.is_tabular and table is not None and table.ndim else max_states
+    has_table = agent_called(config.agent).has_table
+    limit = len(table) if has_table and table is not None and table.ndim else max_states
     space = build(env, max_states=max(1, limit), progress=False)
     if space.num_states > limit:
         raise StateSpaceTooLarge(f"{env} has {space.num_states:,} states; expected at most {limit:,}")

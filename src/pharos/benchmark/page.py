@@ -23,6 +23,7 @@ from pharos.benchmark.charts import (
     radar,
 )
 from pharos.benchmark.contents import (
+    LEARNERS,
     PREDICTORS,
     RESIDUAL,
     Agent,
@@ -214,7 +215,7 @@ def _is_single(one: Agent, other: Agent) -> bool:
 
 
 def _plane(contents: Contents) -> Element | None:
-    name = "ppo" if contents.predictor == "ppo" else "dqn"
+    name = contents.predictor if contents.predictor in LEARNERS else LEARNERS[0]
     points = [
         (f"{task.name}: {description(task)}", table, task.predicted[name] - table, own.value)
         for task in contents.suite.tasks

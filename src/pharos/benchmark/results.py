@@ -80,7 +80,7 @@ class AgentResults:
         if path.is_dir():
             path = path / FILE
             if not path.is_file():
-                finished = len(list(Path(source).glob("runs/*/*/curve.parquet")))
+                finished = len(list(Path(source).glob("runs/*/*/curve.*")))
                 raise ParameterError(
                     f"{path}: no such file; `pharos benchmark run` writes it when its runs have ended, {finished} so "
                     f"far: the same command goes on; with `--seeds` or `--tasks` of what is there it ends here"

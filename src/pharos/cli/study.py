@@ -235,7 +235,7 @@ def predict(
         primary: Only the predictor that stands for each agent, in a small part of the time.
     """
     from pharos import study
-    from pharos.prediction import PRIMARY
+    from pharos.agents import primary_predictors
 
     opened, place = source.opened()
     with progress_line("predicting", logged=True) as tell:
@@ -249,7 +249,7 @@ def predict(
             progress=tell,
         )
     record = study.write_predictions(opened, predictions, out)
-    columns = predictions.columns.intersection(["kernel_regret", *PRIMARY.values()])
+    columns = predictions.columns.intersection(["kernel_regret", *primary_predictors().values()])
     absent = predictions[columns].isna().all(axis=1)
     missing = int(absent.sum())
 

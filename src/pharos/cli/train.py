@@ -59,13 +59,13 @@ def train(
         tensorboard: Write TensorBoard logs into --out.
     """
     env = target.found_environment()
-    from pharos.agents import agent_kind
+    from pharos.agents import agent_called
     from pharos.agents import hyperparameters as hyperparameters_of
     from pharos.training import train as learn
 
     agent, hyperparameters = training.agent, training.hyperparameters
     if table is not None:
-        sight = agent_kind(agent).observation(training.observation)
+        sight = agent_called(agent).observation(training.observation)
         hyperparameters = hyperparameters_of(agent, env.name, sight, hyperparameters, table=table)
     training = replace(
         training,
@@ -184,7 +184,7 @@ def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, ob
         ("cumulative regret", f"{learnt:.6g} of the learnt policies, {played:.6g} as played"),
         ("normalised regret", shown),
         ("mean return", f"{result['mean_return']:.6g} over {pluralize(result['episodes'], 'episode')}"),
-        ("values", "exact" if result["exact"] else "some are estimates, see exact in curve.parquet"),
+        ("values", "exact" if result["exact"] else "some are estimates, see exact in curve.csv"),
         ("chance", chance),
         ("seconds", f"{run.seconds:.1f} ({steps / run.seconds:,.0f} steps/s, evaluation included)"),
         *compiling_fact(),

@@ -1,8 +1,10 @@
 """Environments: the contract of a class (`Environment`, `Layer`), the built-in classes, the catalogue of names.
 
-`import pharos` needs the names of the built-in classes alone; a file is loaded when something in it is first used.
+`import pharos` needs the names of the built-in classes alone; a file is loaded when something in it is first used. The
+classes themselves, such as `environments.Breakout`, are those of BUILT_IN.
 """
 
+import importlib
 from typing import TYPE_CHECKING
 
 from pharos.environments.built_in import BUILT_IN, BuiltIn, on_registration
@@ -45,28 +47,6 @@ if TYPE_CHECKING:
         register,
         source_of,
     )
-    from pharos.environments.mini_grid.mini_grid import MiniGrid as MiniGrid
-    from pharos.environments.mini_grid.mini_grid_empty import MiniGridEmpty as MiniGridEmpty
-    from pharos.environments.mini_grid.mini_grid_rooms import MiniGridRooms as MiniGridRooms
-    from pharos.environments.worlds.blackjack import Blackjack as Blackjack
-    from pharos.environments.worlds.breakout import Breakout as Breakout
-    from pharos.environments.worlds.catch import Catch as Catch
-    from pharos.environments.worlds.cliff_walking import CliffWalking as CliffWalking
-    from pharos.environments.worlds.corner_grid import CornerGrid as CornerGrid
-    from pharos.environments.worlds.deep_sea import DeepSea as DeepSea
-    from pharos.environments.worlds.discounting_chain import DiscountingChain as DiscountingChain
-    from pharos.environments.worlds.endless_sea import EndlessSea as EndlessSea
-    from pharos.environments.worlds.freeway import Freeway as Freeway
-    from pharos.environments.worlds.frozen_lake import FrozenLake as FrozenLake
-    from pharos.environments.worlds.game_2048 import Game2048 as Game2048
-    from pharos.environments.worlds.memory_chain import MemoryChain as MemoryChain
-    from pharos.environments.worlds.pocket_cube import PocketCube as PocketCube
-    from pharos.environments.worlds.river_swim import RiverSwim as RiverSwim
-    from pharos.environments.worlds.simple_grid import SimpleGrid as SimpleGrid
-    from pharos.environments.worlds.sliding_tiles import SlidingTiles as SlidingTiles
-    from pharos.environments.worlds.sokoban import Sokoban as Sokoban
-    from pharos.environments.worlds.taxi import Taxi as Taxi
-    from pharos.environments.worlds.umbrella_chain import UmbrellaChain as UmbrellaChain
 
 __all__ = [
     "Environment",
@@ -81,4 +61,11 @@ __all__ = [
     "register",
 ]
 
-__getattr__ = lazy.attributes(__name__)
+_FILES = {entry.class_name: entry.file for entry in BUILT_IN}
+_attribute = lazy.attributes(__name__)
+
+
+def __getattr__(name: str) -> object:
+    if name in _FILES:
+        return getattr(importlib.import_module(f"{__name__}.{_FILES[name]}"), name)
+    return _attribute(name)

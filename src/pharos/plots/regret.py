@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.agents import agent_kind
+from pharos.agents import agent_called
 from pharos.environments import class_called, instance_name
 from pharos.errors import ParameterError
 from pharos.observations import title
@@ -125,9 +125,10 @@ def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
     def differ(*keys: str) -> bool:
         return any(len({json.dumps(other[key], sort_keys=True) for other in configs}) > 1 for key in keys)
 
-    kind = agent_kind(config["agent"])
+    agent = agent_called(config["agent"])
     observation = title(config["observation"], config.get("observation_options", {})).replace("_", " ")
-    who = kind.title.removeprefix("tabular ") + ("" if kind.is_tabular or not observation else f" ({observation})")
+    is_shown = observation and agent.fixed_observation is None
+    who = agent.title.removeprefix("tabular ") + (f" ({observation})" if is_shown else "")
     parts = [f"{who} on {_in_words(config)}", f"{_spaced(config['steps'])} steps"]
     if differ("chance"):
         parts.append(" ".join(f"{name}={p:g}" for name, p in config["chance"].items() if p) or "no chance")

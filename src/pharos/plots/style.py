@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from pharos.agents import TABULAR_OBSERVATION
+from pharos.agents import TABULAR_OBSERVATION, agent_called
 from pharos.errors import MissingExtra, ParameterError
 from pharos.system.storage import replace_file
 
@@ -25,7 +25,6 @@ T = TypeVar("T")
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MORE_COLORS = ("#CC79A7", "#E69F00", "#F0E442", "#999999")
 OBSERVATION_COLORS = {TABULAR_OBSERVATION: "#009E73", "vector": "#0072B2", "simple_image": "#D55E00"}
-AGENTS = {"q_learning": "tabular Q-learning", "dqn": "DQN", "ppo": "PPO"}
 INK, GRID, DIAGONAL = "#23262d", "#e3e5e8", "#888888"
 DPI, PAGE_DPI = 160, 120
 DATES: dict[str, Any] = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
@@ -98,7 +97,7 @@ def label_edges(axes: Sequence[Any], below: str, beside: str) -> None:
 
 def agent_name(agent: str) -> str:
     """`DQN`; of an algorithm from a module or a file, the name of its class."""
-    return AGENTS.get(agent, agent.rpartition(":")[2])
+    return agent_called(agent).title
 
 
 def slug(name: str) -> str:

@@ -1,13 +1,6 @@
 """Regret of agents predicted before they train, with intervals from published runs."""
 
-from pharos.prediction.learners import (
-    POLICY_CURVES,
-    POLICY_PREDICTORS,
-    PREDICTORS,
-    PRIMARY,
-    SAMPLED_PREDICTORS,
-    predicted,
-)
+from pharos.prediction.learners import PREDICTORS, predicted
 from pharos.prediction.pairs import Pairs
 from pharos.prediction.prediction import PredictedRegret, Prediction, Published, predict, published, regret_predictor
 

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos.agents import agent_called, primary_predictors
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.prediction.learners import PRIMARY, PrimaryRegret, primary_regret, rollouts_of
+from pharos.prediction.learners import PrimaryRegret, primary_regret
 from pharos.prediction.pairs import Pairs
 from pharos.system.storage import plain
 
@@ -100,9 +101,9 @@ def published(agent: str) -> Published:
     Raises:
         ParameterError: there are none.
     """
-    if agent not in PRIMARY:
+    if agent not in primary_predictors():
         raise ParameterError(
-            f"agent {agent!r}: no published runs to calibrate on; expected one of {', '.join(PRIMARY)}"
+            f"agent {agent!r}: no published runs to calibrate on; expected one of {', '.join(primary_predictors())}"
         )
     with FILE.open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["agent"] == agent]
@@ -312,7 +313,7 @@ def predict(
         agent=agent,
         steps=steps,
         states=states,
-        predictor=PRIMARY[agent],
+        predictor=primary_predictors()[agent],
         cells=tuple(cells),
         half_width=width,
         coverage=calibration.coverage(),
@@ -385,11 +386,8 @@ def _checked_states(states: int, env: Environment) -> int:
 
 def _check_steps(config: Mapping[str, Any]) -> None:
     """Refuse a training that ends before anything is learnt."""
-    hyperparameters, steps = config["hyperparameters"], config["steps"]
-    if config["agent"] == "dqn":
-        min_steps, what = int(hyperparameters.get("learning_starts", 0)) + 1, "learning begins"
-    else:
-        min_steps, what = rollouts_of(config).steps, "the first rollout ends"
+    steps = config["steps"]
+    min_steps, what = agent_called(config["agent"]).idealised.min_steps(config)
     if steps < min_steps:
         raise ParameterError(
             f"steps is {steps}, but {what} after {min_steps - 1:,} steps; expected at least {min_steps:,}"

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 REGRETS = {"cumulative_regret": "cumulative regret", "normalized_regret": "normalised regret"}
 PAPER_CHANCE = {"none": "plain", "random_actions": "random", "sticky_actions": "sticky"}
 IMAGE, VECTOR = "simple_image", "vector"
+PAPER_AGENTS = ("dqn", "ppo")
+PAPER_AGENT = PAPER_AGENTS[0]  # the agent of the paper's models and of its figure 3
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Models:
     class_r_squared: float | None
     leave_one_class_out: float | None
     class_alone: float | None = None
-    agent: str = "dqn"
+    agent: str = PAPER_AGENT
 
     def suffix(self, first: str) -> str:
         """Ending of the names of this agent's files; empty for the first agent of a study."""

@@ -51,7 +51,7 @@ here what they were, so that studies which were packed before can be read."""
 def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str | os.PathLike) -> int:
     """Write the finished runs of a study into one Parquet file; return how many.
 
-    A row for each run: `id`; `record`, its run.json; and for each column of curve.parquet a list. Among the metadata of
+    A row for each run: `id`; `record`, its run.json; and for each column of the curve a list. Among the metadata of
     the file are the specification, its digest, and a digest of each run. What agents learnt stays in the folder: some
     hundred kilobytes a run, where a row takes two. Files of code are named relative to the specification, or by their
     name alone where they are elsewhere, with their checksums; nothing tells where they were on this machine.
@@ -226,7 +226,10 @@ def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> b
     partial = storage.temporary_path(target)
     partial.mkdir(parents=True)
     try:
-        training.write_table(partial / "curve.parquet", curve)
+        if "curve.csv" in record.get("checksums", {}):
+            training.write_curve(partial, curve.to_pylist())
+        else:
+            training.write_table(partial / "curve.parquet", curve)
         storage.replace_json(partial / "run.json", record)
         _worker.publish(partial, place, id)
     finally:

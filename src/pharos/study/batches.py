@@ -17,24 +17,18 @@ import time
 from collections import deque
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from pharos.agents.batched import lane_width
-from pharos.environments import Environment, start_distribution
+from pharos.environments import start_distribution
 from pharos.regret import ReferenceValues
 from pharos.study.blocks import Run
 from pharos.study.worker import BATCHES
 from pharos.system import storage
 from pharos.system.storage import ResultCache, cache_directory
-from pharos.training import RunConfig
+from pharos.training import RunConfig, Shapes, lanes
 
 if TYPE_CHECKING:
     from pharos.training import Task
-
-TABLES = 16  # runs of one program that learn tables
 
 
 def task_of(config: Mapping[str, Any]) -> "Task":
@@ -117,11 +111,11 @@ class Batches:
     """
 
     def __init__(self, folder: Path, device: str = "cpu"):
-        self.device = device
         self.folder = folder / BATCHES
         self.sizes: dict[str, int] = {}  # id -> largest batch of a run whose batch was too large for memory
-        self.observations: dict[str, SimpleNamespace] = {}
-        self.keys: dict[str, Hashable] = {}  # by id
+        self.shapes = Shapes(device)
+        self.keys: dict[str, Hashable | None] = {}  # by id, as widths
+        self.widths: dict[str, int] = {}
         self.stored: dict[str, frozenset[str]] = {}
         self.scan_checkpoints()
 
@@ -141,68 +135,35 @@ class Batches:
         """The batch of a run: itself and the runs that are trained with it, which are taken from `pending`."""
         if run.engine != "batched":
             return (run,)
-        now, key, width = time.monotonic(), self.key(run), self.width(run)
-        stored = self.stored.get(run.id)
-        batch = [run]
-        for entry in list(pending):
-            due, other = entry
-            if stored is not None:
-                fits = other.id in stored
-            else:
-                fits = len(batch) < width and due <= now and other.id not in self.stored
-                fits = fits and other.engine == "batched" and self.width(other) >= width and self.key(other) == key
-            if fits:
-                pending.remove(entry)
-                batch.append(other)
-        return tuple(batch)
+        if (stored := self.stored.get(run.id)) is not None:
+            entries = [entry for entry in pending if entry[1].id in stored]
+        else:
+            now = time.monotonic()
+            ready = [
+                (due, other)
+                for due, other in pending
+                if due <= now and other.id not in self.stored and other.engine == "batched"
+            ]
+            runs = [run, *(other for _, other in ready)]
+            widths = [self.width(each) for each in runs]
+            keys = [self.key(each) for each in runs]
+            keyed = [None if key is None else (width, key) for width, key in zip(widths, keys, strict=True)]
+            entries = [ready[i - 1] for i in lanes(keyed, widths)[0][1:]]
+        for entry in entries:
+            pending.remove(entry)
+        return run, *(other for _, other in entries)
 
     def width(self, run: Run) -> int:
         """Largest number of runs in a batch with this one."""
-        is_image = not run.configuration.is_tabular and len(self._observation(run).shape) == 3
-        usual = TABLES if run.configuration.is_tabular else lane_width(is_image, self.device)
-        return min(usual, self.sizes.get(run.id, usual))
+        if run.id not in self.widths:
+            self.widths[run.id] = self.shapes.width(run.configuration)
+        return min(self.widths[run.id], self.sizes.get(run.id, self.widths[run.id]))
 
-    def key(self, run: Run) -> Hashable:
-        """Key of a run: runs with equal keys fit together; one whose key cannot be computed is alone."""
+    def key(self, run: Run) -> Hashable | None:
+        """Key of a run: runs with equal keys fit together; None: it is alone."""
         if run.id not in self.keys:
-            self.keys[run.id] = self._key(run)
+            self.keys[run.id] = self.shapes.key(run.configuration)
         return self.keys[run.id]
-
-    def _key(self, run: Run) -> Hashable:
-        from pharos.agents.batched import group_key
-
-        config = run.configuration
-        if config.is_tabular:
-            return (config.agent, config.environment)
-        try:
-            env = config.make_environment(trust=True)
-            mdp = SimpleNamespace(num_actions=env.num_actions, num_states=most_states(env))
-            run_in_short: Any = SimpleNamespace(
-                observe=self._observation(run), mdp=mdp, hyperparameters=config.hyperparameters, steps=config.steps
-            )
-            key = group_key(config.agent, run_in_short, self.device)
-        except Exception:  # what is wrong with it, the run will say
-            return run.id
-        return (config.agent, config.steps, config.evaluation_interval, key)
-
-    def _observation(self, run: Run) -> Any:
-        """Shape, type and frames of the observation, and whether it is an image; needs no state space."""
-        config = run.configuration
-        entry = run.config
-        names = ("environment", "parameters", "observation", "observation_options")
-        key = json.dumps([entry[name] for name in names], sort_keys=True)
-        if key not in self.observations:
-            from pharos.observations import observe
-
-            try:
-                task = config.task(trust=True)
-                observation = observe(task.env, task.observation, **dict(task.observation_options))
-                shape, dtype = tuple(observation.space.shape or ()), str(observation.space.dtype)
-                is_image, frames = len(shape) == 3 and dtype == "uint8", observation.frames
-            except Exception:
-                shape, dtype, is_image, frames = (), key, False, 1
-            self.observations[key] = SimpleNamespace(shape=shape, dtype=dtype, is_image=is_image, frames=frames)
-        return self.observations[key]
 
     def halve(self, batch: Sequence[Run]) -> None:
         """Halve a batch whose process was killed too often: its runs start anew, in batches of half its size."""
@@ -212,8 +173,3 @@ class Batches:
             if ids & others:
                 shutil.rmtree(folder, ignore_errors=True)
         self.scan_checkpoints()
-
-
-def most_states(environment: Environment) -> float:
-    """Upper bound of the number of states of an environment: the product of the ranges of its variables."""
-    return float(np.prod(environment.components.size.astype(float)))

@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from pharos.agents import TABULAR_OBSERVATION, agent_kind, agent_source, hyperparameters
+from pharos.agents import agent_called, agent_source, hyperparameters
 from pharos.environments import Environment, as_tuples, imported, make, source_of
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.observations import OwnObservation, names, own_observation, title
@@ -318,8 +318,8 @@ class Specification(_Part):
             instance, agent_from = environment.instance, agent_source(agent, self.folder, check=False)
             observations: Sequence[ObservationEntry] = environment.observations or block.observations
             # Tabular agents see the state itself, whatever the block says
-            if agent_kind(agent).is_tabular:
-                observations = [ObservationEntry(name=TABULAR_OBSERVATION)]
+            if (fixed := agent_called(agent).fixed_observation) is not None:
+                observations = [ObservationEntry(name=fixed)]
             # A run for each observation and seed
             for observation, seed in product(observations, seeds):
                 sources = {

@@ -48,7 +48,7 @@ Job = tuple[_worker.BatchRunner, list[dict[str, Any]], list[str], Path, set[str]
 
 
 def train(config: Mapping[str, Any], folder: Path) -> None:
-    """Train a run as `config` says, and write run.json and curve.parquet into `folder`: the runner of studies."""
+    """Train a run as `config` says, and write run.json and curve.csv into `folder`: the runner of studies."""
     from pharos.training import TaskValues, train_config
 
     values = _batches.stored_values(config)
@@ -87,7 +87,7 @@ def run(
         source: YAML file, preset, mapping, Specification, or the folder of a study.
         folder: of the results; None for that folder, or studies/NAME.
         progress: called with a Status every now and then.
-        runner: `runner(config, folder)`, a function of a module, which writes run.json and curve.parquet.
+        runner: `runner(config, folder)`, a function of a module, which writes run.json and curve.csv.
         prepare: called with one config of each instance, in a process of its own, before the runs; None: builds state
             spaces for the usual runner, and does nothing for another.
         batch_runner: `runner(configs, folders, folder for checkpoints)` of runs that the study says are batched; None:

@@ -27,7 +27,7 @@ from pharos.plots import (
     slug,
     thousands,
 )
-from pharos.study.analysis import IMAGE, REGRETS, VECTOR, Models, mean_curve
+from pharos.study.analysis import IMAGE, PAPER_AGENT, PAPER_AGENTS, REGRETS, VECTOR, Models, mean_curve
 from pharos.study.regression import Fit
 from pharos.system.wording import in_words, latex_text
 from pharos.training import CELL
@@ -232,13 +232,13 @@ def pairs_of(cells: "pd.DataFrame", agents: Sequence[str]) -> list[tuple[str, st
 
 def representations_figure(agent: str, image: str) -> str:
     """The name of the figure of `representations`."""
-    parts = ["representations", *([] if agent == "dqn" else [slug(agent)]), *([] if image == IMAGE else [slug(image)])]
-    return "_".join(parts)
+    others = [slug(agent)] * (agent != PAPER_AGENT) + [slug(image)] * (image != IMAGE)
+    return "_".join(["representations", *others])
 
 
 def agents_figure(one: str, two: str) -> str:
     """The name of the figure of two agents."""
-    return "agents" if (one, two) == ("dqn", "ppo") else f"agents_{slug(one)}_{slug(two)}"
+    return "agents" if (one, two) == PAPER_AGENTS else f"agents_{slug(one)}_{slug(two)}"
 
 
 def representations(cells: "pd.DataFrame", *, agent: str = "dqn", image: str = IMAGE) -> "Figure | None":
@@ -381,7 +381,7 @@ def wide_returns(cells: "pd.DataFrame", environment: str, text: Callable[[Mappin
     texts = part.assign(text=[text(row) for row in part.to_dict("records")])
     wide = texts.pivot(index=["instance", "chance"], columns=["agent", "observation"], values="text")
     rows = list(dict.fromkeys(zip(part["instance"], part["chance"], strict=True)))
-    return wide.loc[rows, sorted(wide, key=lambda key: (key[0] != "ppo", *key))]
+    return wide.loc[rows, sorted(wide, key=lambda key: (key[0] != PAPER_AGENTS[1], *key))]
 
 
 def hardness_table(measured: "pd.DataFrame") -> str:

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pharos.agents import POLICY_PREDICTORS, SAMPLED_PREDICTORS
 from pharos.errors import ParameterError
-from pharos.prediction import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS, Pairs
+from pharos.prediction import PREDICTORS, Pairs
 from pharos.statistics import holm, percentiles, permutation_p_value, r_squared, spearman
 from pharos.study import cross_validation
 from pharos.training import CELL

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from pharos import training
+from pharos.agents import POLICY_CURVES
 from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCorrupted
-from pharos.prediction import POLICY_CURVES, PREDICTORS
+from pharos.prediction import PREDICTORS
 from pharos.system.storage import plain
 from pharos.system.wording import pluralize
 from pharos.training import CELL

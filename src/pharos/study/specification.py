@@ -31,7 +31,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from pharos.agents import AGENTS, BATCHED, agent_source, is_known
+from pharos.agents import agent_called, agent_source, agents, is_known
 from pharos.errors import ParameterError, UnknownName
 from pharos.study.blocks import (
     MOST_RUNS,
@@ -281,7 +281,7 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
     number = 0
     for agent in specification.defaults:
         if not _is_agent(agent):
-            yield ("defaults", agent), str(UnknownName("agent", agent, AGENTS))
+            yield ("defaults", agent), str(UnknownName("agent", agent, agents()))
     for i, block in enumerate(specification.blocks):
         kinds = len(block.environments) * len(block.chance) * len(block.agents) * len(block.observations)
         number += kinds * len(specification.option_of(block, "seeds"))
@@ -301,19 +301,19 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
         for agent in engine if isinstance(engine, dict) else ():
             if not _is_agent(agent):
                 where: Loc = ("engine",) if block.engine is None else ("blocks", i, "engine")
-                yield where, str(UnknownName("agent", agent, AGENTS))
+                yield where, str(UnknownName("agent", agent, agents()))
         for j, agent in enumerate(block.agents):
             try:
                 if not _is_agent(agent):
-                    raise UnknownName("agent", agent, AGENTS)
+                    raise UnknownName("agent", agent, agents())
                 agent_source(agent, specification.folder, check=False)
-                if specification.engine_of(block, agent) == "batched" and agent not in (*BATCHED, "q_learning"):
-                    raise ParameterError(
-                        f"agent {agent!r}: the batched engine has {', '.join(BATCHED)} and q_learning, the engine sb3 "
-                        f"has {agent!r}; write engine: {{{BATCHED[0]}: batched}} for some agents only"
-                    )
             except ParameterError as error:
                 yield ("blocks", i, "agents", j), str(error)
+                continue
+            try:
+                agent_called(agent).engine(specification.engine_of(block, agent))
+            except ParameterError as error:
+                yield ("blocks", i, "agents", j), f"{error}; write engine: {{dqn: batched}} for some agents only"
         # Hyperparameters
         for agent, own in block.hyperparameters.items():
             loc = ("blocks", i, "hyperparameters", agent)
@@ -324,7 +324,7 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
 
 
 def _is_agent(name: str) -> bool:
-    return name in AGENTS or is_reference(name)
+    return name in agents() or is_reference(name)
 
 
 def _messages(error: ValidationError, name: str, root: object) -> str:

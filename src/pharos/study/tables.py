@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos import training
-from pharos.agents import agent_kind
+from pharos.agents import agent_called
 from pharos.environments import classes, make
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.regret import regret_scale
@@ -109,7 +109,7 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
 
 
 def curves(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
-    """Table of the evaluations of finished runs, a row each: columns of curve.parquet, and of the run."""
+    """Table of the evaluations of finished runs, a row each: columns of curve.csv, and of the run."""
     return _warned(finished_runs(*opened(source, folder))).points
 
 
@@ -409,7 +409,7 @@ def predict(
         source, folder: as for `run`; no run is looked at.
         blocks, agents, observations: a part of the study: numbers of blocks from 1, names of agents, and of
             observations without their options; None: all.
-        primary: only the predictor that stands for each agent (`pharos.prediction.PRIMARY`) with its table; other
+        primary: only the predictor that stands for each agent (`pharos.agents.Idealised`) with its table; other
             columns are NaN, and `estimated_error` is that of this predictor. A small part of the time.
         progress: called with what is being done.
     Returns:
@@ -425,12 +425,13 @@ def predict(
     """
     import pandas as pd
 
-    from pharos.prediction import POLICY_CURVES, predicted
+    from pharos.agents import POLICY_CURVES
+    from pharos.prediction import predicted
 
     study, _ = opened(source, folder)
     rows: dict[tuple[str, ...], dict[str, Any]] = {}
     for run in _part_of(study, blocks, agents, observations):
-        if agent_kind(run.configuration.agent).is_tabular:
+        if agent_called(run.configuration.agent).has_table:
             continue
         key = tuple(run.cell.values())
         if key in rows:

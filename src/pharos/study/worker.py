@@ -1,7 +1,7 @@
 """One run, or a batch of runs, in one process: the folder of a run appears whole, or not at all.
 
     DIR/partial/ID/   while it is being run: its log (of a batch: with its first run), and whatever the runner writes
-    DIR/runs/ID/      when it is over, moved there in one step: run.json (finished or failed), curve.parquet, log.txt
+    DIR/runs/ID/      when it is over, moved there in one step: run.json (finished or failed), curve.csv, log.txt
     DIR/locks/ID/     held by the process that runs it
 
 A process that is killed leaves a folder in `partial`, which the next attempt throws away, unless its result is
@@ -66,7 +66,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     if record["status"] == FINISHED:
         if not isinstance(record.get("result"), dict):
             raise FileFormatError(f"{file}: is of a finished run, but has no result")
-        training.read_curve_table(folder, ())
+        training.read_rows(folder, ())
     return record
 
 
@@ -126,7 +126,7 @@ def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, P
     seconds = (time.perf_counter() - began) / len(todo)
     for (config, id, place), reason in zip(todo, errors, strict=True):
         if read_status(place) != FINISHED:
-            missing = "the runner returned without a finished run.json and a curve.parquet"
+            missing = "the runner returned without a finished run.json and a curve"
             write_failure(place, config, id, reason or missing, seconds)
         publish(place, folder, id)
 

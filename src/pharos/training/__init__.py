@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from pharos.regret import ReferenceValues, cumulative_expected_regret, regret
     from pharos.training.batch import TrainingProgress, check_device, train_configs
     from pharos.training.curve import Curve, Evaluation, RegretCurve, evaluate_agent
-    from pharos.training.learners import FailedRun, TaskCache
     from pharos.training.options import ENGINES, ExecutionOptions, Horizon, TrainingOptions
+    from pharos.training.prepared import FailedRun, TaskCache
     from pharos.training.results import (
         TrainingResult,
         check_agent,
@@ -32,8 +32,9 @@ if TYPE_CHECKING:
         write_table,
     )
     from pharos.training.runs import train, train_config, train_many, train_parts
+    from pharos.training.schedule import Shapes, dealt, halves, lanes, plan
     from pharos.training.task import CELL, RunConfig, Task, TaskValues, run_id
-    from pharos.training.tuning import SPACES, TuningResult, tune
+    from pharos.training.tuning import TuningResult, tune
 
 __all__ = [
     "ChanceSetting",

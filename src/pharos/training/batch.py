@@ -1,6 +1,6 @@
 """Training: runs that fit together learn under one loop, with the exact value of each policy at chosen steps.
 
-    FOLDER/                      of each run: run.json, curve.parquet, and what was learnt
+    FOLDER/                      of each run: run.json, curve.csv, and what was learnt
     FOLDER/checkpoint/           of a run that learns alone, while it is trained
     CHECKPOINTS/BATCH/           of runs that learn together: all of them, their configurations and curves
 
@@ -13,27 +13,23 @@ import contextlib
 import shutil
 import time
 import warnings
-from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pharos.agents import is_known
+from pharos.agents import Learner, agent_called, is_known
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
-from pharos.policies import is_small_table
 from pharos.system import compiling
 from pharos.system.sources import is_reference
 from pharos.system.storage import digest_of_json, inside, is_full, lock, read_json, remove_leftovers, replace_json
 from pharos.system.wording import in_one_line, pluralize
 from pharos.training import results as _results
 from pharos.training.curve import joint_values
-from pharos.training.learners import FailedRun, Learner, PreparedRun, TaskCache, make_learner
+from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
 from pharos.training.results import Checkpoint, Record, TrainingResult, clear_run, finished_result
+from pharos.training.schedule import lanes
 from pharos.training.task import RunConfig
-
-# Fields from which a run is prepared anew where its batch is halved.
-BEGINNING = ("place", "config", "folder", "task", "hyperparameters", "run", "key")
 
 
 @dataclass(frozen=True)
@@ -175,7 +171,9 @@ class TrainingJobs:
 
     def _groups(self) -> Iterator[list[PreparedRun]]:
         """Yield runs that train alone; then batches restored from checkpoints, and the rest by what fits together."""
-        alone, waiting = [], {}
+        alone: list[PreparedRun] = []
+        waiting: dict[int, PreparedRun] = {}
+        keys: dict[int | None, Hashable] = {}
         # Finished runs need no training; others train alone or wait for a batch
         for place, config in enumerate(self.configs):
             try:
@@ -188,44 +186,29 @@ class TrainingJobs:
                 clear_run(folder)
                 self.results[place] = done
                 self.done += config.steps
-            elif config.engine == "batched" or self._is_shared_table(place, config):
-                waiting[place] = config
+                continue
+            try:
+                run = PreparedRun(place, config, folder, self.tasks)
+                is_single = len(self.configs) == 1 or (folder is not None and (folder / "checkpoint").exists())
+                key = run.key(is_single=is_single)
+                run.is_alone = key is None
+            except Exception as error:
+                self.fail(place, error)
+                continue
+            if run.is_alone:
+                alone.append(run)
             else:
-                alone.append(place)
-        for place in alone:
-            if (run := self._prepared_run(place, is_alone=True)) is not None:
-                yield [run]
+                waiting[place], keys[place] = run, key
+        yield from ([run] for run in alone)
         yield from self._stored_groups(waiting)
         # Runs with equal keys, in lanes
-        groups: dict[Hashable, list[PreparedRun]] = defaultdict(list)
-        for place in waiting:
-            if (run := self._prepared_run(place)) is not None:
-                groups[run.key].append(run)
-        for group in groups.values():
-            width = self.lane or len(group)
-            for first in range(0, len(group), width):
-                yield group[first : first + width]
+        rest = list(waiting.values())
+        for lane in lanes([keys[run.place] for run in rest], [self.lane or len(rest)] * len(rest)):
+            yield [rest[i] for i in lane]
 
-    def _is_shared_table(self, place: int, config: RunConfig) -> bool:
-        """Whether a run learns a table together with others: it has few states, and no checkpoint of a run alone."""
-        if not config.is_tabular or len(self.configs) == 1:
-            return False
-        folder = self.folders[place]
-        try:
-            return is_small_table(self.tasks.task(config).mdp) and not (folder and (folder / "checkpoint").exists())
-        except Exception:  # what is wrong with it, it is told alone
-            return False
-
-    def _prepared_run(self, place: int, *, is_alone: bool = False) -> PreparedRun | None:
-        try:
-            return self.tasks.prepare(place, self.configs[place], self.folders[place], is_alone=is_alone)
-        except Exception as error:
-            self.fail(place, error)
-            return None
-
-    def _stored_groups(self, waiting: dict[int, RunConfig]) -> Iterator[list[PreparedRun]]:
+    def _stored_groups(self, waiting: dict[int, PreparedRun]) -> Iterator[list[PreparedRun]]:
         """Batches of checkpoints, with the runs that they had, which are taken from `waiting`."""
-        by_id = {config.id: place for place, config in waiting.items()}
+        by_id = {run.config.id: place for place, run in waiting.items()}
         finished = {self.configs[place].id for place, end in self.results.items() if isinstance(end, TrainingResult)}
         for folder, configs in self._stored_batches():
             places = [by_id.get(config.id) for config in configs]
@@ -237,11 +220,11 @@ class TrainingJobs:
                 continue
             try:
                 group = [
-                    self.tasks.prepare(None, config, None)
-                    if place is None
-                    else self.tasks.prepare(place, self.configs[place], self.folders[place])
+                    PreparedRun(None, config, None, self.tasks) if place is None else waiting[place]
                     for place, config in zip(places, configs, strict=True)
                 ]
+                for run in group:
+                    run.key()
             except Exception:  # what is wrong with a run is found later, where it fails alone
                 continue
             for config in configs:
@@ -308,7 +291,7 @@ class TrainingGroup:
             )
         self.jobs.done = before
         for part in (self.group[:middle], self.group[middle:]):
-            fresh = [PreparedRun(*(getattr(each, name) for name in BEGINNING)) for each in part]
+            fresh = [PreparedRun(each.place, each.config, each.folder, each.tasks) for each in part]
             TrainingGroup(self.jobs, fresh).train()
 
     def _train(self) -> None:
@@ -317,7 +300,7 @@ class TrainingGroup:
         if self.is_alone and self._is_finished():
             return
         logs = first.folder / "tensorboard" if self.jobs.tensorboard and first.folder is not None else None
-        self.learner = make_learner(self.group, self.jobs.tasks.device, logs)
+        self.learner = agent_called(self.config.agent).learner(self.group, self.jobs.tasks.device, logs)
         checkpoint = self._checkpoint()
         if checkpoint is not None:
             entries, spent = checkpoint.restore(self.learner) or ([], 0.0)

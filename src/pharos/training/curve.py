@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from pharos.agents import agent_called
 from pharos.errors import PharosError
 from pharos.policies import (
     Evaluation,
@@ -29,7 +30,7 @@ from pharos.training import results as _results
 from pharos.training.task import Task
 
 if TYPE_CHECKING:
-    from pharos.training.learners import PreparedRun
+    from pharos.training.prepared import PreparedRun
 
 
 BLOCK = 4096  # observations that policies are asked about at once
@@ -110,7 +111,9 @@ def joint_values(batch: PolicyBatch, runs: "Sequence[PreparedRun]") -> dict[int,
 
     These are policies of DQN where nothing is random, and of runs that share a task of few states and see one frame.
     """
-    walks = [i for i, each in enumerate(runs) if each.error is None and _walks(each)]
+    walks: list[int] = []
+    if isinstance(batch, BestActions):
+        walks = [i for i, each in enumerate(runs) if each.error is None and _walks(each)]
     values = _values_of_walks(batch, runs, walks)
     tasks = defaultdict(list)
     for i, run in enumerate(runs):
@@ -123,12 +126,12 @@ def joint_values(batch: PolicyBatch, runs: "Sequence[PreparedRun]") -> dict[int,
 
 
 def _walks(run: "PreparedRun") -> bool:
-    return run.config.agent == "dqn" and is_walk(run.task.mdp)
+    return agent_called(run.config.agent).is_greedy and is_walk(run.task.mdp)
 
 
 def _frames(run: "PreparedRun") -> int:
     """Number of states in one observation of the agent: more than 1 where frames are stacked."""
-    return 1 if run.config.is_tabular else run.task.observer.frames
+    return 1 if agent_called(run.config.agent).has_table else run.task.observer.frames
 
 
 def _values_of_walks(batch: PolicyBatch, runs: "Sequence[PreparedRun]", places: Sequence[int]) -> dict[int, Evaluation]:

@@ -1,9 +1,7 @@
 """The folder of a run: record and checkpoints while it is trained; result and agent once it is finished.
 
-run.json and curve.parquet are each written whole or not at all, with digests.
-
-Where pyarrow is not installed the curve is text: curve.csv, with the same columns, values to the last bit and digest.
-Nothing is pickled.
+run.json and curve.csv are each written whole or not at all, with digests. Nothing is pickled. Earlier runs have their
+curve in curve.parquet, with the same columns, values to the last bit and digest; it is read.
 """
 
 import contextlib
@@ -24,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from pharos.agents import NETWORK, POLICY, agent_called
 from pharos.environments import class_called
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, ResultCorrupted, UntrustedCode
 from pharos.system import storage
@@ -36,8 +35,7 @@ if TYPE_CHECKING:
 
 
 FORMAT = 1
-RECORD, CURVE, POLICY, AGENT = "run.json", "curve.parquet", "policy.npy", "agent"
-TEXT_CURVE = "curve.csv"
+RECORD, CURVE, EARLIER_CURVE = "run.json", "curve.csv", "curve.parquet"
 AGAIN = "delete the folder and execute the run again"
 ANEW = "delete the folder to start anew"
 CHECKPOINT_SECONDS = 10.0
@@ -57,7 +55,7 @@ COLUMNS = {
     "exact": "bool",
     "error_bound": "float64",
 }
-"""Columns of curve.parquet, a row for each evaluation. docs/agents.md defines them."""
+"""Columns of curve.csv, a row for each evaluation. docs/agents.md defines them."""
 _TYPES: dict[str, Callable[[Any], Any]] = {"int64": int, "float64": float, "bool": bool}
 _TRUTHS = {"True": True, "False": False}
 
@@ -82,7 +80,7 @@ def write_record(folder: Path, record: Mapping[str, Any]) -> None:
     """Replace run.json in one step; numbers that JSON cannot say are null.
 
     The record gets a `digest` of all that it says; that of a finished run also `checksums` of the other files of the
-    run, which are written before it: of `curve.parquet` (see `digest_of_curve`), and of what the agent has learnt; and
+    run, which are written before it: of `curve.csv` (see `digest_of_curve`), and of what the agent has learnt; and
     `written`, the date.
     """
     if record.get("status") == "finished":
@@ -92,24 +90,16 @@ def write_record(folder: Path, record: Mapping[str, Any]) -> None:
 
 
 def write_curve(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Replace curve.parquet in one step, with checksums of its pages; the same rows give the same bytes.
+    """Replace curve.csv in one step; the same rows give the same bytes.
 
-    Without pyarrow it is curve.csv, whose numbers are the shortest decimals that mean the same float64.
+    Numbers are the shortest decimals that mean the same float64.
     """
-    if _has_pyarrow():
-        import pyarrow as pa
-
-        schema = pa.schema([(name, pa.type_for_alias(dtype)) for name, dtype in COLUMNS.items()])
-        columns = [pa.array([row[name] for row in rows], schema.field(name).type) for name in COLUMNS]
-        write_table(folder / CURVE, pa.Table.from_arrays(columns, schema=schema))
-        (folder / TEXT_CURVE).unlink(missing_ok=True)
-        return
     lines = io.StringIO(newline="")
     writer = csv.writer(lines, lineterminator="\n")
     writer.writerow(COLUMNS)
     writer.writerows([repr(_TYPES[dtype](row[name])) for name, dtype in COLUMNS.items()] for row in rows)
-    storage.replace_file(folder / TEXT_CURVE, lines.getvalue())
-    (folder / CURVE).unlink(missing_ok=True)
+    storage.replace_file(folder / CURVE, lines.getvalue())
+    (folder / EARLIER_CURVE).unlink(missing_ok=True)
 
 
 def _has_pyarrow() -> bool:
@@ -151,7 +141,12 @@ def read_record(folder: str | os.PathLike) -> dict[str, Any]:
 
 def read_curve(folder: str | os.PathLike, *, columns: Iterable[str] = tuple(COLUMNS)) -> "pd.DataFrame":
     """Return the evaluations of a run, a row each; see `read_curve_table`."""
-    return read_curve_table(folder, columns).to_pandas()
+    curve = _read_curve(Path(folder), columns)
+    if isinstance(curve, dict):
+        import pandas as pd
+
+        return pd.DataFrame(curve)
+    return curve.to_pandas()
 
 
 def read_curve_table(folder: str | os.PathLike, columns: Iterable[str] = tuple(COLUMNS)) -> "pa.Table":
@@ -161,54 +156,63 @@ def read_curve_table(folder: str | os.PathLike, columns: Iterable[str] = tuple(C
         columns: those that must be there.
     Raises:
         FileFormatError: there are none, or columns are missing. ResultCorrupted: the file was cut short or changed
-        after it was written, or is that of another run.
+        after it was written, or is that of another run. MissingExtra: pyarrow is not installed.
     """
-    path = _curve_file(Path(folder))
-    if path.name == TEXT_CURVE:
+    curve = _read_curve(Path(folder), columns)
+    if isinstance(curve, dict):
         import pyarrow as pa
 
-        table = pa.table(_read_text(path))
-    else:
-        table = read_table(path)
-    missing = [name for name in columns if name not in table.column_names]
+        return pa.table(curve)
+    return curve
+
+
+def read_rows(folder: str | os.PathLike, columns: Iterable[str] = tuple(COLUMNS)) -> list[dict[str, Any]]:
+    """Return the evaluations of a run, a dictionary each, as `read_curve_table`; curve.csv needs no pyarrow."""
+    curve = _read_curve(Path(folder), columns)
+    if isinstance(curve, dict):
+        values = (column.tolist() for column in curve.values())
+        return [dict(zip(curve, row, strict=True)) for row in zip(*values, strict=True)]
+    return curve.to_pylist()
+
+
+def _read_curve(folder: Path, columns: Iterable[str]) -> "dict[str, np.ndarray] | pa.Table":
+    """The curve of a run, compared with its digest: columns of curve.csv, or the table of an earlier Parquet file."""
+    path = _curve_file(folder)
+    curve = _read_text(path) if path.name == CURVE else read_table(path)
+    names = curve if isinstance(curve, dict) else curve.column_names
+    missing = [name for name in columns if name not in names]
     if missing:
         raise FileFormatError(f"{path}: lacks the columns {', '.join(missing)}")
-    _check_digest(path, _columns_of(table))
-    return table
-
-
-def read_rows(folder: str | os.PathLike) -> list[dict[str, Any]]:
-    """Return the evaluations of a run, a dictionary each, as `read_curve_table`; of curve.csv without pyarrow too."""
-    path = _curve_file(Path(folder))
-    if path.name == CURVE:
-        return read_curve_table(folder).to_pylist()
-    columns = _read_text(path)
-    _check_digest(path, columns)
-    values = (column.tolist() for column in columns.values())
-    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
+    _check_digest(path, curve if isinstance(curve, dict) else _columns_of(curve))
+    return curve
 
 
 def _curve_file(folder: Path) -> Path:
-    """The file that has the curve: curve.csv where only that is there."""
-    text = folder / TEXT_CURVE
-    return text if text.exists() and not (folder / CURVE).exists() else folder / CURVE
+    """The file that has the curve: curve.csv, or the Parquet file of an earlier run or of a study's own runner."""
+    earlier = folder / EARLIER_CURVE
+    return earlier if earlier.exists() and not (folder / CURVE).exists() else folder / CURVE
 
 
 def _read_text(path: Path) -> dict[str, np.ndarray]:
     """Columns of a curve.csv by name.
 
     Raises:
-        ResultCorrupted: it was cut short or changed.
+        FileFormatError: there is none. ResultCorrupted: it was cut short or changed.
     """
     read: dict[str, Callable[[str], Any]] = {"int64": int, "float64": float, "bool": _TRUTHS.__getitem__}
     try:
         check_regular(path)
         with open(path, encoding="utf-8", newline="") as file:
-            head, *rows = csv.reader(file, strict=True)
+            text = file.read()
+        if not text.endswith("\n"):
+            raise ValueError("its last line has no end")
+        head, *rows = csv.reader(io.StringIO(text), strict=True)
         return {
             name: np.array([read[COLUMNS[name]](text) for text in column], COLUMNS[name])
             for name, column in zip(head, zip(*rows, strict=True) if rows else [()] * len(head), strict=True)
         }
+    except FileNotFoundError:
+        raise FileFormatError(f"{path}: no such file; expected the folder of a finished run") from None
     except (OSError, ValueError, KeyError, csv.Error) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise ResultCorrupted(f"{path}: cannot be read, it was cut short or changed: {reason}; {AGAIN}") from None
@@ -228,7 +232,7 @@ def check_agent(folder: Path) -> None:
         ResultCorrupted: one is missing or was changed after it was written.
     """
     for name, expected in _expected_checksums(folder).items():
-        if name in (CURVE, TEXT_CURVE):
+        if name in (CURVE, EARLIER_CURVE):
             continue
         try:
             digest = storage.digest_of_file(folder / name)
@@ -306,9 +310,9 @@ def _checksums(folder: Path) -> dict[str, str]:
     """Checksums of the files of a finished run, by their names within its folder."""
     checksums = {}
     if (curve := _curve_file(folder)).exists():
-        columns = _read_text(curve) if curve.name == TEXT_CURVE else _columns_of(read_table(curve))
+        columns = _read_text(curve) if curve.name == CURVE else _columns_of(read_table(curve))
         checksums[curve.name] = _digest_of_columns(columns)
-    for path in (folder / POLICY, *sorted((folder / AGENT).rglob("*"))):
+    for path in (folder / POLICY, *sorted((folder / NETWORK).rglob("*"))):
         if path.is_file():
             storage.sync(path)
             checksums[path.relative_to(folder).as_posix()] = storage.digest_of_file(path)
@@ -325,14 +329,6 @@ def _expected_checksums(folder: Path) -> dict[str, str]:
 def write_policy(folder: Path, policy: object) -> None:
     """Replace policy.npy: the policy of a tabular agent, as `pharos evaluate --policy` takes it."""
     storage.replace_array(folder / POLICY, policy)
-
-
-def new_agent(folder: Path) -> Path:
-    """The empty folder of the agent of a run; an older one is removed, so that no link in it is written through."""
-    place = storage.inside(folder, AGENT)
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir(parents=True)
-    return place
 
 
 # Checkpoints and agents -----------------------------------------------------------------------------------------------
@@ -355,7 +351,7 @@ class TrainingResult:
     Attributes:
         config: of the run.
         result: summary: values of the optimal, uniform, worst and final policy, regrets, episodes.
-        curve: a row for each evaluation, a dictionary with the columns of curve.parquet.
+        curve: a row for each evaluation, a dictionary with the columns of curve.csv.
         agent: the trained agent: a `QLearning` or a model of Stable-Baselines3; None where the run was finished before.
         folder: of the run, or None.
         seconds: time that it took, without that of compiling.
@@ -503,6 +499,8 @@ def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task,
         UntrustedCode: the run names code, and is not trusted.
         MissingExtra: Stable-Baselines3 is not installed.
     """
+    from pharos.training.prepared import PreparedRun, TaskCache
+
     folder = Path(folder)
     record = read_record(folder)
     if record.get("status") != "finished":
@@ -513,19 +511,13 @@ def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task,
     try:
         config = RunConfig.from_dict(record["config"])
         task = config.task(trust=trust)
-        agent = config.algorithm(trust=trust)
+        tasks = TaskCache(trust=trust)
+        tasks.adopt(config, task)
+        run = PreparedRun(None, config, None, tasks)
+        run.hyperparameters = record["hyperparameters"]
+        _ = run.algorithm  # or what is wrong with it
     except UntrustedCode as error:
         raise UntrustedCode(f"{folder / 'run.json'}: {error}") from error
     except FileFormatError as error:
         raise FileFormatError(f"{folder / 'run.json'}: {error}") from error
-    if config.is_tabular:
-        try:
-            check_regular(folder / "policy.npy")
-            return task, np.load(folder / "policy.npy", allow_pickle=False)
-        except Exception as error:  # the header is read as Python
-            raise FileFormatError(f"{folder / 'policy.npy'}: cannot be read: {error}") from error
-    from pharos.training.learners import Deep
-
-    learner = Deep(agent, task, record["hyperparameters"], config.steps, config.seed, None)
-    learner.load(folder / "agent")
-    return task, learner.agent
+    return task, agent_called(config.agent).load(folder, run)

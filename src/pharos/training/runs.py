@@ -1,7 +1,7 @@
 """Training an agent on a task, with the exact regret of its policy at chosen steps; runs that are killed resume.
 
     FOLDER/run.json         configuration, versions, status, result
-    FOLDER/curve.parquet    a row for each evaluation (curve.csv where pyarrow is not installed)
+    FOLDER/curve.csv        a row for each evaluation
     FOLDER/checkpoint/      while it runs: what the next attempt goes on from; arrays, JSON and tensors, never code
 
 A run that is killed goes on from its last checkpoint when it is started again: at most the last interval between
@@ -15,9 +15,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pharos.agents import agent_kind
+from pharos.agents import agent_called
 from pharos.agents import hyperparameters as hyperparameters_of
-from pharos.agents.batched import lane_width
 from pharos.environments import Environment
 from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, PharosError
 from pharos.observations import own_observation
@@ -25,9 +24,10 @@ from pharos.system.records import split, takes
 from pharos.system.workers import Workers
 from pharos.training import results as _results
 from pharos.training.batch import ProgressCallback, TrainingJobs, TrainingProgress, train_configs
-from pharos.training.learners import FailedRun, TaskCache
 from pharos.training.options import TrainingOptions
+from pharos.training.prepared import FailedRun, TaskCache
 from pharos.training.results import TrainingResult, finished_result
+from pharos.training.schedule import Shapes, plan
 from pharos.training.task import RunConfig, Task, TaskValues
 
 RunProgress = Callable[[int, int, Mapping[str, Any]], None]
@@ -84,8 +84,8 @@ def train_many(
     Args:
         seeds: of the runs, each another.
         device: of the batched engine: "cpu" or "cuda".
-        workers: processes that share whole lanes of the batched engine, where there is a folder for results. Results do
-            not depend on it.
+        workers: processes that share the runs, lane by lane, where there is a folder for results; runs that train alone
+            stay in one. Results do not depend on it.
         out: a folder, in which each run has its own, seed-0 and so on; None: nothing is written. Finished runs there
             are returned, and what was killed goes on from its last checkpoint.
         progress: called after each evaluation.
@@ -103,7 +103,8 @@ def train_many(
     folder = None if out is None else Path(out)
     folders = None if folder is None else [folder / f"seed-{seed}" for seed in numbers]
     checkpoints = None if folder is None else folder / "checkpoints"
-    parts = parts_of(configs, workers, device)
+    is_alone = Shapes(device).key(configs[0]) is None
+    parts = plan(configs, workers=1 if is_alone else workers, device=device)
     if folders is not None and len(parts) > 1:
         results = train_parts(configs, folders, parts, checkpoints=checkpoints, device=device, progress=progress)
     else:
@@ -151,12 +152,11 @@ def _train(
     tensorboard: bool = False,
 ) -> TrainingResult:
     """Train a single run; its errors are raised."""
-    if tensorboard and config.engine == "batched":
-        raise ParameterError("TensorBoard's logs are those of Stable-Baselines3; expected the engine sb3, or none")
-    if tensorboard and (folder is None or config.is_tabular):
+    if tensorboard and (folder is None or not agent_called(config.agent).has_tensorboard(config.engine)):
         raise ParameterError(
-            f"TensorBoard's logs were asked for, with {config.agent} and {'a' if folder else 'no'} folder for results; "
-            f"expected an algorithm of Stable-Baselines3 and a folder (out)"
+            f"TensorBoard's logs were asked for, with {config.agent}, the engine {config.engine} and "
+            f"{'a' if folder else 'no'} folder for results; expected an algorithm of Stable-Baselines3, the engine sb3 "
+            f"and a folder (out)"
         )
 
     def tell(now: TrainingProgress) -> None:
@@ -179,7 +179,7 @@ def _runs(
     """The task, and the configuration of a run with each of the seeds; `options` as `train` takes them."""
     training, parameters = split(TrainingOptions, options)
     agent, hyperparameters, table = training.agent, training.hyperparameters, options.get("hyperparameters")
-    name = agent_kind(agent).observation(training.observation)
+    name = agent_called(agent).observation(training.observation)
     task = Task.of(
         environment,
         parameters,
@@ -196,16 +196,6 @@ def _runs(
 
 
 # Processes: whole lanes of the batched engine each, and files as the only results -------------------------------------
-
-
-def parts_of(configs: Sequence[RunConfig], workers: int, device: str = "cpu") -> list[list[int]]:
-    """Places of the runs by process: whole lanes, dealt out in turn; one list where there is nothing to share."""
-    width = lane_width(any("image" in config.observation for config in configs), device)
-    lanes = [list(range(first, min(first + width, len(configs)))) for first in range(0, len(configs), width)]
-    number = min(workers, len(lanes))
-    if number < 2 or any(config.engine != "batched" for config in configs):
-        return [list(range(len(configs)))]
-    return [[place for lane in lanes[part::number] for place in lane] for part in range(number)]
 
 
 def train_parts(

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import BATCHED, agent_kind, agent_source, is_known
+from pharos.agents import agent_called, agent_source, is_known
 from pharos.environments import Environment, as_tuples, class_called, class_of, make, source_of
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.mdp import (
@@ -273,7 +273,7 @@ class RunConfig(TrainingOptions):
         seed: of everything random.
         horizon: number of steps of an episode in values and returns; None: discounted values without a horizon.
         evaluation_interval: steps between evaluations of the policy.
-        hyperparameters: of the agent, which go before those of agents/hyperparameters.py.
+        hyperparameters: of the agent, which go before its defaults.
         engine: what trains networks, one of ENGINES. Tables are the same with each, so theirs is always "sb3"; `id` and
             `to_dict` have it only where it is another.
         sources: where a class, observation or agent of the user's own comes from, under "environment", "observation"
@@ -291,13 +291,7 @@ class RunConfig(TrainingOptions):
     def __post_init__(self) -> None:
         if self.engine not in ENGINES:
             raise UnknownName("engine", self.engine, ENGINES)
-        if self.is_tabular:
-            object.__setattr__(self, "engine", "sb3")
-        elif self.engine == "batched" and self.agent not in BATCHED:
-            raise ParameterError(
-                f"agent {self.agent!r}: the batched engine has {', '.join(BATCHED)} and q_learning; "
-                f"the engine sb3 has {self.agent!r}"
-            )
+        object.__setattr__(self, "engine", agent_called(self.agent).engine(self.engine))
         for name in ("steps", "evaluation_interval"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value < 2**63:
@@ -371,11 +365,6 @@ class RunConfig(TrainingOptions):
     def id(self) -> str:
         """The name of the run: a digest of the configuration, the same on every machine."""
         return run_id(self.to_dict())
-
-    @property
-    def is_tabular(self) -> bool:
-        """Whether the agent learns a table over the states."""
-        return agent_kind(self.agent).is_tabular
 
     def make_environment(self, *, trust: bool = False, strict: bool = False) -> Environment:
         """The environment of the run.

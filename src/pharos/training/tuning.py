@@ -14,7 +14,6 @@ Source: Bergstra et al. (2011), Algorithms for hyper-parameter optimization; Aki
 """
 
 import contextlib
-import inspect
 import json
 import math
 import os
@@ -28,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.agents import Q_LEARNING_DEFAULTS, agent_kind, algorithm
+from pharos.agents import agent_called, agents
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, FolderLocked, MissingExtra, ParameterError
@@ -38,7 +37,7 @@ from pharos.system import storage
 from pharos.system.wording import pluralize
 from pharos.training import results as _results
 from pharos.training.batch import TrainingProgress, train_configs
-from pharos.training.learners import FailedRun, TaskCache
+from pharos.training.prepared import FailedRun, TaskCache
 from pharos.training.task import RunConfig, Task, run_id
 
 if TYPE_CHECKING:
@@ -48,44 +47,6 @@ EVALUATIONS = 20  # of a run
 JOURNAL = "journal.log"
 _STATUS = {"COMPLETE": "finished", "PRUNED": "given up"}
 _AGAIN = "delete the folder and search again"
-SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
-    "q_learning": {
-        "learning_rate": ("log", 0.01, 1.0),
-        "visits_exponent": ("one of", 0.0, 0.6, 0.8),
-        "gamma": ("one of", 0.95, 0.99, 0.999),
-        "initial_q": ("one of", 0.0, 0.5, 1.0, 2.0),
-        "exploration_final_eps": ("linear", 0.0, 0.1),
-        "exploration_fraction": ("linear", 0.01, 0.5),
-    },
-    "dqn": {
-        "learning_rate": ("log", 5e-5, 2e-3),
-        "batch_size": ("one of", 32, 64, 128),
-        "gamma": ("one of", 0.95, 0.98, 0.99, 0.995),
-        "n_steps": ("one of", 1, 3, 5),
-        "train_freq": ("one of", 1, 4, 8),
-        "learning_starts": ("one of", 200, 1000, 5000),
-        "target_update_interval": ("one of", 100, 500, 1000, 2500),
-        "exploration_fraction": ("linear", 0.05, 0.5),
-        "exploration_final_eps": ("linear", 0.01, 0.1),
-    },
-    "ppo": {
-        "learning_rate": ("log", 5e-5, 2e-3),
-        "n_steps": ("one of", 16, 32, 64, 128, 256),
-        "n_epochs": ("one of", 4, 8),
-        "gamma": ("one of", 0.95, 0.98, 0.99, 0.995),
-        "gae_lambda": ("linear", 0.8, 1.0),
-        "ent_coef": ("log", 1e-4, 0.1),
-        "clip_range": ("one of", 0.1, 0.2, 0.3),
-    },
-    "a2c": {
-        "learning_rate": ("log", 5e-5, 5e-3),
-        "n_steps": ("one of", 5, 16, 32),
-        "gamma": ("one of", 0.95, 0.98, 0.99, 0.995),
-        "gae_lambda": ("linear", 0.8, 1.0),
-        "ent_coef": ("log", 1e-4, 0.1),
-    },
-}
-"""Search space of each agent: between two bounds on a logarithmic or a linear scale, or one of some values."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +102,8 @@ def tune(  # noqa: PLR0913
         chances: several kinds of chance, such as [{}, {"random": 0.1}, {"reward_delay": 3}], each for every instance;
             in place of `sticky` and `random`.
         seeds: of the runs of a trial; keep them apart from the seeds of the experiment that follows.
-        space: what is searched, in the form of `SPACES`; None: what that says of the agent.
+        space: what is searched: of each hyperparameter ("log", low, high), ("linear", low, high) or ("one of", value,
+            ...); None: the agent's own (`pharos.agents.Agent.space`).
         search_seed: of the search.
         engine: "sb3": the runs of a trial one after the other; "batched": at once.
         shortlist, predicted: of so many proposals the one is tried whose hyperparameters this function gives the least
@@ -240,7 +202,7 @@ class _Search:
 
     @cached_property
     def _observed(self) -> OwnObservation | str:
-        requested = agent_kind(self.agent).observation(self.observation)
+        requested = agent_called(self.agent).observation(self.observation)
         return own_observation(requested) or requested
 
     @cached_property
@@ -320,11 +282,11 @@ class _Search:
 
 
 def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dict[str, tuple[Any, ...]]:
-    """`space`, or that of the agent in SPACES; ParameterError where there is none, or an entry is wrong."""
-    searched = space if space is not None else SPACES.get(agent)
+    """`space`, or that of the agent; ParameterError where there is none, or an entry is wrong."""
+    searched = space if space is not None else agent_called(agent).space
     if not searched:
         raise ParameterError(
-            f"agent {agent!r} has no space to search; expected one of {', '.join(SPACES)}, or give `space`, such as "
+            f"agent {agent!r} has no space to search; expected one of {', '.join(agents())}, or give `space`, such as "
             f"{{'learning_rate': ('log', 0.0001, 0.01)}}"
         )
     for name, choices in searched.items():
@@ -344,14 +306,6 @@ def suggested_value(trial: "optuna.Trial", name: str, choices: tuple[Any, ...]) 
     if kind == "one of":
         return trial.suggest_categorical(name, values)
     return trial.suggest_float(name, *values, log=kind == "log")
-
-
-def _default_value(agent: str, name: str) -> object:
-    """The agent's own default of a hyperparameter that the table leaves out; None where it has none."""
-    if agent_kind(agent).is_tabular:
-        return Q_LEARNING_DEFAULTS.get(name)
-    parameter = inspect.signature(algorithm(agent)).parameters.get(name)
-    return None if parameter is None or parameter.default is parameter.empty else parameter.default
 
 
 def _allows(choices: tuple[Any, ...], value: object) -> bool:
@@ -384,7 +338,7 @@ def _study(optuna: ModuleType, search: _Search, records: Sequence[Mapping[str, A
             )
         )
     if not records:
-        before = {key: search.table.get(key, _default_value(search.agent, key)) for key in search.space}
+        before = {key: search.table.get(key, agent_called(search.agent).library_default(key)) for key in search.space}
         study.enqueue_trial({key: value for key, value in before.items() if _allows(search.space[key], value)})
     return study
 

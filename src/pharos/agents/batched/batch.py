@@ -1,19 +1,16 @@
 """A batch: any number of runs, packed into lanes."""
 
+import importlib
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 
+from pharos.agents.agent import joined_states, state_of
 from pharos.agents.batched.arithmetic import is_gpu
-from pharos.agents.batched.dqn import DQNLane
-from pharos.agents.batched.lane import Lane, RunPolicy
-from pharos.agents.batched.ppo import PPOLane
+from pharos.agents.batched.lane import RunPolicy
 from pharos.agents.batched.runs import BatchRun, group_key, lane_width, lane_widths
-from pharos.agents.deep import joined_states, state_of
 from pharos.errors import ParameterError
-
-LANES: dict[str, type[Lane]] = {"dqn": DQNLane, "ppo": PPOLane}
 
 
 class Batch:
@@ -34,8 +31,9 @@ class Batch:
         self.runs = list(runs)
         is_image = runs[0].observe.is_image
         self.width = lane_width(is_image, device)  # of all lanes but the last
+        lane = importlib.import_module(f"pharos.agents.batched.{agent}").LANE
         self.lanes = [
-            LANES[agent](self.runs[i * self.width : (i + 1) * self.width], width, device)
+            lane(self.runs[i * self.width : (i + 1) * self.width], width, device)
             for i, width in enumerate(lane_widths(len(runs), is_image, device))
         ]
 

@@ -223,3 +223,7 @@ class DQNLane(Lane[QNetworks]):
             **super().stored(i),
             **{name.replace("q_net", "q_net_target", 1): value for name, value in target.items()},
         }
+
+
+LANE = DQNLane
+"""The class of lanes that batch.py makes."""

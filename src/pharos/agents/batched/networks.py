@@ -1,4 +1,4 @@
-"""W networks of one shape as one: the networks of agents/deep.py with the heads of Stable-Baselines3.
+"""W networks of one shape as one: the networks of agents/sb3.py with the heads of Stable-Baselines3.
 
 Layers have parameters with a leading axis of runs, and their gradients are written out.
 

@@ -189,3 +189,7 @@ class MinibatchUpdate:
         lane = self._lane
         lane.network.backward(lane.values, lane.gradient_views, *self._gradients)
         lane.adam()
+
+
+LANE = PPOLane
+"""The class of lanes that batch.py makes."""

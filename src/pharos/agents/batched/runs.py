@@ -3,10 +3,11 @@
 import math
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
+from pharos.agents.agent import RunShape
 from pharos.errors import ParameterError
 from pharos.mdp import ChanceSetting, TabularMDP
 
@@ -77,7 +78,7 @@ ONLY: dict[str, Any] = {
     "sde_sample_freq": -1,
     "clip_range_vf": None,
 }
-NATURE = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in deep.py
+NATURE = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in sb3.py
 MOST_REMEMBERED = 1 << 14  # states whose target values are kept
 BLOCK = 4096  # states that are observed at once
 
@@ -166,6 +167,13 @@ class BatchRun:
     chance: ChanceSetting = ChanceSetting()
     staying: np.ndarray | None = None
 
+    @property
+    def shape(self) -> RunShape:
+        """Its sizes."""
+        look = self.observe
+        sizes = self.mdp.num_actions, self.mdp.num_states
+        return RunShape(tuple(look.shape), str(look.dtype), look.is_image, look.frames, *sizes)
+
 
 def supports(agent: str, hyperparameters: Mapping[str, Any]) -> str | None:
     """None if the engine has the agent and its hyperparameters; else the first that it lacks, and why."""
@@ -205,25 +213,37 @@ def resolved(agent: str, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def group_key(agent: str, run: BatchRun, device: str = "cpu") -> Hashable:
+class SizedRun(Protocol):
+    """What `group_key` needs of a run."""
+
+    @property
+    def hyperparameters(self) -> Mapping[str, Any]: ...
+
+    @property
+    def steps(self) -> int: ...
+
+    @property
+    def shape(self) -> RunShape: ...
+
+
+def group_key(agent: str, run: SizedRun, device: str = "cpu") -> Hashable:
     """Key of a run; runs with equal keys can share a batch.
 
     On the processor they see observations of one shape. Elsewhere, where a wide lane costs hardly more than a narrow
     one, vectors share a batch with others of about their length, and small images with those of as many channels and
     about as many pixels (see `_scale`).
     """
-    options = resolved(agent, run.hyperparameters)
+    options, size = resolved(agent, run.hyperparameters), run.shape
     shared = tuple((name, repr(options[name])) for name in OF_A_BATCH[agent])
-    observation: tuple[Any, ...] = (tuple(run.observe.shape), str(run.observe.dtype), run.observe.is_image)
-    frames = run.observe.frames
+    observation: tuple[Any, ...] = (size.shape, size.dtype, size.is_image)
     remembers = device == "cpu" and agent == "dqn" and remembers_targets(run)
     if device != "cpu":
-        shape, _ = as_networks_see(tuple(run.observe.shape), run.observe.is_image)
-        if is_small(shape, run.observe.is_image):
+        shape, _ = as_networks_see(size.shape, size.is_image)
+        if is_small(shape, size.is_image):
             observation = ("small image", shape[0], _scale(shape[1] * shape[2]))
-        elif not run.observe.is_image:
+        elif not size.is_image:
             observation = ("vector", _scale(math.prod(shape)))
-    return agent, run.steps, run.mdp.num_actions, observation, frames, shared, remembers
+    return agent, run.steps, size.num_actions, observation, size.frames, shared, remembers
 
 
 def _scale(number: int) -> int:
@@ -246,18 +266,18 @@ def as_networks_see(shape: tuple[int, ...], is_image: bool) -> tuple[tuple[int, 
     return (shape[2], *shape[:2]), True
 
 
-def remembers_targets(run: BatchRun) -> bool:
+def remembers_targets(run: SizedRun) -> bool:
     """Whether DQN queries its target network for every state once per copy: fewer queries than all minibatches make.
 
     Never where several frames are seen: there are more histories than states.
     """
-    if run.observe.frames > 1:
+    if run.shape.frames > 1:
         return False
     options = resolved("dqn", run.hyperparameters)
     rollout = options["train_freq"] * options["n_envs"]
     updates = options["gradient_steps"] if options["gradient_steps"] >= 0 else rollout
     queries = options["target_update_interval"] / rollout * updates * options["batch_size"]
-    return 2 * run.mdp.num_states <= min(queries, 2 * MOST_REMEMBERED)
+    return 2 * run.shape.num_states <= min(queries, 2 * MOST_REMEMBERED)
 
 
 def _net_arch(hyperparameters: Mapping[str, Any]) -> Any:

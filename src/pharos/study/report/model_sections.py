@@ -7,7 +7,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.plots import agent_name, slug
-from pharos.study.analysis import REGRETS, Models, agreement, paper_agreement
+from pharos.study.analysis import PAPER_AGENT, REGRETS, Models, agreement, paper_agreement
 from pharos.study.figures import agents_figure
 from pharos.study.regression import Fit
 from pharos.study.report.page import Figures, ReportTable, Section, image, table
@@ -36,7 +36,7 @@ def models_section(results: Results, figures: Figures, left_out: list[str]) -> S
 def _models_of(models: Models, results: Results, figures: Figures) -> dict[str, Any]:
     import pandas as pd
 
-    paper = results.comparison is not None and models.agent == "dqn"
+    paper = results.comparison is not None and models.agent == PAPER_AGENT
     what = REGRETS[models.regret]
     heading = f"{what.capitalize()} of {agent_name(models.agent)}"
     fits = pd.DataFrame([_line(fit) for fit in models.fits])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.study.aliasing import aliasing_table, with_aliasing
-from pharos.study.analysis import REGRETS, Models, PaperComparison, compare, intervals, models
+from pharos.study.analysis import PAPER_AGENTS, REGRETS, Models, PaperComparison, compare, intervals, models
 from pharos.study.findings import findings
 from pharos.study.profiles import improvements, profiles
 from pharos.study.specification import Specification
@@ -16,8 +16,6 @@ from pharos.study.tables import cells, finished_runs, hardness_cost, hardness_ta
 
 if TYPE_CHECKING:
     import pandas as pd
-
-PAPER_AGENTS = ("dqn", "ppo")
 
 
 @dataclass(frozen=True)

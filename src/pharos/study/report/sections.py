@@ -12,7 +12,7 @@ import numpy as np
 from pharos.environments import start_distribution
 from pharos.errors import PharosError
 from pharos.plots import agent_name, slug
-from pharos.study.analysis import IMAGE, VECTOR
+from pharos.study.analysis import IMAGE, PAPER_AGENT, VECTOR
 from pharos.study.figures import label, pairs_of, representations_figure, returns_table, wide_returns
 from pharos.study.report.model_sections import agreement_section, models_section
 from pharos.study.report.page import Figures, Section, data_url, image, table
@@ -194,7 +194,7 @@ def _representations(results: Results, figures: Figures, left_out: list[str]) ->
             f"Normalised regret of {agent_name(agent)} that sees a vector against that of {agent_name(agent)} that "
             "sees an image, a point for each instance and kind of chance. Below the dotted line the image is harder."
         )
-        if results.comparison is not None and agent == "dqn":
+        if results.comparison is not None and agent == PAPER_AGENT:
             caption += " The paper's figure 3."
         parts.append({"figure": image(figures, representations_figure(agent, observation), caption), "lines": lines})
     if not parts:
