@@ -38,88 +38,116 @@ if _is_command():
         _signal.signal(_signal.SIGINT, _end_at_once)
     from pharos.system import interrupts as _interrupts  # noqa: F401  (its `atexit` is to be the first)
 
-import importlib
 import warnings as _warnings
-from typing import Any
+from typing import TYPE_CHECKING
 
 from pharos.interaction import registration as _registration  # noqa: F401  (Gymnasium's registry)
-from pharos.system.lazy import conflict as _conflict
+from pharos.system import lazy as _lazy
 
-if _conflict() is not None:
-    _warnings.warn(str(_conflict()), stacklevel=2)
+if TYPE_CHECKING:
+    from pharos import (
+        agents,
+        benchmark,
+        bisimulation,
+        drawing,
+        environments,
+        errors,
+        explorer,
+        exporters,
+        hardness,
+        importers,
+        interaction,
+        mdp,
+        observations,
+        plots,
+        policies,
+        prediction,
+        solvers,
+        state_space,
+        study,
+        training,
+    )
+    from pharos import (
+        experiments as experiments,
+    )
+    from pharos import (
+        leaderboard as leaderboard,
+    )
+    from pharos import (
+        sb3_env as sb3_env,
+    )
+    from pharos import (
+        validation as validation,
+    )
+    from pharos.environments import Environment, Layer, list_environments, make, register
+    from pharos.errors import PharosError
+    from pharos.explorer import explore
+    from pharos.interaction import GymEnv, make_vec, to_gymnax
+    from pharos.mdp import TabularMDP, lazy_actions, random_actions, sticky_actions
+    from pharos.observations import observe
+    from pharos.policies import evaluate_policy
+    from pharos.prediction import predict
+    from pharos.solvers import Solution, value_iteration
+    from pharos.state_space import StateSpace, load
+    from pharos.state_space.build import build
+    from pharos.state_space.conformance import check_environment
+    from pharos.training import train, train_many
+
+if _lazy.conflict() is not None:
+    _warnings.warn(str(_lazy.conflict()), stacklevel=2)
 
 __version__ = "0.1.0"
 
-_HOMES = {
-    "Environment": "pharos.environments",
-    "Layer": "pharos.environments",
-    "make": "pharos.environments",
-    "list_environments": "pharos.environments",
-    "register": "pharos.environments",
-    "check_environment": "pharos.state_space.conformance",
-    "build": "pharos.state_space",
-    "load": "pharos.state_space",
-    "StateSpace": "pharos.state_space",
-    "TabularMDP": "pharos.mdp",
-    "sticky_actions": "pharos.mdp",
-    "random_actions": "pharos.mdp",
-    "lazy_actions": "pharos.mdp",
-    "Solution": "pharos.solvers",
-    "value_iteration": "pharos.solvers",
-    "evaluate_policy": "pharos.policies",
-    "observe": "pharos.observations",
-    "GymEnv": "pharos.interaction",
-    "make_vec": "pharos.interaction",
-    "to_gymnax": "pharos.interaction",
-    "train": "pharos.training",
-    "train_many": "pharos.training",
-    "predict": "pharos.prediction",
-    "explore": "pharos.explorer",
-    "PharosError": "pharos.errors",
-}
-# Modules that stand in another folder than their public name says.
-_MODULES = {
-    "bisimulation": "pharos.bisimulation",
-    "experiments": "pharos.experiments",
-    "leaderboard": "pharos.leaderboard",
-    "sb3_env": "pharos.sb3_env",
-    "validation": "pharos.validation",
-}
-_PACKAGES = (
-    "errors",
-    "environments",
+__all__ = [
+    "Environment",
+    "GymEnv",
+    "Layer",
+    "PharosError",
+    "Solution",
+    "StateSpace",
+    "TabularMDP",
+    "__version__",
+    "agents",
+    "benchmark",
+    "bisimulation",
+    "build",
+    "check_environment",
     "drawing",
-    "state_space",
-    "mdp",
-    "solvers",
+    "environments",
+    "errors",
+    "evaluate_policy",
+    "explore",
+    "explorer",
+    "exporters",
     "hardness",
     "importers",
-    "exporters",
-    "observations",
     "interaction",
-    "policies",
-    "agents",
-    "training",
-    "prediction",
+    "lazy_actions",
+    "list_environments",
+    "load",
+    "make",
+    "make_vec",
+    "mdp",
+    "observations",
+    "observe",
     "plots",
+    "policies",
+    "predict",
+    "prediction",
+    "random_actions",
+    "register",
+    "solvers",
+    "state_space",
+    "sticky_actions",
     "study",
-    "benchmark",
-    "explorer",
-)
+    "to_gymnax",
+    "train",
+    "train_many",
+    "training",
+    "value_iteration",
+]
 
-__all__ = [*_HOMES, *_PACKAGES, "bisimulation", "__version__"]
-
-
-def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        value = getattr(importlib.import_module(_HOMES[name]), name)
-        globals()[name] = value
-        return value
-    if name in _PACKAGES:
-        return importlib.import_module(f"pharos.{name}")
-    if name in _MODULES:
-        return importlib.import_module(_MODULES[name])
-    raise AttributeError(f"module 'pharos' has no attribute {name!r}")
+__getattr__ = _lazy.attributes(__name__)
 
 
 def __dir__() -> list[str]:

@@ -3,6 +3,7 @@
 import ast
 import functools
 import importlib
+import os
 import re
 import subprocess
 import sys
@@ -118,7 +119,8 @@ def test_imports_point_to_what_comes_before():
 
 @pytest.mark.slow
 def test_nothing_stands_on_study_and_benchmark():
-    users = {(path, name) for path, name, _ in imports() if name.split(".")[1] in TOP}
+    found = [(path, name) for path, name, _ in imports() if path != "__init__.py"]  # whose names load late
+    users = {(path, name) for path, name in found if name.split(".")[1] in TOP}
     below = {(path, name) for path, name in users if part_of(path) not in {*USERS_OF_TOP, name.split(".")[1]}}
     assert {f"{path}: {name}" for path, name in below if (path, name.split(".")[1]) not in LICENSED} == set()
     assert {part_of(path) for path, _ in users} >= TOP | USERS_OF_TOP
@@ -260,3 +262,46 @@ def names_in(text: str) -> list[tuple[str, str]]:
     for package, names in re.findall(r"from pharos\.(\w+) import ([\w, ]+)", text):
         found += [(package, name.split()[0]) for name in names.split(",") if package in PACKAGES]
     return found
+
+
+# Types ----------------------------------------------------------------------------------------------------------------
+
+
+SCRIPT = """
+env = pharos.make("frozen_lake/4x4")
+space = pharos.build(env)
+mdp = pharos.sticky_actions(space.mdp(gamma=0.99), 0.25)
+solution = pharos.value_iteration(mdp)
+reveal_type(env)  # Environment
+reveal_type(space)  # StateSpace
+reveal_type(mdp)  # TabularMDP
+reveal_type(solution.value_at_start)  # float
+reveal_type(pharos.hardness.diameter(mdp))  # Interval
+reveal_type(pharos.train("q_learning", env, steps=100))  # TrainingResult
+reveal_type(pharos.make_vec(env, 4))  # VectorEnv
+"""
+
+
+@pytest.mark.long
+def test_every_public_name_has_a_type_for_checkers(tmp_path):
+    api = pytest.importorskip("mypy.api")
+    names = [name for name in pharos.__all__ if name != "__version__"]
+    parts = [name for name in names if hasattr(getattr(pharos, name), "__path__")]
+    names += [f"{part}.{name}" for part in parts for name in getattr(pharos, part).__all__]
+    assert len(names) > 200
+    script, refused = tmp_path / "script.py", "pharos.value_iteration(space)\n"
+    script.write_text("import pharos\n" + "".join(f"reveal_type(pharos.{name})\n" for name in names) + SCRIPT + refused)
+    options = (
+        "--follow-imports=silent",
+        "--no-error-summary",
+        f"--cache-dir={tmp_path}",
+        f"--config-file={os.devnull}",
+    )
+    lines = [line.partition(f"{script}:")[2] for line in api.run([str(script), *options])[0].splitlines()]
+    types = [line.partition("Revealed type is ")[2] for line in lines if "Revealed type" in line]
+    expected = [line.partition("# ")[2] for line in SCRIPT.splitlines() if "# " in line]
+    untyped = [name for name, kind in zip(names, types[: len(names)], strict=True) if kind in ("", '"Any"')]
+    assert not untyped
+    for kind, ending in zip(types[len(names) :], expected, strict=True):
+        assert kind.endswith(f'{ending}"'), kind
+    assert [line for line in lines if "error:" in line and "[arg-type]" in line and "StateSpace" in line]

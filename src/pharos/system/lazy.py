@@ -15,7 +15,7 @@ from pathlib import Path
 
 
 def attributes(package: str) -> Callable[[str], object]:
-    """The `__getattr__` of a package: the names that its `__init__.py` imports under `TYPE_CHECKING`.
+    """The `__getattr__` of a package: the names that its `__init__.py` imports under `TYPE_CHECKING`, modules included.
 
     Args:
         package: its `__name__`.
@@ -35,6 +35,8 @@ def attributes(package: str) -> Callable[[str], object]:
         if name.startswith("__") or name not in places():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module, name_there = places()[name]
+        if module == package:
+            return importlib.import_module(f"{package}.{name_there}")
         value = getattr(importlib.import_module(module), name_there)
         setattr(sys.modules[package], name, value)
         return value
