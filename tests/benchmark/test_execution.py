@@ -299,8 +299,9 @@ def test_a_process_that_dies_takes_the_run_with_it_that_it_was_at(suite, tmp_pat
     die = "    import os\n    if seed == 1:\n        os._exit(3)\n"
     (tmp_path / "mine.py").write_text(LEARN.replace("    draw =", die + "    draw ="))
     agent = f"{tmp_path / 'mine.py'}:learn"
-    end = benchmark.run(agent, suite, out=tmp_path / "out", seeds=range(3), tasks="sea", workers=1)
-    assert list(end.missing) == ["sea, seed 1"] and "its process ended" in end.missing["sea, seed 1"]
+    with pytest.raises(AllRunsFailed) as error:
+        benchmark.run(agent, suite, out=tmp_path / "out", seeds=range(3), tasks="sea", workers=1)
+    assert list(error.value.outcome.missing) == ["sea, seed 1"]
     runs = sorted(path.parent.name for path in (tmp_path / "out").glob("runs/sea/*/run.json"))
     assert runs == ["seed-0", "seed-2"]
 
