@@ -295,6 +295,18 @@ def test_a_full_disk_is_said_by_the_runs_of_a_generator(suite, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_process_that_dies_takes_the_run_with_it_that_it_was_at(suite, tmp_path):
+    die = "    import os\n    if seed == 1:\n        os._exit(3)\n"
+    (tmp_path / "mine.py").write_text(LEARN.replace("    draw =", die + "    draw ="))
+    agent = f"{tmp_path / 'mine.py'}:learn"
+    with pytest.raises(AllRunsFailed) as error:
+        benchmark.run(agent, suite, out=tmp_path / "out", seeds=range(3), tasks="sea", workers=1)
+    assert list(error.value.outcome.missing) == ["sea, seed 1"]
+    runs = sorted(path.parent.name for path in (tmp_path / "out").glob("runs/sea/*/run.json"))
+    assert runs == ["seed-0", "seed-2"]
+
+
+@pytest.mark.slow
 def test_streams_may_be_closed_and_a_folder_need_not_be_of_utf8(suite, file, tmp_path):
     """As a job scheduler begins it; processes of the generator have closed streams as well."""
     write_suite(suite, tmp_path / "small.yaml")

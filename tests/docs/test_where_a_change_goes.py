@@ -70,7 +70,7 @@ class Halves(Observation):
 AGENT = '''
 import numpy as np
 
-from pharos.agents.agent import TableAgent
+from pharos.agents.agent import TableBasedAgent
 
 
 class AlwaysRight:
@@ -92,7 +92,7 @@ class AlwaysRight:
         self.steps = int(state["steps"])
 
 
-class AlwaysRightAgent(TableAgent):
+class AlwaysRightAgent(TableBasedAgent):
     def table(self, run):
         return AlwaysRight(run.task.mdp)
 

@@ -115,11 +115,8 @@ class RunShape:
     num_states: float
 
 
-class PlannedRun(Protocol):
-    """A run of which the sizes alone are known, see `pharos.training.schedule`."""
-
-    @property
-    def config(self) -> Any: ...
+class SizedRun(Protocol):
+    """A run of which the sizes are known."""
 
     @property
     def hyperparameters(self) -> Mapping[str, Any]: ...
@@ -129,6 +126,13 @@ class PlannedRun(Protocol):
 
     @property
     def shape(self) -> RunShape: ...
+
+
+class PlannedRun(SizedRun, Protocol):
+    """A run whose states need not be built, see `pharos.training.Shapes`."""
+
+    @property
+    def config(self) -> Any: ...
 
 
 AtPoint = Callable[[int], Mapping[str, Any] | None]
@@ -305,7 +309,7 @@ class TableLearner(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TableAgent(Agent):
+class TableBasedAgent(Agent):
     """An agent that learns a table over the states, whose index it sees; runs on few states train together.
 
     Tables are the same with each engine, so theirs is always "sb3".

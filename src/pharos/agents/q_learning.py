@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents.agent import LearningRun, TableAgent
+from pharos.agents.agent import LearningRun, TableBasedAgent
 from pharos.agents.idealised import Idealised
 from pharos.errors import ParameterError, UnknownName
 from pharos.mdp import TabularMDP
@@ -196,7 +196,7 @@ def checked_options(changes: Mapping[str, Any]) -> dict[str, Any]:
     return options
 
 
-class QLearningAgent(TableAgent):
+class QLearningAgent(TableBasedAgent):
     """Q-learning as an agent that has a name."""
 
     def library_default(self, name: str) -> object:

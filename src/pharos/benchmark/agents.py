@@ -12,11 +12,9 @@
 import contextlib
 import hashlib
 import inspect
-import multiprocessing
 import os
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +28,7 @@ from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
 from pharos.system.sources import Source, find, is_reference, load, source_of
 from pharos.system.wording import in_one_line
-from pharos.system.workers import check_guard, end_with_parent, without_interrupts, without_main
+from pharos.system.workers import Workers, one_thread
 from pharos.training import (
     Curve,
     RunConfig,
@@ -38,6 +36,7 @@ from pharos.training import (
     TaskCache,
     check_agent,
     clear_run,
+    dealt,
     evaluate_agent,
     plan,
     read_record,
@@ -52,7 +51,6 @@ from pharos.training import (
 )
 
 EXACT = ("oracle", "random")
-THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 Tell = Callable[[float, str], None]
 """tell(share of the steps that are done, text)."""
@@ -252,35 +250,53 @@ class GeneratedForm(Form):
             yield _generate(self.learn, self.label, job, protocol)
 
     def _in_processes(self, jobs: Sequence[Job], protocol: Protocol, workers: int) -> Iterator[str | None]:
-        """Yield None or an error message for each run, in the order in which the runs end."""
-        if not jobs:
-            return
+        """Yield None or an error message for each run, in the order in which the runs end.
+
+        Where a process dies, the run that it was at has failed, and another process goes on with the others.
+        """
         assert self.source is not None
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(min(workers, len(jobs)), context, _begin, (dict.fromkeys(THREADS, "1"),))
-        try:
-            with without_main(self.learn), without_interrupts():
-                ends = {pool.submit(_generate_from, self.source, self.label, job, protocol): job for job in jobs}
-            for end in as_completed(ends):
-                error = end.exception()  # its process is gone, or could not write: its folder says nothing
-                if isinstance(error, OSError):
-                    self.errors[ends[end].folder] = f"{error.strerror or error}; the same command goes on"
-                yield end.result() if error is None else in_one_line(error)
-        finally:
-            processes = list((pool._processes or {}).values())
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in processes:
-                process.terminate()
-                process.join()
-            for process in processes:
-                check_guard(process.exitcode)
+        seconds = [job.task.seconds.get(self.label, 1.0) for job in jobs]
+        left = {
+            str(part): deque(jobs[i] for i in sorted(indices)) for part, indices in enumerate(dealt(seconds, workers))
+        }
+        with Workers() as pool, one_thread():
+
+            def start(key: str) -> None:
+                pool.start(key, _generate_all, (self.source, self.label, list(left[key]), protocol), [self.learn])
+
+            for key in left:
+                start(key)
+            while pool:
+                for key, event in pool.events():
+                    if not isinstance(event, int):  # one of its runs has ended
+                        (error,) = event
+                        yield self._ended(left[key].popleft(), error)
+                    elif left[key]:
+                        yield self._ended(left[key].popleft(), f"its process ended with exit code {event}")
+                        if left[key]:
+                            start(key)
+
+    def _ended(self, job: Job, error: str | OSError | None) -> str | None:
+        """Note the error of a run that could not write its own, as of a full disk or a process that is gone."""
+        if isinstance(error, OSError):
+            self.errors[job.folder] = f"{error.strerror or error}; the same command goes on"
+            return in_one_line(error)
+        return error
 
 
-def _begin(variables: Mapping[str, str]) -> None:
-    """Prepare a worker process: it ends with its parent, and its standard output goes to standard error."""
-    end_with_parent()
-    os.environ.update(variables)
+def _generate_all(
+    source: Source, label: str, jobs: Sequence[Job], protocol: Protocol, send: Callable[[tuple[object]], None]
+) -> None:
+    """The body of a process: run one job after the other, and send (None,) or (error,) after each.
+
+    Its standard output goes to standard error.
+    """
     os.dup2(2, 1)
+    for job in jobs:
+        try:
+            send((_generate_from(source, label, job, protocol),))
+        except OSError as error:
+            send((error,))
 
 
 def _generate_from(source: Source, label: str, job: Job, protocol: Protocol) -> str | None:

@@ -46,7 +46,7 @@ Source = AgentResults | str | os.PathLike
 
 
 @dataclass(frozen=True)
-class Agent:
+class ScoredAgent:
     """An agent on the page: its name, its results and their scores."""
 
     name: str
@@ -65,13 +65,13 @@ class Contents:
     """
 
     suite: Suite
-    agent: Agent
-    beside: Sequence[Agent]
+    agent: ScoredAgent
+    beside: Sequence[ScoredAgent]
     comparisons: Sequence[Comparison]
     predictor: str
 
     @property
-    def agents(self) -> list[Agent]:
+    def agents(self) -> list[ScoredAgent]:
         """The agent of the report, then its baselines."""
         return [self.agent, *self.beside]
 
@@ -102,11 +102,11 @@ def contents_of(
     if predictor not in (None, "none", *PREDICTORS):
         raise ParameterError(f"predictor {predictor}; expected one of {', '.join(PREDICTORS)}, none")
     others = [results_of(each) for each in beside]
-    agents: list[Agent] = []
+    agents: list[ScoredAgent] = []
     for source, each in zip((results, *beside), (own, *others), strict=True):
         names = [agent.name.lower() for agent in agents]
         name = next(name for name in _names(source, each.agent, not agents) if name.lower() not in names)
-        agents.append(Agent(name, each, score(each, suite)))
+        agents.append(ScoredAgent(name, each, score(each, suite)))
     comparisons = [compare(own, each, suite=suite) for each in others]
     return Contents(suite, agents[0], agents[1:], comparisons, predictor or kind_of(own))
 
@@ -133,7 +133,7 @@ def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:
     yield from (f"{name} ({k})" for k in count(2))
 
 
-def regret_of(agent: Agent, task: BenchmarkTask) -> ConfidenceInterval | None:
+def regret_of(agent: ScoredAgent, task: BenchmarkTask) -> ConfidenceInterval | None:
     """Normalised regret of an agent on a task, clipped to [0, 1]; None where it did not run."""
     own = agent.score.tasks.get(task.name)
     return None if own is None else ConfidenceInterval(1 - own.value, 1 - own.high, 1 - own.low)
@@ -202,12 +202,12 @@ def description(task: BenchmarkTask) -> str:
     return f"{world}; {sight}; {f'chance {chance}' if chance else 'no chance added'}"
 
 
-def final_regret(agent: Agent, task: BenchmarkTask) -> float:
+def final_regret(agent: ScoredAgent, task: BenchmarkTask) -> float:
     """Normalised regret of an agent at the last evaluation of a task, each run's clipped to [0, 1]."""
     return float(np.clip(agent.results.curves[task.name][:, -1], 0.0, 1.0).mean())
 
 
-def learning_curve(agent: Agent, names: Sequence[str]) -> list[ConfidenceInterval]:
+def learning_curve(agent: ScoredAgent, names: Sequence[str]) -> list[ConfidenceInterval]:
     """Mean over tasks of normalised regret at each evaluation, each run's clipped to [0, 1]; empty if one was not run.
 
     Args:

@@ -26,8 +26,8 @@ from pharos.benchmark.contents import (
     LEARNERS,
     PREDICTORS,
     RESIDUAL,
-    Agent,
     Contents,
+    ScoredAgent,
     Source,
     contents_of,
     description,
@@ -210,7 +210,7 @@ def _core(contents: Contents) -> Element | None:
     )
 
 
-def _is_single(one: Agent, other: Agent) -> bool:
+def _is_single(one: ScoredAgent, other: ScoredAgent) -> bool:
     return min(len(each.results.seeds) for each in (one, other)) == 1
 
 

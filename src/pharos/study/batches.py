@@ -25,7 +25,7 @@ from pharos.study.blocks import Run
 from pharos.study.worker import BATCHES
 from pharos.system import storage
 from pharos.system.storage import ResultCache, cache_directory
-from pharos.training import RunConfig, Shapes, lanes
+from pharos.training import RunConfig, Shapes, halves, lanes
 
 if TYPE_CHECKING:
     from pharos.training import Task
@@ -168,7 +168,7 @@ class Batches:
     def halve(self, batch: Sequence[Run]) -> None:
         """Halve a batch whose process was killed too often: its runs start anew, in batches of half its size."""
         ids = {run.id for run in batch}
-        self.sizes |= dict.fromkeys(ids, max(1, len(batch) // 2))
+        self.sizes |= {run.id: len(half) for half in halves(batch) for run in half}
         for folder, others in self._checkpoints().items():
             if ids & others:
                 shutil.rmtree(folder, ignore_errors=True)

@@ -13,6 +13,7 @@ import contextlib
 import shutil
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +29,7 @@ from pharos.training import results as _results
 from pharos.training.curve import joint_values
 from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
 from pharos.training.results import Checkpoint, Record, TrainingResult, clear_run, finished_result
-from pharos.training.schedule import lanes
+from pharos.training.schedule import halves, lanes
 from pharos.training.task import RunConfig
 
 
@@ -139,12 +140,31 @@ class TrainingJobs:
     def run(self) -> list[TrainingResult | FailedRun]:
         """Train all runs; return their results in order."""
         for group in self._groups():
-            TrainingGroup(self, group).train()
+            waiting = deque([group])
+            while waiting:
+                runs, before = waiting.popleft(), self.done
+                failure = TrainingGroup(self, runs).train()
+                if failure is not None:
+                    self.done = before
+                    waiting.extendleft(reversed(self._halves(runs, failure)))
         if self.checkpoints is not None and self.checkpoints.is_dir():
             for folder in (*self.checkpoints.iterdir(), self.checkpoints):
                 with contextlib.suppress(OSError):  # it is not empty
                     folder.rmdir()
         return [self.results[place] for place in range(len(self.configs))]
+
+    def _halves(self, group: list[PreparedRun], failure: Exception) -> list[list[PreparedRun]]:
+        """Halves of a group that needed too much memory, or whose program one run has ended; they begin anew."""
+        parts = halves([PreparedRun(each.place, each.config, each.folder, each.tasks) for each in group])
+        reason = "out of memory" if _is_memory(failure) else in_one_line(failure)
+        if reason not in self.reasons:
+            self.reasons.add(reason)
+            warnings.warn(
+                f"{reason}: {pluralize(len(group), 'run')} at once; "
+                f"goes on with {pluralize(len(parts[0]), 'run')} at once",
+                stacklevel=2,
+            )
+        return parts
 
     def fail(self, place: int, error: Exception) -> None:
         """Raise the error of a run that could not begin where `raises` is set, else record it as a FailedRun."""
@@ -258,13 +278,12 @@ class TrainingGroup:
         self.has_begun = self.holds = False  # whether runs are marked as running; whether checkpoints are this batch's
         self.held = contextlib.ExitStack()  # the folder of checkpoints, or that of a run alone
 
-    def train(self) -> None:
-        """Train the group; in halves where it needs too much memory, or where one run ends the program."""
-        before = self.jobs.done
+    def train(self) -> Exception | None:
+        """Train the group. Returns None, or the error that has ended the program of several runs."""
         with self.held:
             try:
                 self._train()
-                return
+                return None
             except CallbackError as stop:
                 (cause,) = stop.args
                 if self.jobs.raises and self.is_alone and isinstance(cause, Exception):
@@ -276,23 +295,10 @@ class TrainingGroup:
                 failure = error
                 vars(self).pop("learner", None)
                 self._remove_checkpoint()
-        # One run alone has failed; several are tried again in halves
-        if len(self.group) == 1:
-            self._fail(failure)
-            return
-        middle = len(self.group) // 2
-        reason = "out of memory" if _is_memory(failure) else in_one_line(failure)
-        if reason not in self.jobs.reasons:
-            self.jobs.reasons.add(reason)
-            warnings.warn(
-                f"{reason}: {pluralize(len(self.group), 'run')} at once; "
-                f"goes on with {pluralize(middle, 'run')} at once",
-                stacklevel=2,
-            )
-        self.jobs.done = before
-        for part in (self.group[:middle], self.group[middle:]):
-            fresh = [PreparedRun(each.place, each.config, each.folder, each.tasks) for each in part]
-            TrainingGroup(self.jobs, fresh).train()
+        if len(self.group) > 1:
+            return failure
+        self._fail(failure)
+        return None
 
     def _train(self) -> None:
         began, compiled = time.perf_counter(), compiling.seconds()

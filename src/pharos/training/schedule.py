@@ -119,7 +119,7 @@ def _shape(config: RunConfig, unknown: str) -> RunShape:
 
 @dataclass(frozen=True)
 class _Sizes:
-    """A run as `Agent.group_key` takes it: a `pharos.agents.agent.PlannedRun`."""
+    """A run as `Agent.group_key` takes it: a `PlannedRun`."""
 
     config: RunConfig
     shapes: Shapes

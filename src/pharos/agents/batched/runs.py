@@ -3,11 +3,11 @@
 import math
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from pharos.agents.agent import RunShape
+from pharos.agents.agent import RunShape, SizedRun
 from pharos.errors import ParameterError
 from pharos.mdp import ChanceSetting, TabularMDP
 
@@ -211,19 +211,6 @@ def resolved(agent: str, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
     if agent == "dqn" and not isinstance(result["train_freq"], int):
         result["train_freq"] = int(result["train_freq"][0])
     return result
-
-
-class SizedRun(Protocol):
-    """What `group_key` needs of a run."""
-
-    @property
-    def hyperparameters(self) -> Mapping[str, Any]: ...
-
-    @property
-    def steps(self) -> int: ...
-
-    @property
-    def shape(self) -> RunShape: ...
 
 
 def group_key(agent: str, run: SizedRun, device: str = "cpu") -> Hashable:
