@@ -7,11 +7,12 @@ import pytest
 from test_reach import CHANCES
 
 from pharos import solvers
-from pharos.agents.batched import make_batch
+from pharos.agents import agent_called
 from pharos.mdp import TabularMDP, lazy_actions, sticky_actions
 from pharos.policies import Evaluation, TableAnswers, is_small_table, table_values
 from pharos.training import ChanceSetting, RunConfig, TaskCache, evaluate_agent
 from pharos.training.curve import joint_values
+from pharos.training.prepared import PreparedRun
 
 SETTING = {"steps": 300, "horizon": 16, "evaluation_interval": 100, "engine": "batched"}
 
@@ -110,8 +111,8 @@ def test_the_runs_of_a_batch_have_the_values_that_each_has_alone(agent):
         return RunConfig(environment="simple_grid", chance=chance, agent=agent, seed=seed, **SETTING)
 
     cells = [(sticky, seed) for sticky in (0.25, 0.1) for seed in range(3)]
-    group = [tasks.prepare(seed, config(sticky, seed), None) for sticky, seed in cells]
-    batch = make_batch(agent, [run.run for run in group])
+    group = [PreparedRun(seed, config(sticky, seed), None, tasks) for sticky, seed in cells]
+    batch = agent_called(agent).learner(group, "cpu")
     batch.learn([150], lambda point: None)
     values = joint_values(batch, group)
     assert values == {i: evaluate_agent(batch.policy(i), run.task) for i, run in enumerate(group)}
