@@ -39,7 +39,7 @@ def simulated():
             rng.normal(*shape, MANY)
             for shape in ((0.04, 0.03), (0.08, 0.04), (0.15, 0.07), (0.36, 0.12), (0.79, 0.15), (0.85, 0.1))
         ],
-        "one rung": [_failing(share, rng) for share in (0.0, 0.0, 0.0, 0.3, 1.0, 1.0)],
+        "one-rung": [_failing(share, rng) for share in (0.0, 0.0, 0.0, 0.3, 1.0, 1.0)],
     }
     rungs = {axis: {f"{axis}-{level}": runs for level, runs in enumerate(own)} for axis, own in ladders.items()}
     suite = Suite(

@@ -31,6 +31,8 @@ from pharos.agents import primary_predictors
 from pharos.prediction import Published
 from pharos.prediction.learners import primary_regret
 from pharos.prediction.prediction import FILE
+from pharos.statistics import spearman
+from pharos.study.cross_validation import held_out
 from pharos.study.tables import CELL
 from pharos.training import RunConfig
 
@@ -125,16 +127,13 @@ def judge(file, resamples):
 def said_of(cells, resamples):
     """The columns of a row of the table: of the cells, with intervals over classes drawn anew."""
     rng, known = np.random.default_rng(0), of(cells)
-    names = np.unique(known.classes)
-    samples = []
-    for _ in range(resamples):
-        drawn = [cells[cells["environment"] == name].assign(environment=f"{name} {n}", study=f"{name} {n}")
-                 for n, name in enumerate(rng.choice(names, len(names)))]  # fmt: skip
-        samples.append(statistics(of(pd.concat(drawn))))
-    low, high = np.nanquantile(samples, [0.025, 0.975], axis=0)
+    number = len(np.unique(known.classes))
+    drawn = [np.bincount(rng.choice(number, number), minlength=number) for _ in range(resamples)]
+    values = statistics(known, np.array([np.ones(number, int), *drawn]))
     r_squared, rho, unfitted, pairs = (
-        f"{value:.2f} ({a:.2f} to {b:.2f})" for value, a, b in zip(statistics(known), low, high, strict=True)
-    )
+        f"{each[0]:.2f} ({low:.2f} to {high:.2f})"
+        for each in values for low, high in [np.nanquantile(each[1:], [0.025, 0.975])]
+    )  # fmt: skip
     width = f"± {known.half_width():.2f} | {known.coverage():.2f}"
     return f"{r_squared} | {rho} | {pairs} of {len(known.pairs.first)} | {unfitted} | {width}"
 
@@ -204,25 +203,24 @@ def of(cells):
     return Published(cells["environment"].to_numpy(str), mdps.to_numpy(str), *numbers)
 
 
-def statistics(known):
-    """(R2 of classes left out, rank correlation, R2 without a fit, share of pairs in order)."""
-    from scipy.stats import spearmanr
+def statistics(known, counts):
+    """((R,) R2 of classes left out, (R,) rank correlation, (R,) R2 without a fit, (R,) share of pairs in order).
 
-    x, y, classes = known.predicted, known.observed, known.classes
-    counts = {name: np.sum(classes == name) for name in np.unique(classes)}
-    weights = np.array([1 / counts[name] for name in classes])
-    told = np.empty(len(y))
-    for name in counts:
-        use = classes != name
-        slope, level = np.polyfit(x[use], y[use], 1, w=np.sqrt(weights[use]))
-        told[~use] = level + slope * x[~use]
-    mean = np.average(y, weights=weights)
-    total = np.sum(weights * (y - mean) ** 2)
+    Args:
+        counts: (R, C) how often each class counts in each of R samples. A class is left out wherever it stands.
+    """
+    x, y, classes = known.predicted, known.observed, np.unique(known.classes, return_inverse=True)[1]
+    number, pairs = counts.shape[1], known.pairs
+    sizes, total = np.bincount(classes), counts.sum(axis=1)
+    mean, squares, errors = (counts @ (np.bincount(classes, of) / sizes) / total for of in (y, y**2, (y - x) ** 2))
+    right = np.bincount(classes[pairs.first], pairs.right(x), minlength=number)
+    of_pairs = counts @ np.bincount(classes[pairs.first], minlength=number)
+    rows = [np.repeat(np.arange(len(y)), count[classes]) for count in counts]
     return (
-        1 - np.sum(weights * (y - told) ** 2) / total,
-        spearmanr(x.round(9), y.round(9)).statistic,
-        1 - np.sum(weights * (y - x) ** 2) / total,
-        known.pairs.agreement(x),
+        held_out(x[:, None], y, classes, counts)[0],
+        np.array([spearman(x[some], y[some]) for some in rows]),
+        1 - errors / (squares - mean**2),
+        np.divide(counts @ right, of_pairs, out=np.full(len(counts), np.nan), where=of_pairs > 0),
     )
 
 

@@ -54,7 +54,7 @@ def outputs():
     ours, theirs, levels = strata(0), strata(1), np.array([1.0, 2.0, 4.0, 8.0])
     weights = [0.3] * 8
     rng = np.random.default_rng(5)
-    curves = [rng.random((7, number)) for number in (3, 1, 6)]
+    curves = [rng.random((7, number)) for number in (3, 2, 6)]
     rng = np.random.default_rng(7)
     classes = np.repeat(np.arange(6), 5)
     y = rng.random(30) + classes / 6
@@ -217,8 +217,40 @@ def test_the_interval_of_a_crossing_is_that_of_plain_python(regrets, target):
         return
     levels = [1.0, 2.0, 4.0, 8.0]
     low, high = fieller_interval(np.array(levels), [np.array(each) for each in regrets], target)
-    assert low == pytest.approx(naive.crossing_of_limit(levels, regrets, 1, target), abs=4 / 64)
-    assert high == pytest.approx(naive.crossing_of_limit(levels, regrets, -1, target), abs=4 / 64)
+    assert low == pytest.approx(naive.crossing_of_limit(levels, regrets, 1, target), abs=1e-9)
+    assert high == pytest.approx(naive.crossing_of_limit(levels, regrets, -1, target), abs=1e-9)
+
+
+def test_ends_of_the_interval_of_a_crossing_are_where_students_interval_ends_at_the_target():
+    """Between levels of few and many runs, one without spread; SciPy's interval of a mean at a level itself."""
+    rng, levels = np.random.default_rng(0), np.array([1.0, 2.0, 5.0])
+    for _ in range(20):
+        rungs = [rng.uniform(0.1, 0.3, 3), np.full(4, 0.45), rng.uniform(0.7, 0.9, 9)]
+        low, high = fieller_interval(levels, rungs, 0.5)
+        assert 1.0 <= low <= high <= 5.0
+        for end, side in ((low, 1), (high, -1)):
+            left = 0 if end < 2.0 else 1
+            share = (end - levels[left]) / (levels[left + 1] - levels[left])
+            weights = {left: 1.0 - share, left + 1: share}
+            error = standard_error([rungs[i] for i in weights], list(weights.values()))
+            mean = sum(weight * rungs[i].mean() for i, weight in weights.items())
+            assert student_interval(mean, *error)[2 if side > 0 else 1] == pytest.approx(0.5, abs=1e-12)
+    runs = np.array([0.2, 0.4, 0.3, 0.35])
+    upper = stats.t.interval(0.95, 3, runs.mean(), stats.sem(runs))[1]
+    low, high = fieller_interval(levels[:2], [runs, np.full(2, 1.0)], upper + 1e-9)
+    assert low == pytest.approx(1.0, abs=1e-6) and low > 1.0
+    assert fieller_interval(levels[:2], [runs, np.full(2, 1.0)], upper - 1e-9)[0] == -math.inf
+
+
+@pytest.mark.slow
+def test_intervals_of_a_crossing_cover_it():
+    """Normal runs about 0.05, 0.3, 0.7, 0.95: the crossing of 0.5 is halfway between the second and the third level."""
+    rng, levels = np.random.default_rng(0), np.array([1.0, 2.0, 4.0, 8.0])
+    intervals = [
+        fieller_interval(levels, [rng.normal(mean, 0.15, 5) for mean in (0.05, 0.3, 0.7, 0.95)], 0.5)
+        for _ in range(2000)
+    ]
+    assert 0.94 <= np.mean([low <= 3.0 <= high for low, high in intervals]) <= 0.97
 
 
 def test_the_interval_of_a_crossing_of_exact_means_is_the_crossing_and_of_one_run_nothing():
@@ -243,7 +275,6 @@ def test_an_interval_contains_the_estimate_and_shrinks_with_more_runs():
 
 
 def test_intervals_are_scipys_to_the_last_digit():
-    """SciPy refuses strata of one run, which draw no numbers here."""
     for seed, confidence in ((0, 0.95), (7, 0.8)):
         expected = stats.bootstrap(
             strata(seed),
@@ -253,17 +284,8 @@ def test_intervals_are_scipys_to_the_last_digit():
             confidence_level=confidence,
             random_state=np.random.default_rng(seed),
         ).confidence_interval
-        alone = [np.full(1, 0.25), *strata(seed)]
         options = {"confidence": confidence, "resamples": 300, "seed": seed}
-
-        def without_first(_, *rest, axis):
-            return interquartile_mean(*rest, axis=axis)
-
         assert interval(strata(seed), **options) == pytest.approx((expected.low, expected.high), abs=1e-15)
-        lower, upper = bootstrap_interval(
-            alone, lambda one, *rest, axis: interquartile_mean(*rest, axis=axis), **options
-        )
-        assert (lower, upper) == pytest.approx((expected.low, expected.high), abs=1e-15)
 
 
 def test_an_interval_of_equal_results_is_a_point():
@@ -274,20 +296,33 @@ def test_an_interval_of_equal_results_is_a_point():
 def test_the_interval_is_that_of_resampling_each_task_by_a_loop():
     """The twin of the vectorised bootstrap; both ends within four standard errors of such a quantile."""
     rng = np.random.default_rng(3)
-    tasks = [rng.normal(size=5), rng.normal(2, 3, size=4), np.array([7.0])]
+    tasks = [rng.normal(size=5), rng.normal(2, 3, size=4), np.array([7.0, 7.0])]
     draws = [interquartile_mean(*(rng.choice(task, len(task)) for task in tasks)) for _ in range(4000)]
     for end, tail in zip(interval(tasks, resamples=4000), (0.025, 0.975), strict=True):
         near = np.quantile(draws, [max(0, tail - 0.014), min(1, tail + 0.014)])
         assert near[0] <= end <= near[1]
 
 
-def test_runs_are_drawn_whole_and_tasks_of_one_run_stay_as_they_are():
+def test_runs_are_drawn_whole():
     runs = np.random.default_rng(0).normal(size=(5, 3))
     twice = np.concatenate([runs, runs], axis=1).T  # (6 points, 5 runs): points 3 to 5 repeat 0 to 2
     lower, upper = bootstrap_interval([twice], lambda task, axis: task.mean(axis=axis), resamples=50)
     assert (lower[:3] == lower[3:]).all() and (upper[:3] == upper[3:]).all() and (lower < upper).all()
-    lower, upper = bootstrap_interval([np.zeros((2, 4)), np.full((2, 1), 8.0)], mean_of_means)
+    lower, upper = bootstrap_interval([np.zeros((2, 4)), np.full((2, 2), 8.0)], mean_of_means)
     assert lower.tolist() == upper.tolist() == [4.0, 4.0]
+
+
+@pytest.mark.parametrize("numbers", [(1,), (1, 1, 1, 1, 1), (5, 1), (1, 40, 40)])
+def test_a_task_of_one_run_leaves_no_interval_as_it_leaves_no_standard_error(numbers):
+    """Its run might have been any other: resamples of five such tasks all agree, which says nothing of the mean."""
+    tasks = [np.arange(3.0 * number).reshape(3, number) for number in numbers]
+    ends = bootstrap_interval(tasks, mean_of_means, resamples=20)
+    assert all(end.shape == (3,) and np.isnan(end).all() for end in ends)
+    assert np.isnan(interval([task[0] for task in tasks])).all()
+    assert math.isnan(mean_interval([task[0] for task in tasks])[1])
+    two = [np.concatenate([task, task + 1], axis=1) for task in tasks]
+    lower, upper = bootstrap_interval(two, mean_of_means, resamples=200)
+    assert (lower < upper).all()
 
 
 def test_a_bootstrap_of_nothing_and_of_what_is_not_finite_is_refused():

@@ -24,7 +24,7 @@ CONFIDENCE = 0.95
 TIE_TOLERANCE = 1e-9  # of the spread: what differs by less is rounding, and has one rank
 ZERO_VARIANCE = 1e-30  # equal numbers whose mean is rounded vary by less
 RESAMPLED = 1 << 22  # numbers that one batch of resamples may hold
-GRID = 256  # points of a segment between two levels, where `fieller_interval` compares a band with its target
+GRID = 256  # points of a segment between two levels, between which `fieller_interval` looks for a root
 
 Strata = Sequence[np.ndarray]
 UNBOUNDED = (-math.inf, math.inf)
@@ -192,18 +192,19 @@ def fieller_interval(levels: np.ndarray, strata: Strata, target: float) -> tuple
     """Return the 95 % interval of the level at which a mean that is linear between levels crosses a target from below.
 
     It holds the levels at which Student's interval of the interpolated mean contains the target: from the first one
-    whose upper limit reaches it to the last one whose lower limit does not exceed it.
+    whose upper limit reaches it to the last one whose lower limit does not exceed it. Both ends are roots, found to
+    rounding between neighbours of 256 points of a segment.
 
     Args:
         levels: (L,) increasing. strata: for each level the values of its runs.
     Returns:
         NaN and NaN if a level has one run; -/+ infinity for an end beyond the first or last level.
-    Cost: 256 points between two levels.
     Source: Fieller (1954), Some problems in interval estimation.
 
     >>> fieller_interval(np.array([1.0, 3.0]), [np.array([0.0, 0.0]), np.array([1.0, 1.0])], target=0.5)
     (2.0, 2.0)
     """
+    from scipy.optimize import brentq
     from scipy.special import stdtrit
 
     sizes = np.array([len(own) for own in strata])
@@ -211,26 +212,34 @@ def fieller_interval(levels: np.ndarray, strata: Strata, target: float) -> tuple
         return math.nan, math.nan
     means, variances = np.array([own.mean() for own in strata]), _variances(strata) / sizes
     variances[variances < ZERO_VARIANCE] = 0.0
-    # Mean and half width of Student's interval on a fine grid of levels, interpolated between neighbours
-    grid, position = levels, np.arange(len(levels), dtype=np.float64)
-    if len(levels) > 1:
-        position = np.linspace(0.0, len(levels) - 1.0, GRID * (len(levels) - 1) + 1)
-        grid = np.interp(position, np.arange(len(levels)), levels)
-    left = np.minimum(position.astype(int), max(len(levels) - 2, 0))
-    right = np.minimum(left + 1, len(levels) - 1)
-    share = position - left
-    parts = np.stack([(1.0 - share) ** 2 * variances[left], share**2 * variances[right]])
-    total = parts.sum(axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        degrees = total**2 / (parts[0] ** 2 / (sizes[left] - 1) + parts[1] ** 2 / (sizes[right] - 1))
-        half = np.where(total > 0.0, stdtrit(degrees, (1.0 + CONFIDENCE) / 2.0) * np.sqrt(total), 0.0)
-    mean = (1.0 - share) * means[left] + share * means[right]
-    reaching, staying = np.flatnonzero(mean + half >= target), np.flatnonzero(mean - half <= target)
-    low = -math.inf if reaching.size and reaching[0] == 0 else grid[reaching[0]] if reaching.size else levels[-1]
-    high = (
-        math.inf if staying.size and staying[-1] == len(grid) - 1 else grid[staying[-1]] if staying.size else levels[0]
-    )
-    return float(low), float(high)
+    last = len(levels) - 1
+
+    def excess(position: Any, side: int) -> Any:
+        """Upper (side 1) or lower (side -1) limit of the mean less the target; positions count levels from 0."""
+        left = np.minimum(np.asarray(position).astype(int), max(last - 1, 0))
+        right = np.minimum(left + 1, last)
+        share = position - left
+        parts = np.stack([(1.0 - share) ** 2 * variances[left], share**2 * variances[right]])
+        total = parts.sum(axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            degrees = total**2 / (parts[0] ** 2 / (sizes[left] - 1) + parts[1] ** 2 / (sizes[right] - 1))
+            half = np.where(total > 0.0, stdtrit(degrees, (1.0 + CONFIDENCE) / 2.0) * np.sqrt(total), 0.0)
+        return (1.0 - share) * means[left] + share * means[right] + side * half - target
+
+    def level(outside: float, inside: float, side: int) -> float:
+        root = brentq(excess, outside, inside, args=(side,), xtol=1e-15)
+        return float(np.interp(root, np.arange(last + 1), levels))
+
+    grid = np.linspace(0.0, last, GRID * last + 1)
+    reaching, staying = np.flatnonzero(excess(grid, 1) >= 0.0), np.flatnonzero(excess(grid, -1) <= 0.0)
+    low, high = (float(levels[-1]), float(levels[0]))  # without a level that holds the target
+    if reaching.size:
+        first = reaching[0]
+        low = level(grid[first - 1], grid[first], 1) if first > 0 else -math.inf
+    if staying.size:
+        first = staying[-1]
+        high = level(grid[first + 1], grid[first], -1) if first < len(grid) - 1 else math.inf
+    return low, high
 
 
 def _variances(strata: Strata) -> np.ndarray:
@@ -250,7 +259,7 @@ def bootstrap_interval(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return both ends of the percentile bootstrap interval of a statistic of several strata.
 
-    Each stratum is resampled with replacement by itself; one of a single run stays as it is.
+    Each stratum is resampled with replacement by itself.
 
     Args:
         strata: arrays (..., N) of N runs each; N may differ. The other axes are drawn together, such as all points of
@@ -258,13 +267,14 @@ def bootstrap_interval(
         statistic: `statistic(*strata, axis=-1)`, vectorised over all other axes.
         confidence, resamples, seed: of the bootstrap.
     Returns:
-        lower, upper: of the shape of the statistic; NaN if it is NaN for a resample.
+        lower, upper: of the shape of the statistic; NaN if it is NaN for a resample, or if a stratum has one run: that
+            does not say how runs vary.
     Raises:
         ParameterError: there is no stratum, or one is empty or has an entry that is not finite.
     Cost: `resamples` times the statistic, in batches.
     Source: Efron and Tibshirani (1993), An introduction to the bootstrap, section 13.3; draws as scipy.stats.bootstrap.
 
-    >>> low, high = bootstrap_interval([np.array([0.0, 1.0]), np.array([0.5])], mean_of_means)
+    >>> low, high = bootstrap_interval([np.array([0.0, 1.0]), np.array([0.5, 0.5])], mean_of_means)
     >>> float(low), float(high)
     (0.25, 0.75)
     """
@@ -275,14 +285,14 @@ def bootstrap_interval(
         )
     if not all(np.isfinite(array).all() for array in arrays):
         raise ParameterError("a bootstrap needs finite results; found NaN or infinity")
-    if max(array.shape[-1] for array in arrays) == 1:
-        value = np.asarray(statistic(*arrays, axis=-1))
-        return value, value
+    if min(array.shape[-1] for array in arrays) == 1:
+        nothing = np.full_like(np.asarray(statistic(*arrays, axis=-1), np.float64), np.nan)
+        return nothing, nothing
     rng, values = np.random.default_rng(seed), []
     batch = max(1, RESAMPLED // sum(array.size for array in arrays))
     for first in range(0, resamples, batch):
         size = min(batch, resamples - first)
-        drawn = [array[..., _indices(array.shape[-1], size, rng)] for array in arrays]
+        drawn = [array[..., rng.integers(0, array.shape[-1], (size, array.shape[-1]))] for array in arrays]
         values.append(statistic(*drawn, axis=-1))
     ascending, tail = np.sort(np.concatenate(values, axis=-1), axis=-1), (1 - confidence) / 2
     return _quantile(ascending, tail), _quantile(ascending, 1 - tail)
@@ -295,11 +305,6 @@ def _quantile(ascending: np.ndarray, share: float) -> np.ndarray:
     above, fraction = min(int(position), number - 1), position % 1
     between = (1 - fraction) * ascending[..., above - 1] + fraction * ascending[..., above]
     return np.where(np.isnan(ascending[..., -1]), np.nan, between)
-
-
-def _indices(number: int, resamples: int, rng: np.random.Generator) -> np.ndarray:
-    """(R, N) runs of each resample; nothing is drawn from one run."""
-    return rng.integers(0, number, (resamples, number)) if number > 1 else np.zeros((resamples, 1), np.int64)
 
 
 def percentiles(values: np.ndarray, *shares: float) -> np.ndarray:

@@ -1,14 +1,17 @@
 """The paper's findings, on cells whose truth is known."""
 
 import importlib
+import itertools
 import math
 
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import strategies as st
 from scipy import stats
 
 from pharos import study
+from strategies import examples
 
 _findings = importlib.import_module("pharos.study.findings")
 
@@ -284,15 +287,53 @@ def test_classes_that_lack_an_observation_are_no_data():
 @pytest.mark.parametrize("number", (6, 10, 18, 44))
 def test_the_interval_of_a_difference_holds_what_the_signed_rank_test_does_not_exclude(number):
     differences = np.random.default_rng(number).normal(0.3, 1, number)
-    effect, lower, upper = _findings._shift(differences)
+    (effect, lower, upper), p = _findings._signed_ranks(differences)
     assert lower < effect < upper
+    assert p == pytest.approx(stats.wilcoxon(differences, method="exact").pvalue, rel=1e-9)
     for inside, outside in ((lower + 1e-6, lower - 1e-6), (upper - 1e-6, upper + 1e-6)):
         assert stats.wilcoxon(differences - inside, method="exact").pvalue > 0.05
         assert stats.wilcoxon(differences - outside, method="exact").pvalue <= 0.05
 
 
 def test_five_differences_have_no_interval():
-    assert _findings._shift(np.arange(1.0, 6.0)) == (3.0, -math.inf, math.inf)
+    assert _findings._signed_ranks(np.arange(1.0, 6.0)) == ((3.0, -math.inf, math.inf), 0.0625)
+
+
+@pytest.mark.parametrize("paper", ("image", "vector"))
+def test_a_verdict_has_the_sign_of_the_effect_beside_it(paper):
+    """More tasks in which vectors are slightly harder, but clearly less regret with them: images have more regret."""
+    cells = made(instances=16)[lambda rows: rows["agent"] == "dqn"]
+    environment = {"image": "simple_grid", "vector": "freeway"}[paper]
+    differences = np.concatenate([-np.arange(1, 18), np.arange(18, 33)]) / 1000
+    for name, regret in (("vector", 0.5), ("simple_image", 0.5 + differences)):
+        cells.loc[(cells["environment"] == environment) & (cells["observation"] == name), "normalized_regret"] = regret
+    assert np.median(differences) < 0 < np.mean(differences)
+    row = verdicts(cells)[OBSERVATION, environment]
+    assert row.p < 0.05 and 0 < row.lower < row.effect < row.upper
+    assert (row.ours, row.verdict) == ("image", "agrees" if paper == "image" else "disagrees")
+
+
+@examples(300, st.lists(st.integers(-4, 9), min_size=1, max_size=24))
+def test_the_signed_rank_test_its_effect_and_its_interval_agree(integers):
+    """With ties and zeros too: significant if and only if the interval excludes 0, and then on the effect's side."""
+    differences = np.array(integers) / 8
+    (effect, lower, upper), p = _findings._signed_ranks(differences)
+    assert lower <= effect <= upper and 0 < p <= 1
+    assert (p < 0.05) == (lower > 0 or upper < 0)
+    if p < 0.05:
+        assert (effect > 0) == (lower > 0)
+    mirrored, same = _findings._signed_ranks(-differences)
+    assert same == p and mirrored == (-effect, -upper, -lower)
+
+
+def test_the_signed_rank_test_is_exact_on_all_signs():
+    """Of all 2^9 signs of nine differences each is as likely: the share with as small a sum of ranks, both sides."""
+    sizes = np.array([0.3, 1.1, 0.2, 0.7, 2.0, 0.5, 0.9, 1.3, 0.1])
+    signs = np.array(list(itertools.product((-1, 1), repeat=9)))
+    sums = np.where(signs > 0, stats.rankdata(sizes), 0).sum(axis=1)
+    for row, total in list(zip(signs, sums, strict=True))[::37]:
+        share = np.mean((sums <= min(total, 45 - total)) | (sums >= max(total, 45 - total)))
+        assert _findings._signed_ranks(row * sizes)[1] == pytest.approx(share)
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """The study's statistics against their formulas, and against fits done another way."""
 
+import math
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -157,4 +159,8 @@ def test_profiles_and_improvements_compare_what_has_runs_on_the_same_tasks():
     seen = table[(table["observation"] == "vector")]
     assert (seen["lower"] <= seen["share"]).all() and (seen["share"] <= seen["upper"]).all()
     assert seen.loc[seen["score"] < 0.75, "share"].min() == 1.0 and seen.loc[seen["score"] > 0.81, "share"].max() == 0.0
+    assert table.loc[table["observation"] == "index", ["lower", "upper"]].isna().all(axis=None)  # one run
+    alone = pd.concat([runs.iloc[:-1], runs.iloc[:1].assign(instance="c"), runs.iloc[3:4].assign(instance="c")])
+    (row,) = improvements(alone, resamples=50).itertuples()  # on a third task both have one run
+    assert row.tasks == 3 and row.probability == 0.0 and math.isnan(row.lower) and math.isnan(row.upper)
     assert improvements(runs.assign(normalized_regret=np.nan)).empty and profiles(runs.iloc[:0]).empty

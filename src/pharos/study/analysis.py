@@ -120,8 +120,7 @@ def _pooled_r_squared(fits: Sequence[Fit], model: str) -> float | None:
 def intervals(rows: "pd.DataFrame", *, resamples: int = 1000) -> "pd.DataFrame":
     """Interquartile mean of the normalised regret for each class, agent and observation, with 95 % bootstrap interval.
 
-    Runs are resampled within each task (instance and chance), as Agarwal et al. (2021) do; NaN where no task has two
-    runs.
+    Runs are resampled within each task (instance and chance), as Agarwal et al. (2021) do; NaN if a task has one run.
     """
     import pandas as pd
 
@@ -136,8 +135,7 @@ def intervals(rows: "pd.DataFrame", *, resamples: int = 1000) -> "pd.DataFrame":
         lower, upper = bootstrap_interval(tasks, interquartile_mean, resamples=resamples)
         line = dict(zip(("environment", "agent", "observation"), key, strict=True))
         line |= {"tasks": len(tasks), "runs": len(defined)}
-        ends = (float(lower), float(upper)) if max(map(len, tasks)) > 1 else (float("nan"),) * 2
-        lines.append(line | {"iqm": float(interquartile_mean(*tasks)), "lower": ends[0], "upper": ends[1]})
+        lines.append(line | {"iqm": float(interquartile_mean(*tasks)), "lower": float(lower), "upper": float(upper)})
     columns = ["environment", "agent", "observation", "tasks", "runs", "iqm", "lower", "upper"]
     return pd.DataFrame(lines, columns=columns)
 
@@ -150,7 +148,7 @@ def mean_curve(
     Args:
         tasks: for each task an array (runs, T).
     Returns:
-        mean, lower, upper: (T,) each.
+        mean, lower, upper: (T,) each; both ends NaN if a task has one run.
     """
     curves = [np.asarray(task).T for task in tasks]
     lower, upper = bootstrap_interval(curves, mean_of_means, resamples=resamples, seed=seed)

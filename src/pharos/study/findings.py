@@ -124,39 +124,39 @@ def _compared(
     cells: "pd.DataFrame", finding: str, environment: str, paper: str, sides: Mapping[str, tuple[str, str]]
 ) -> dict[str, Any]:
     """Finding on which of two pairs of agent and observation, in `sides`, has more regret on the tasks of a class."""
-    from scipy import stats
-
     part = cells[cells["environment"] == environment]
     wide = part.pivot_table(index=["instance", "chance"], columns=["agent", "observation"], values="normalized_regret")
     (first, one), (second, other) = sides.items()
     if not {one, other} <= set(wide.columns) or len(both := wide[[one, other]].dropna()) == 0:
         return _nothing(finding, environment, paper, "no task with both")
     difference = both[one].to_numpy(float) - both[other].to_numpy(float)
-    p = float(stats.wilcoxon(difference).pvalue) if (difference != 0).any() else 1.0
-    ours = first if np.median(difference) > 0 else second
+    effect, p = _signed_ranks(difference)
+    ours = first if effect[0] > 0 else second
     evidence = (
         f"{first} {both[one].mean():.3f}, {second} {both[other].mean():.3f} of random play's regret; {first} harder in "
         f"{int((difference > 0).sum())} of {len(difference)} tasks"
     )
     power = _power_of_mean(SMALLEST_DIFFERENCE, float(difference.std(ddof=1)), len(difference)) if p < 1 else math.nan
-    verdict, effect = _verdict(ours == paper, p), _shift(difference)
-    return _row(finding, environment, paper, ours, evidence, p, verdict, power, effect)
+    return _row(finding, environment, paper, ours, evidence, p, _verdict(ours == paper, p), power, effect)
 
 
-def _shift(differences: np.ndarray) -> Effect:
-    """The estimate by Hodges and Lehmann of paired differences; its interval holds what the signed-rank test does not
-    exclude, everything where there are fewer than six.
+def _signed_ranks(differences: np.ndarray) -> tuple[Effect, float]:
+    """The estimate by Hodges and Lehmann of paired differences, its interval, and the two-sided p-value of Wilcoxon's
+    signed-rank test, by the exact distribution without ties. Averages of two differences that are 0 count as evidence
+    for either side, so the interval holds 0 if p >= LEVEL, and everything with fewer than six differences.
 
-    Source: Hollander, Wolfe and Chicken (2014), Nonparametric statistical methods, sections 3.2 and 3.3.
+    Source: Hollander, Wolfe and Chicken (2014), Nonparametric statistical methods, sections 3.1 to 3.3.
     """
     first, second = np.triu_indices(len(differences))
     averages = np.sort((differences[first] + differences[second]) / 2)
     chances = np.ones(1)  # probabilities of each sum of the positive ranks under the null hypothesis
     for rank in range(1, len(differences) + 1):
         chances = (np.pad(chances, (0, rank)) + np.pad(chances, (rank, 0))) / 2
-    excluded = int((np.cumsum(chances) <= LEVEL / 2).sum())
+    tail = np.cumsum(chances)
+    excluded = int((tail <= LEVEL / 2).sum())
     ends = (averages[excluded - 1], averages[-excluded]) if excluded else (-math.inf, math.inf)
-    return float(np.median(averages)), float(ends[0]), float(ends[1])
+    p = min(1.0, 2 * float(tail[min((averages >= 0).sum(), (averages <= 0).sum())]))
+    return (float(np.median(averages)), float(ends[0]), float(ends[1])), p
 
 
 def _verdict(agrees: bool, p: float) -> str:
@@ -338,14 +338,14 @@ def _vectors_explained_better(models: Models, resamples: int) -> dict[str, Any]:
 
     ends = bootstrap_interval([np.arange(len(tasks))], difference, resamples=resamples)
     lower, upper = map(float, ends)
-    verdict = "agrees" if lower > 0 else "disagrees" if upper < 0 else "undecided"
+    value = float(difference(np.arange(len(tasks)), 0))
+    verdict = "agrees" if min(value, lower) > 0 else "disagrees" if max(value, upper) < 0 else "undecided"
     ours = f"R² {vector.r_squared:.2f} with vectors, {image.r_squared:.2f} with images"
     evidence = f"difference {lower:+.2f} to {upper:+.2f} (95 %, {len(tasks)} tasks resampled)"
     error = (upper - lower) / (2 * NORMAL)
     printed = _PRINTED_R2["vector"] - _PRINTED_R2["image"]
     power = _power_of_error(printed, error)
-    effect = (float(difference(np.arange(len(tasks)), 0)), lower, upper)
-    return _row(finding, "all", paper, ours, evidence, math.nan, verdict, power, effect)
+    return _row(finding, "all", paper, ours, evidence, math.nan, verdict, power, (value, lower, upper))
 
 
 def _power_of_error(effect: float, error: float) -> float:

@@ -32,7 +32,7 @@ def profiles(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame":
         runs: as from `table`.
     Returns:
         Columns `environment`, `agent`, `observation`, `score` (the threshold), `share` (of runs above it), `lower`,
-        `upper`, `tasks`. Tasks whose regret cannot be normalised are left out.
+        `upper` (NaN if a task has one run), `tasks`. Tasks whose regret cannot be normalised are left out.
     """
     import pandas as pd
 
@@ -68,7 +68,7 @@ def improvements(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame
         runs: as from `table`.
     Returns:
         Columns IMPROVEMENT_COLUMNS; `ours` and `theirs` are pairs "agent, observation" that have runs on the same
-        tasks; the interval is the 95 % stratified bootstrap's.
+        tasks; the interval is the 95 % stratified bootstrap's, NaN if a task has one run.
     """
     import pandas as pd
 

@@ -125,10 +125,7 @@ def _regret(results: Results, figures: Figures) -> Section:
     marks = ["" if exact[key] else "≈ " for key in keys]
     shown = estimates.assign(
         iqm=[f"{mark}{value:.3f}" for mark, value in zip(marks, estimates["iqm"], strict=True)],
-        interval=[
-            f"{low:.3f} to {high:.3f}" if np.isfinite(low) else "one run a task"
-            for low, high in zip(estimates["lower"], estimates["upper"], strict=True)
-        ],
+        interval=_intervals(estimates, 3),
     )
     columns = ["environment", "agent", "observation", "tasks", "runs", "iqm", "interval"]
     return Section(
@@ -143,22 +140,23 @@ def _regret(results: Results, figures: Figures) -> Section:
         table=table(
             shown[columns],
             "Interquartile mean of the normalised regret (0: optimal from the first episode on; 1: as bad as acting "
-            "at random) and its 95 % stratified bootstrap interval. With few seeds such intervals are too narrow. ≈: "
-            "some values are estimated.",
+            "at random) and its 95 % stratified bootstrap interval. With few seeds such intervals are too narrow; n/a: "
+            "a task has one run. ≈: some values are estimated.",
         ),
     )
+
+
+def _intervals(rows: "pd.DataFrame", digits: int) -> list[str]:
+    """Texts of the columns `lower` and `upper`; n/a if there is no interval."""
+    ends = zip(rows["lower"], rows["upper"], strict=True)
+    return [f"{low:.{digits}f} to {high:.{digits}f}" if np.isfinite(low) else "n/a" for low, high in ends]
 
 
 def _profiles(results: Results, figures: Figures) -> Section | None:
     """Profiles and improvements; None where there is but one agent and observation."""
     if len(results.improvements) == 0:
         return None
-    shown = results.improvements.assign(
-        interval=[
-            f"{low:.2f} to {high:.2f}"
-            for low, high in zip(results.improvements["lower"], results.improvements["upper"], strict=True)
-        ]
-    ).drop(columns=["lower", "upper"])
+    shown = results.improvements.assign(interval=_intervals(results.improvements, 2)).drop(columns=["lower", "upper"])
     return Section(
         "Profiles",
         "regret",
@@ -171,7 +169,8 @@ def _profiles(results: Results, figures: Figures) -> Section | None:
         table=table(
             shown,
             "How probable it is that a run of the first has less regret than one of the second on the same task, the "
-            "mean over tasks, with the 95 % stratified bootstrap interval; 0.5: no difference.",
+            "mean over tasks, with the 95 % stratified bootstrap interval (n/a: a task has one run); 0.5: no "
+            "difference.",
             digits=2,
         ),
     )

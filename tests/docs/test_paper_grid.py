@@ -1,0 +1,56 @@
+"""The tables of large instances in docs/evidence/paper-grid.md, digit by digit from the packed runs."""
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("pyarrow.parquet")
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "evidence" / "paper-grid.md").read_text(encoding="utf-8")
+RETURN = "return, mean ± deviation"
+# How the text above a table begins -> packed runs, agent, observation, and its columns of (return ± deviation, policies
+# at the end, normalised regret)
+TABLES = {
+    "**The large instances**": ("paper", "dqn", "vector", (1, 2, 4)),
+    "**With the small Freeway's": ("crossing", "dqn", "vector", (1, 2, 4)),
+    "**DQN with images**": ("paper", "dqn", "simple_image", (1, 2, 4)),
+    "**PPO with vectors on": ("paper", "ppo", "vector", (1, 2, 3)),
+    "**PPO with images**": ("paper", "ppo", "simple_image", (1, 2, 4)),
+    "**Breakout with chance**, DQN": ("paper", "dqn", "vector", (2, 3, 4)),
+    "**Breakout with chance**, DQN and PPO": ("paper", "ppo", "vector", (5, 6, 7)),
+    "**Breakout with chance, PPO with": ("paper", "ppo", "simple_image", (2, 3, 4)),
+}
+
+
+def rows_below(words):
+    """Cells of the rows of the first table with returns and deviations below a text."""
+    text = PAGE[PAGE.index(words) :]
+    table = text[text.index(RETURN) :].split("\n\n")[0]
+    return [[cell.strip(" `") for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+
+
+def check(text, number):
+    """The printed number is this one, rounded once to its digits."""
+    digits = len(text.partition(".")[2])
+    assert float(text) == float(f"{number:.{digits}f}"), f"{text} is {number}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", TABLES)
+def test_the_large_tables_are_those_of_the_packed_runs(words, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    study, agent, observation, (of_return, of_policies, of_regret) = TABLES[words]
+    runs = importlib.import_module("article").packed(f"{study}/runs.parquet")[0]
+    runs = runs[(runs["agent"] == agent) & (runs["observation"] == observation)]
+    rows = [row for row in rows_below(words) if not row[0].startswith("ten Freeways")]
+    assert len(rows) >= 10
+    for row in rows:
+        chance = row[1] if "with chance" in words else "plain"
+        some = runs[(runs["instance"] == row[0]) & (runs["chance"] == chance)]
+        mean, deviation = row[of_return].split(" ± ")
+        check(mean, some["return"].mean())
+        check(deviation, some["return"].std(ddof=1))
+        for text, value in zip(row[of_policies].split(", "), sorted(some["final_value"]), strict=True):
+            check(text, value)
+        check(row[of_regret], some["normalized_regret"].mean())

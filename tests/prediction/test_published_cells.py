@@ -1,0 +1,93 @@
+"""Statistics of the published cells, which benchmarks/prediction_cells.py prints, beside plain loops; and the pages."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from benchmark_modules import benchmark
+from pharos.prediction import Published
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+@pytest.fixture(scope="module")
+def cells():
+    return benchmark("prediction_cells")
+
+
+def published(classes=5):
+    """Classes of different sizes, whose regrets go with predictions."""
+    rng = np.random.default_rng(0)
+    names = np.repeat([f"class-{c}" for c in range(classes)], rng.integers(4, 9, classes))
+    mdps = np.array([f"{name} {i % 2}" for i, name in enumerate(names)])
+    x = rng.random(len(names))
+    y = x + rng.normal(0, 0.3, len(names)) + np.unique(names, return_inverse=True)[1] / classes
+    return Published(names, mdps, x, y, np.ones(len(names)), np.ones(len(names)))
+
+
+def plainly(known, count):
+    """The four statistics of a sample of classes, copy by copy; a class is left out with all of its copies."""
+    copies = [name for name, number in zip(np.unique(known.classes), count, strict=True) for _ in range(number)]
+    rows = [np.flatnonzero(known.classes == name) for name in copies]
+    x, y = known.predicted, known.observed
+    estimates = []
+    for name, own in zip(copies, rows, strict=True):
+        rest = [other for each, other in zip(copies, rows, strict=True) if each != name]
+        weights = np.sqrt(np.concatenate([np.full(len(other), 1 / len(other)) for other in rest]))
+        slope, level = np.polyfit(x[np.concatenate(rest)], y[np.concatenate(rest)], 1, w=weights)
+        estimates.append(level + slope * x[own])
+    mean = np.mean([y[own].mean() for own in rows])
+    total = sum(np.mean((y[own] - mean) ** 2) for own in rows)
+    errors = sum(np.mean((y[own] - each) ** 2) for own, each in zip(rows, estimates, strict=True))
+    together = np.concatenate(rows)
+    right, pairs = 0, 0
+    for own in rows:
+        for i, first in enumerate(own):
+            for second in own[i + 1 :]:
+                if known.mdps[first] == known.mdps[second] and abs(y[first] - y[second]) > 0.05:
+                    pairs, right = pairs + 1, right + ((x[first] > x[second]) == (y[first] > y[second]))
+    return (
+        1 - errors / total,
+        stats.spearmanr(x[together], y[together]).statistic,
+        1 - sum(np.mean((y[own] - x[own]) ** 2) for own in rows) / total,
+        right / pairs,
+    )
+
+
+@pytest.mark.parametrize("count", [(1, 1, 1, 1, 1), (2, 0, 1, 1, 1), (0, 3, 1, 0, 1), (1, 0, 3, 1, 0), (0, 0, 1, 2, 2)])
+def test_statistics_of_a_sample_of_classes_are_those_of_plain_loops(cells, count):
+    known = published()
+    found = [float(each[0]) for each in cells.statistics(known, np.array([count]))]
+    assert found == pytest.approx(plainly(known, count), abs=1e-9)
+
+
+def test_a_class_that_is_drawn_twice_is_not_predicted_from_its_copy(cells):
+    """Points (0, 0) and (1, 1), four times each, and (2, 0): lines through the others say 2, 0 and 2."""
+    names, x, y = np.repeat(["a", "b", "c"], 2), np.repeat([0.0, 1.0, 2.0], 2), np.repeat([0.0, 1.0, 0.0], 2)
+    known = Published(names, names, x, y, np.ones(6), np.ones(6))
+    r_squared, _, _, pairs = cells.statistics(known, np.array([[4, 4, 1]]))
+    assert r_squared == pytest.approx([1 - (4 * 4 + 4 * 1 + 1 * 4) / (20 / 9)])
+    assert np.isnan(pairs).all()  # no regrets of an MDP differ
+
+
+@pytest.mark.slow
+def test_the_pages_have_the_numbers_of_the_cells(cells, capsys):
+    cells.judge(cells.FILE, 1000)
+    lines = capsys.readouterr().out.splitlines()
+    evidence, page = ((DOCS / name).read_text(encoding="utf-8") for name in ("evidence/sealed-1.md", "prediction.md"))
+    assert len(lines) == 6
+    for line in lines:
+        assert line in evidence
+        name, agent, count, r_squared, rho, pairs, _, width, coverage = line.strip("| ").split(" | ")
+        if name == "all 26":
+            assert f"| {agent} | {count} | {r_squared} | {rho} | {pairs} | {width} | {coverage} |" in page
+
+
+def test_classes_of_one_size_weigh_alike_if_their_cells_do():
+    """All sealed classes have as many cells of an agent, so that weights explain no difference between two tables."""
+    cells = pd.read_csv(DOCS / "studies" / "sealed-1" / "cells.csv")
+    sizes = cells.groupby(["agent", "environment"]).size()
+    assert len(sizes) == 28 and set(sizes) == {7}
