@@ -70,8 +70,27 @@ def test_samples_of_classes_count_each_as_often_as_it_was_drawn():
         aims = y[rows]
         expected = 1 - weights @ (aims - predicted) ** 2 / (weights @ (aims - aims.mean()) ** 2)
         assert score == pytest.approx(expected)
-        first = np.unique(rows, return_index=True)[1]
-        assert correlation == pytest.approx(spearman(predicted[first], aims[first]))
+        assert correlation == pytest.approx(spearman(predicted, aims))
+
+
+@pytest.mark.slow
+def test_intervals_over_classes_cover_the_rank_correlation():
+    """Classes differ in the predictor and by a part that it does not tell; the truth is that of 20,000 classes."""
+
+    def world(rng, number):
+        classes = np.repeat(np.arange(number), 7)
+        x = 1.5 * rng.normal(size=number)[classes] + rng.normal(size=len(classes))
+        return x, x + 0.8 * rng.normal(size=number)[classes] + 0.5 * rng.normal(size=len(classes)), classes
+
+    rng = np.random.default_rng(0)
+    truth = spearman(*world(rng, 20_000)[:2])
+    covered = []
+    for seed in range(200):
+        x, y, classes = world(rng, 26)
+        counts = held_out.resampled_classes(26, 200, seed)
+        low, high = np.percentile(held_out.held_out(x[:, None], y, classes, counts)[1], (2.5, 97.5))
+        covered.append(low <= truth <= high)
+    assert 0.91 <= np.mean(covered) <= 0.98
 
 
 def test_permutations_give_each_class_the_predictors_of_another():
