@@ -42,10 +42,11 @@ def calibration(y: np.ndarray, predicted: np.ndarray, classes: np.ndarray) -> tu
 
 
 def resampled_classes(count: int, resamples: int, seed: int) -> Counts:
-    """(R, C) counts of classes drawn anew, at least three different ones in each sample (two, of two)."""
+    """(R, C) counts of classes drawn anew, at least three different ones in each sample; none of fewer than four
+    classes, which make but one such sample."""
     rng = np.random.default_rng(seed)
     drawn = rng.multinomial(count, np.full(count, 1 / count), resamples)
-    return drawn[(drawn > 0).sum(axis=1) >= min(3, count)]
+    return drawn[((drawn > 0).sum(axis=1) >= 3) & (count > 3)]
 
 
 def held_out(x: np.ndarray, y: np.ndarray, classes: np.ndarray, counts: Counts) -> tuple[np.ndarray, np.ndarray]:
