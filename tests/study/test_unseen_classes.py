@@ -7,7 +7,7 @@ import pytest
 from pharos import study
 from pharos.errors import ParameterError
 from pharos.prediction.pairs import Pairs
-from pharos.statistics import permutation_p_value, r_squared, spearman
+from pharos.statistics import percentiles, permutation_p_value, r_squared, spearman
 from pharos.study import PredictedCells, leave_one_class_out
 from pharos.study import cross_validation as held_out
 from pharos.study.predictions import late
@@ -70,8 +70,27 @@ def test_samples_of_classes_count_each_as_often_as_it_was_drawn():
         aims = y[rows]
         expected = 1 - weights @ (aims - predicted) ** 2 / (weights @ (aims - aims.mean()) ** 2)
         assert score == pytest.approx(expected)
-        first = np.unique(rows, return_index=True)[1]
-        assert correlation == pytest.approx(spearman(predicted[first], aims[first]))
+        assert correlation == pytest.approx(spearman(predicted, aims))
+
+
+@pytest.mark.slow
+def test_intervals_over_classes_cover_the_rank_correlation():
+    """Classes differ in the predictor and by a part that it does not tell; the truth is that of 20,000 classes."""
+
+    def world(rng, number):
+        classes = np.repeat(np.arange(number), 7)
+        x = 1.5 * rng.normal(size=number)[classes] + rng.normal(size=len(classes))
+        return x, x + 0.8 * rng.normal(size=number)[classes] + 0.5 * rng.normal(size=len(classes)), classes
+
+    rng = np.random.default_rng(0)
+    truth = spearman(*world(rng, 20_000)[:2])
+    covered = []
+    for seed in range(200):
+        x, y, classes = world(rng, 26)
+        counts = held_out.resampled_classes(26, 200, seed)
+        low, high = np.percentile(held_out.held_out(x[:, None], y, classes, counts)[1], (2.5, 97.5))
+        covered.append(low <= truth <= high)
+    assert 0.91 <= np.mean(covered) <= 0.98
 
 
 def test_permutations_give_each_class_the_predictors_of_another():
@@ -140,6 +159,31 @@ def test_pairs_of_observations_of_one_mdp_are_compared():
     pairs = Pairs.of(y, mdps)
     assert (len(pairs.first), pairs.agreement(x)) == (number, right / number)
     assert pairs.agreement(np.zeros(24)) == 0.5
+
+
+def test_pairs_of_a_single_class_have_no_interval_over_classes():
+    """However often it is drawn, its share is the same: an interval without width, which holds nothing but itself."""
+    y, x, mdps = np.array([0.0, 1.0, 2.0, 0.5, 0.5]), np.array([0.0, 2.0, 1.0, 1.5, 0.7]), np.array([0, 0, 0, 1, 1])
+    counts = np.array([[1, 1, 1], [2, 0, 1], [0, 2, 1]])
+    pairs = Pairs.of(y, mdps)
+    assert pairs.agreement(x) == pytest.approx(2 / 3)
+    assert np.isnan(pairs.interval(x, np.array([0, 0, 0, 1, 1]), counts)).all()
+    assert np.isnan(Pairs.of(np.zeros(5), mdps).interval(x, np.array([0, 0, 0, 1, 1]), counts)).all()
+    low, high = Pairs.of(y, np.array([0, 0, 1, 1, 2])).interval(x, np.array([0, 0, 1, 1, 2]), counts)
+    assert low < 0.1 and high > 0.9  # one of two pairs is in order, each in a class of its own
+
+
+@pytest.mark.parametrize("classes", (2, 3, 4))
+def test_intervals_over_classes_need_four(classes):
+    """Three that differ, drawn from three, are those three: all samples would be one, and intervals without width."""
+    x, y, number, mdps = design(classes=classes, predictors=1)
+    counts = held_out.resampled_classes(classes, 200, 0)
+    assert (counts.sum(axis=1) == classes).all() and ((counts > 0).sum(axis=1) >= 3).all()
+    assert len(np.unique(counts, axis=0)) == {2: 0, 3: 0, 4: 13}[classes]  # (1, 1, 1, 1), and twelve of (2, 1, 1, 0)
+    ends = [percentiles(each, 2.5, 97.5) for each in held_out.held_out(x, y, number, counts)]
+    ends.append(Pairs.of(y, mdps).interval(x[:, 0], number, counts))
+    for low, high in ends:
+        assert low < high if classes == 4 else np.isnan([low, high]).all()
 
 
 def test_predictions_that_differ_by_rounding_are_alike():

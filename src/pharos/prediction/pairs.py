@@ -78,7 +78,8 @@ class Pairs:
         return float(ndtr(difference / deviation).mean())
 
     def interval(self, x: np.ndarray, classes: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
-        """95 % interval of the agreement over samples of classes; (NaN, NaN) without pairs.
+        """95 % interval of the agreement over samples of classes; (NaN, NaN) without any, or if fewer than two
+        classes have pairs.
 
         Args:
             x, classes: (N,) of cells. counts: (R, C), how often each class counts in each sample.
@@ -86,9 +87,10 @@ class Pairs:
         number = counts.shape[1]
         right = np.bincount(classes[self.first], self.right(x), minlength=number)
         pairs = np.bincount(classes[self.first], minlength=number)
+        if (pairs > 0).sum() < 2 or len(counts) == 0:
+            return np.nan, np.nan
         total = counts @ pairs
-        shares = (counts @ right)[total > 0] / total[total > 0]
-        lower, upper = np.percentile(shares, (2.5, 97.5)) if len(shares) else (np.nan, np.nan)
+        lower, upper = np.percentile((counts @ right)[total > 0] / total[total > 0], (2.5, 97.5))
         return float(lower), float(upper)
 
     def permuted(

@@ -42,17 +42,18 @@ def calibration(y: np.ndarray, predicted: np.ndarray, classes: np.ndarray) -> tu
 
 
 def resampled_classes(count: int, resamples: int, seed: int) -> Counts:
-    """(R, C) counts of classes drawn anew, at least three different ones in each sample (two, of two)."""
+    """(R, C) counts of classes drawn anew, at least three different ones in each sample; none of fewer than four
+    classes, which make but one such sample."""
     rng = np.random.default_rng(seed)
     drawn = rng.multinomial(count, np.full(count, 1 / count), resamples)
-    return drawn[(drawn > 0).sum(axis=1) >= min(3, count)]
+    return drawn[((drawn > 0).sum(axis=1) >= 3) & (count > 3)]
 
 
 def held_out(x: np.ndarray, y: np.ndarray, classes: np.ndarray, counts: Counts) -> tuple[np.ndarray, np.ndarray]:
     """((R,) R2, (R,) rho) of classes left out one by one, for samples of classes.
 
-    A class that counts twice is left out wherever it stands, so none is predicted from itself. Rank correlations are
-    over the cells of the classes that are there, each once; of at most MOST_RANKED samples, the others are NaN.
+    A class that counts twice is left out wherever it stands, so none is predicted from itself; its cells are ranked
+    twice. Rank correlations are of at most MOST_RANKED samples, the others are NaN.
     """
     means = np.stack([x[classes == each].mean(axis=0) for each in range(classes.max() + 1)]).mean(axis=0)
     spread = x.std(axis=0)
@@ -70,8 +71,8 @@ def held_out(x: np.ndarray, y: np.ndarray, classes: np.ndarray, counts: Counts) 
     # Rank correlations need the predictions themselves
     rho = np.full(len(counts), np.nan)
     for r, count in enumerate(counts[:MOST_RANKED]):
-        some = count[classes] > 0
-        rho[r] = spearman(np.einsum("np,np->n", lines[r, classes[some]], design[some]), y[some])
+        rows = np.repeat(np.arange(len(y)), count[classes])
+        rho[r] = spearman(np.einsum("np,np->n", lines[r, classes[rows]], design[rows]), y[rows])
     return scores, rho
 
 

@@ -131,10 +131,10 @@ def unseen_classes(
     Returns:
         Columns `agent`, `outcome`, `predictor`, `baseline`, `cells`, `classes`, then
         left out: `r_squared` and `rho` (Spearman's) of classes left out one by one, with the ends of their 95 %
-            intervals over classes drawn anew; `floor_r_squared` and `floor_rho`, what 95 % of permutations of classes
-            stay below; `p_rho`; `r_squared_mdp`, each instance left out with all its kinds of chance; `calibration`
-            and `calibration_offset`, slope and intercept of the outcome on what was predicted; `ceiling`, the largest
-            R2 that noise over seeds leaves;
+            intervals over classes drawn anew (NaN of fewer than four); `floor_r_squared` and `floor_rho`, what 95 % of
+            permutations of classes stay below; `p_rho`; `r_squared_mdp`, each instance left out with all its kinds of
+            chance; `calibration` and `calibration_offset`, slope and intercept of the outcome on what was predicted;
+            `ceiling`, the largest R2 that noise over seeds leaves;
         within: `rho_within`, the mean over classes of the rank correlation within; `pairs`, of observations of one MDP
             whose outcomes differ by more than 0.05; `agreement`, the share of them that is ordered rightly, with
             interval, `p_agreement` and `agreement_ceiling`, what noise over seeds leaves; `image_pairs`,
@@ -267,9 +267,7 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
     count = classes.max() + 1
     scores, rho = cross_validation.held_out(x, y, classes, np.ones((1, count), int))
     drawn = cross_validation.resampled_classes(count, RESAMPLES, seed)
-    ends = np.full((2, 2), np.nan)  # of the intervals of R2 and of rho
-    if count >= 3:
-        ends = np.array([percentiles(each, 2.5, 97.5) for each in cross_validation.held_out(x, y, classes, drawn)])
+    ends = np.array([percentiles(each, 2.5, 97.5) for each in cross_validation.held_out(x, y, classes, drawn)])
     predicted = cross_validation.class_predictions(x, y, classes, classes)
     dummies = np.eye(count)[classes][:, 1:] if not x.shape[1] else x
     by_mdp = cross_validation.class_predictions(dummies, y, cells.instances, classes)
