@@ -389,7 +389,7 @@ def test_spaces_are_solved_and_searched_where_they_lie(world, spaces, tmp_path, 
     assert wide.num_states == narrow.num_states
     one, other = (pharos.load(each.folder, environment=WORLDS[world]).mdp(0.95) for each in (narrow, wide))
     assert same(one.rewards, other.rewards)
-    for options in ({}, {"blocks": 2}, {"dtype": "float32", "tolerance": 1e-3}, {"processes": "mpi"}):
+    for options in ({}, {"dtype": "float32", "tolerance": 1e-3}, {"processes": "mpi"}):
         with threads(ranked, 2):
             found, expected = value_iteration(other, **options), value_iteration(one, **options)
         assert same(found.v, expected.v) and same(found.q, expected.q), options
