@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from command_line import answer
 from edits import edited_json
 from patience import PATIENCE, wait_for
 from pharos import benchmark, evaluate_policy
@@ -85,6 +86,35 @@ def test_the_oracle_has_no_regret_and_random_play_all_of_it(suite, tmp_path):
         assert found.axes["exploration"].frontier.censored == {0.0: "above", 1.0: "below"}[expected]
         said = json.loads((tmp_path / name / "score.json").read_text())
         assert said["core"]["value"] == found.score.value and said["agent"] == name
+
+
+def test_a_run_answers_with_scores_intervals_and_the_steps_that_were_used(suite, tmp_path):
+    """Of 300 steps an agent that stops after 20 uses 20; Q-learning uses all."""
+    write_suite(suite, tmp_path / "small.yaml")
+    code = "\n    for _ in range(20):\n        if any(env.step(0)[2:4]):\n            env.reset()\n"
+    (tmp_path / "brief.py").write_text(
+        f"def learn(env, steps, seed):\n    env.reset(){code}    yield lambda seen: [0] * len(seen)\n"
+    )
+    options = ("--suite", tmp_path / "small.yaml", "--seeds", 2)
+    for agent, steps in ((f"{tmp_path / 'brief.py'}:learn", 20), ("q_learning", 300), ("oracle", 0)):
+        folder = tmp_path / f"runs-{steps}"
+        said = answer("benchmark", "run", "--agent", agent, *options, "--out", folder)
+        stored = json.loads((folder / "score.json").read_text())
+        assert said["steps_used"] == 3 * 2 * steps
+        assert said["score"] == {
+            "value": stored["core"]["value"],
+            "lower": stored["core"]["low"],
+            "upper": stored["core"]["high"],
+        }
+        scores = {each["name"]: each["score"] for each in said["tasks"]}
+        assert {name: each["value"] for name, each in scores.items()} == {
+            name: each["value"] for name, each in stored["tasks"].items()
+        }
+        axis = said["axes"]["exploration"]
+        assert axis["score"]["value"] == scores["sea-5"]["value"] and axis["frontier"]["unit"] == "bits"
+        assert axis["frontier"]["censored"] in ("above", "below", "") and set(axis["frontier"]) >= {"lower", "upper"}
+    said = answer("benchmark", "run", "--agent", "oracle", *options, "--tasks", "sea-5", "--out", tmp_path / "ladder")
+    assert said["score"] is None and [each["name"] for each in said["tasks"]] == ["sea-5"]
 
 
 # Generators -----------------------------------------------------------------------------------------------------------

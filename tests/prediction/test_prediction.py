@@ -111,6 +111,9 @@ def test_a_dqn_is_predicted_by_the_sampled_learner_with_its_schedule():
         assert cell.value == expected.value
         assert cell.tabular == expected.tabular.mean
         assert (cell.low, cell.high) == (max(0.0, cell.value - answer.half_width), cell.value + answer.half_width)
+        entry = cell.to_dict()
+        assert (cell.lower, cell.upper) == (cell.low, cell.high) == (entry["lower"], entry["upper"])
+        assert (entry["low"], entry["high"]) == (entry["lower"], entry["upper"])
     assert answer.half_width == published("dqn").half_width()
     assert [cell.observation for cell in answer.cells] == ["vector", "hash(bits=8)"]
     assert answer.predictor == "sampled_regret" and answer.states == 5

@@ -88,6 +88,11 @@ class Form:
         """Train all runs. Each leaves a finished run.json and a curve in its folder, or a run.json with its error."""
         raise NotImplementedError
 
+    def steps_used(self, job: Job, protocol: Protocol) -> int:
+        """Environment steps of a finished run: as the environment counted them, else those of the protocol."""
+        counted = read_record(job.folder)["result"].get("counted_steps")
+        return protocol.steps if counted is None else int(counted)
+
     def curve(self, job: Job, protocol: Protocol) -> tuple[np.ndarray, bool]:
         """(evaluations,) normalised regret, and whether all of it is exact.
 
@@ -389,6 +394,9 @@ class ExactForm(Form):
 
     def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
         """Do nothing: there is nothing to learn."""
+
+    def steps_used(self, job: Job, protocol: Protocol) -> int:
+        return 0
 
     def curve(self, job: Job, protocol: Protocol) -> tuple[np.ndarray, bool]:
         if job.task.name not in self.regrets:

@@ -42,12 +42,14 @@ class Outcome:
         folder: of the runs.
         missing: "task, seed" -> why that run has no result.
         suite: that was run.
+        steps_used: environment steps of all finished runs together.
     """
 
     results: AgentResults
     folder: Path
     missing: Mapping[str, str]
     suite: Suite
+    steps_used: int = 0
 
     @cached_property
     def scores(self) -> BenchmarkScore:
@@ -189,7 +191,7 @@ def _collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any]
     curves: dict[str, list[np.ndarray]] = {}
     exact: dict[str, bool] = {}
     missing: dict[str, str] = {}
-    seeds = tuple(dict.fromkeys(job.seed for job in jobs))
+    seeds, steps = tuple(dict.fromkeys(job.seed for job in jobs)), 0
     for job in jobs:
         task = job.task.name
         try:
@@ -197,12 +199,13 @@ def _collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any]
         except PharosError as error:
             missing[f"{task}, seed {job.seed}"] = in_one_line(error)
             continue
+        steps += form.steps_used(job, suite.protocol)
         curves.setdefault(task, []).append(curve)
         exact[task] = exact.get(task, True) and is_exact
     whole = {task: np.stack(each) for task, each in curves.items() if len(each) == len(seeds)}
     full_record = {**record, "exact": {task: exact[task] for task in whole}}
     results = AgentResults(str(record["agent"]), suite.name, suite.digest, seeds, whole, full_record)
-    outcome = Outcome(results, folder, missing, suite)
+    outcome = Outcome(results, folder, missing, suite, steps)
     if not whole:
         reason, _ = Counter(missing.values()).most_common(1)[0]
         raise AllRunsFailed(folder, {reason: reason}, outcome)

@@ -38,7 +38,7 @@ class ConfidenceInterval:
 
     Attributes:
         value: of a frontier that the ladder does not reach: its last or first level.
-        low, high: NaN with one seed; an infinite end of a frontier lies beyond the ladder.
+        low, high: NaN with one seed; an infinite end of a frontier lies beyond the ladder. Also `lower` and `upper`.
         censored: "above" or "below" where the value lies beyond the last or before the first rung, else empty.
     """
 
@@ -46,6 +46,20 @@ class ConfidenceInterval:
     low: float = math.nan
     high: float = math.nan
     censored: str = ""
+
+    @property
+    def lower(self) -> float:
+        """Lower end of the interval."""
+        return self.low
+
+    @property
+    def upper(self) -> float:
+        """Upper end of the interval."""
+        return self.high
+
+    def to_dict(self) -> dict[str, float]:
+        """The value and the ends, for JSON."""
+        return {"value": self.value, "lower": self.lower, "upper": self.upper}
 
     @staticmethod
     def of_mean(strata: Sequence[np.ndarray], bounds: tuple[float, float] = UNBOUNDED) -> "ConfidenceInterval":
@@ -85,6 +99,11 @@ class AxisScore:
     unit: str
     score: ConfidenceInterval
     frontier: ConfidenceInterval
+
+    def to_dict(self) -> Mapping[str, Mapping[str, object]]:
+        """Score and frontier, for JSON."""
+        of_frontier = {"unit": self.unit, "censored": self.frontier.censored}
+        return {"score": self.score.to_dict(), "frontier": {**self.frontier.to_dict(), **of_frontier}}
 
 
 @dataclass(frozen=True)

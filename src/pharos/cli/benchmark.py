@@ -131,6 +131,7 @@ def run(
         complain(f"{count} x {reason}")
     facts: list[tuple[str, object]] = [
         ("runs", f"{pluralize(len(results.seeds), 'seed')} of {pluralize(len(results.curves), 'task')}"),
+        ("steps used", f"{outcome.steps_used:,}"),
         ("missing", "; ".join(missing) or "none"),
         ("regret", f"{results.mean():.4g} of uniform play, mean of all runs" if results.curves else "none"),
     ]
@@ -144,6 +145,10 @@ def run(
         "digest": results.digest,
         "seeds": results.seeds,
         "normalized_regret": {task: curve.mean() for task, curve in results.curves.items()},
+        "score": outcome.score.to_dict() if outcome.scores.has_core else None,
+        "axes": {axis: each.to_dict() for axis, each in outcome.axes.items()},
+        "tasks": [{"name": task, "score": each.to_dict()} for task, each in outcome.scores.tasks.items()],
+        "steps_used": outcome.steps_used,
         "failed": missing,
         "folder": out,
     }

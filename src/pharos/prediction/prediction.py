@@ -128,12 +128,22 @@ class PredictedRegret(PrimaryRegret):
 
     Attributes:
         observation: what the agent sees, with its options.
-        low, high: ends of the interval that held LEVEL of the published cells, at least 0.
+        low, high: ends of the interval that held LEVEL of the published cells, at least 0; also `lower` and `upper`.
     """
 
     observation: str
     low: float
     high: float
+
+    @property
+    def lower(self) -> float:
+        """Lower end of the interval."""
+        return self.low
+
+    @property
+    def upper(self) -> float:
+        """Upper end of the interval."""
+        return self.high
 
     @property
     def label(self) -> str:
@@ -142,7 +152,7 @@ class PredictedRegret(PrimaryRegret):
 
     def to_dict(self) -> dict[str, Any]:
         """The attributes, JSON-able."""
-        return plain(vars(self))
+        return plain({**vars(self), "lower": self.lower, "upper": self.upper})
 
 
 @dataclass(frozen=True)
