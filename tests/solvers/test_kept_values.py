@@ -331,6 +331,11 @@ def test_options_that_do_not_go_together_are_refused_before_any_mdp(options, mes
     assert message in refusal(ParameterError, Solving, **options)
 
 
+def test_true_is_no_number_of_processes():
+    for evaluate in (pharos.evaluate_policy, solvers.evaluate_policy):
+        assert "processes" in refusal(ParameterError, evaluate, ring(), [0] * 400, processes=True)
+
+
 def test_a_file_of_values_is_refused_if_the_mdp_has_a_horizon(tmp_path):
     message = refusal(ParameterError, value_iteration, ring().with_horizon(5), values=tmp_path / "x.npy")
     assert "found 5 steps" in message and not (tmp_path / "x.npy").exists()

@@ -389,7 +389,9 @@ def evaluate_policy(
     if isinstance(policy, TabularAgent):
         policy = policy.policy_table()
     options: solvers.SolvingOptions = {} if horizon is None else {"horizon": horizon}
-    solving = solvers.Solving.of(mdp, tolerance, options if processes == 1 else {**options, "processes": processes})
+    if processes != 1 or processes is True:  # which is no number of processes
+        options["processes"] = processes
+    solving = solvers.Solving.of(mdp, tolerance, options)
     if observation is not None or isinstance(policy, Policy | RecurrentPolicy | SB3Model):
         if solving.is_distributed:
             raise ParameterError("a policy that sees observations is evaluated by one process; expected processes=1")
