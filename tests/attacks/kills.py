@@ -26,8 +26,20 @@ from pharos.system.workers import one_thread
 CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link", "os.symlink")
 """What Python reports (`sys.addaudithook`) of a process that changes files, beside files that it opens."""
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
-VOLATILE = {"seconds", "compiling_seconds", "written", "digest", "elapsed", "remaining", "updated", "process", "host"}
-"""What JSON files say of when and where, not of what came out."""
+VOLATILE = {
+    "seconds",
+    "compiling_seconds",
+    "written",
+    "digest",
+    "elapsed",
+    "remaining",
+    "updated",
+    "process",
+    "host",
+    "batch",
+}
+"""What JSON files say of when, where and beside which other runs (fewer, once some have ended), not of what came
+out."""
 UNCOMPARED = ("log.txt", "status.json", "lock")
 REMADE = ("cache/values",)
 """What is computed again where it is not there, and then not kept."""
