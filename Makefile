@@ -7,7 +7,7 @@ BIN := .venv/bin
 .venv/.ok: pyproject.toml setup.py constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip uninstall -q -y pharos 2>/dev/null  # the name of this distribution before it was pharos-rl
-	$(BIN)/python -m pip install -q -e ".[dev]" -c constraints.txt
+	$(BIN)/python -m pip install -q --no-compile -e ".[dev]" -c constraints.txt
 	@touch $@
 
 quickstart: .venv/.ok
@@ -28,7 +28,7 @@ lint: .venv/.ok
 	$(BIN)/mypy
 
 .venv/.docs: .venv/.ok
-	$(BIN)/python -m pip install -q -e ".[docs]" -c constraints.txt
+	$(BIN)/python -m pip install -q --no-compile -e ".[docs]" -c constraints.txt
 	@touch $@
 
 docs: .venv/.docs

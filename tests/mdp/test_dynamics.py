@@ -29,6 +29,7 @@ from pharos.mdp import (
     sticky_actions,
 )
 from pharos.mdp.dynamics import TopologicalOrder
+from pharos.mdp.reachability import restricted_to
 from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
 from strategies import (
     LAYOUTS,
@@ -97,7 +98,7 @@ class Listed(Dynamics):
     def no_such_method(self, *_):
         raise NotImplementedError
 
-    sample = part = restricted_to = merged = arrays = no_such_method
+    sample = part = _restricted_to = merged = arrays = no_such_method
 
 
 def backed_up(dynamics, equation, x):
@@ -205,9 +206,18 @@ def test_backups_compiled_for_many_states_and_for_few_have_the_same_bits(layout,
         monkeypatch.setattr(outcomes, "UNROLLED_FROM", first)
         mdp = _drawn_mdp(layout)
         answers.append(_backed_up(mdp))
-        is_tuple = isinstance(bellman.actions_of(mdp.num_actions, mdp.num_states), tuple)
+        is_tuple = isinstance(bellman.actions_of(mdp.num_actions, mdp.dynamics.is_unrolled), tuple)
         assert (mdp.reward_table.for_kernels[0].dtype, is_tuple) == ((np.uint8, True) if first == 0 else (float, False))
     assert answers[0] == answers[1] and len(answers[0]) == 27
+
+
+@pytest.mark.parametrize("layout", ["table", "lazy", *LAYOUTS])
+def test_sweeps_of_some_states_are_compiled_as_those_of_all(layout, monkeypatch):
+    mdp = _drawn_mdp(layout)
+    for first, dtype in ((40, np.uint8), (41, np.float64)):
+        monkeypatch.setattr(outcomes, "UNROLLED_FROM", first)
+        part = restricted_to(replace(mdp), np.arange(30))
+        assert part.dynamics.is_unrolled == (first == 40) and part.reward_table.for_kernels[0].dtype == dtype
 
 
 def _drawn_mdp(layout):

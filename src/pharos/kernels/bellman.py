@@ -19,7 +19,7 @@ from numba import njit, types, uint64
 
 from pharos.kernels.interpreted import interpreted_first, overload
 from pharos.kernels.kernel_cache import kernel
-from pharos.kernels.outcomes import expectation, fetch_values, is_unrolled, outcome, outcomes_of, size_of
+from pharos.kernels.outcomes import expectation, fetch_values, outcome, outcomes_of, size_of
 
 # Orders ---------------------------------------------------------------------------------------------------------------
 
@@ -123,14 +123,13 @@ UNROLLED = 128  # actions
 AHEAD = 32
 
 
-def actions_of(num_actions: int, num_states: int) -> "tuple[int, ...] | np.ndarray":
-    """The argument `actions`, A zeros: an array, or, if states are many, a tuple.
+def actions_of(num_actions: int, unrolled: bool) -> "tuple[int, ...] | np.ndarray":
+    """The argument `actions`, A zeros: an array, or, if sweeps are unrolled (`is_unrolled`), a tuple.
 
     The compiler knows a tuple's length and unrolls the loops over actions: sweeps are 3 to 4 times as fast, and each
     number of actions is compiled by itself (minutes, for more than UNROLLED).
     """
-    is_tuple = num_actions <= UNROLLED and is_unrolled(num_states)
-    return (0,) * num_actions if is_tuple else np.zeros(num_actions, np.int8)
+    return (0,) * num_actions if num_actions <= UNROLLED and unrolled else np.zeros(num_actions, np.int8)
 
 
 def reward_at(table, palette, s, a):

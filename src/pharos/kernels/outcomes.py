@@ -119,9 +119,9 @@ def is_unrolled(num_states):
     return num_states >= UNROLLED_FROM
 
 
-def each_of(num_outcomes, num_states):
-    """The last entry of `transitions`, for sweeps: a tuple of K zeros if K is small and states are many, else K."""
-    return (0,) * num_outcomes if num_outcomes <= UNROLLED and is_unrolled(num_states) else num_outcomes
+def each_of(num_outcomes, unrolled):
+    """The last entry of `transitions`, for sweeps: a tuple of K zeros if K is small and sweeps are unrolled, else K."""
+    return (0,) * num_outcomes if num_outcomes <= UNROLLED and unrolled else num_outcomes
 
 
 def _is_lazy(transitions):

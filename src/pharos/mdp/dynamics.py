@@ -114,6 +114,7 @@ class Dynamics(ABC):
         has_ends: whether some execution ends the episode without a next state.
         laziness: probability that nothing happens, as far as `lazy` has added it.
         workers: threads of a backup, where it has several; None for all processors.
+        is_of_many: whether these are some states of an MDP with so many that its sweeps are unrolled.
     """
 
     num_states: int
@@ -124,6 +125,7 @@ class Dynamics(ABC):
     has_ends: bool
     laziness: float = 0.0
     workers: int | None = None
+    is_of_many: bool = False
 
     # Of each representation ------------------------------------------------------------------------------------------
 
@@ -148,6 +150,11 @@ class Dynamics(ABC):
         return self.for_kernels if table is None else read_only(table)
 
     @property
+    def is_unrolled(self) -> bool:
+        """Whether sweeps are compiled for the very numbers of actions and outcomes, see `kernels.outcomes`."""
+        return self.is_of_many or outcomes.is_unrolled(self.num_states)
+
+    @property
     def for_sweeps(self) -> object:
         """The argument `transitions` of sweeps, in types that let the compiler make them faster."""
         return self.for_kernels
@@ -161,8 +168,7 @@ class Dynamics(ABC):
         """(N,): a next state of each execution, -1 for the end. Draws nothing where each has one outcome."""
 
     @abstractmethod
-    def restricted_to(self, states: np.ndarray) -> "Dynamics":
-        """The dynamics of these states alone, ascending and renumbered; transitions that leave them are replaced."""
+    def _restricted_to(self, states: np.ndarray) -> "Dynamics": ...
 
     @abstractmethod
     def merged(self, classes: np.ndarray, representatives: np.ndarray) -> "Dynamics":
@@ -187,6 +193,15 @@ class Dynamics(ABC):
 
     # Derived operations -----------------------------------------------------------------------------------------------
 
+    def restricted_to(self, states: np.ndarray) -> "Dynamics":
+        """The dynamics of these states alone, ascending and renumbered; transitions that leave them are replaced.
+
+        Their sweeps are compiled as those of all states are: who asks for many such parts has a large MDP.
+        """
+        part = self._restricted_to(states)
+        part.is_of_many = self.is_unrolled
+        return part
+
     def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray, runs: np.ndarray | None = None) -> None:
         """Set out to T x, out not x itself. Between the rows of the states and the end there may be those of a halo.
 
@@ -205,7 +220,7 @@ class Dynamics(ABC):
             kernel = bellman.sticky_backup if chance.is_sticky else bellman.optimal_backup
             weights = chance.triple if chance.is_sticky else chance.uniform
             arrays += weights, choice
-        arrays += x_, out_, bellman.actions_of(self.num_actions, self.num_states)
+        arrays += x_, out_, bellman.actions_of(self.num_actions, self.is_unrolled)
         whole = np.array([[0, self.num_states]])
 
         def block(part: np.ndarray) -> None:
@@ -363,7 +378,7 @@ class Dynamics(ABC):
             from pharos.kernels import bellman
 
             tables = (self.for_sweeps, *equation.rewards.for_kernels, equation.gamma)
-            actions, chance = bellman.actions_of(self.num_actions, self.num_states), equation.chance.uniform
+            actions, chance = bellman.actions_of(self.num_actions, self.is_unrolled), equation.chance.uniform
             groups = (parts.order, parts.starts, parts.has_cycle)
             bellman.sweep_groups(*tables, chance, choice, x[:, 0], actions, *groups, target, settled, most, before)
             return
@@ -436,7 +451,7 @@ def swept(
     rewards, gamma, chance, select = equation
     others = (*rewards.for_kernels, gamma)
     tables = (transitions, *others)
-    actions, scratch = bellman.actions_of(num_actions, rewards.shape[0]), np.empty(num_actions)
+    actions, scratch = bellman.actions_of(num_actions, rewards.is_unrolled), np.empty(num_actions)
     choice, places = _choice(select), part or (0, rewards.shape[0])
     if choice is None:
         assert isinstance(select, PolicyTable)

@@ -45,11 +45,13 @@ class Rewards:
         table: (S, A) uint8 codes, or (S, A) float64 rewards.
         palette: (at most 256,) float64, or empty.
         rounding: bound on the error of each reward: 0 for rewards that were given, above it for means of several.
+        is_of_many: whether these are some states of an MDP with so many that its sweeps are unrolled.
     """
 
     table: np.ndarray
     palette: np.ndarray
     rounding: float = 0.0
+    is_of_many: bool = False
 
     @staticmethod
     def from_array(rewards: np.ndarray, rounding: float = 0.0) -> "Rewards":
@@ -71,10 +73,15 @@ class Rewards:
         """(S, A)."""
         return self.table.shape  # type: ignore[return-value]
 
+    @property
+    def is_unrolled(self) -> bool:
+        """Whether sweeps over them are compiled for their kind, see `kernels.outcomes`."""
+        return self.is_of_many or outcomes.is_unrolled(self.shape[0])
+
     @cached_property
     def for_kernels(self) -> tuple[np.ndarray, np.ndarray]:
         """(table, palette), the arguments of kernels; the rewards of few states are float64, one type for all."""
-        if outcomes.is_unrolled(self.shape[0]):
+        if self.is_unrolled:
             return read_only(self.table), read_only(self.palette)
         return read_only(np.ascontiguousarray(self.array)), read_only(np.empty(0))
 
@@ -89,7 +96,7 @@ class Rewards:
 
     def of(self, states: slice | np.ndarray) -> "Rewards":
         """The rewards of some states alone."""
-        return Rewards(np.asarray(self.table[states]), self.palette, self.rounding)
+        return Rewards(np.asarray(self.table[states]), self.palette, self.rounding, self.is_unrolled)
 
     def mixed(self, other: "Rewards", p: float) -> "Rewards":
         """(1 - p) times these rewards plus p times others of the same shape.

@@ -97,8 +97,8 @@ class Table(Dynamics):
         local, halo = split(partial(blocks_of, rows), rows.shape, start, stop)
         return Table(local), halo
 
-    def restricted_to(self, states: np.ndarray) -> "Table":
-        """The table of these states alone; transitions that leave them lead back to where they came from."""
+    def _restricted_to(self, states: np.ndarray) -> "Table":
+        # transitions that leave them lead back to where they came from
         number = np.full(self.num_states, -1, np.int64)
         number[states] = np.arange(len(states))
         table = np.asarray(self.next_states[states])
@@ -202,7 +202,7 @@ class Lazy(Dynamics):
         tables, halo = self.tables.part(start, stop)
         return Lazy(tables, self.laziness, self.roundings), halo
 
-    def restricted_to(self, states: np.ndarray) -> Dynamics:
+    def _restricted_to(self, states: np.ndarray) -> Dynamics:
         return Lazy(self.tables.restricted_to(states), self.laziness, self.roundings)
 
     def merged(self, classes: np.ndarray, representatives: np.ndarray) -> Dynamics:
@@ -369,7 +369,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
     @cached_property
     def for_kernels(self) -> tuple[Any, ...]:  # type: ignore[override]
         size = self.num_states * self.num_actions
-        if not kernels.is_unrolled(self.num_states) and size * self.num_outcomes <= _COPIED:
+        if not self.is_unrolled and size * self.num_outcomes <= _COPIED:
             # few: a copy in one form, whatever they are stored in, so that kernels are compiled once
             which, successors, probabilities = self.possible(np.arange(size))
             offsets = np.append(0, np.cumsum(np.bincount(which, minlength=size)))
@@ -395,7 +395,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
 
     @cached_property
     def for_sweeps(self) -> tuple[object, ...]:  # type: ignore[override]
-        return (*self.for_kernels[:-1], kernels.each_of(self.num_outcomes, self.num_states))
+        return (*self.for_kernels[:-1], kernels.each_of(self.num_outcomes, self.is_unrolled))
 
     @cached_property
     def mass(self) -> float:  # type: ignore[override]
@@ -461,8 +461,8 @@ class OutcomeTable(OutcomeRows, Dynamics):
         local, halo = split(partial(blocks_of, entries), entries.shape, start, stop)
         return self._of_states(slice(start, stop), slice(first, last), local), halo
 
-    def restricted_to(self, states: np.ndarray) -> "OutcomeTable":
-        """The table of these states alone; transitions that leave them lead back to where they came from."""
+    def _restricted_to(self, states: np.ndarray) -> "OutcomeTable":
+        # transitions that leave them lead back to where they came from
         number = np.full(self.num_states + 1, -2, np.int64)
         number[states], number[-1] = np.arange(len(states)), -1
         return self._renumbered(states, number)

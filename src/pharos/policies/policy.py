@@ -358,9 +358,10 @@ class QueriedPolicy:
             entries = (outcomes.probabilities[stays], (outcomes.which[stays], next_states[stays]))
             matrix = sparse.csr_matrix(entries, (count * num_actions, count))
             sub_mdp = TabularMDP.from_matrices(matrix, rewards, ends=lacking(matrix), **setting)
-        table = replace(sub_mdp.reward_table, rounding=rounding)
+        sub_mdp.dynamics.is_of_many = is_of_many = mdp.dynamics.is_unrolled
+        table = replace(sub_mdp.reward_table, rounding=rounding, is_of_many=is_of_many)
         if mdp.horizon is not None:  # every step reads the rewards: no palette
-            table = Rewards(np.asarray(rewards, np.float64), np.empty(0), rounding)
+            table = Rewards(np.asarray(rewards, np.float64), np.empty(0), rounding, is_of_many)
         return replace(sub_mdp, reward_table=table, chance=mdp.chance, residual=mdp.residual.plus(sub_mdp.residual))
 
 
