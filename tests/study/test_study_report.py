@@ -250,6 +250,15 @@ def test_what_has_no_run_is_not_measured_and_the_cost_is_told_beforehand(tmp_pat
     assert len(study.hardness_table(spec, tmp_path)) == 2
 
 
+def test_a_report_begins_with_who_won_by_how_much_and_how_sure_that_is(tmp_path, sketched):
+    _, page = report_of(tmp_path, agents=["ppo"])
+    text = " ".join(page.text)
+    first = text.partition("Summary")[2]
+    first = first.partition("Summary")[2] or first  # after the list of contents
+    assert first.index("has the least normalised regret") < first.index("are finished")
+    assert re.search(r"PPO, \w+: \d\.\d\d, \d\.\d\d more on \d tasks? \(95 % interval .* p [<=] ", first)
+
+
 def test_estimated_regret_is_marked_and_its_half_width_stands_in_the_summary(tmp_path, sketched):
     def estimate(spec):
         file = tmp_path / "runs" / spec.runs[0].id / "curve.parquet"
