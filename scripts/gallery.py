@@ -1,4 +1,4 @@
-"""Makes the pictures of docs/worlds.md, its last section: every class, what people and agents see, and an optimal policy at play.
+"""Makes the pictures of docs/worlds.md: every class, what people and agents see, and an optimal policy at play.
 
 python scripts/gallery.py                      all classes
 python scripts/gallery.py sokoban taxi         these alone; the other sections stay as they are
