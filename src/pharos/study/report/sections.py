@@ -107,6 +107,7 @@ def _winner(results: Results) -> list[str]:
     if not others:
         return [f"{label(*first)} has a normalised regret of {means[first]:.2f}, {over} ({scale})."]
     lines = [f"{label(*first)} has the least normalised regret: {means[first]:.2f}, {over} ({scale})."]
+    lines = [lines[0][:1].upper() + lines[0][1:]]
     lines += [_behind(results.differences, first, other, means[other]) for other in others[:MOST_COMPARED]]
     if len(others) > MOST_COMPARED:
         lines.append(f"{len(others) - MOST_COMPARED} more have a larger one: see Regret and Profiles below.")
