@@ -24,8 +24,9 @@ import site_pages
 ROOT = Path(__file__).parents[1]
 DOCS, STAGED, SITE = ROOT / "docs", ROOT / "build" / "docs", ROOT / "site"
 OUTSIDE = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "README.md": "start.md"}
-FIRST_PAGES = ("index.md", "start.md")  # which lead to the pages of environments where the repository has the gallery
-GENERATED_LISTS = ("docs/decisions", "docs/tutorials")
+FIRST_PAGES = ("index.md", "start.md")  # which lead to pages of environments, for which the repository has one of all
+LISTS = ("docs/decisions", "docs/tutorials", "docs/evidence")  # folders with a page that lists the others
+ASIDE = ("decisions/", "evidence/", "studies/")  # for readers of the project: neither in the navigation nor searched
 CONVERTED = (".ipynb",)
 FOREIGN_WORKER = "https://unpkg.com/iframe-worker/shim"  # what the theme would load instead of assets/search-worker.js
 LINK = re.compile(r"(\]\()([^)\s]+)(\))")
@@ -59,6 +60,9 @@ def stage() -> Path:
     pages["benchmark.md"] = str(pages["benchmark.md"]).replace(site_pages.BOARD, site_pages.baseline_board())
     pages |= {name: site_pages.live(name, str(pages[name])) for name in site_pages.LIVE}
     pages["index.md"] = f"---\nhide: [navigation, toc]\n---\n\n{pages['index.md']}"
+    for name in pages:
+        if name.endswith(".md") and name.startswith(ASIDE):
+            pages[name] = f"---\nsearch: {{exclude: true}}\n---\n\n{pages[name]}"
     for name, content in pages.items():
         data = content.read_bytes() if isinstance(content, Path) else content
         put(STAGED / name, data.encode() if isinstance(data, str) else data)
@@ -67,10 +71,10 @@ def stage() -> Path:
             path.unlink()
     config = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
     config |= {"docs_dir": str(STAGED), "site_dir": str(SITE)}
-    written = {name: text for name, text in pages.items() if name.startswith("decisions/")}
-    decided = {**generated["decisions"], **written}
-    config["nav"] = with_sections(config["nav"], {**generated, "decisions": decided})
-    missing = [name for name in pages if name.endswith(".md") and f"'{name}'" not in repr(config["nav"])]
+    config["nav"] = with_sections(config["nav"], generated)
+    placed = repr(config["nav"])
+    missing = [name for name in pages if name.endswith(".md") and f"'{name}'" not in placed]
+    missing = [name for name in missing if not name.startswith(ASIDE)]
     if missing:
         config["nav"].append({"More": missing})  # pages that mkdocs.yml does not place
     python = config["plugins"][-1]["mkdocstrings"]["handlers"]["python"]
@@ -99,9 +103,9 @@ def relinked(text: str, source: Path, name: str) -> str:
         path = os.path.normpath(source.parent / link)
         if path in OUTSIDE:
             staged = OUTSIDE[path]
-        elif name in FIRST_PAGES and path == "docs/gallery.md":
+        elif name in FIRST_PAGES and path == "docs/worlds.md":
             staged = "environments/index.md"
-        elif path in GENERATED_LISTS:
+        elif path in LISTS:
             staged = f"{path.removeprefix('docs/')}/index.md"
         elif path.startswith("docs/") and not (ROOT / path).is_dir():
             staged = path.removeprefix("docs/").replace(".ipynb", ".md")

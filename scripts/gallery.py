@@ -1,4 +1,4 @@
-"""Makes docs/gallery.md and its pictures: every class, what people and agents see, and an optimal policy at play.
+"""Makes the pictures of docs/worlds.md: every class, what people and agents see, and an optimal policy at play.
 
 python scripts/gallery.py                      all classes
 python scripts/gallery.py sokoban taxi         these alone; the other sections stay as they are
@@ -142,7 +142,7 @@ def shown(env, state):
     )
 
 
-HEAD = """# Gallery
+HEAD = """## Pictures
 
 Made by `python scripts/gallery.py`. *What agents see*, from the left: the drawing for people, the complex image at its
 natural size and at 84 x 84 pixels, and the planes of the simple image, one for each layer, after some steps of the
@@ -185,10 +185,11 @@ def played(env, policy, cls):
 def main(chosen) -> None:
     """Write the rows of the chosen classes anew; of all of them where none is named."""
     FOLDER.mkdir(exist_ok=True)
-    page = DOCS / "gallery.md"
-    texts = re.findall(r"^(\| \*\*(\w+)\*\* .*)$", page.read_text(), re.MULTILINE) if chosen else []
+    page = DOCS / "worlds.md"
+    before, _, after = page.read_text().partition("## Pictures\n")
+    texts = re.findall(r"^(\| \*\*(\w+)\*\* .*)$", after, re.MULTILINE) if chosen else []
     rows = {cls: text for text, cls in texts} | {cls: row(cls) for cls in chosen or INSTANCES}
-    page.write_text(HEAD + "".join(f"{rows[cls]}\n" for cls in INSTANCES if cls in rows))
+    page.write_text(before + HEAD + "".join(f"{rows[cls]}\n" for cls in INSTANCES if cls in rows))
 
 
 if __name__ == "__main__":

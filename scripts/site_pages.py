@@ -111,7 +111,7 @@ PACKAGES = {  # page of the reference -> (title, module)
 def environments() -> dict[str, str]:
     """A page for each class, and one that shows them all."""
     stored = json.loads((DOCS / "environments.json").read_text())
-    gallery = rows_of((DOCS / "gallery.md").read_text())
+    gallery = rows_of((DOCS / "worlds.md").read_text().partition("## Pictures\n")[2])
     pages = {f"environments/{name}.md": page_of(cls, stored, gallery.get(name, "")) for name, cls in classes().items()}
     cards = [card_of(cls, stored, gallery.get(name, "")) for name, cls in classes().items()]
     index = (

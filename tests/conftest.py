@@ -7,6 +7,7 @@ take from them.
 """
 
 import fcntl
+import math
 import os
 import sysconfig
 import tempfile
@@ -20,10 +21,12 @@ from hypothesis import HealthCheck, settings
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from pharos.cli import answers
 from pharos.system import compiling
 
 compiling.SMALL = 0  # tests are small, and of compiled code; those of tests/kernels/test_interpreted.py are not
 compiling.announces = False  # else what a test finds on standard error depends on what was compiled before
+answers.TOLD_AFTER = math.inf  # or on how busy the machine is
 
 for name, derandomize in (("fixed", True), ("explore", False)):
     settings.register_profile(

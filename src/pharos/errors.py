@@ -20,6 +20,7 @@
     ├── PrecisionError                  the requested precision is finer than the error bound allows
     ├── DivergenceError (ValueError)    the value asked for may be infinite
     ├── UndefinedMeasure                the measure does not exist for this MDP; the message says what would define it
+    │   └── MeasureUnfinished           its budget ended before anything was proven
     └── MissingExtra (ImportError)      an optional dependency is needed; the message names the extra
 
 A message says whose, expected, found, and what to try, in one line.
@@ -135,6 +136,10 @@ class DivergenceError(PharosError, ValueError):
 
 class UndefinedMeasure(PharosError):
     """The measure does not exist for this MDP; the message says what would define it."""
+
+
+class MeasureUnfinished(UndefinedMeasure):
+    """The budget of a measure ended before it had a value or proven bounds."""
 
 
 class MissingExtra(PharosError, ImportError):

@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import threading
 
 import pytest
 from rich.console import Console
@@ -215,6 +216,39 @@ def test_a_progress_bar_says_what_happens_before_anything_is_counted(monkeypatch
     with answers.progress_bar("training", 20_000, "loading, building, compiling, first evaluation"):
         pass
     assert "0/20000" in screen.file.getvalue() and "first evaluation" in screen.file.getvalue()
+
+
+def test_slow_work_is_told_after_ten_seconds_and_ever_more_seldom(monkeypatch, capsys):
+    monkeypatch.setattr(answers, "TOLD_AFTER", 10.0)
+    now = [0.0]
+    work = answers.SlowWork("measuring", clock=lambda: now[0])
+    work.text = "diameter  between 3 and 9"
+    lines = []
+    for now[0] in map(float, range(300)):
+        work.tell_if_due()
+        if line := capsys.readouterr().err:
+            lines.append((now[0], line))
+    assert [seconds for seconds, _ in lines] == [10, 20, 40, 80, 140, 200, 260]
+    assert lines[1][1] == "pharos: measuring: diameter between 3 and 9, 20 s so far\n"
+
+
+def test_work_outside_a_terminal_is_watched_while_it_lasts(monkeypatch, capsys):
+    told = threading.Event()
+    monkeypatch.setattr(answers, "TOLD_AFTER", 0.0)
+    monkeypatch.setattr(answers, "complain", lambda line: told.set() if "far along" in line else None)
+    with answers.progress_line("measuring") as tell:
+        tell("far along")
+        assert told.wait(PATIENCE)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_growing_table_prints_each_row_at_once_and_keeps_its_columns(capsys):
+    table = answers.GrowingTable({"measure": 8, "value": 10, ">seconds": 7})
+    table.add(["diameter", "7", "0.25"])
+    first = capsys.readouterr().out
+    table.add(["gap", "between 1 and 2", "10.00"])
+    assert first.splitlines() == ["measure   value       seconds", "diameter  7              0.25"]
+    assert capsys.readouterr().out.splitlines() == ["gap       between 1     10.00", "          and 2"]
 
 
 @pytest.mark.slow

@@ -62,15 +62,14 @@ def test_links_of_pages_lead_somewhere(page):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["start.md", "how-to.md"])
-def test_the_code_of_pages_prints_what_they_say(name):
-    namespace, compared = {}, 0
+def test_the_code_of_the_first_page_prints_what_it_says():
+    name, namespace, compared = "start.md", {}, 0
     for code, expected in BLOCK.findall((DOCS / name).read_text()):
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             exec(compile(code, name, "exec"), namespace)
         assert printed.getvalue() == expected
         compared += bool(expected)
-    assert compared >= 3
+    assert compared >= 6
 
 
 @pytest.mark.long
@@ -114,7 +113,7 @@ BEFORE = {
     "benchmark.md": "from pharos import benchmark\ntask = benchmark.load_suite().core[0].name\n"
     "benchmark.run('random', out='results/mine', seeds=[0], tasks=[task])\n",
     "importing.md": "import numpy as np\nimport pharos\nP, R = [np.eye(2), np.eye(2)[[1, 0]]], np.eye(2)\n",
-    "submissions.md": "import pharos\npharos.train('q_learning', 'frozen_lake/4x4', steps=200, out='runs/lake')\n",
+    "benchmark-rules.md": "import pharos\npharos.train('q_learning', 'frozen_lake/4x4', steps=200, out='runs/lake')\n",
     "regret.md": "import pharos\npharos.train('dqn', 'frozen_lake/4x4', steps=200, random=0.1, out='runs/dqn-0')\n",
 }
 

@@ -10,7 +10,7 @@ from pharos.errors import ParameterError
 from pharos.study.specification import parse
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGE = (DOCS / "running-a-study.md").read_text(encoding="utf-8")
+PAGE = (DOCS / "study.md").read_text(encoding="utf-8")
 
 
 def test_the_study_on_the_page_is_valid():

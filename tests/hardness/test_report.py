@@ -2,13 +2,15 @@
 
 import contextlib
 import json
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 import command_line
 import pharos
-from pharos import hardness
+from pharos import Environment, hardness
+from pharos.cli import hardness as command
 from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
 from pharos.hardness import registry as _registry
 from pharos.mdp import TabularMDP
@@ -119,6 +121,189 @@ def test_an_interval_is_computed_anew_with_a_larger_budget():
     assert hardness.report(mdp, "squeezed", budget=20)["squeezed"].value["upper"] == 5
 
 
+# Budgets --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lift(Environment):
+    """A lift between floors: on each one person may wait for another floor, and the car has one button for each."""
+
+    floors: int = 4
+    arrivals: float = 0.3
+
+    name = "people_lift"
+    actions = ("down", "up", "doors")
+
+    @property
+    def outcomes(self):
+        return 1 + self.floors * (self.floors - 1)
+
+    def variables(self):
+        waiting, buttons = [range(self.floors)] * self.floors, [range(2)] * self.floors
+        return {"floor": range(self.floors), "waiting": waiting, "button": buttons}
+
+    def initial_state(self):
+        return (0, *[0] * (2 * self.floors))
+
+    def probability(self, state, action, outcome):
+        return 1.0 - self.arrivals if outcome == 0 else self.arrivals / (self.floors * (self.floors - 1))
+
+    def transition(self, state, action, outcome, out):
+        floor = state[0]
+        if action < 2:
+            out[0] = min(max(floor + 2 * action - 1, 0), self.floors - 1)
+        else:
+            out[1 + self.floors + floor] = 0
+            if state[1 + floor] > 0:
+                out[1 + floor] = 0
+                out[1 + self.floors + (floor + state[1 + floor]) % self.floors] = 1
+        if outcome > 0:
+            where = (outcome - 1) // (self.floors - 1)
+            if out[1 + where] == 0:
+                out[1 + where] = 1 + (outcome - 1) % (self.floors - 1)
+
+    def is_terminal(self, state):
+        return False
+
+    def reward(self, state, action, next_state):
+        waiting = 0
+        for floor in range(self.floors):
+            if next_state[1 + floor] > 0:
+                waiting += 1
+        has_arrived = action == 2 and state[1 + self.floors + state[0]] == 1
+        return (1 if has_arrived else 0) - 0.1 * waiting
+
+
+INTERVALS = {"diameter", "start_eccentricity"}
+
+
+def spent(mdp, names="all", **options):
+    """A report whose budget is spent when a measure begins."""
+    return hardness.report(mdp, names, budget=0, keep=False, **options)
+
+
+@pytest.mark.slow
+def test_a_spent_budget_ends_every_measure_of_a_world_with_chance():
+    space = pharos.build(Lift(floors=3), progress=False)
+    assert space.num_states == 567
+    seen = pharos.observations.representation(space, "vector")
+    report = spent(space.mdp(gamma=0.99), horizon=50, representation=seen)
+    open_ends = {name for name, result in report.results.items() if result.is_out_of_budget}
+    bounded = {name for name, result in report.results.items() if result.certificate.kind == "interval"}
+    # what a deterministic MDP alone has says so before any work
+    assert set(report.results) - open_ends - bounded == {"tight_effective_horizon"}
+    assert bounded == INTERVALS
+    assert all("--budget" in report[name].undefined for name in open_ends)
+    assert all("--budget" in report[name].certificate.note for name in bounded)
+    diameter = report["diameter"].value
+    closer = hardness.diameter(space.mdp(gamma=0.99), budget=hardness.interval.Budget(searches=3))
+    assert diameter["lower"] < closer.lower < closer.upper < diameter["upper"]
+
+
+def test_a_spent_budget_ends_every_measure_of_a_world_without_chance():
+    report = spent(grid(), horizon=6, representation=pharos.observations.representation(grid_space(), "vector"))
+    ended = {name for name, result in report.results.items() if result.is_out_of_budget}
+    certain = {"diameter", "start_eccentricity", "environmental_value_norm"}  # one search; 0 without chance
+    assert set(report.results) - ended <= certain | {"mixing_time"}
+    assert "tight_effective_horizon" in ended and "covering" in ended and "kernel_regret" in ended
+
+
+def grid_space():
+    return pharos.build(pharos.make("simple_grid", height=3, width=4))
+
+
+def test_values_that_a_budget_has_ended_are_not_tried_again_by_the_next_measure(monkeypatch):
+    calls = []
+
+    def counted(*arguments, **options):
+        calls.append(1)
+        return pharos.value_iteration(*arguments, **options)
+
+    monkeypatch.setattr(_registry, "value_iteration", counted)
+    report = spent(corridor(), f"{SUM},minimal_gap,environmental_value_norm")
+    assert len(calls) == 1
+    assert "optimal values" in report["minimal_gap"].undefined
+    assert "error_bound" not in report.conventions
+
+
+def test_the_budget_is_of_each_measure(monkeypatch):
+    clock = [0.0]
+
+    class Watch:
+        compiling = 0.0
+
+        def __init__(self):
+            self.began = clock[0]
+
+        @property
+        def seconds(self):
+            return clock[0] - self.began
+
+    def slow(seconds):
+        def measure(problem):
+            for step in range(seconds):
+                clock[0] += 1
+                problem.report("slow", f"step {step}")
+            return 1.0
+
+        return measure
+
+    monkeypatch.setattr("pharos.hardness.interval.Stopwatch", Watch)
+    for name, seconds in (("first", 3), ("second", 5), ("third", 4)):
+        hardness.register(name, slow(seconds), definition="")
+    report = hardness.report(corridor(), "first,second,third", budget=4.5)
+    assert [report[name].value for name in ("first", "second", "third")] == [1.0, None, 1.0]
+    assert report["second"].undefined == (
+        "not available: the budget of 4.5 s ended at step 4; give a larger one (--budget)"
+    )
+    assert hardness.report(corridor(), "second")["second"].value == 1.0  # without a budget no loop is ended
+
+
+def test_each_result_is_told_as_soon_as_it_is_there():
+    events = []
+    for name in ("first", "second"):
+        hardness.register(name, lambda problem, name=name: events.append(name) or 1.0, definition="")
+    hardness.report(corridor(), "first,second", on_result=lambda result: events.append(f"row {result.name}"))
+    assert events == ["first", "row first", "second", "row second"]
+
+
+def test_rows_are_printed_as_they_come(monkeypatch):
+    printed = []
+    monkeypatch.setattr(command._Table, "add", lambda table, result: printed.append(result.name))
+    hardness.register("last", lambda problem: float(len(printed)), definition="")
+    answer = command_line.run("hardness", "frozen_lake/4x4", "--measures", "diameter,minimal_gap,last")
+    assert answer.exit_code == 0 and printed == ["diameter", "minimal_gap", "last"]
+    assert command_line.answer("hardness", "frozen_lake/4x4", "--measures", "last")["measures"]["last"] == 3
+    assert printed == ["diameter", "minimal_gap", "last"]  # JSON is one object, at the end
+
+
+def test_the_command_gives_each_measure_thirty_seconds(monkeypatch):
+    budgets = []
+    hardness.register("asked", lambda problem: budgets.append(problem.budget.seconds) or 1.0, definition="")
+    for words in ([], ["--budget", 5]):
+        assert command_line.run("hardness", "frozen_lake/4x4", "--measures", "asked", *words).exit_code == 0
+    assert budgets == [hardness.interval.COMMAND_SECONDS, 5] == [30, 5]
+
+
+def test_the_table_has_no_undefined_row_unless_it_was_asked_for():
+    rows = command_line.run("hardness", "frozen_lake/4x4").stdout
+    assert "undefined" not in rows and "\ncovering" not in rows and "\neffective_horizon " not in rows
+    assert "\nstationary_effective_horizon" in rows
+    assert "effective_horizon, covering: defined for episodes" in rows
+    with_horizon = command_line.run("hardness", "frozen_lake/4x4", "--horizon", 20).stdout
+    assert "\neffective_horizon " in with_horizon and "\ncovering" in with_horizon
+    assert "stationary" not in with_horizon
+    assert "undefined" in command_line.run("hardness", "frozen_lake/4x4", "--measures", "covering").stdout
+    answer = command_line.answer("hardness", "frozen_lake/4x4")
+    assert answer["measures"]["covering"] is answer["measures"]["effective_horizon"] is None
+    assert "give a horizon" in answer["undefined"]["covering"]
+
+
+def test_the_table_says_what_a_budget_has_ended():
+    told = command_line.run("hardness", "frozen_lake/4x4", "--budget", 0, "--fresh").stdout
+    assert "not available" in told and "sum_of_reciprocal_gaps, " in told and "--budget" in told
+
+
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 1, "results": 3}', '{"format": 2}'])
 def test_a_spoilt_file_of_kept_results_is_replaced(text):
     mdp = grid()
@@ -208,10 +393,10 @@ def test_values_that_floats_cannot_hold_leave_the_other_measures():
 
 
 def test_reasons_stand_below_the_table():
-    lines = run("simple_grid").stdout.splitlines()
+    lines = run("simple_grid", "--measures", "effective_horizon,diameter").stdout.splitlines()
     row = next(line for line in lines if line.startswith("effective_horizon"))
     assert row.split()[1] == "undefined" and "give a horizon" not in row
-    assert any("effective_horizon is defined for episodes of T steps: give a horizon" in line for line in lines)
+    assert "effective_horizon: defined for episodes of T steps: give a horizon" in lines
 
 
 # Kept results ---------------------------------------------------------------------------------------------------------

@@ -441,6 +441,52 @@ def test_episodes_that_end_before_they_begin_are_noted():
     assert report.num_states == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        *[(name, "max_episode_steps") for name in ("time_limit", "horizon", "max_episode_step")],
+        *[("layer", "layers"), ("is_termina", "is_terminal"), ("initial_sates", "initial_states")],
+    ],
+)
+def test_attributes_that_nothing_reads_and_are_near_to_one_of_the_contract_are_noted(name, meant):
+    assert pharos.check_environment(corridor(**{name: 60})).notes[-1] == f"{name} is not used; did you mean {meant}?"
+
+
+def test_attributes_of_the_users_own_are_not_noted():
+    reward = lambda self, state, action, next_state: float(self.rewards[next_state[0]])  # noqa: E731
+    report = pharos.check_environment(corridor(rewards=(0, 0, 0, 0, 1), reward=reward, palette=RED, speed=3))
+    assert report.notes == ()
+
+
+def test_a_world_without_ends_says_when_episodes_end():
+    def transition(self, state, action, out):
+        out[0] = (state[0] + action) % 5
+
+    endless = {"is_terminal": Environment.is_terminal, "transition": transition}
+    note = pharos.check_environment(corridor(**endless)).notes[-1]
+    assert note.startswith("no state is terminal") and "1,000 steps" in note and "max_episode_steps" in note
+    limited = pharos.check_environment(corridor(max_episode_steps=50, **endless))
+    assert not any("terminal" in each for each in limited.notes)
+
+
+def test_a_name_that_a_class_of_pharos_has_is_noted():
+    assert (
+        "'frozen_lake' is the name of a class of pharos"
+        in pharos.check_environment(corridor(name="frozen_lake")).notes[-1]
+    )
+
+
+@pytest.mark.parametrize(
+    ("rule", "told"),
+    [("grid", "grid() fails: NameError"), ("variables", "variables() or initial_state() fails: NameError")],
+)
+def test_a_slip_in_a_declaration_is_one_line(rule, told):
+    def broken(self):
+        return undeclared  # noqa: F821
+
+    assert told in message(corridor(**{rule: broken}))
+
+
 @pytest.mark.long
 def test_truths_and_numbers_of_numpy_are_accepted():
     def reward(self, state, action, next_state):

@@ -208,7 +208,7 @@ def test_a_study_without_dqn_says_nothing_false_and_has_no_empty_section(tmp_pat
     left_out = ("Findings of the paper", "Unseen classes", "Agreement of agents", "Beside the paper")
     assert page.headings == [each for each in HEADINGS if each not in left_out]
     assert "the paper prints" not in text and "Findings" not in text and "The paper's figure" not in text
-    assert "Cumulative regret of PPO" in text and "costs PPO more regret" in text
+    assert "Cumulative regret of PPO" in text and "costs PPO more regret" not in text  # of four tasks
     names = {file.stem for file in report.figures}
     assert {"representations_ppo", "single_model_cumulative", "regret_by_task_frozen_lake"} <= names
     assert any(file.name == "coefficients_cumulative_regret.csv" for file in report.tables)
@@ -248,6 +248,15 @@ def test_what_has_no_run_is_not_measured_and_the_cost_is_told_beforehand(tmp_pat
     ]
     assert len(list(tmp_path.glob("hardness/*.json"))) == 1
     assert len(study.hardness_table(spec, tmp_path)) == 2
+
+
+def test_a_report_begins_with_who_won_by_how_much_and_how_sure_that_is(tmp_path, sketched):
+    _, page = report_of(tmp_path, agents=["ppo"])
+    text = " ".join(page.text)
+    first = text.partition("Summary")[2]
+    first = first.partition("Summary")[2] or first  # after the list of contents
+    assert first.index("has the least normalised regret") < first.index("are finished")
+    assert re.search(r"PPO, \w+: \d\.\d\d, \d\.\d\d more on \d tasks? \(95 % interval .* p [<=] ", first)
 
 
 def test_estimated_regret_is_marked_and_its_half_width_stands_in_the_summary(tmp_path, sketched):

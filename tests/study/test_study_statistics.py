@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.stats
 
 from pharos.errors import ParameterError
 from pharos.study import (
@@ -15,7 +16,7 @@ from pharos.study import (
     paper_regressions,
     paper_returns,
 )
-from pharos.study.profiles import THRESHOLDS, improvements, profiles
+from pharos.study.profiles import THRESHOLDS, improvements, other_winners, profiles, regret_differences
 
 
 def study_table(noise: float, seed: int = 0, num_instances: int = 12) -> pd.DataFrame:
@@ -164,3 +165,46 @@ def test_profiles_and_improvements_compare_what_has_runs_on_the_same_tasks():
     (row,) = improvements(alone, resamples=50).itertuples()  # on a third task both have one run
     assert row.tasks == 3 and row.probability == 0.0 and math.isnan(row.lower) and math.isnan(row.upper)
     assert improvements(runs.assign(normalized_regret=np.nan)).empty and profiles(runs.iloc[:0]).empty
+
+
+def runs_of(**regrets):
+    """Runs of agents on a vector: name -> ((regrets of a task), ...), with returns 1 - regret."""
+    rows = [
+        {"agent": agent, "observation": "vector", "instance": f"world/{task}", "chance": "plain"}
+        | {"environment": "world", "normalized_regret": regret, "return": 1 - regret}
+        for agent, tasks in regrets.items()
+        for task, own in enumerate(tasks)
+        for regret in own
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_the_difference_of_two_agents_on_a_task_is_that_of_welchs_test():
+    ours, theirs = [0.1, 0.2, 0.25], [0.4, 0.7, 0.5, 0.45]
+    row = regret_differences(runs_of(a=[ours], b=[theirs])).iloc[0]
+    test = scipy.stats.ttest_ind(ours, theirs, equal_var=False)
+    interval = test.confidence_interval(0.95)
+    assert (row["ours"], row["theirs"], row["tasks"]) == (("a", "vector"), ("b", "vector"), 1)
+    assert row["difference"] == pytest.approx(np.mean(ours) - np.mean(theirs))
+    assert (row["lower"], row["upper"]) == pytest.approx((interval.low, interval.high))
+    assert row["adjusted"] == row["p_value"] == pytest.approx(test.pvalue)
+
+
+def test_differences_are_means_over_common_tasks_and_corrected_for_their_number():
+    runs = runs_of(a=[[0.1, 0.2], [0.3, 0.4], [9.0, 9.1]], b=[[0.5, 0.6], [0.6, 0.8]], c=[[0.15, 0.2], [0.3, 0.45]])
+    table = regret_differences(runs)
+    assert table["tasks"].tolist() == [2, 2, 2]
+    assert table["difference"].tolist() == pytest.approx([-0.375, -0.025, 0.35])
+    assert (table["adjusted"] >= table["p_value"]).all() and table["adjusted"].max() == table["p_value"].max()
+    assert table["adjusted"].min() == pytest.approx(3 * table["p_value"].min())
+    assert np.isnan(regret_differences(runs_of(a=[[0.1]], b=[[0.2, 0.3]]))["adjusted"]).all()  # one run says nothing
+
+
+def test_tasks_whose_highest_return_is_not_of_the_least_regret_are_named():
+    runs = runs_of(a=[[0.1, 0.2], [0.3]], b=[[0.5], [0.6]])
+    assert len(other_winners(runs)) == 0 and other_winners(runs).attrs["tasks"] == 2
+    played = runs.assign(**{"return": [1.0, 2.0, 5.0, 9.0, 4.0]})
+    (row,) = other_winners(played).to_dict("records")
+    assert (row["instance"], row["most"], row["least"]) == ("world/0", ("b", "vector"), ("a", "vector"))
+    assert (row["most_return"], row["least_return"]) == (9.0, 1.5)
+    assert (row["most_regret"], row["least_regret"]) == pytest.approx((0.5, 0.15))

@@ -8,6 +8,8 @@ import re
 import shlex
 import signal
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
@@ -20,6 +22,7 @@ from pharos.system.interrupts import INTERRUPTED, is_importing, send_again
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import Progress
     from rich.text import Text
 
     from pharos.environments import Environment
@@ -92,22 +95,97 @@ class _Trimmed:
         return self.stream.write(re.sub(r" +(?=\n)", "", text))
 
 
+TOLD_AFTER, TOLD_AT_LEAST_EVERY = 10.0, 60.0  # seconds of work after which a line says what is going on, and again
+
+
+class SlowWork:
+    """Lines on standard error on work that takes long, where no terminal shows its progress.
+
+    The first comes after `TOLD_AFTER` seconds, the next ones when it has taken twice as long, and every
+    `TOLD_AT_LEAST_EVERY` seconds in the end.
+
+    Attributes:
+        text: how far the work is.
+    """
+
+    def __init__(self, what: str, clock: Callable[[], float] = time.monotonic):
+        self.what, self.text = what, ""
+        self._clock, self._began, self._due = clock, clock(), TOLD_AFTER
+
+    def tell_if_due(self) -> None:
+        """Write a line if the time for one has come."""
+        seconds = self._clock() - self._began
+        if seconds >= self._due:
+            self._due = seconds + min(seconds, TOLD_AT_LEAST_EVERY)
+            complain(f"{self.what}{': ' * bool(self.text)}{self.text}, {seconds:.0f} s so far")
+
+    @contextlib.contextmanager
+    def watched(self) -> Iterator["SlowWork"]:
+        """Look once a second, in a thread, whether a line is due."""
+        is_done = threading.Event()
+
+        def watch() -> None:
+            while not is_done.wait(1.0):
+                self.tell_if_due()
+
+        thread = threading.Thread(target=watch, daemon=True)
+        thread.start()
+        try:
+            yield self
+        finally:
+            is_done.set()
+            thread.join()
+
+
 @contextlib.contextmanager
-def progress_line(what: str, *, logged: bool = False) -> Iterator[Callable[[str], None]]:
-    """Report progress in a line on standard error, on a terminal; removed at the end.
+def told_if_slow(what: str) -> Iterator[None]:
+    """Say on standard error, where that is no terminal, that a block is slow whose own progress is for terminals."""
+    with contextlib.nullcontext() if sys.stderr.isatty() else SlowWork(what).watched():
+        yield
+
+
+class ProgressLine:
+    """A line of progress: call it with a text."""
+
+    def __init__(self, show: Callable[[str], None], bar: "Progress | None" = None):
+        self._show, self._bar = show, bar
+
+    def __call__(self, text: str) -> None:
+        self._show(text)
+
+    @contextlib.contextmanager
+    def away(self) -> Iterator[None]:
+        """Remove the line for the time of the block, which prints on the same terminal."""
+        if self._bar is not None:
+            self._bar.stop()
+        yield
+        if self._bar is not None:
+            self._bar.start()
+
+
+@contextlib.contextmanager
+def progress_line(what: str, *, logged: bool = False) -> Iterator[ProgressLine]:
+    """Report progress in a line on standard error: on a terminal always, and removed at the end; else if it is slow.
 
     Args:
-        logged: whether each text is a line of its own elsewhere, as in a log; else nothing is written there.
+        logged: whether each text is a line of its own where there is no terminal, as in a log.
     """
     if not sys.stderr.isatty():
-        yield lambda text: print(f"pharos: {text}", file=sys.stderr, flush=True) if logged else None
+        with SlowWork(what).watched() as work:
+
+            def tell(text: str) -> None:
+                work.text = text
+                if logged:
+                    print(f"pharos: {text}", file=sys.stderr, flush=True)
+
+            yield ProgressLine(tell)
         return
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn(what), TextColumn("{task.fields[text]}"), TimeElapsedColumn())
     with Progress(*columns, console=console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=None, text="")
-        yield lambda text: bar.update(task, text=text)
+        yield ProgressLine(lambda text: bar.update(task, text=text), bar)
 
 
 @contextlib.contextmanager
@@ -179,6 +257,35 @@ def print_table(
     to.print(table)
     for text in notes:
         to.print(escape(text), style="dim", soft_wrap=True)
+
+
+class GrowingTable:
+    """A table whose rows are printed one by one; what is too long for its column goes on in the next line.
+
+    Args:
+        columns: name to width; `>name` has numbers, which end at one place; of width 0: a share of what is left.
+    """
+
+    def __init__(self, columns: Mapping[str, int]):
+        self._columns, self._to = columns, console()
+        self._print(columns, style="bold")
+
+    def add(self, row: Iterable["str | Text"]) -> None:
+        """Print a row."""
+        self._print(row)
+
+    def _print(self, row: Iterable["str | Text"], style: str = "") -> None:
+        from rich.markup import escape
+        from rich.table import Table
+
+        line = Table(box=None, pad_edge=False, show_header=False, expand=not all(self._columns.values()))
+        for number, (name, width) in enumerate(self._columns.items()):
+            how: dict[str, Any] = {"justify": "right"} if name.startswith(">") else {"overflow": "fold"}
+            how |= {"width": width} if width else {"ratio": 1}
+            line.add_column(style=style or ("" if number else "cyan"), no_wrap=not number, **how)
+        line.add_row(*(escape(cell.removeprefix(">")) if isinstance(cell, str) else cell for cell in row))
+        self._to.print(line)
+        self._to.file.flush()
 
 
 def describe_discount(gamma: float, horizon: int | None) -> str:

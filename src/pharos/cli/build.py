@@ -192,6 +192,9 @@ def counts_of_table(mdp: "TabularMDP") -> dict[str, int]:
 # Check ----------------------------------------------------------------------------------------------------------------
 
 
+UNSOLVED = "not solved: not all states were looked at; --max-states 100000 looks at so many"
+
+
 def check(target: Target, *, max_states: Count = 1000) -> Answer:
     """Check an environment against the contract, state by state, and whether any policy beats uniform play.
 
@@ -202,7 +205,7 @@ def check(target: Target, *, max_states: Count = 1000) -> Answer:
     from pharos import check_environment
 
     conformance = check_environment(env, max_states=max_states)
-    values, sentence = _values(env) if conformance.complete else (None, "not solved: not all states were looked at")
+    values, sentence = _values(env) if conformance.complete else (None, UNSOLVED)
     notes = {"notes": [*conformance.notes, sentence], "values": values, "compiling_seconds": compiling.seconds()}
     lines = [sentence, *(f"{name}: {value}" for name, value in compiling_fact())]
     return Answer({**vars(conformance), **notes}, "\n  ".join([str(conformance), *lines]))

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, compiling_fact, complain, print_table, progress_line
+from pharos.cli.answers import (
+    Answer,
+    GrowingTable,
+    compiling_fact,
+    complain,
+    console,
+    print_table,
+    progress_line,
+    told_if_slow,
+)
 from pharos.cli.options import Building, Chance, Count, Discount, Seconds, Target, file_ending, parse_parameters
 from pharos.errors import ParameterError
 from pharos.system import compiling
@@ -18,7 +27,7 @@ from pharos.system.wording import pluralize
 from pharos.training import TrainingOptions
 
 if TYPE_CHECKING:
-    from pharos.hardness import Report, Representation
+    from pharos.hardness import Report, Representation, Result
     from pharos.mdp import TabularMDP
     from pharos.prediction import Prediction
 
@@ -37,7 +46,7 @@ def hardness(
     chance: Chance,
     tolerance: float = 1e-9,
     restart: bool = True,
-    budget: Seconds = 300.0,
+    budget: Seconds = 30.0,
     observation: str | None = None,
     option: Mapping[str, Any],
     network: str | None = None,
@@ -49,6 +58,7 @@ def hardness(
     values: Path | None = None,
     fresh: bool = False,
     building: Building,
+    json: bool,
 ) -> Answer:
     """Measure how hard an instance is: visitation, estimation and planning complexity.
 
@@ -58,7 +68,7 @@ def hardness(
         horizon: Steps of an episode, for measures of episodes.
         tolerance: Largest error of the optimal values, in units of return.
         restart: Whether terminal states lead back to the start.
-        budget: Seconds a measure may take before it gives a proven interval.
+        budget: Seconds a measure may take before it gives a proven interval, or says that it is not available.
         observation: What the agent sees, as of train: adds measures of what its network makes of it.
         option: Option of the observation, such as hide=row.
         network: mlp128, mlp128x2, cnn16, nature; that of the agents when not given. Or file.py:function, your own.
@@ -70,51 +80,63 @@ def hardness(
         values: Folder for values and bounds while they are computed, in place of memory; what was killed goes on.
         fresh: Compute anew what is kept beside the state space.
     """
-    needs_rewards = True
-    if measures is not None:
-        from pharos.hardness import selected_measures
+    from pharos.hardness import selected_measures
 
-        wanted = selected_measures(measures)  # an unknown name is told before anything is built
-        needs_rewards = any(each.depends != "structure" for each in wanted)
+    # an unknown name is told before anything is built
+    wanted = selected_measures(measures, is_seen=observation is not None)
+    needs_rewards = any(each.depends != "structure" for each in wanted)
     of_network = {"network": network, "initialisation": initialisation, "optimizer": optimizer, "landmarks": landmarks}
     useless = [name for name, value in {"option": option or None, **of_network}.items() if value is not None]
     if observation is None and useless:
         raise ParameterError(f"--{useless[0]} goes with --observation NAME, what the agent sees")
     own = target.is_imported  # an imported MDP has a discount and a horizon of its own
-    mdp = target.mdp(
-        building,
-        gamma=0.99 if gamma is None and not own else gamma,
-        horizon=horizon if gamma == 1 or own else None,
-        chance=chance,
-        by_range=not needs_rewards,
-    )
+    with told_if_slow("building the state space, or loading it"):
+        mdp = target.mdp(
+            building,
+            gamma=0.99 if gamma is None and not own else gamma,
+            horizon=horizon if gamma == 1 or own else None,
+            chance=chance,
+            by_range=not needs_rewards,
+        )
     representation = None
     if observation is not None:
         named = {"network": network, "initialisation": initialisation or "pytorch", "landmarks": landmarks}
         mdp, representation = _represented(target, mdp, observation, building, {**option, **named})
+    names = [each.name for each in wanted]
+    steps = mdp.horizon if horizon is None else horizon
+    if measures is None and steps is None and mdp.gamma < 1:
+        names.insert(names.index("effective_horizon") + 1, "stationary_effective_horizon")  # which needs no horizon
     from pharos.hardness import Schedule
     from pharos.hardness import report as measure
 
+    table = None
+    if not (json or latex):
+        shown = [name for name in names if measures is not None or steps is not None or name != "covering"]
+        is_named = measures is not None
+        table = _Table(target.title, _setting(mdp, steps, chance), shown, definitions, is_named)
     with progress_line("measuring") as tell:
+
+        def show(result: "Result") -> None:
+            if table is not None:
+                with tell.away():
+                    table.add(result)
+
         report = measure(
             mdp,
-            measures,
+            names,
             horizon=horizon,
             tolerance=tolerance,
             restart=restart,
             budget=budget,
             keep=not fresh,
-            progress=lambda what, line: tell(f"{what}  {line}"),
+            progress=lambda what, line: tell(f"{what}  {line}".rstrip()),
+            on_result=show,
             representation=representation,
             schedule=None if representation is None else Schedule(optimizer=optimizer or "gradient"),
             folder=values,
         )
-
-    def table() -> None:
-        _print(target.title, report, chance.in_words(mdp.dynamics.has_chance), definitions)
-
     answer = {**report.to_dict(), "compiling_seconds": compiling.seconds()}
-    return Answer(answer, report.to_latex() if latex else table)
+    return Answer(answer, report.to_latex() if table is None else lambda: _print_notes(report))
 
 
 def _represented(
@@ -135,39 +157,74 @@ def _represented(
         return mdp, representation(space, observation, **options)
 
 
-def _print(title: str, report: "Report", chance: str, definitions: bool) -> None:
-    from rich.text import Text
+def _setting(mdp: "TabularMDP", horizon: int | None, chance: Chance) -> str:
+    """Size, discount, horizon and chance, in a line."""
+    states, actions = pluralize(mdp.num_states, "state"), pluralize(mdp.num_actions, "action")
+    discount = f"discount {mdp.gamma:g}, horizon {'none' if horizon is None else horizon}"
+    return f"{states} x {actions}, {discount}, chance: {chance.in_words(mdp.dynamics.has_chance)}"
 
-    rows: list[list[str | Text]] = []
-    notes = []
-    for result in report.results.values():
-        value = Text("undefined", "dim") if result.undefined else result.text
+
+# Widths of the column of values: of all, and of measures whose values are several numbers.
+VALUE, LONG_VALUES = 28, {**dict.fromkeys(IDEALISED, 50), "stationary_effective_horizon": 36, "covering": 68}
+
+
+class _Table:
+    """Measures in rows, each printed as soon as it is there.
+
+    Args:
+        names: of the measures.
+        is_named: whether the user named them, so that one that is not defined has a row as well.
+    """
+
+    def __init__(self, title: str, setting: str, names: list[str], definitions: bool, is_named: bool):
+        from rich.markup import escape
+
+        self.has_definitions, self.is_named = definitions, is_named
+        screen = console()
+        screen.print(escape(title), style="bold", soft_wrap=True)
+        screen.print(escape(setting), style="dim", soft_wrap=True)
+        width = max((LONG_VALUES.get(name, VALUE) for name in names), default=VALUE)
+        columns = {"measure": max(map(len, names)), "value": width, "exact": 10, ">seconds": 7}
+        self.rows = GrowingTable(columns | ({"definition": 0, "source": 0} if definitions else {}))
+
+    def add(self, result: "Result") -> None:
+        """Print the row of a measure, unless it is not defined and nobody asked for it."""
+        from rich.text import Text
+
+        if result.undefined and not (result.is_out_of_budget or self.is_named):
+            return
+        missing = "not available" if result.is_out_of_budget else "undefined"
+        value = Text(missing, "dim") if result.undefined else result.text
         exact = "" if result.undefined else PROVEN[result.certificate.kind]
         if exact and result.name in IDEALISED:
             exact = "prediction"
-        row = [result.name, value, exact, "kept" if result.kept else f"{result.seconds:.2f}"]
-        rows.append(row + ([result.definition, Text(result.source, "dim")] if definitions else []))
+        row: list[str | Text] = [result.name, value, exact, "kept" if result.kept else f"{result.seconds:.2f}"]
+        self.rows.add(row + ([result.definition, Text(result.source, "dim")] if self.has_definitions else []))
+
+
+def _print_notes(report: "Report") -> None:
+    """Print what the rows do not say: errors, ties, reasons."""
+    from rich.markup import escape
+
+    reasons: dict[str, list[str]] = {}
+    for result in report.results.values():
         if note := result.undefined or result.certificate.note:
-            notes.append(note if note.startswith(result.name) else f"{result.name}: {note}")
-    conventions = report.conventions
-    horizon = "none" if conventions["horizon"] is None else conventions["horizon"]
-    setting = (
-        f"{pluralize(conventions['num_states'], 'state')} x {pluralize(conventions['num_actions'], 'action')}, "
-        f"discount {conventions['gamma']:g}, horizon {horizon}, chance: {chance}"
-    )
+            reasons.setdefault(note.removeprefix(result.name).lstrip(": ").removeprefix("is "), []).append(result.name)
     remarks = []
-    error = conventions.get("error_bound")
+    error = report.conventions.get("error_bound")
     if error is not None and math.isfinite(error):
         remarks.append(f"values are within {error:.2g} of the optimal ones (proven)")
-    remarks += [*_ties(report), *(f"compiling: {how_long}" for _, how_long in compiling_fact()), *notes]
+    remarks += [*_ties(report), *(f"compiling: {how_long}" for _, how_long in compiling_fact())]
+    remarks += [f"{', '.join(names)}: {reason}" for reason, names in reasons.items()]
     if not {*IDEALISED}.isdisjoint(report.results):
         remarks.append(
             "prediction: regret of an idealised learner, 0 is optimal, 1 is uniform play; kernel_regret has "
             "expectations in the place of draws. `pharos predict` has the form that agrees best "
             "with runs, and an interval"
         )
-    columns = ["measure", "value", "exact", ">seconds", *(["definition", "source"] if definitions else [])]
-    print_table(title, columns, rows, before=[setting], notes=remarks)
+    screen = console()
+    for text in remarks:
+        screen.print(escape(text), style="dim", soft_wrap=True)
 
 
 def _ties(report: "Report") -> list[str]:

@@ -27,7 +27,7 @@ import numpy as np
 import xxhash
 
 from pharos.errors import FileFormatError, ParameterError, UndefinedMeasure
-from pharos.hardness.interval import Budget, BudgetClock, Interval, MeasureProgress, conventions_of
+from pharos.hardness.interval import MORE, Budget, BudgetClock, Interval, MeasureProgress, conventions_of
 from pharos.hardness.stochastic_diameter import stochastic_diameter, stochastic_start_eccentricity
 from pharos.hardness.sum_sweep import Graph, SumSweep
 from pharos.kernels import graph as kernels
@@ -131,10 +131,14 @@ def start_eccentricity_interval(
     restart: bool = True,
     tolerance: float = 1e-6,
     budget: Budget | float | None = None,
+    progress: Callable[[MeasureProgress], None] | None = None,
 ) -> Interval:
-    """Return `start_eccentricity` as an `Interval`: exact, or what is proven within the budget. Arguments: the same."""
+    """Return `start_eccentricity` as an `Interval`: exact, or what is proven within the budget.
+
+    Arguments: the same, and `progress`, as of `diameter`.
+    """
     _check_tolerance(tolerance)
-    spending = BudgetClock(Budget.of(budget), None, conventions_of(mdp, restart))
+    spending = BudgetClock(Budget.of(budget), progress, conventions_of(mdp, restart))
     graph = Graph.of(mdp, restart)
     if graph is None:
         return stochastic_start_eccentricity(mdp, restart, tolerance, spending)
@@ -147,7 +151,7 @@ def start_eccentricity_interval(
     for start, weight in zip(starts, weights, strict=True):
         if spending.is_over and spending.searches:
             num_starts = pluralize(len(starts), "start state")
-            note = f"budget spent after the searches from {spending.searches} of {num_starts}"
+            note = f"budget spent after the searches from {spending.searches} of {num_starts}; {MORE}"
             break
         num_reached, largest, _ = graph.search_forward(int(start), distance)
         spending.searches += 1
@@ -460,7 +464,7 @@ class LeanSweep(SumSweep):
             raise OverflowError  # a bound was cut
         self._sweep()
         upper = self._upper()
-        note = f"budget spent: {self._open()[0]} states may have a larger eccentricity than {self.best}"
+        note = f"budget spent: {self._open()[0]} states may have a larger eccentricity than {self.best}; {MORE}"
         return self._result(self.best, upper, note if upper > self.best else "")
 
     def _is_bounded(self) -> bool:

@@ -100,7 +100,13 @@ class EffectiveHorizon(LookAhead):
 
 
 @require_mdp
-def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int = 0) -> EffectiveHorizon:
+def effective_horizon(
+    mdp: TabularMDP,
+    *,
+    horizon: int | None = None,
+    tight: int = 0,
+    progress: Callable[[str], object] | None = None,
+) -> EffectiveHorizon:
     """Return the effective horizon of an MDP, and what it is made of.
 
         Q^1 = Q of the uniform policy,  Q^{k+1}_t(s, a) = r(s, a) + E max_b Q^k_{t+1}(s', b),  Q^k_T = r
@@ -113,6 +119,7 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
     Args:
         horizon: T; None: that of the MDP.
         tight: the largest k for which the tight bound of `gorp_bound` is computed as well; 0: none.
+        progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: there is no horizon, or the table of all steps does not fit into memory: 8 GiB under chance,
             else 60 % of that of the machine. PrecisionError: returns may pass 1e150.
@@ -125,8 +132,9 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
     check_returns("effective_horizon", mdp, steps)
     mdp = mdp_within(mdp, steps)
     compiled = applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > COMPILED
-    parts = parts_of(LargeHorizon(mdp, steps, TIE) if compiled else SmallHorizon(mdp, steps))
-    bound = gorp_bound(mdp, horizon=steps, max_k=tight).value if tight else None
+    tell = progress or str
+    parts = parts_of(LargeHorizon(mdp, steps, TIE, tell) if compiled else SmallHorizon(mdp, steps, tell))
+    bound = gorp_bound(mdp, horizon=steps, max_k=tight, progress=progress).value if tight else None
     conventions = {
         "horizon": steps,
         "gamma": 1.0,
@@ -139,7 +147,7 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
 
 def parts_of(values: "SmallHorizon | LargeHorizon") -> dict[str, Any]:
     """Fields of an `EffectiveHorizon`, but for `tight` and `conventions`."""
-    ahead, greedy = look_ahead(values, values.steps, values.num_actions, values.greedy_return)
+    ahead, greedy = look_ahead(values, values.steps, values.num_actions, values.greedy_return, values.tell)
     returns = dict(zip(("optimal_return", "random_return", "worst_return"), values.returns, strict=True))
     return {**vars(ahead), **returns, "greedy_returns": greedy, "num_states": values.num_visitable}
 
@@ -203,8 +211,8 @@ class SmallHorizon(FiniteHorizonValues):
         values: (T, N, A) Q^k. variance: (T, N, A) var^k.
     """
 
-    def __init__(self, mdp: TabularMDP, steps: int):
-        super().__init__(mdp, steps)
+    def __init__(self, mdp: TabularMDP, steps: int, tell: Callable[[str], object] = str):
+        super().__init__(mdp, steps, tell)
         self.values, self.variance = self.explored, (self.explored - self.worst) * (self.best - self.worst)
         values = (self.best.max(axis=2)[0], self.explored_value[0], self.worst.min(axis=2)[0])
         self.returns = tuple(map(self.at_start, values))
@@ -284,10 +292,10 @@ class LargeHorizon:
         optimal: (T, S) bit a is set where a is optimal.
     """
 
-    def __init__(self, mdp: TabularMDP, steps: int, tie: float):
+    def __init__(self, mdp: TabularMDP, steps: int, tie: float, tell: Callable[[str], object] = str):
         from pharos.kernels import horizon as kernels
 
-        self.kernels, self.steps, self.num_actions = kernels, steps, mdp.num_actions
+        self.kernels, self.steps, self.num_actions, self.tell = kernels, steps, mdp.num_actions, tell
         states = mdp.num_states
         bits = next(
             kind for kind in (np.uint8, np.uint16, np.uint32, np.uint64) if mdp.num_actions <= 8 * kind(0).itemsize
@@ -312,6 +320,7 @@ class LargeHorizon:
         best, worst = np.zeros((2, states)), np.zeros((2, states))
         for t in range(steps - 1, -1, -1):
             now, after = t % 2, 1 - t % 2
+            tell(f"values of step {t} of {steps}")
             kernels.values(
                 *(self.next_states, self.rewards, tie, best[after], worst[after], self.ahead[t + 1]),
                 *(best[now], worst[now], self.ahead[t], self.optimal[t], self.spread[t]),
@@ -347,6 +356,7 @@ class LargeHorizon:
         n, most = self._begin(), np.zeros(3)
         now, after = self.nodes
         for t in range(self.steps):
+            self.tell(f"states met at step {t} of {self.steps}")
             n = self.kernels.step_along(
                 *(self.next_states, self.rewards, self.ahead[t + 1], self.optimal[t], self.spread[t], log, near),
                 *(now, n, after, self.is_visited, most),
@@ -362,6 +372,7 @@ class LargeHorizon:
     def advance(self, spread: bool = True) -> None:
         nothing = np.zeros(len(self.next_states))
         for t in range(self.steps):
+            self.tell(f"lookahead of step {t} of {self.steps}")
             self.kernels.lookahead(self.next_states, self.rewards, 1.0, self.ahead[t + 1], self.ahead[t])
             if spread:
                 after = self.spread[t + 1] if t + 1 < self.steps else nothing
@@ -505,12 +516,15 @@ class _Nodes:
         self.choices, self.table, self.num_nodes = choices, choices.table, len(choices.underlying)
         self.starts = np.array(sorted(node for node, _ in choices.starts))
         self.rewards = choices.rewards(mdp)
-        tell("values of optimal play")
-        best = optimal_solution(mdp, solution) if solution is not None else solved(value_iteration, mdp, tolerance)
-        tell("values of the worst play")
-        worst = solved(worst_value, mdp, tolerance)
-        tell("values of uniform play")
-        explored = solved(uniform_value, mdp, tolerance)
+
+        def solution_of(solve: Callable[..., Solution], whose: str) -> Solution:
+            tell(f"values of {whose} play")
+            return solved(
+                solve, mdp, tolerance, progress=lambda sweeps, _: tell(f"sweep {sweeps} of the values of {whose} play")
+            )
+
+        best = solution_of(value_iteration, "optimal") if solution is None else optimal_solution(mdp, solution)
+        worst, explored = solution_of(worst_value, "the worst"), solution_of(uniform_value, "uniform")
         self.error = mdp.gamma * max(best.error_bound, worst.error_bound, explored.error_bound)
         self.error += mdp.reward_table.rounding
         everywhere = np.arange(self.num_nodes)

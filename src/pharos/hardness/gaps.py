@@ -403,24 +403,27 @@ def gaps(
     return _summed(mdp, optimal_solution(mdp, solution), tie_tolerance)
 
 
-def resolved_gaps(mdp: TabularMDP, solution: Solution, in_place: bool = False) -> Gaps:
+def resolved_gaps(
+    mdp: TabularMDP, solution: Solution, in_place: bool = False, go_on: Callable[[], bool] = lambda: True
+) -> Gaps:
     """The gaps of a solution; of a more accurate one where ties are unresolved, or the sum is wide.
 
     in_place: whether the values of the solution may become the more accurate ones; its bound holds for these, too.
+    go_on: whether there may be another sweep; asked before each.
     """
     if solution.horizon is not None or mdp.gamma == 1.0:
         return _summed(mdp, solution, None)
     settled = solution
     if TieProof(mdp).holds:  # else ties cannot be proven that way
-        settled = _settled(mdp, solution, in_place)
+        settled = _settled(mdp, solution, in_place, go_on)
     result = _summed(mdp, settled, None)
     if result.is_resolved or settled is not solution:
         return result
-    settled = _settled(mdp, solution, in_place)
+    settled = _settled(mdp, solution, in_place, go_on)
     return _summed(mdp, settled, None) if settled.error_bound < solution.error_bound else result
 
 
-def _settled(mdp: TabularMDP, solution: Solution, in_place: bool) -> Solution:
+def _settled(mdp: TabularMDP, solution: Solution, in_place: bool, go_on: Callable[[], bool]) -> Solution:
     """The solution after more sweeps, until values do not change, or by no more than rounding.
 
     The bound is that of `pharos.solvers`: (rho change + rounding) / (1 - rho). Values that do not change at all make
@@ -439,7 +442,7 @@ def _settled(mdp: TabularMDP, solution: Solution, in_place: bool) -> Solution:
         x[:] = solution.x
     largest = max(float(x.max(initial=0.0)), -float(x.min(initial=0.0)))
     sweeps = 0
-    while sweeps < _SWEEPS:
+    while sweeps < _SWEEPS and go_on():
         sweeps += 1
         change = mdp.dynamics.sweep(equation, x)
         largest += change

@@ -57,7 +57,12 @@ class GorpBound:
 
 @require_mdp
 def gorp_bound(
-    mdp: TabularMDP, *, horizon: int | None = None, max_k: int = 1, methods: Sequence[str] = METHODS[:2]
+    mdp: TabularMDP,
+    *,
+    horizon: int | None = None,
+    max_k: int = 1,
+    methods: Sequence[str] = METHODS[:2],
+    progress: Callable[[str], object] | None = None,
 ) -> GorpBound:
     """Return a bound on the samples that GORP needs to act optimally through an episode with probability 1/2.
 
@@ -75,6 +80,7 @@ def gorp_bound(
             up to 1), `bernstein` (up to 100 sequences) and `exact` (returns 0 or R, any k, m up to 10^6: the
             probabilities themselves). The first two are the default, and give the effective horizons that BRIDGE
             published. With `exact` instead of `binomial` the bound is proven, and far smaller.
+        progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: the MDP has chance or several outcomes: GORP's sequences of actions then lead nowhere in
             particular.
@@ -93,7 +99,7 @@ def gorp_bound(
     if not names:
         raise ParameterError(f"no methods given; expected some of {', '.join(METHODS)}")
     _needs_one_outcome("gorp_bound", mdp)
-    search = GorpSearch(mdp, steps, names)
+    search = GorpSearch(mdp, steps, names, progress or str)
     ms, failures = (list(each) for each in zip(*map(search.samples, ks), strict=True))
     log_actions = math.log(mdp.num_actions) if mdp.num_actions > 1 else math.inf
     values = [math.inf if m is None else k + math.log(m) / log_actions for k, m in zip(ks, ms, strict=True)]
@@ -213,8 +219,8 @@ def _needs_one_outcome(name: str, mdp: TabularMDP) -> None:
 class GorpSearch:
     """The smallest m, to 1 %, that is proven to make GORP fail with probability 1/2 at most."""
 
-    def __init__(self, mdp: TabularMDP, steps: int, methods: tuple[str, ...]):
-        self.tree, self.methods = FiniteHorizonValues(mdp, steps), methods
+    def __init__(self, mdp: TabularMDP, steps: int, methods: tuple[str, ...], tell: Callable[[str], object] = str):
+        self.tree, self.methods, self.tell = FiniteHorizonValues(mdp, steps, tell), methods, tell
         assert self.tree.table is not None
         self.nodes_at = [self.tree.first]
         for t in range(steps - 1):
@@ -251,6 +257,7 @@ class GorpSearch:
             open_ = np.flatnonzero(f.max(axis=1) > f.min(axis=1))
             for block in np.array_split(open_, max(1, len(open_) * tree.num_actions ** (2 * k) // 10**6)):
                 if len(block):
+                    self.tell(f"k = {k}, m = {m:.4g}, step {t} of {tree.steps}")
                     now[nodes[block]] = self._worst_case(nodes[block], t, f[block], m, k)
             after = now
         return tree.at_start(after)

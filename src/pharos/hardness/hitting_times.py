@@ -118,6 +118,8 @@ SWEEPS = 40
 WIDEST = 8_000
 # Sweeps that a linear solve takes as long as: FILL_IN times the cube of that number of nodes, by the outcomes.
 FILL_IN = 1 / 30
+# Seconds that a sweep takes for each outcome on a slow core: a linear solve that would outlast the budget is not begun.
+SECONDS_EACH = 2e-9
 # Times half of `SWEEPS` that are made in any case.
 LEAST = 6
 # They end closer than the tolerance asks for, nearly as close as a linear solve does.
@@ -255,7 +257,7 @@ class HittingTimes:
         allow."""
         bounds, failures, stalls, apart = self._converged(j, count, tolerance, enough, spending), 0, 0, math.inf
         while not bounds.meets(tolerance) and bounds.upper > enough and not spending.is_over:
-            if count > SOLVABLE or self._width(count) > WIDEST:
+            if count > SOLVABLE or self._width(count) > self._widest(spending):
                 if bounds.limited:
                     return bounds
                 bounds = self.sweep(j, count, 8 * SWEEPS, enough, spending)
@@ -308,6 +310,11 @@ class HittingTimes:
                 if now >= before or left * math.log(before / now) < 3 * math.log(now / goal):
                     break
         return bounds
+
+    @staticmethod
+    def _widest(spending: BudgetClock) -> float:
+        """Width up to which linear solves are tried, given the time that is left."""
+        return min(WIDEST, (max(spending.seconds_left, 0.0) / (FILL_IN * SECONDS_EACH)) ** (1 / 3))
 
     def _width(self, count: int) -> int:
         """Most nodes at the same distance from the target."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.errors import ParameterError
+from pharos.errors import MeasureUnfinished, ParameterError
 from pharos.mdp import TabularMDP
 from pharos.system.compiling import Stopwatch
 
@@ -196,6 +196,13 @@ class Budget:
         return budget if isinstance(budget, Budget) else Budget(seconds=budget)
 
 
+COMMAND_SECONDS = 30.0
+"""Budget of `pharos hardness` if none is given, in seconds."""
+
+MORE = "a larger budget (--budget) may prove closer bounds"
+"""What the note of an interval that a budget has ended advises."""
+
+
 @dataclass(frozen=True)
 class MeasureProgress:
     """Progress of a measure: the interval so far, searches done, candidates left, and seconds since the start."""
@@ -225,6 +232,10 @@ class BudgetClock:
         self.searches = 0
         self._reported = -math.inf
 
+    def restart(self) -> None:
+        """Begin again, for another measure of the same budget."""
+        self._watch, self.searches, self._reported = Stopwatch(), 0, -math.inf
+
     @property
     def seconds(self) -> float:
         """Seconds since the start, without those of compiling."""
@@ -233,7 +244,18 @@ class BudgetClock:
     @property
     def is_over(self) -> bool:
         """Whether a limit is reached."""
-        return self.searches >= self.budget.searches or self.seconds >= self.budget.seconds
+        return self.searches >= self.budget.searches or self.seconds_left <= 0
+
+    @property
+    def seconds_left(self) -> float:
+        """Seconds until the budget ends; infinite if it does not limit them."""
+        return self.budget.seconds - self.seconds
+
+    def check(self, line: str) -> None:
+        """MeasureUnfinished if the seconds are over; `line` says how far the work is."""
+        if self.seconds_left <= 0:
+            spent = f"the budget of {self.budget.seconds:g} s ended at {line}" if line else "the budget has ended"
+            raise MeasureUnfinished(f"not available: {spent}; give a larger one (--budget)")
 
     def signed(self, interval: Interval) -> Interval:
         """The interval, with its conventions, searches and seconds."""

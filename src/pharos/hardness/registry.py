@@ -7,12 +7,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
+from pharos.errors import MeasureUnfinished, ParameterError, UndefinedMeasure, UnknownName
 from pharos.hardness.diameter import diameter, start_eccentricity_interval
 from pharos.hardness.effective_horizon import effective_horizon, stationary_effective_horizon
 from pharos.hardness.gaps import Gaps, resolved_gaps, solved
 from pharos.hardness.gorp import gorp_bound
-from pharos.hardness.interval import Budget, Certified, MeasureProgress
+from pharos.hardness.interval import Budget, BudgetClock, Certified, MeasureProgress
 from pharos.hardness.representation.kernel_regret import (
     aliasing_floor,
     kernel_learning_time,
@@ -26,6 +26,7 @@ from pharos.hardness.value_norm import action_gap_regularity, certified_value_no
 from pharos.hardness.visitation import covering, distribution_mismatch, exploration_time, mixing_time
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, value_iteration
+from pharos.system.wording import pluralize
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,8 @@ class Problem:
         rollouts: of the idealised actor-critic; None: those of `Rollouts`.
         sampling: of the learner that draws; None: that of `Sampling`.
         folder: where optimal values and bounds of searches are kept while they are computed; None: in memory.
+        is_strict: whether the budget also ends measures without bounds to show for it, which are then not available.
+        clock: of the running measure.
     """
 
     mdp: TabularMDP
@@ -57,23 +60,47 @@ class Problem:
     rollouts: Rollouts | None = None
     sampling: Sampling | None = None
     folder: Path | None = None
+    is_strict: bool = False
 
     @cached_property
+    def clock(self) -> BudgetClock:
+        """Clock of the budget, which `report` starts anew for each measure."""
+        return BudgetClock(self.budget, None)
+
+    @property
     def solution(self) -> Solution:
-        """Optimal values."""
-        return solved(
-            value_iteration,
-            self.mdp,
-            self.tolerance,
-            keep_all=self.mdp.horizon is not None and self._is_small,
-            progress=lambda sweeps, bound: self.report("values", f"sweep {sweeps}, error at most {bound:.2g}"),
-            values=None if self.folder is None or self.mdp.horizon is not None else self.folder / "optimal.npy",
-        )
+        """Optimal values; MeasureUnfinished if the budget of a measure ended before they were there."""
+        if isinstance(self._solved, MeasureUnfinished):
+            raise self._solved
+        return self._solved
+
+    @cached_property
+    def _solved(self) -> Solution | MeasureUnfinished:  # what a budget has ended is not tried by the next measure again
+        try:
+            return solved(
+                value_iteration,
+                self.mdp,
+                self.tolerance,
+                keep_all=self.mdp.horizon is not None and self._is_small,
+                progress=self.of_solver("the optimal values"),
+                values=None if self.folder is None or self.mdp.horizon is not None else self.folder / "optimal.npy",
+            )
+        except MeasureUnfinished as error:
+            return error
+
+    @property
+    def error_bound(self) -> float | None:
+        """Error bound of the optimal values; None if no measure has used them, or the budget has ended them."""
+        result = vars(self).get("_solved")
+        return result.error_bound if isinstance(result, Solution) else None
 
     @cached_property
     def gaps(self) -> Gaps:
         """Suboptimality gaps."""
-        return resolved_gaps(self.mdp, self.solution, in_place=self.folder is not None)
+        return resolved_gaps(self.mdp, self.solution, in_place=self.folder is not None, go_on=self._may_go_on)
+
+    def _may_go_on(self) -> bool:
+        return not self.is_strict or self.clock.seconds_left > 0
 
     def episode(self, measure: str) -> int:
         """The horizon; UndefinedMeasure where there is none."""
@@ -88,7 +115,20 @@ class Problem:
         return self.representation
 
     def report(self, what: str, line: str) -> None:
-        """Report progress."""
+        """Report progress; MeasureUnfinished if the budget has ended, so that every loop that reports keeps to it."""
+        if self.is_strict:
+            self.clock.check(line)
+        self._show(what, line)
+
+    def of_solver(self, what: str) -> Callable[[int, float], None]:
+        """Progress callback of a solver, which keeps to the budget."""
+        return lambda sweeps, bound: self.report(what, f"sweep {sweeps} of {what}, error at most {bound:.2g}")
+
+    def reporter(self, what: str) -> Callable[[str], None]:
+        """Progress callback of a measure, which keeps to the budget."""
+        return lambda line: self.report(what, line)
+
+    def _show(self, what: str, line: str) -> None:
         if self.progress is not None:
             self.progress(what, line)
 
@@ -97,9 +137,9 @@ class Problem:
 
         def show(progress: MeasureProgress) -> None:
             upper = f"{progress.upper:.6g}" if math.isfinite(progress.upper) and progress.upper < 2**31 - 1 else "?"
-            self.report(
+            self._show(
                 what,
-                f"between {progress.lower:.6g} and {upper}, {progress.searches} searches, "
+                f"between {progress.lower:.6g} and {upper}, {pluralize(progress.searches, 'search', 'searches')}, "
                 f"{progress.candidates:,} states open",
             )
 
@@ -214,10 +254,21 @@ Outcome = TypeVar("Outcome")
 
 
 def _start_eccentricity(problem: Problem) -> Certified:
-    interval = start_eccentricity_interval(problem.mdp, restart=problem.restart, budget=problem.budget)
+    interval = start_eccentricity_interval(
+        problem.mdp,
+        restart=problem.restart,
+        budget=problem.budget,
+        progress=problem.interval_reporter("start_eccentricity"),
+    )
     if not interval.exact and math.isinf(interval.upper):
         raise UndefinedMeasure(f"start_eccentricity: at least {interval.lower:.6g}; {interval.note}")
     return Certified(interval.upper, interval.lower, interval.upper, interval.exact, interval.note)
+
+
+def _of_episodes(function: Callable[..., Outcome], problem: Problem) -> Outcome:
+    """Result of a measure of episodes, which has the function's name."""
+    name = function.__name__
+    return function(problem.mdp, horizon=problem.episode(name), progress=problem.reporter(name))
 
 
 def _minimal_gap(problem: Problem) -> Certified:
@@ -283,14 +334,16 @@ register(
 )
 register(
     "environmental_value_norm",
-    lambda problem: certified_value_norm(problem.mdp, problem.solution),
+    lambda problem: certified_value_norm(
+        problem.mdp, problem.solution, progress=problem.reporter("environmental_value_norm")
+    ),
     definition="max over s, a of the standard deviation of V*(s') under p(. | s, a)",
     source="Maillard, Mann and Mannor (2014), definition 1",
     **_VALUES,
 )
 register(
     "effective_horizon",
-    lambda problem: effective_horizon(problem.mdp, horizon=problem.episode("effective_horizon")),
+    lambda problem: _of_episodes(effective_horizon, problem),
     definition="min over k of k + log_A m_k: m_k samples of k steps followed by random play tell optimal actions apart",
     source="Laidlaw, Russell and Dragan (2023), theorem 5.4",
     complexity="planning",
@@ -299,7 +352,7 @@ register(
 )
 register(
     "covering",
-    lambda problem: covering(problem.mdp, horizon=problem.episode("covering")),
+    lambda problem: _of_episodes(covering, problem),
     definition="min over s, a of max over t of mu_t(s, a) under uniform play; length <= ln(2 S A) / omega",
     source="Laidlaw, Russell and Dragan (2023); Even-Dar and Mansour (2003)",
     complexity="visitation",
@@ -316,7 +369,9 @@ register(
 )
 register(
     "distribution_mismatch",
-    lambda problem: distribution_mismatch(problem.mdp, solution=problem.solution),
+    lambda problem: distribution_mismatch(
+        problem.mdp, solution=problem.solution, progress=problem.reporter("distribution_mismatch")
+    ),
     definition="max over s of d*(s) / d(s), discounted visits of the optimal and of the uniform policy",
     source="Kakade and Langford (2002); Agarwal et al. (2021), section 4.2",
     complexity="visitation",
@@ -326,7 +381,7 @@ register(
 )
 register(
     "mixing_time",
-    lambda problem: mixing_time(problem.mdp, restart=problem.restart),
+    lambda problem: mixing_time(problem.mdp, restart=problem.restart, progress=problem.reporter("mixing_time")),
     definition="min t with max over s of the total variation of P^t(s, .) to the stationary distribution <= 1/4; "
     "uniform play",
     source="Kearns and Singh (2002); Levin, Peres and Wilmer (2009), section 4.5",
@@ -337,7 +392,11 @@ register(
 )
 register(
     "tight_effective_horizon",
-    lambda problem: gorp_bound(problem.mdp, horizon=problem.episode("tight_effective_horizon")),
+    lambda problem: gorp_bound(
+        problem.mdp,
+        horizon=problem.episode("tight_effective_horizon"),
+        progress=problem.reporter("tight_effective_horizon"),
+    ),
     definition="1 + log_A m, m samples with which greedy over random policy fails with probability <= 1/2",
     source="Laidlaw, Russell and Dragan (2023), appendix C",
     complexity="planning",
@@ -351,7 +410,7 @@ register(
         problem.mdp,
         problem.solution if problem.mdp.horizon is None else None,
         steps=problem.horizon,
-        progress=lambda line: problem.report("stationary_effective_horizon", line),
+        progress=problem.reporter("stationary_effective_horizon"),
     ),
     definition="the effective horizon with one discounted value a state in place of one for each step",
     source="pharos; after Laidlaw, Russell and Dragan (2023), theorem 5.4",
@@ -362,7 +421,7 @@ register(
 )
 register(
     "exploration_time",
-    lambda problem: exploration_time(problem.mdp, horizon=problem.episode("exploration_time")),
+    lambda problem: _of_episodes(exploration_time, problem),
     definition="expected steps after which uniform play, in episodes of T steps, meets a reward above half the largest",
     source="pharos",
     complexity="visitation",
@@ -374,10 +433,9 @@ register(
 
 def _represented(function: Callable[..., Outcome], problem: Problem, *options: str) -> Outcome:
     """Result of a measure of the representation; options: names in `problem`, beside schedule and horizon."""
-    representation = problem.seen(function.__name__)
-    return function(
-        problem.mdp, representation, **{name: getattr(problem, name) for name in ("schedule", "horizon", *options)}
-    )
+    name, representation = function.__name__, problem.seen(function.__name__)
+    settings = {option: getattr(problem, option) for option in ("schedule", "horizon", *options)}
+    return function(problem.mdp, representation, progress=problem.reporter(name), **settings)
 
 
 register(

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import xxhash
 
-from pharos.errors import PrecisionError, UndefinedMeasure
+from pharos.errors import MeasureUnfinished, PrecisionError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of, finite
 from pharos.hardness.registry import Measure, Problem, selected_measures
 from pharos.hardness.representation.learning import Representation, Rollouts, Schedule
@@ -36,6 +36,7 @@ class Result:
         value: a number, or the measure's result as a dictionary; None where it is undefined.
         text: the value for people.
         undefined: why there is no value, and what would define it; empty where there is one.
+        is_out_of_budget: whether there is no value because the budget ended.
         seconds: time that it took, when it was computed.
         kept: whether it stood beside the state space, and was not computed now.
         certificate: what is proven of it.
@@ -48,6 +49,7 @@ class Result:
     value: Any = None
     text: str = ""
     undefined: str = ""
+    is_out_of_budget: bool = False
     seconds: float = 0.0
     kept: bool = False
     certificate: Certificate = field(default_factory=lambda: Certificate("float64"))
@@ -126,6 +128,7 @@ def report(  # noqa: PLR0913
     budget: Budget | float | None = None,
     keep: bool = True,
     progress: Callable[[str, str], None] | None = None,
+    on_result: Callable[[Result], None] | None = None,
     representation: Representation | None = None,
     schedule: Schedule | None = None,
     rollouts: Rollouts | None = None,
@@ -141,11 +144,12 @@ def report(  # noqa: PLR0913
             gamma and the horizon of the MDP itself.
         tolerance: largest error of the optimal values, in units of return.
         restart: convention of the diameter: terminal states lead back to the start.
-        budget: what each measure may spend (seconds, or a `Budget`; 300 s by default) before it returns a proven
-            interval.
+        budget: what each measure may spend, in seconds, or a `Budget`: one that it ends has a proven interval, or no
+            value yet (`Result.is_out_of_budget`). None: 300 s for measures that have intervals, no limit for others.
         keep: use results kept beside the state space, and keep new ones there. Nothing is kept where there is no
             folder.
         progress: called with the name of the running measure and a line on how far it is.
+        on_result: called with each `Result` as soon as it is there.
         representation: what the agent's network makes of the states, `pharos.observations.representation`; with one,
             measures of it are part of the report.
         schedule: of the idealised learner that these have; rollouts: of the actor-critic; sampling: of the
@@ -165,11 +169,16 @@ def report(  # noqa: PLR0913
     wanted = selected_measures(measures, representation is not None)
     schedule = schedule or Schedule()
     options = (representation, schedule, rollouts, sampling, None if folder is None else Path(folder))
-    problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress, *options)
+    is_strict = budget is not None
+    problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress, *options, is_strict)
     conventions = _conventions(problem)
     file = ResultsFile(mdp, conventions) if keep else None
-    results = {measure.name: _measured(measure, problem, file) for measure in wanted}
-    bounds = (_error_bound(problem), None if file is None else file.error_bound)
+    results = {}
+    for measure in wanted:
+        results[measure.name] = _measured(measure, problem, file)
+        if on_result is not None:
+            on_result(results[measure.name])
+    bounds = (problem.error_bound, None if file is None else file.error_bound)
     if numbers := [bound for bound in bounds if bound is not None]:
         conventions["error_bound"] = max(numbers)
     return Report(results, conventions, watch.seconds)
@@ -182,21 +191,19 @@ def _measured(measure: Measure, problem: Problem, file: "ResultsFile | None") ->
     if entry is not None and (problem.folder is None or entry["certificate"].kind != "interval"):
         return replace(empty, **entry, kept=True)
     watch = Stopwatch()
-    problem.report(measure.name, "")
+    problem.clock.restart()
+    if problem.progress is not None:
+        problem.progress(measure.name, "")
     try:
         outcome = measure.function(problem)
     except (UndefinedMeasure, PrecisionError) as error:
-        return replace(empty, undefined=str(error), seconds=watch.seconds)
+        is_over = isinstance(error, MeasureUnfinished)
+        return replace(empty, undefined=str(error), is_out_of_budget=is_over, seconds=watch.seconds)
     certificate, seconds = certificate_of(outcome), watch.seconds
     result = replace(empty, value=_plain(outcome), text=_text(outcome), certificate=certificate, seconds=seconds)
     if file is not None:
-        file.put(measure, result, problem.budget, _error_bound(problem))
+        file.put(measure, result, problem.budget, problem.error_bound)
     return result
-
-
-def _error_bound(problem: Problem) -> float | None:
-    """Error bound of the optimal values; None where no measure has used them."""
-    return problem.solution.error_bound if "solution" in vars(problem) else None
 
 
 def _plain(value: object) -> object:

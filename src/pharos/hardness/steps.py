@@ -6,6 +6,7 @@ executed action) and the starts without one. Source: Laidlaw, Russell and Dragan
 `return_distribution`: the distribution of the return of a policy over such an episode.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,7 +51,9 @@ class FiniteHorizonValues:
         first: (N,) bool, the start nodes. num_visitable: states (pairs under sticky actions) that can be visited.
     """
 
-    def __init__(self, mdp: TabularMDP, steps: int):
+    def __init__(self, mdp: TabularMDP, steps: int, tell: Callable[[str], object] = str):
+        """tell: called with a line for each step."""
+        self.tell = tell
         size = (mdp.num_states + 1) * mdp.policy_width
         needed = 40 * steps * size * mdp.num_actions
         if needed > MEMORY:
@@ -67,6 +70,7 @@ class FiniteHorizonValues:
         self.explored_value = np.empty(shape[:2])
         self.best[-1] = self.worst[-1] = self.explored[-1] = self.rewards
         for t in range(steps - 1, -1, -1):
+            tell(f"values of step {t} of {steps}")
             if t < steps - 1:
                 self.best[t] = self.backup(self.best[t + 1].max(axis=1))
                 self.worst[t] = self.backup(self.worst[t + 1].min(axis=1))
@@ -112,6 +116,7 @@ class FiniteHorizonValues:
         result = np.empty(self.best.shape)
         result[-1] = self.rewards
         for t in range(self.steps - 1):
+            self.tell(f"lookahead of step {t} of {self.steps}")
             result[t] = self.backup(values[t + 1].max(axis=1))
         return result
 

@@ -48,7 +48,7 @@ from functools import cached_property
 import numpy as np
 
 from pharos.hardness.hitting_times import SWEEPS, HittingTimes
-from pharos.hardness.interval import BudgetClock, Interval
+from pharos.hardness.interval import MORE, BudgetClock, Interval
 from pharos.kernels import hitting
 from pharos.kernels.hitting import UNIT
 from pharos.mdp import ExpandedMDP, TabularMDP, outcomes_of
@@ -337,11 +337,11 @@ class TargetBounds:
         exact = is_infinite or (not left and math.isfinite(upper) and upper - lower <= 2 * self.tolerance * upper)
         note = ""
         if left:
-            note = f"budget spent: {left} of {self.choices.num_targets} targets {self.farther}"
+            note = f"budget spent: {left} of {self.choices.num_targets} targets {self.farther}; {MORE}"
         elif not exact and self.limited:
             note = f"hitting times are so large that 64-bit floats prove no closer bounds of {self.limited} targets"
         elif not exact:
-            note = "budget spent before the bounds of the last targets met"
+            note = f"budget spent before the bounds of the last targets met; {MORE}"
         bounds = (math.inf, math.inf) if is_infinite else (lower, upper)
         method = "a stochastic shortest path problem for each target, bounds from residuals"
         interval = Interval(*bounds, exact, finite_part=lower, tolerance=self.tolerance, method=method, note=note)
@@ -567,6 +567,10 @@ class _Eccentricity(TargetBounds):
                     self.shorten()
                     self.has_hubs = False
             target = int(self.upper.argmax())
+            self.report()
+
+    def report(self) -> None:
+        self.spending.report(self.lower, max(self.settled_upper, float(self.upper.max())), self.num_open)
 
     def _settle(self, target: int) -> np.ndarray | None:
         """Settle a target; returns upper bounds (nodes,) of its hitting times, where all are known."""

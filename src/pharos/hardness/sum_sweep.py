@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike
 
-from pharos.hardness.interval import Budget, BudgetClock, Interval
+from pharos.hardness.interval import COMMAND_SECONDS, MORE, Budget, BudgetClock, Interval
 from pharos.kernels import graph as kernels
 from pharos.kernels import many_searches
 from pharos.mdp import TabularMDP
@@ -227,6 +227,9 @@ _FEW_ORBITS = 64
 # Bytes that searches from many nodes may take.
 _BATCH_MEMORY = 2**31
 COUNTING = 10.0  # seconds for counting the pairs of an infinite diameter, unless a budget is given
+DEFAULTS = (Budget(), Budget(seconds=COMMAND_SECONDS))
+# Table entries that are followed in a second on a slow core, to know how many a budget allows for.
+READS = 10**8
 
 
 class SumSweep:
@@ -263,6 +266,7 @@ class SumSweep:
         if upper > self.best:
             open_states = pluralize(self._open()[0], "state")
             note = f"budget spent: {open_states} may have a larger eccentricity than {self.best}"
+            note += f"; {MORE}"
             if clock:
                 note += f"; {clock}"
         return self._result(self.best, upper, note)
@@ -477,12 +481,13 @@ class SumSweep:
             return f"all cycles have multiples of {cycle} steps, but a layer of {widest} states is too wide to follow"
         layers = GraphLayers.of(layer, widths, graph.dtype)
         now, later = (np.empty((widest, -(-widest // 64)), np.uint64) for _ in range(2))
-        max_reads = 200 * graph.num_nodes * graph.next_states.shape[1] + 10**8
+        affordable = max(self.spending.seconds_left, 0.0) * READS
+        max_reads = int(min(200 * graph.num_nodes * graph.next_states.shape[1] + 10**8, affordable))
         gap, _ = kernels.last_gap(graph.next_states, graph.ends, graph.start, *layers, now, later, max_reads)
         if gap == -2:
             return f"all cycles have multiples of {cycle} steps, but some state needs more to reach its whole layer"
         if gap == -3:
-            return f"all cycles have multiples of {cycle} steps, but following the layers takes too long"
+            return f"all cycles have multiples of {cycle} steps, but following the layers takes too long for the budget"
         self.method = f"reach sets in the {cycle} layers of a clock, none of more than {widest} states"
         return self._result(cycle + int(gap), cycle + int(gap), "")
 
@@ -493,7 +498,7 @@ def _infinite_diameter(graph: Graph, spending: BudgetClock) -> Interval:
     The value is known before any pair is counted, so of the default budget no more than COUNTING seconds go into that.
     """
     size = graph.num_nodes
-    end = spending.seconds + COUNTING if spending.budget == Budget() else math.inf
+    end = spending.seconds + COUNTING if spending.budget in DEFAULTS else math.inf
     words = 8 if 24 * 8 * size <= _BATCH_MEMORY else 1
     origins, front, coming = (np.zeros((size, words), np.uint64) for _ in range(3))
     scratch = (origins, front, coming, graph.queue, np.empty_like(graph.queue))
@@ -514,7 +519,7 @@ def _infinite_diameter(graph: Graph, spending: BudgetClock) -> Interval:
     note = "some states cannot be reached from others"
     if not counted:
         note += f"; counted for {spending.seconds:.0f} s: the pairs from {done} of {pluralize(size, 'state')}"
-        note += ", so the counts are lower bounds"
+        note += ", so the counts are lower bounds; a budget of your own (--budget) counts more"
         unreachable = max(unreachable, 1)
     method = "searches from all states, many at once"
     interval = Interval(math.inf, math.inf, True, unreachable, float(finite), counted, method=method, note=note)

@@ -4,6 +4,7 @@ Action-gap regularity: how often actions are nearly as good as each other.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,8 +50,10 @@ def environmental_value_norm(mdp: TabularMDP, solution: Solution | None = None) 
     return certified_value_norm(mdp, solution).value
 
 
-def certified_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> Certified:
-    """Return `environmental_value_norm` with its interval.
+def certified_value_norm(
+    mdp: TabularMDP, solution: Solution | None = None, *, progress: Callable[[str], object] = str
+) -> Certified:
+    """Return `environmental_value_norm` with its interval; `progress` is called with a line for each block of states.
 
     A standard deviation changes by no more than the values do. Every variance is a sum of squares of values less their
     mean, in the row of one state, so that large values that lie close together lose no digits.
@@ -63,7 +66,8 @@ def certified_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> C
     states, largest = np.flatnonzero((lone | nodes.any(axis=1)) & live), 0.0
     size = float(np.abs(solution.x).max(initial=0.0))
     scale = 2.0 ** math.frexp(size)[1] if 0 < size < math.inf else 1.0  # squares of 1e160 and 1e-170 are no floats
-    for block in np.array_split(states, max(1, -(-states.size // _BLOCK))):
+    for number, block in enumerate(np.array_split(states, max(1, -(-states.size // _BLOCK)))):
+        progress(f"state {number * _BLOCK:,} of {states.size:,}")
         means, within = _outcomes(mdp, solution.x, block, scale)
         first = lone[block]
         largest = max(largest, _largest_variance(mdp.chance.first, means[first], within[first], 0))

@@ -12,7 +12,7 @@ rarer an exploring policy visits the states of the optimal policy.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -95,6 +95,7 @@ def occupancy(
     executed: bool = False,
     keep_all: bool = False,
     tolerance: float = 1e-9,
+    progress: Callable[[str], object] | None = None,
 ) -> Occupancy:
     """Return the occupancy measure of a policy.
 
@@ -111,6 +112,7 @@ def occupancy(
         executed: whether a_t is the action that is executed, after chance; otherwise the one that the policy chooses.
         keep_all: whether to keep mu_t for all t, with a horizon.
         tolerance: of the sum of all visits, without a horizon.
+        progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: gamma is 1 and there is no horizon, so that visits may be infinite.
         ParameterError: the policy or an option is wrong, or all steps would take more than 8 GiB.
@@ -129,8 +131,9 @@ def occupancy(
     if not tolerance > 0:
         raise ParameterError(f"tolerance is {tolerance!r}; expected a number above 0")
     total, largest = np.zeros(shape), np.zeros(shape)
-    by_step, scale, steps, left = [], 1.0, 0, 0.0
+    by_step, scale, steps, left, tell = [], 1.0, 0, 0.0, progress or str
     for now, first, alive in walk.distributions():
+        tell(f"visits of step {steps}")
         if walk.horizon is None:
             left = scale * alive / (1 - mdp.gamma)
             if left <= tolerance:
@@ -177,7 +180,11 @@ def discounted_visits(
 
 
 def discounted_arrivals(
-    mdp: TabularMDP, policy: TablePolicy | None = None, *, tolerance: float = 1e-9
+    mdp: TabularMDP,
+    policy: TablePolicy | None = None,
+    *,
+    tolerance: float = 1e-9,
+    tell: Callable[[str], object] = str,
 ) -> tuple[np.ndarray, float]:
     """Return the visits of states without a horizon, in terminal states and the end by arrival; and what they may lack
     together.
@@ -189,7 +196,7 @@ def discounted_arrivals(
         (S + 1,) float64, entry S for the end; and the bound.
     """
     walk = Propagation(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
-    started, visits, left = walk.discounted(tolerance)
+    started, visits, left = walk.discounted(tolerance, tell)
     executed = walk.executed(started, visits)
     result = np.append(started + visits.sum(axis=1), 0.0)
     over = np.flatnonzero(~walk.live)
@@ -267,7 +274,7 @@ class Propagation:
         first = started[:, None]
         return later + self.first.chance.executed(first, chosen_mass(self.first.policy, first))
 
-    def discounted(self, tolerance: float) -> tuple[np.ndarray, np.ndarray, float]:
+    def discounted(self, tolerance: float, tell: Callable[[str], object] = str) -> tuple[np.ndarray, np.ndarray, float]:
         """((S,), (S, W), bound): discounted visits of the first step, under sticky actions alone; of the others; and a
         bound on the visits that are missing."""
         started, waiting = self.after_the_start()
@@ -276,6 +283,7 @@ class Propagation:
         visits, before = np.zeros_like(waiting), math.inf
         while True:
             left = self.mdp.dynamics.accumulate_visits(self.later, gamma, _LEAST, waiting, visits) / (1 - gamma)
+            tell(f"visits are known to {left:.2g}")
             if left <= tolerance or left >= before:
                 return started, visits, left
             before = left
@@ -327,17 +335,24 @@ class StandardOccupancy:
     q: np.ndarray
 
 
-def standard_occupancy(mdp: TabularMDP, gamma: float, episode: int) -> StandardOccupancy:
+def standard_occupancy(
+    mdp: TabularMDP, gamma: float, episode: int, tell: Callable[[str], object] = str
+) -> StandardOccupancy:
     """The mean of the undiscounted occupancies of uniform play and of optimal play over episodes of some steps.
 
     Args:
         gamma: the learner's discount, of the values that optimal play follows; its ties are chosen alike.
+        tell: called with a line for each sweep of values and each step of play.
     """
-    solution = value_iteration(mdp.with_gamma(gamma).with_horizon(None))
+
+    def tell_sweep(sweeps: int, _bound: float) -> None:
+        tell(f"sweep {sweeps} of the learner's values")
+
+    solution = value_iteration(mdp.with_gamma(gamma).with_horizon(None), progress=tell_sweep)
     best = solution.optimal_actions(max(1e-8, 4 * solution.error_bound))
     plain, total = mdp.with_gamma(1.0), np.zeros(mdp.num_states)
     for policy in (None, best / best.sum(axis=1, keepdims=True)):
-        visits = occupancy(plain, policy, horizon=episode).states
+        visits = occupancy(plain, policy, horizon=episode, progress=tell).states
         total += visits / (2 * visits.sum())
     return StandardOccupancy(total, solution.q)
 
@@ -381,7 +396,9 @@ class ExplorationTime:
 
 
 @require_mdp
-def exploration_time(mdp: TabularMDP, *, horizon: int | None = None) -> ExplorationTime:
+def exploration_time(
+    mdp: TabularMDP, *, horizon: int | None = None, progress: Callable[[str], object] | None = None
+) -> ExplorationTime:
     """Return the expected steps, and episodes, after which uniform play has executed an action with a large reward.
 
     With p the probability that an episode meets one, and l the expected steps of an episode up to its end or to there:
@@ -389,6 +406,7 @@ def exploration_time(mdp: TabularMDP, *, horizon: int | None = None) -> Explorat
 
     Args:
         horizon: steps of an episode; None: that of the MDP.
+        progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: there are no episodes, or no reward is positive.
     Cost: O(S A) a step.
@@ -403,8 +421,9 @@ def exploration_time(mdp: TabularMDP, *, horizon: int | None = None) -> Explorat
     mass = np.zeros((mdp.num_states, 1))
     np.add.at(mass[:, 0], mdp.start_states, mdp.start_probabilities)
     probability = length = 0.0
-    chance = mdp.chance.first
-    for _ in range(steps):
+    chance, tell = mdp.chance.first, progress or str
+    for t in range(steps):
+        tell(f"step {t} of {steps}")
         mass[~live] = 0.0
         total = mass.sum(axis=1, keepdims=True)
         length += float(total.sum())
@@ -452,7 +471,9 @@ class Covering:
 
 
 @require_mdp
-def covering(mdp: TabularMDP, *, horizon: int | None = None) -> Covering:
+def covering(
+    mdp: TabularMDP, *, horizon: int | None = None, progress: Callable[[str], object] | None = None
+) -> Covering:
     """Return how rarely random play meets the rarest state and action.
 
         mu_t(s, a) = P(s_t = s, a_t = a) for uniform play from the start;  L <= ln(2 S A) / min over s, a of max over t
@@ -463,6 +484,7 @@ def covering(mdp: TabularMDP, *, horizon: int | None = None) -> Covering:
 
     Args:
         horizon: T; None: that of the MDP.
+        progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: there is no horizon.
     Cost: O(S A) for each of the T steps, and O(S) memory, under sticky actions O(S A). 200 steps on the 2.4 million
@@ -470,7 +492,7 @@ def covering(mdp: TabularMDP, *, horizon: int | None = None) -> Covering:
     Source: Laidlaw, Russell and Dragan (2023), section 3 and appendix; the bound: Even-Dar and Mansour (2003).
     """
     steps = steps_of("covering", mdp, horizon)
-    largest, total = _occupied(mdp, steps)
+    largest, total = _occupied(mdp, steps, progress or str)
     states = len(total)
     if not states:
         raise UndefinedMeasure("covering: every start state is terminal, so that nothing is played")
@@ -480,12 +502,13 @@ def covering(mdp: TabularMDP, *, horizon: int | None = None) -> Covering:
     return Covering(omega_max, omega_sum, length, states, {"horizon": steps, "exploration": "uniform"})
 
 
-def _occupied(mdp: TabularMDP, steps: int) -> tuple[np.ndarray, np.ndarray]:
+def _occupied(mdp: TabularMDP, steps: int, tell: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray]:
     """(max over t, sum over t) of the probability of each node that uniform play meets and that is not terminal."""
     walk = Propagation(mdp, None, steps)
     largest, total = np.zeros((mdp.num_states, walk.width)), np.zeros((mdp.num_states, walk.width))
     alone = np.zeros((0, 1))  # under sticky actions a start has no previous action: nodes of their own
-    for now, first, _ in walk.distributions():
+    for t, (now, first, _) in enumerate(walk.distributions()):
+        tell(f"step {t} of {steps}")
         if first and mdp.is_sticky:
             alone = now[walk.live]
             continue
@@ -537,6 +560,7 @@ def mixing_time(
     epsilon: float = 0.25,
     restart: bool = True,
     lazy: bool = False,
+    progress: Callable[[str], object] | None = None,
 ) -> MixingTime:
     """Return the mixing time of the Markov chain of a policy.
 
@@ -547,6 +571,7 @@ def mixing_time(
         epsilon: in (0, 1/2).
         restart: an action in a terminal state leads back to the start, as for the diameter.
         lazy: of the chain (I + P) / 2, which has no period.
+        progress: called with a line now and then; an exception of its own ends the computation.
     Returns:
         A MixingTime; infinite where the chain has a period, or several recurrent classes.
     Raises:
@@ -587,7 +612,7 @@ def mixing_time(
     period = _period(chain)
     if period != 1:
         return MixingTime(math.inf, period, 1.0, conventions)
-    steps, distance = _time(chain.toarray(), float(epsilon))
+    steps, distance = _time(chain.toarray(), float(epsilon), progress or str)
     return MixingTime(float(steps), 1, distance, conventions)
 
 
@@ -625,7 +650,7 @@ def _period(chain: "csr_matrix") -> int:
     return int(np.gcd.reduce(level[rows] + 1 - level[columns]))
 
 
-def _time(chain: np.ndarray, epsilon: float) -> tuple[int, float]:
+def _time(chain: np.ndarray, epsilon: float, tell: Callable[[str], object]) -> tuple[int, float]:
     """(t_mix, distance there): squares until it is near enough, then bisection by the squares on the way."""
     size = len(chain)
     epsilon += ROUNDING
@@ -639,11 +664,13 @@ def _time(chain: np.ndarray, epsilon: float) -> tuple[int, float]:
         return 0, distance(np.eye(size))
     powers = [chain]
     while distance(powers[-1]) > epsilon:
+        tell(f"more than {2 ** (len(powers) - 1):,} steps")
         powers.append(powers[-1] @ powers[-1])
         if len(powers) > 60:
             raise UndefinedMeasure("mixing_time: the chain takes more than 2^60 steps")
     steps, power = 0, np.eye(size)  # the largest t that is not near enough, and P^t
     for i in range(len(powers) - 2, -1, -1):
+        tell(f"between {steps + 1:,} and {steps + 2 ** (i + 1):,} steps")
         further = power @ powers[i]
         if distance(further) > epsilon:
             steps, power = steps + 2**i, further
@@ -655,7 +682,12 @@ def _time(chain: np.ndarray, epsilon: float) -> tuple[int, float]:
 
 @require_mdp
 def distribution_mismatch(
-    mdp: TabularMDP, policy: TablePolicy | None = None, solution: Solution | None = None, *, tolerance: float = 1e-9
+    mdp: TabularMDP,
+    policy: TablePolicy | None = None,
+    solution: Solution | None = None,
+    *,
+    tolerance: float = 1e-9,
+    progress: Callable[[str], object] | None = None,
 ) -> Interval:
     """Return the distribution mismatch coefficient of a policy.
 
@@ -669,6 +701,7 @@ def distribution_mismatch(
         policy: as for `evaluate_policy`; None: uniform.
         solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, or what floats reach.
         tolerance: of the sums of d and of d*.
+        progress: called with a line now and then; an exception of its own ends the computation.
     Returns:
         An interval: it is wide where d(s) is not much larger than `tolerance`, and infinite at the upper end where it
         is smaller.
@@ -686,8 +719,8 @@ def distribution_mismatch(
             "distribution_mismatch is defined for discounted MDPs without a horizon: give gamma < 1 and no horizon"
         )
     solution = optimal_solution(mdp, solution)
-    best, lacking = discounted_arrivals(mdp, solution.policy, tolerance=tolerance)
-    other, missing = discounted_arrivals(mdp, policy, tolerance=tolerance)
+    best, lacking = discounted_arrivals(mdp, solution.policy, tolerance=tolerance, tell=progress or str)
+    other, missing = discounted_arrivals(mdp, policy, tolerance=tolerance, tell=progress or str)
     there = support_with_ends(mdp, solution.policy)
     # All numbers are sums of products, each of at most as many factors as there are steps that count.
     steps = mdp.num_states + 32 / (1 - mdp.gamma)

@@ -6,6 +6,7 @@ contract.
 """
 
 import contextlib
+import difflib
 import json
 import numbers
 import operator
@@ -21,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.drawing import ground_of, shape_of
-from pharos.environments import Environment, Layer, State, start_distribution
+from pharos.environments import Environment, Layer, State, classes, start_distribution
 from pharos.errors import ParameterError, RuleError, UnknownName
 from pharos.rules import mutable_attributes, pack, unpack
 from pharos.state_space.guarded_rules import SUM_TOLERANCE, InterpretedCheck
@@ -101,6 +102,7 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
         kind = type(getattr(env, name)).__name__
         notes.append(f"rules read {name}, a {kind}, which can change after states were enumerated; expected a tuple")
     _note_unseen_values(env, states, complete, notes)
+    _note_names(env, notes)
     return Conformance(
         environment=str(env),
         num_states=len(states),
@@ -178,6 +180,42 @@ def _note_unseen_values(env: Environment, states: list[State], complete: bool, n
                 f"{values[0]} to {values[-1]}" if len(values) == values[-1] - values[0] + 1 else f"{len(values)} values"
             )
             notes.append(f"{variable} is declared as {low} to {high}; {where} it takes {description}")
+
+
+# What users call the attributes of a class, beside names that are merely spelt wrong
+OTHER_NAMES = dict.fromkeys(("time_limit", "horizon", "max_steps", "episode_length", "timeout"), "max_episode_steps")
+OTHER_NAMES |= {"done": "is_terminal", "terminal": "is_terminal", "step": "transition"}
+NEAR = 0.8  # share of letters in common from which on a name is taken for a slip
+
+
+def _note_names(env: Environment, notes: list[str]) -> None:
+    """Note an end that is left out, attributes that nothing reads and are near to one of the contract, and a name that
+    a class of pharos has."""
+    cls = type(env)
+    if cls.is_terminal is Environment.is_terminal and cls.max_episode_steps is Environment.max_episode_steps:
+        notes.append(
+            "no state is terminal, as it has no is_terminal: episodes end at the time limit, "
+            f"{env.max_episode_steps:,} steps; max_episode_steps sets another one"
+        )
+    contract = {name for name in vars(Environment) if not name.startswith("_")}
+    own = [each for each in cls.__mro__ if not each.__module__.startswith("pharos.")]
+    names = dict.fromkeys(name for each in own for name in vars(each) if not name.startswith("_"))
+    used = {name for each in own for value in vars(each).values() for name in _names_in(value)}
+    for name in names:
+        if name in contract or name in used or name in env.parameters or hasattr(object, name):
+            continue
+        near = difflib.get_close_matches(name, contract, n=1, cutoff=NEAR)
+        if meant := OTHER_NAMES.get(name) or (near[0] if near else ""):
+            notes.append(f"{name} is not used; did you mean {meant}?")
+    if own and classes().get(env.name, cls).__module__.startswith("pharos."):
+        notes.append(f"{env.name!r} is the name of a class of pharos as well; choose another name")
+
+
+def _names_in(value: object) -> tuple[str, ...]:
+    """Names that a rule or a property reads."""
+    function = value.fget if isinstance(value, property) else value
+    code = getattr(function, "__code__", None)
+    return () if code is None else code.co_names
 
 
 # The rules, compiled --------------------------------------------------------------------------------------------------
@@ -386,6 +424,8 @@ def check_declarations(env: Environment) -> None:
         again_starts = start_distribution(env)
     except ParameterError as error:
         raise RuleError(str(error)) from error
+    except Exception as error:  # of code of the user's own
+        raise RuleError(f"{env}: variables() or initial_state() fails: {_told(error)}") from error
     if len(env.variables()) != len(components.variables):
         raise RuleError(f"{env}: variables() declares {len(env.variables())} names; expected the same at every call")
     if starts[0] != again_starts[0] or (starts[1] != again_starts[1]).any():
@@ -420,10 +460,17 @@ def check_layers(env: Environment, notes: list[str]) -> None:
         fits = operator.index(rows) >= 1 and operator.index(columns) >= 1
     except (TypeError, ValueError, NotImplementedError):
         fits = False
+    except Exception as error:  # of code of the user's own
+        raise RuleError(f"{env}: grid() fails: {_told(error)}") from error
     if not fits:
         raise RuleError(
             f"{env}: it has layers but grid() does not give (rows, columns); expected two integers, at least 1"
         )
+
+
+def _told(error: Exception) -> str:
+    """An error of the user's code in a line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def _check_layer(where: str, name: object, layer: object) -> None:

@@ -1,4 +1,4 @@
-"""Performance profiles of agents and observations in a study, and how probable one improves on another.
+"""Performance profiles of agents and observations in a study, differences, and how probable one improves on another.
 
 The score of a run is 1 minus its normalised regret: 1 is optimal from the first episode on, 0 as bad as acting at
 random. A task is an instance under one kind of chance; runs are resampled within each task.
@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.statistics import bootstrap_interval, mean_of_means, probability_of_improvement
+from pharos.statistics import (
+    bootstrap_interval,
+    holm,
+    mean_of_means,
+    probability_of_improvement,
+    standard_error,
+    student_interval,
+    welch_p_value,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -20,6 +28,7 @@ if TYPE_CHECKING:
 THRESHOLDS = np.linspace(-0.25, 1.0, 51)
 GROUP = ["agent", "observation"]
 TASK = ["instance", "chance"]
+DIFFERENCE_COLUMNS = ["ours", "theirs", "tasks", "difference", "lower", "upper", "p_value", "adjusted"]
 IMPROVEMENT_COLUMNS = ["environment", "ours", "theirs", "tasks", "probability", "lower", "upper"]
 
 
@@ -88,6 +97,63 @@ def improvements(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame
             names = (", ".join(one), ", ".join(other))
             rows.append((environment, *names, len(tasks), float(improvement(*samples)), float(lower), float(upper)))
     return pd.DataFrame(rows, columns=IMPROVEMENT_COLUMNS)
+
+
+def regret_differences(runs: "pd.DataFrame") -> "pd.DataFrame":
+    """Difference in normalised regret of each two agents or observations, the mean over the tasks that both have.
+
+    Args:
+        runs: as from `table`.
+    Returns:
+        Columns DIFFERENCE_COLUMNS; `ours` and `theirs` are pairs (agent, observation), `difference` is the regret of
+        the first less that of the second, with Student's 95 % interval over runs within tasks; `p_value` is that of
+        Welch's t, and `adjusted` the same after Holm's correction for the number of rows. NaN if a task has one run.
+    """
+    import pandas as pd
+
+    rows: list[tuple[Any, ...]] = []
+    groups = {key: _scores(own) for key, own in runs.groupby(GROUP, sort=True)}
+    for (one, ours), (other, theirs) in combinations(groups.items(), 2):
+        tasks = [task for task in ours if task in theirs]
+        if not tasks:
+            continue
+        strata, weight = [scores[task] for scores in (theirs, ours) for task in tasks], 1.0 / len(tasks)
+        value = sum(float(theirs[task].mean() - ours[task].mean()) for task in tasks) * weight
+        error, degrees = standard_error(strata, [weight] * len(strata))
+        p_value = welch_p_value(value, error, degrees)
+        rows.append((one, other, len(tasks), *student_interval(value, error, degrees), p_value))
+    table = pd.DataFrame(rows, columns=DIFFERENCE_COLUMNS[:-1])
+    return table.assign(adjusted=holm(table["p_value"].to_numpy(float)))
+
+
+def other_winners(runs: "pd.DataFrame") -> "pd.DataFrame":
+    """Tasks on which the agent with the highest return is not the one with the least regret.
+
+    Args:
+        runs: as from `table`.
+    Returns:
+        Columns `instance`, `chance`; `most` and `least`, the pairs (agent, observation) with the highest return and
+        with the least regret, and of both the means `most_return`, `most_regret`, `least_return`, `least_regret`. The
+        attribute `attrs["tasks"]` counts the tasks that several of them have.
+    """
+    import pandas as pd
+
+    rows, tasks = [], 0
+    means = runs.groupby([*TASK, *GROUP], sort=True)[["return", "normalized_regret"]].mean().dropna()
+    for task, part in means.groupby(level=TASK, sort=True):
+        if len(part) < 2:
+            continue
+        tasks += 1
+        part = part.droplevel(TASK)
+        most, least = part["return"].idxmax(), part["normalized_regret"].idxmin()
+        if part.loc[most, "return"] > part.loc[least, "return"] and (
+            part.loc[most, "normalized_regret"] > part.loc[least, "normalized_regret"]
+        ):
+            rows.append((*task, most, least, *part.loc[most], *part.loc[least]))
+    numbers = ["most_return", "most_regret", "least_return", "least_regret"]
+    result = pd.DataFrame(rows, columns=[*TASK, "most", "least", *numbers])
+    result.attrs["tasks"] = tasks
+    return result
 
 
 def _scores(part: "pd.DataFrame") -> dict[Any, np.ndarray]:

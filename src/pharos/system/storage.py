@@ -583,7 +583,7 @@ def cache_directory() -> Path:
         place = temporary_folder("pharos-")
         os.environ["PHAROS_CACHE_DIR"] = str(place)
         warnings.warn(
-            f"{problem}; state spaces and compiled code go to a temporary folder and are gone at the end: "
+            f"{problem}; state spaces and compiled code go to a temporary folder and are deleted on exit: "
             f"to keep them set PHAROS_CACHE_DIR",
             RuntimeWarning,
             stacklevel=2,

@@ -118,7 +118,7 @@ def kernel_regret(
     schedule: Schedule | None = None,
     solution: Solution | None = None,
     horizon: int | None = None,
-    progress: Callable[[str], None] | None = None,  # noqa: ARG001  (learners of a report have one signature)
+    progress: Callable[[str], object] | None = None,
 ) -> KernelRegret:
     """Return the expected regret of Q-learning in the tangent kernel of a network.
 
@@ -136,6 +136,7 @@ def kernel_regret(
         schedule: None: that of `Schedule`.
         solution: the optimal values of `mdp`, where they are known.
         horizon: steps of an episode that the learner sees; None: the MDP's, else the time limit.
+        progress: called with a line now and then; an exception of its own ends the computation.
     Returns:
         A KernelRegret. Actions whose values are within 1e-6 of the state's largest one are chosen alike. Values are in
         the MDP's setting (gamma, horizon). What agents see is the state, not the previous action: under sticky actions
@@ -148,7 +149,7 @@ def kernel_regret(
         kernel is 4 C^2 bytes of C different observations; beyond MOST_EXACT of them, landmarks.
     Source: pharos; Sirignano and Spiliopoulos (2019), Cai et al. (2019) for the limit of wide networks.
     """
-    learner = IdealisedLearner(mdp, representation, schedule, horizon, solution)
+    learner = IdealisedLearner(mdp, representation, schedule, horizon, solution, progress)
     return regret_in_kernel(learner, {"schedule": asdict(learner.schedule)})
 
 
@@ -197,6 +198,7 @@ def kernel_policy_regret(
     rollouts: Rollouts | None = None,
     solution: Solution | None = None,
     horizon: int | None = None,
+    progress: Callable[[str], object] | None = None,
 ) -> KernelRegret:
     """Return the expected regret of an actor-critic whose policy and values learn in the tangent kernel of a network.
 
@@ -220,6 +222,7 @@ def kernel_policy_regret(
         rollouts: None: those of `Rollouts`.
         solution: the optimal values of `mdp`, where they are known.
         horizon: steps of an episode that the learner sees; None: the MDP's, else the time limit.
+        progress: called with a line now and then; an exception of its own ends the computation.
     Returns:
         A KernelRegret; a phase is a rollout. Actions whose logits are within 1e-6 of the state's largest one are
         chosen alike by the greedy policy. Values are in the MDP's setting (gamma, horizon). Under sticky actions
@@ -232,7 +235,7 @@ def kernel_policy_regret(
     Source: pharos; Sutton et al. (2000) for the gradient, Schulman et al. (2016) for G, Schulman et al. (2017) for the
         objective, Agarwal et al. (2021) for tables.
     """
-    learner = PolicyLearner(mdp, representation, schedule, horizon, solution)
+    learner = PolicyLearner(mdp, representation, schedule, horizon, solution, progress)
     learner.rollouts = rollouts or Rollouts()
     of_schedule = {name: getattr(learner.schedule, name) for name in ("steps", "gamma", "optimizer")}
     return regret_in_kernel(learner, {"schedule": of_schedule, "rollouts": learner.rollouts.to_dict()})
@@ -251,6 +254,7 @@ class PolicyLearner(IdealisedLearner):
         returns = np.zeros((len(self.states), self.mdp.num_actions))
         rows, steps = [], self.rollouts.gradient_steps
         for step in range(0, self.schedule.steps, self.rollouts.steps):
+            self.tell(f"step {step:,} of {self.schedule.steps:,}")
             behaviour = softmax(logits)
             policy, memory = behaviour[observations.groups], Memory(self.mdp, self.states)
             played, length = memory.play(self.visits(policy), policy, 1)
@@ -370,7 +374,12 @@ class Spectral:
 
 @require_mdp
 def kernel_learning_time(
-    mdp: TabularMDP, representation: Representation, *, schedule: Schedule | None = None, horizon: int | None = None
+    mdp: TabularMDP,
+    representation: Representation,
+    *,
+    schedule: Schedule | None = None,
+    horizon: int | None = None,
+    progress: Callable[[str], object] | None = None,
 ) -> Spectral:
     """Return the time that kernel gradient flow takes to learn the optimal advantages.
 
@@ -382,6 +391,7 @@ def kernel_learning_time(
     Args:
         schedule: for its discount, that of Q*; None: that of `Schedule`.
         horizon: steps of an episode, for visits; None: the MDP's, else the time limit.
+        progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: there are no episodes, or every action is optimal everywhere.
         ParameterError: the representation is of other states.
@@ -394,12 +404,17 @@ def kernel_learning_time(
         eigenvalues, energy = _spectrum(kernel, advantage, weights)
         return _time(eigenvalues / eigenvalues.sum(), energy)
 
-    return _spectral("kernel_learning_time", mdp, representation, schedule, horizon, time)
+    return _spectral("kernel_learning_time", mdp, representation, schedule, horizon, time, progress or str)
 
 
 @require_mdp
 def kernel_sample_complexity(
-    mdp: TabularMDP, representation: Representation, *, schedule: Schedule | None = None, horizon: int | None = None
+    mdp: TabularMDP,
+    representation: Representation,
+    *,
+    schedule: Schedule | None = None,
+    horizon: int | None = None,
+    progress: Callable[[str], object] | None = None,
 ) -> Spectral:
     """Return how many samples kernel regression takes to know the optimal action values but for a tenth of their
     variance.
@@ -418,23 +433,28 @@ def kernel_sample_complexity(
         centred = kernel - mean[:, None] - mean[None] + weights @ mean
         return _samples(*_spectrum(centred, q - weights @ q, weights))
 
-    return _spectral("kernel_sample_complexity", mdp, representation, schedule, horizon, samples)
+    return _spectral("kernel_sample_complexity", mdp, representation, schedule, horizon, samples, progress or str)
 
 
 @require_mdp
 def aliasing_floor(
-    mdp: TabularMDP, representation: Representation, *, schedule: Schedule | None = None, horizon: int | None = None
+    mdp: TabularMDP,
+    representation: Representation,
+    *,
+    schedule: Schedule | None = None,
+    horizon: int | None = None,
+    progress: Callable[[str], object] | None = None,
 ) -> float:
     """Return the share of the variance of Q* that no function of the observation explains: E Var(Q* | o) / Var Q*.
 
-    Visits as for `kernel_learning_time`; summed over actions. 0 where the observation tells the state.
+    Visits and arguments as for `kernel_learning_time`; summed over actions. 0 where the observation tells the state.
 
     Raises:
         UndefinedMeasure: there are no episodes, or Q* is the same everywhere.
     Cost: values and two occupancies.
     Source: pharos; the law of total variance.
     """
-    setting = _setting(mdp, representation, schedule, horizon, "aliasing_floor")
+    setting = _setting(mdp, representation, schedule, horizon, "aliasing_floor", progress or str)
     states = np.flatnonzero(setting.states > 0)
     weights, q, observations = setting.states[states], setting.q[states], Grouped(representation.classes, states)
     if len(observations) == len(states):
@@ -448,10 +468,15 @@ def aliasing_floor(
 
 
 def _setting(
-    mdp: TabularMDP, representation: Representation, schedule: Schedule | None, horizon: int | None, name: str
+    mdp: TabularMDP,
+    representation: Representation,
+    schedule: Schedule | None,
+    horizon: int | None,
+    name: str,
+    tell: Callable[[str], object],
 ) -> StandardOccupancy:
     episode = representation.episode(mdp, horizon, name)
-    return standard_occupancy(mdp, (schedule or Schedule()).gamma, episode)
+    return standard_occupancy(mdp, (schedule or Schedule()).gamma, episode, tell)
 
 
 def _spectral(
@@ -461,15 +486,17 @@ def _spectral(
     schedule: Schedule | None,
     horizon: int | None,
     function: Callable[[np.ndarray, np.ndarray, np.ndarray], float],
+    tell: Callable[[str], object],
 ) -> Spectral:
     """Spectral result of a function of (kernel (C, C), weights (C,), mean values (C, A)) of the observations."""
-    setting = _setting(mdp, representation, schedule, horizon, name)
+    setting = _setting(mdp, representation, schedule, horizon, name, tell)
     states = np.flatnonzero(setting.states > 0)
     observations = Grouped(representation.classes, states)
     weights = observations.sums(setting.states[states])
     q = observations.sums(setting.states[states, None] * setting.q[states]) / weights[:, None]
 
     def of(count: int) -> float:
+        tell(f"the spectrum of {min(count, len(observations)):,} observations")
         places, share = _drawn(weights, count)
         rows = observations.representatives[places]
         return function(representation.kernel(rows, rows).astype(np.float64), share, q[places])

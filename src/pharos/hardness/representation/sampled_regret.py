@@ -6,7 +6,7 @@ of expected targets, and rewards as they are paid: what a DQN loses by luck, thi
 
 import copy
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
@@ -169,6 +169,7 @@ def sampled_regret(
     sampling: Sampling | None = None,
     solution: Solution | None = None,
     horizon: int | None = None,
+    progress: Callable[[str], object] | None = None,
 ) -> SampledRegret:
     """Return the regret of Q-learning in the tangent kernel of a network, learnt from drawn transitions.
 
@@ -191,6 +192,7 @@ def sampled_regret(
         sampling: None: that of `Sampling`.
         solution: the optimal values of `mdp`, where they are known.
         horizon: steps of an episode that the learner sees; None: the MDP's, else the time limit.
+        progress: called with a line now and then; an exception of its own ends the computation.
     Returns:
         A SampledRegret. With the identity for a kernel it is tabular Q-learning with a replay memory. Rewards are those
         of drawn outcomes where the MDP is of an environment, else expected ones. The same seed gives the same number.
@@ -201,7 +203,7 @@ def sampled_regret(
         Beyond MOST_EXACT observations landmarks, whose walks take no longer for more of them. 24 bytes a step.
     Source: pharos; Mnih et al. (2015) for what is drawn.
     """
-    learner = SampledLearner(mdp, representation, schedule, horizon, solution)
+    learner = SampledLearner(mdp, representation, schedule, horizon, solution, progress)
     learner.sampling = sampling = sampling or Sampling()
     operators, landmarks = learner.operators()
     (descent, adam), *half = map(learner.both, operators)
@@ -286,6 +288,7 @@ class SampledLearner(IdealisedLearner):
         vector, largest_step = np.full((count, 1), count**-0.5), 0.0
         stops = np.unique([*looks, *range(0, schedule.steps, schedule.period)])
         for step, next_stop in zip(stops, [*stops[1:], schedule.steps], strict=True):
+            self.tell(f"step {step:,} of {schedule.steps:,} of a walk")
             if step in looks:
                 values = np.empty((count, num_actions))
                 kernels.values(kernel, learnt, values)

@@ -9,7 +9,7 @@ from pharos.agents import TABULAR_OBSERVATION
 from pharos.study.aliasing import aliasing_table, with_aliasing
 from pharos.study.analysis import PAPER_AGENTS, REGRETS, Models, PaperComparison, compare, intervals, models
 from pharos.study.findings import findings
-from pharos.study.profiles import improvements, profiles
+from pharos.study.profiles import improvements, other_winners, profiles, regret_differences
 from pharos.study.specification import Specification
 from pharos.study.status import Status, duration, status
 from pharos.study.tables import cells, finished_runs, hardness_cost, hardness_table, paper_instance
@@ -33,6 +33,8 @@ class Results:
         intervals: of the normalised regret of each class, agent and observation.
         profiles, improvements: performance profiles of agents and observations, and how probable one improves on
             another.
+        differences: in normalised regret, of each two agents or observations over all classes.
+        other_winners: tasks on which the highest return is not that of the least regret.
         comparison, findings: beside the paper; None where the study is not the paper's.
     """
 
@@ -48,6 +50,8 @@ class Results:
     intervals: "pd.DataFrame"
     profiles: "pd.DataFrame"
     improvements: "pd.DataFrame"
+    differences: "pd.DataFrame"
+    other_winners: "pd.DataFrame"
     comparison: PaperComparison | None
     findings: "pd.DataFrame | None"
 
@@ -115,6 +119,8 @@ def results_of(study: Specification, place: Path, progress: Callable[[str], None
         intervals=intervals(done.runs),
         profiles=profiles(done.runs),
         improvements=improvements(done.runs),
+        differences=regret_differences(done.runs),
+        other_winners=other_winners(done.runs),
         comparison=compare(table, study.runs, fitted[: len(REGRETS)]) if of_the_paper else None,
         findings=findings(table, fitted[0]) if of_the_paper else None,
     )

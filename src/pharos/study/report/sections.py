@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PICTURE_PIXELS = 220
+FEWEST_TASKS = 10  # of which it is counted how many are harder as an image
 
 
 def sections_of(results: Results, figures: Figures) -> list[Section]:
@@ -60,6 +61,7 @@ def _summary(results: Results) -> Section:
         f"{pluralize(runs['seed'].nunique(), 'seed')}; {int(runs['steps'].sum()):,} steps, which took one processor "
         f"{duration(runs['seconds'].sum())}."
     ]
+    lines = [*_winner(results), *_other_winners(results), *lines]
     if (estimated := _estimated(runs)) is not None:
         lines.append(estimated)
     main = results.models[0].get("single", "all")
@@ -80,6 +82,69 @@ def _summary(results: Results) -> Section:
     errors = [f"{count} × {error}" for error, count in Counter(now.errors.values()).items()]
     damaged = list({**now.damaged, **results.damaged}.values())
     return Section("Summary", "summary", lines=lines, missing=missing, errors=errors, damaged=damaged)
+
+
+MOST_COMPARED = 6  # agents and observations with a sentence of their own
+
+
+def _winner(results: Results) -> list[str]:
+    """Sentences on who has the least regret, by how much less than each other one, and how sure that is.
+
+    All are compared on the tasks that all of them have, or, where there is none, each on its own.
+    """
+    groups = {
+        key: own.groupby(["instance", "chance"])["normalized_regret"].mean().dropna()
+        for key, own in results.runs.groupby(["agent", "observation"], sort=True)
+    }
+    groups = {key: own for key, own in groups.items() if len(own)}
+    if not groups:
+        return ["No run has a normalised regret: no policy beats uniform play."]
+    shared = sorted(set.intersection(*(set(own.index) for own in groups.values())))
+    means = {key: float((own.loc[shared] if shared else own).mean()) for key, own in groups.items()}
+    first, *others = sorted(means, key=lambda key: means[key])
+    over = f"the mean over {pluralize(len(shared), 'task')}" if shared else "the mean over its own tasks"
+    scale = "0 is optimal from the first episode on, 1 as bad as acting at random"
+    if not others:
+        return [f"{label(*first)} has a normalised regret of {means[first]:.2f}, {over} ({scale})."]
+    lines = [f"{label(*first)} has the least normalised regret: {means[first]:.2f}, {over} ({scale})."]
+    lines = [lines[0][:1].upper() + lines[0][1:]]
+    lines += [_behind(results.differences, first, other, means[other]) for other in others[:MOST_COMPARED]]
+    if len(others) > MOST_COMPARED:
+        lines.append(f"{len(others) - MOST_COMPARED} more have a larger one: see Regret and Profiles below.")
+    return lines
+
+
+def _behind(differences: "pd.DataFrame", first: tuple[str, str], other: tuple[str, str], regret: float) -> str:
+    """A sentence on one that is not the first."""
+    forward = differences[(differences["ours"] == first) & (differences["theirs"] == other)]
+    backward = differences[(differences["ours"] == other) & (differences["theirs"] == first)]
+    if len(forward) == len(backward) == 0:
+        return f"{label(*other)}: {regret:.2f}, on other tasks: no comparison."
+    row, sign = (forward.iloc[0], -1.0) if len(forward) else (backward.iloc[0], 1.0)
+    more, ends = sign * row["difference"], sorted((sign * row["lower"], sign * row["upper"]))
+    text = f"{label(*other)}: {regret:.2f}, {more:.2f} more on {pluralize(int(row['tasks']), 'task')}"
+    if not np.isfinite(row["p_value"]):
+        return f"{text}; a task has one run, so nothing can be said about how sure this is."
+    p = "p < 0.001" if row["adjusted"] < 0.001 else f"p = {row['adjusted']:.3f}"
+    corrected = f" after Holm's correction for {len(differences)} comparisons" if len(differences) > 1 else ""
+    verdict = ("worse" if more > 0 else "better") if row["adjusted"] < 0.05 else "not shown to differ"
+    return f"{text} (95 % interval {ends[0]:.2f} to {ends[1]:.2f}, {p}{corrected}): {verdict}."
+
+
+def _other_winners(results: Results) -> list[str]:
+    """A sentence if returns and regret order agents differently, with the task on which regrets are farthest apart."""
+    tasks = results.other_winners
+    if len(tasks) == 0:
+        return []
+    row = tasks.loc[(tasks["most_regret"] - tasks["least_regret"]).idxmax()]
+    many = pluralize(results.other_winners.attrs["tasks"], "task")
+    return [
+        f"Returns and regret order them differently in {len(tasks)} of {many}. On {row['instance']} ({row['chance']}) "
+        f"{label(*row['most'])} has the highest return ({row['most_return']:.2f}) and a regret of "
+        f"{row['most_regret']:.2f}; {label(*row['least'])} has the least regret ({row['least_regret']:.2f}) and a "
+        f"return of {row['least_return']:.2f}. Returns are of episodes played while learning, exploration included; "
+        "regret is of the policies that were learnt."
+    ]
 
 
 def _estimated(runs: "pd.DataFrame") -> str | None:
@@ -187,7 +252,7 @@ def _representations(results: Results, figures: Figures, left_out: list[str]) ->
         lines = [
             f"{in_words(str(name))}: the {in_words(observation) if observation != IMAGE else 'image'} costs "
             f"{agent_name(agent)} more regret in {row['sum']} of {row['size']} tasks"
-            for name, row in harder.iterrows()
+            for name, row in harder[harder["size"] >= FEWEST_TASKS].iterrows()
         ]
         caption = (
             f"Normalised regret of {agent_name(agent)} that sees a vector against that of {agent_name(agent)} that "
