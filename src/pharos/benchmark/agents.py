@@ -38,13 +38,11 @@ from pharos.training import (
     clear_run,
     dealt,
     evaluate_agent,
-    plan,
     read_record,
     read_rows,
     regret,
     run_id,
     train_configs,
-    train_parts,
     write_curve,
     write_policy,
     write_record,
@@ -161,17 +159,14 @@ class TrainedForm(Form):
             if not agent_called(self.label).resumes_exactly(config.engine):
                 clear_run(job.folder)
         folders, seconds = [job.folder for job in jobs], [job.task.seconds.get(self.label, 1.0) for job in jobs]
-        parts = plan(configs, workers=workers, seconds=seconds)
 
         def progress(now: Any) -> None:
             failures = f", {now.failed} failed" if now.failed else ""
             tell(now.done / now.total, f"{now.finished} of {len(jobs)} runs{failures}")
 
-        if len(parts) > 1:
-            train_parts(configs, folders, parts, checkpoints=checkpoints, device="cpu", progress=progress)
-            return
         tasks = TaskCache(trust=True)  # the user has named the code
-        train_configs(configs, folders, checkpoints=checkpoints, progress=progress, tasks=tasks)
+        options = {"progress": progress, "tasks": tasks, "workers": workers, "seconds": seconds}
+        train_configs(configs, folders, checkpoints=checkpoints, **options)
 
     def _config(self, job: Job, protocol: Protocol) -> RunConfig:
         task, agent = job.task.training_task(protocol), agent_called(self.label)

@@ -10,8 +10,16 @@ from pharos.system import lazy
 if TYPE_CHECKING:
     from pharos.mdp import ChanceSetting
     from pharos.regret import ReferenceValues, cumulative_expected_regret, regret
-    from pharos.training.batch import TrainingProgress, check_device, train_configs
     from pharos.training.curve import Curve, Evaluation, RegretCurve, evaluate_agent
+    from pharos.training.execution import (
+        EXIT_BUSY,
+        Execution,
+        Pool,
+        TrainingProgress,
+        Work,
+        check_device,
+        train_configs,
+    )
     from pharos.training.options import ENGINES, ExecutionOptions, Horizon, TrainingOptions
     from pharos.training.prepared import FailedRun, TaskCache
     from pharos.training.results import (
@@ -31,7 +39,7 @@ if TYPE_CHECKING:
         write_record,
         write_table,
     )
-    from pharos.training.runs import train, train_config, train_many, train_parts
+    from pharos.training.runs import train, train_config, train_many
     from pharos.training.schedule import Shapes, dealt, halves, lanes, plan
     from pharos.training.task import CELL, RunConfig, Task, TaskValues, run_id
     from pharos.training.tuning import TuningResult, tune

@@ -10,7 +10,6 @@ same curve file.
 """
 
 import os
-import signal
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,16 +17,14 @@ from typing import Any
 from pharos.agents import agent_called
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment
-from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, PharosError
+from pharos.errors import AllRunsFailed, ParameterError
 from pharos.observations import own_observation
 from pharos.system.records import split, takes
-from pharos.system.workers import Workers
-from pharos.training import results as _results
-from pharos.training.batch import ProgressCallback, TrainingJobs, TrainingProgress, train_configs
+from pharos.training.execution import ProgressCallback, Training, TrainingProgress, train_configs
 from pharos.training.options import TrainingOptions
 from pharos.training.prepared import FailedRun, TaskCache
-from pharos.training.results import TrainingResult, finished_result
-from pharos.training.schedule import Shapes, plan
+from pharos.training.results import TrainingResult
+from pharos.training.schedule import Shapes
 from pharos.training.task import RunConfig, Task, TaskValues
 
 RunProgress = Callable[[int, int, Mapping[str, Any]], None]
@@ -103,14 +100,11 @@ def train_many(
     folder = None if out is None else Path(out)
     folders = None if folder is None else [folder / f"seed-{seed}" for seed in numbers]
     checkpoints = None if folder is None else folder / "checkpoints"
-    is_alone = Shapes(device).key(configs[0]) is None
-    parts = plan(configs, workers=1 if is_alone else workers, device=device)
-    if folders is not None and len(parts) > 1:
-        results = train_parts(configs, folders, parts, checkpoints=checkpoints, device=device, progress=progress)
-    else:
-        tasks = TaskCache(device=device)
-        tasks.adopt(configs[0], task)
-        results = train_configs(configs, folders, checkpoints=checkpoints, progress=progress, tasks=tasks)
+    tasks = TaskCache(device=device)
+    tasks.adopt(configs[0], task)
+    if Shapes(device).key(configs[0]) is None:
+        workers = 1
+    results = train_configs(configs, folders, checkpoints=checkpoints, progress=progress, tasks=tasks, workers=workers)
     failed = {
         f"seed {seed}": end.error for seed, end in zip(numbers, results, strict=True) if isinstance(end, FailedRun)
     }
@@ -164,8 +158,8 @@ def _train(
             progress(now.rows[0]["step"], config.steps, now.rows[0])
 
     folders, checkpoints = (None, None) if folder is None else ([folder], folder / "checkpoints")
-    jobs = TrainingJobs([config], folders, checkpoints, tell, tasks, raises=True, tensorboard=tensorboard)
-    (end,) = jobs.run()
+    options = {"raises": True, "tensorboard": tensorboard}
+    (end,) = Training([config], folders, [[0]], checkpoints, tell, tasks, **options).results_in_order()
     assert isinstance(end, TrainingResult)
     return end
 
@@ -193,66 +187,3 @@ def _runs(
         hyperparameters = hyperparameters_of(agent, task.env.name, str(task.observation), table=Path(table))
     same = {name: getattr(training, name) for name in ("steps", "evaluation_interval", "engine")}
     return task, [RunConfig.of_task(task, agent, seed=seed, hyperparameters=hyperparameters, **same) for seed in seeds]
-
-
-# Processes: whole lanes of the batched engine each, and files as the only results -------------------------------------
-
-
-def train_parts(
-    configs: Sequence[RunConfig],
-    folders: Sequence[Path],
-    parts: Sequence[Sequence[int]],
-    *,
-    checkpoints: Path | None,
-    device: str,
-    progress: ProgressCallback | None,
-) -> list[TrainingResult | FailedRun]:
-    """Train as `train_configs` does, each part in a process of its own, which ends with this one."""
-    done, finished, failed = [0] * len(parts), [0] * len(parts), [0] * len(parts)
-    total = sum(config.steps for config in configs)
-    with Workers() as workers:
-        for number, part in enumerate(parts):
-            entries = [(configs[place].to_dict(), folders[place]) for place in part]
-            workers.start(str(number), _train_part, (entries, checkpoints, device), configs[0].definitions)
-        while workers:
-            for key, now in workers.events():
-                if isinstance(now, OSError):
-                    raise now
-                if not isinstance(now, TrainingProgress):
-                    continue  # it has ended
-                number = int(key)
-                done[number], finished[number], failed[number] = now.done, now.finished, now.failed
-                if progress is not None:
-                    rows = {parts[number][place]: row for place, row in now.rows.items()}
-                    progress(TrainingProgress(sum(done), total, rows, sum(finished), sum(failed)))
-    return [_end(config, folder) for config, folder in zip(configs, folders, strict=True)]
-
-
-def _train_part(
-    entries: Sequence[tuple[dict[str, Any], Path]],
-    checkpoints: Path | None,
-    device: str,
-    tell: ProgressCallback,
-) -> None:
-    """Body of a process: train its part and send the progress. SIGTERM ends it at once, as there is nothing to clean
-    up, and a repeated call needs its locks."""
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    configs, folders = zip(*entries, strict=True)
-    tasks = TaskCache(trust=True, device=device)  # of code that the process which started this one has imported
-    try:
-        train_configs(configs, folders, checkpoints=checkpoints, progress=tell, tasks=tasks)
-    except OSError as error:  # a full disk, which ends the other parts as well
-        tell(error)  # type: ignore[arg-type]
-
-
-def _end(config: RunConfig, folder: Path) -> TrainingResult | FailedRun:
-    """The result in the folder of a run, or why there is none."""
-    try:
-        done = finished_result(folder, config)
-        if done is not None:
-            return done
-        text = _results.read_record(folder).get("error") if (folder / _results.RECORD).exists() else None
-    except (ParameterError, FileFormatError) as error:
-        return FailedRun(config.to_dict(), folder, error)
-    text = text or f"{folder}: the process that trained it ended without a result; the same command goes on from there"
-    return FailedRun(config.to_dict(), folder, PharosError(text))
