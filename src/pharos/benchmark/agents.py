@@ -165,7 +165,7 @@ class TrainedForm(Form):
             tell(now.done / now.total, f"{now.finished} of {len(jobs)} runs{failures}")
 
         tasks = TaskCache(trust=True)  # the user has named the code
-        options = {"progress": progress, "tasks": tasks, "workers": workers, "seconds": seconds}
+        options: dict[str, Any] = {"progress": progress, "tasks": tasks, "workers": workers, "seconds": seconds}
         train_configs(configs, folders, checkpoints=checkpoints, **options)
 
     def _config(self, job: Job, protocol: Protocol) -> RunConfig:

@@ -10,18 +10,21 @@ from pharos.system import lazy
 if TYPE_CHECKING:
     from pharos.mdp import ChanceSetting
     from pharos.regret import ReferenceValues, cumulative_expected_regret, regret
+    from pharos.training.batch import train_group
     from pharos.training.curve import Curve, Evaluation, RegretCurve, evaluate_agent
     from pharos.training.execution import (
+        ATTEMPTS,
         EXIT_BUSY,
         Execution,
         Pool,
         TrainingProgress,
         Work,
         check_device,
+        stored_batches,
         train_configs,
     )
     from pharos.training.options import ENGINES, ExecutionOptions, Horizon, TrainingOptions
-    from pharos.training.prepared import FailedRun, TaskCache
+    from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
     from pharos.training.results import (
         TrainingResult,
         check_agent,

@@ -49,7 +49,7 @@ class Named(Protocol):
 
 R = TypeVar("R", bound=Named)
 Work = tuple[Callable[..., Any], Sequence[Any], Sequence[object]]
-"""function, its arguments but for the last, `send`, and the classes and functions that it needs."""
+"""function, its arguments but for the last, `send(message)`, and the classes and functions that it needs."""
 
 
 class Pool(Protocol):
@@ -80,7 +80,10 @@ class Execution(Generic[R]):
         attempts: ATTEMPTS; 1 for a pool that begins again itself.
     Attributes:
         waiting: (the earliest time to begin, runs). running: key of the process -> (runs, when it began).
+        lost_servers: how often in a row the process that forks workers was gone.
     """
+
+    lost_servers = 0
 
     def __init__(
         self,
@@ -96,8 +99,7 @@ class Execution(Generic[R]):
         self.running: dict[str, tuple[list[R], float]] = {}
         self.pool, self.num_workers, self.timeout, self.attempts = pool, workers, timeout, attempts
         self.checkpoints = checkpoints
-        self.kills: dict[R, int] = defaultdict(int)
-        self.lost_servers = 0
+        self.kills: dict[int, int] = defaultdict(int)  # by the identity of the run
         self._keys = map(str, itertools.count())
         self._reasons: set[str] = set()
 
@@ -111,8 +113,8 @@ class Execution(Generic[R]):
         """Whether there is a result, or the reason why not; `ended`: the process that trained it has just ended."""
         raise NotImplementedError
 
-    def receive(self, key: str, message: Any) -> None:
-        """Take what the work has sent."""
+    def receive(self, key: str, message: tuple[Any, ...]) -> None:
+        """Take a message of the work; whatever else comes from a pool is the end of a process."""
         raise NotImplementedError
 
     def fail(self, run: R, reason: str) -> None:
@@ -143,8 +145,8 @@ class Execution(Generic[R]):
             key: of the process that has, or had, them. reason: told once; empty where each run will say it.
         """
         if key in self.running:
-            mine = self.running[key][0]
-            mine[:] = [run for run in mine if run not in runs]
+            group, leaving = self.running[key][0], {id(run) for run in runs}
+            group[:] = [run for run in group if id(run) not in leaving]
         self._forget(runs)
         parts = [part for part in halves(runs) if part]
         self.waiting.extendleft((0.0, part) for part in reversed(parts))
@@ -207,43 +209,50 @@ class Execution(Generic[R]):
             return
         has_room = self.waiting and len(self.running) < self.num_workers
         for key, event in self.pool.events(BUSY_SECONDS if has_room else WAITING_SECONDS):
-            if isinstance(event, int):
-                self._end(key, event)
-            else:
+            if isinstance(event, tuple):
                 self.receive(key, event)
+            else:
+                self._end(key, event)
         for key, (group, began) in self.running.items():
             if self.timeout is not None and time.monotonic() - began > self.timeout * len(group):
-                self.kills.update({run: self.attempts for run in group})
+                self.kills.update({id(run): self.attempts for run in group})
                 assert self.pool is not None
                 self.pool.kill(key)
 
-    def _end(self, key: str, code: int) -> None:
-        """Count the results of a process that has ended; its other runs wait again."""
+    def _end(self, key: str, code: int | str) -> None:
+        """Count the results of a process that has ended; its other runs wait again.
+
+        Args:
+            code: exit code; or, of other pools, why it has died.
+        """
         group, _ = self.running.pop(key)
         left = [run for run in group if not self.is_over(run, ended=code in (0, EXIT_BUSY))]
         if code == SERVER_LOST and left and self.lost_servers < LOST_SERVERS:
             self.lost_servers += 1  # the worker may well live: the next attempt waits for it
         elif code != EXIT_BUSY:
-            self._repeat(key, left, f"by signal {-code}" if code < 0 else f"with exit code {code}")
+            self._repeat(key, left, code if isinstance(code, str) else self._in_words(code))
             return
         if left:  # another process is at them
             self.waiting.append((time.monotonic() + BUSY_SECONDS, left))
 
-    def _repeat(self, key: str, group: list[R], how: str) -> None:
+    def _in_words(self, code: int) -> str:
+        how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
+        return f"its process ended {how}, {pluralize(self.attempts, 'time')}; was there memory enough?"
+
+    def _repeat(self, key: str, group: list[R], reason: str) -> None:
         """Let runs without results wait again, up to `attempts` times; then halve them, or let a single run fail."""
         for run in group:
-            self.kills[run] += 1
-        most = max((self.kills[run] for run in group), default=0)
+            self.kills[id(run)] += 1
+        most = max((self.kills[id(run)] for run in group), default=0)
         if group and most < self.attempts:
             self.waiting.append((0.0, group))
         elif len(group) > 1 and most == self.attempts:
-            self.kills.update({run: 0 for run in group})
+            self.kills.update({id(run): 0 for run in group})
             self.halve(key, group)
         else:
             for run in group:
-                late = self.kills[run] > self.attempts
-                killed = f"its process ended {how}, {pluralize(self.attempts, 'time')}; was there memory enough?"
-                self.fail(run, f"took longer than {self.timeout:g} s" if late else killed)
+                is_late = self.kills[id(run)] > self.attempts
+                self.fail(run, f"took longer than {self.timeout:g} s" if is_late else reason)
 
 
 def stored_batches(checkpoints: Path | None) -> dict[Path, frozenset[str]]:
@@ -383,11 +392,11 @@ class Training(Execution[PreparedRun]):
     def is_over(self, run: PreparedRun, *, ended: bool = False) -> bool:
         return run.place in self.results
 
-    def receive(self, key: str, message: Any) -> None:
+    def receive(self, key: str, message: tuple[Any, ...]) -> None:
         """Take what `train_group` tells."""
-        if isinstance(message, OSError):  # a full disk, which ends the other groups as well
-            raise message
         kind, *content = message
+        if kind == "error":  # a full disk, which ends the other groups as well
+            raise content[0]
         if kind == "rows":
             self.steps[key], rows = content
             self._report(rows)
@@ -423,7 +432,7 @@ def _train_in_process(
     checkpoints: Path | None,
     device: str,
     options: Mapping[str, Any],
-    send: Callable[[Any], None],
+    send: Callable[[tuple[Any, ...]], None],
 ) -> None:
     """Body of a process: train a group, and send what `train_group` tells.
 
@@ -444,4 +453,4 @@ def _train_in_process(
     try:
         train_group(runs, checkpoints, tell, **options)
     except OSError as error:
-        send(error)
+        send(("error", error))
