@@ -22,8 +22,6 @@ from typing import Any
 import numpy as np
 
 from pharos.agents import agent_called, agents, check_hyperparameters, is_known
-from pharos.benchmark.budget import Learn, generated_curve, uniform_policy
-from pharos.benchmark.jax_agents import LearnCompiled, compiled_curves
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
 from pharos.system.sources import Source, find, is_reference, load, source_of
@@ -31,18 +29,23 @@ from pharos.system.wording import in_one_line
 from pharos.system.workers import Workers, one_thread
 from pharos.training import (
     Curve,
+    Learn,
+    LearnCompiled,
     RunConfig,
     Task,
     TaskCache,
     check_agent,
     clear_run,
+    compiled_curves,
     dealt,
     evaluate_agent,
+    generated_curve,
     read_record,
     read_rows,
     regret,
     run_id,
     train_configs,
+    uniform_policy,
     write_curve,
     write_policy,
     write_record,

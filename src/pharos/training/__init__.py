@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from pharos.mdp import ChanceSetting
     from pharos.regret import ReferenceValues, cumulative_expected_regret, regret
     from pharos.training.batch import train_group
+    from pharos.training.budget import BudgetSpent, Learn, Snapshots, generated_curve, uniform_policy
     from pharos.training.curve import Curve, Evaluation, RegretCurve, evaluate_agent
     from pharos.training.execution import (
         ATTEMPTS,
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
         stored_batches,
         train_configs,
     )
+    from pharos.training.jax_agents import LearnCompiled, compiled_curves
     from pharos.training.options import ENGINES, ExecutionOptions, Horizon, TrainingOptions
     from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
     from pharos.training.results import (

@@ -30,7 +30,8 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.interaction import GymEnv
 from pharos.policies import PolicyAnswers, PolicyLike, RecurrentPolicy, SB3Model, deep_policy
-from pharos.training import Curve, Evaluation, Task, evaluate_agent
+from pharos.training.curve import Curve, Evaluation, evaluate_agent
+from pharos.training.task import Task
 
 BLOCK = 4096  # observations that a policy is asked about at once
 LARGEST = 100_000  # states that it is asked about in advance
