@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import agent_called, agents, check_hyperparameters, is_known
+from pharos.agents import COMPILED, agent_called, agents, check_hyperparameters, form_of, is_known
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
 from pharos.system.sources import Source, find, is_reference, load, source_of
@@ -189,31 +189,16 @@ class TrainedForm(Form):
 # Generators -----------------------------------------------------------------------------------------------------------
 
 
-def _function(code: object, source: Source | None, setting: Mapping[str, Any]) -> Form:
+def _function(code: Callable[..., Any], source: Source | None, setting: Mapping[str, Any]) -> Form:
     name = source.name if source is not None else getattr(code, "__qualname__", repr(code))
-    if code is None and source is not None:
-        where, _, attribute = source.name.rpartition(":")
-        raise ParameterError(f"agent {name!r}: {where} has no {attribute!r}; expected the name of a class or function")
-    if not callable(code):
-        raise ParameterError(
-            f"agent {name!r} is {code!r}; expected a class for Stable-Baselines3, or a function learn(env, steps, seed)"
-        )
+    form = form_of(name, code)
     if setting:
         raise ParameterError(
             f"agent {name!r} is a function, which has its hyperparameters in its code; found {', '.join(setting)}"
         )
     checksum = sha256(source.file) if source is not None else _text_checksum(code)
-    with contextlib.suppress(TypeError, ValueError):
-        inspect.signature(code).bind(None, None, 0, None)
-        return CompiledForm(name, "jax", source=source, checksum=checksum, learn=code)
-    try:
-        inspect.signature(code).bind(None, 0, 0)
-    except (TypeError, ValueError) as error:
-        raise ParameterError(
-            f"agent {name!r}: {error}; expected a function learn(env, steps, seed), or learn(env, params, steps, key) "
-            f"of JAX"
-        ) from None
-    return GeneratedForm(name, "generator", source=source, checksum=checksum, learn=code)
+    kind = CompiledForm if form == COMPILED else GeneratedForm
+    return kind(name, form, source=source, checksum=checksum, learn=code)
 
 
 def _text_checksum(code: Callable[..., Any]) -> str:

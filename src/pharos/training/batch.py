@@ -19,12 +19,14 @@ from typing import Any
 
 from pharos.agents import Learner, agent_called, is_known
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
+from pharos.policies import PolicyLike
 from pharos.system import compiling
 from pharos.system.sources import is_reference
 from pharos.system.storage import digest_of_json, inside, is_full, lock, read_json, remove_leftovers, replace_json
 from pharos.system.wording import in_one_line
+from pharos.training import functions  # noqa: F401  (who trains functions)
 from pharos.training import results as _results
-from pharos.training.curve import joint_values
+from pharos.training.curve import Evaluation, joint_values
 from pharos.training.prepared import FailedRun, PreparedRun
 from pharos.training.results import Checkpoint, TrainingResult, clear_run, finished_result
 from pharos.training.schedule import lanes
@@ -227,7 +229,11 @@ class Program:
         return done is not None
 
     def _checkpoint(self) -> Checkpoint | None:
-        """The checkpoint of the group; None where it has no folder, or where another process trains the same batch."""
+        """The checkpoint of the group; None if it has no folder, if it cannot be resumed, or if another process trains
+        the same batch.
+        """
+        if not hasattr(self.learner, "save"):
+            return None
         if self.is_alone:
             folder = self.runs[0].folder
             return None if folder is None else Checkpoint(folder / "checkpoint", self.config.id)
@@ -286,14 +292,17 @@ class Program:
 
     def _evaluate(self, step: int) -> dict[int, dict[str, Any]]:
         """Evaluate the policies: a row for each run that has not failed, by its place in the group."""
-        rows, values = {}, {} if self.is_alone else joint_values(self.learner, self.runs)
+        rows: dict[int, dict[str, Any]] = {}
+        policies: list[PolicyLike | Evaluation] = [self.learner.policy(i) for i in range(len(self.runs))]
+        values = {i: policy for i, policy in enumerate(policies) if isinstance(policy, Evaluation)}
+        if not self.is_alone and not values:
+            values = joint_values(self.learner, self.runs)
         episodes, returns = self.learner.episodes, self.learner.returns
         for i, run in enumerate(self.runs):
             if run.error is not None:
                 continue
-            policy = self.learner.policy(i)
             try:
-                rows[i] = run.curve.add(step, int(episodes[i]), float(returns[i]), policy, values.get(i))
+                rows[i] = run.curve.add(step, int(episodes[i]), float(returns[i]), policies[i], values.get(i))
             except Exception as error:
                 run.fail(error)
         if all(run.error is not None for run in self.runs):
@@ -318,7 +327,9 @@ class Program:
                 _results.write_curve(folder, curve)
                 run.write("finished", seconds=share, **entries, result=result)
             rows = [{name: row[name] for name in _results.COLUMNS} for row in curve]
-            end = TrainingResult(config, result, rows, self.learner.policy(i), folder, share)
+            policy = self.learner.policy(i)
+            learnt = None if isinstance(policy, Evaluation) else policy
+            end = TrainingResult(config, result, rows, learnt, folder, share)
             self.tell(("end", run.place, end))
         self._remove_checkpoint()
         if self.is_alone and (folder := self.runs[0].folder) is not None:

@@ -130,8 +130,8 @@ class PreparedRun:
         return self.tasks.task(self.config)
 
     @property
-    def algorithm(self) -> str | type:
-        """The name of its agent, or a class of the user's own."""
+    def algorithm(self) -> str | Callable[..., Any]:
+        """The name of its agent, or a class or function of the user's own."""
         return self.config.algorithm(trust=self.tasks.trust, strict=self.tasks.strict)
 
     @property

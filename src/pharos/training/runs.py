@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pharos.agents import agent_called
+from pharos.agents import agent_called, agent_name
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment
 from pharos.errors import AllRunsFailed, ParameterError
@@ -32,7 +32,7 @@ RunProgress = Callable[[int, int, Mapping[str, Any]], None]
 
 @takes(TrainingOptions)
 def train(
-    agent: str,
+    agent: str | Callable[..., Any],
     environment: Environment | str,
     *,
     seed: int = 0,
@@ -44,8 +44,9 @@ def train(
     """Train an agent, and measure the exact regret of its policy as it learns.
 
     Args:
-        agent: "q_learning", "dqn", "ppo", "a2c", or "module:Class" or "file.py:Class" of an algorithm for
-            Stable-Baselines3.
+        agent: "q_learning", "dqn", "ppo", "a2c"; or "module:Name" or "file.py:Name" of an algorithm for
+            Stable-Baselines3, or of a function learn(env, steps, seed) that yields policies; or such a class or
+            function itself.
         environment: a name, with its parameters as keywords, or an Environment.
         seed: decides everything random.
         out: folder of the run; None: nothing is written. A finished run there is returned, an unfinished one resumed.
@@ -58,7 +59,7 @@ def train(
             suggested.
         MissingExtra: Stable-Baselines3 is not installed.
     """
-    task, (config,) = _runs(environment, {"agent": agent, **options}, [seed])
+    task, (config,) = _runs(environment, {"agent": agent_name(agent), **options}, [seed])
     tasks = TaskCache()
     tasks.adopt(config, task)
     return _train(config, tasks, None if out is None else Path(out), progress, tensorboard)
@@ -66,7 +67,7 @@ def train(
 
 @takes(TrainingOptions, engine="batched")
 def train_many(
-    agent: str,
+    agent: str | Callable[..., Any],
     environment: Environment | str,
     *,
     seeds: Iterable[int],
@@ -96,7 +97,7 @@ def train_many(
     numbers = [int(seed) for seed in seeds]
     if not numbers or len(set(numbers)) != len(numbers):
         raise ParameterError(f"seeds are {numbers}; expected at least one, each once")
-    task, configs = _runs(environment, {"agent": agent, "engine": "batched", **options}, numbers)
+    task, configs = _runs(environment, {"agent": agent_name(agent), "engine": "batched", **options}, numbers)
     folder = None if out is None else Path(out)
     folders = None if folder is None else [folder / f"seed-{seed}" for seed in numbers]
     checkpoints = None if folder is None else folder / "checkpoints"
