@@ -87,8 +87,8 @@ def train_many(
         out: a folder, in which each run has its own, seed-0 and so on; None: nothing is written. Finished runs there
             are returned, and what was killed goes on from its last checkpoint.
         progress: called after each evaluation.
-        options: as for `train`. The engine is "batched" unless told otherwise: all runs as one program (dqn, ppo, and
-            q_learning one after the other); "sb3": one after the other.
+        options: as for `train`. The engine is "batched" unless told otherwise, if it has the agent: all runs as one
+            program (dqn, ppo, and q_learning one after the other); "sb3": one after the other.
     Returns:
         The result of each run in the order of the seeds; a run that failed says why, and does not stop the others.
     Raises:
@@ -97,7 +97,9 @@ def train_many(
     numbers = [int(seed) for seed in seeds]
     if not numbers or len(set(numbers)) != len(numbers):
         raise ParameterError(f"seeds are {numbers}; expected at least one, each once")
-    task, configs = _runs(environment, {"agent": agent_name(agent), "engine": "batched", **options}, numbers)
+    name = agent_name(agent)
+    options = {"agent": name, "engine": agent_called(name).engines[-1], **options}
+    task, configs = _runs(environment, options, numbers)
     folder = None if out is None else Path(out)
     folders = None if folder is None else [folder / f"seed-{seed}" for seed in numbers]
     checkpoints = None if folder is None else folder / "checkpoints"
