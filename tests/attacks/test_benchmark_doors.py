@@ -26,11 +26,11 @@ import pharos
 from attacks.damage import Attack, Refused, Tally, command, outcome
 from pharos import benchmark, importers, study
 from pharos.benchmark import BenchmarkTask, BudgetSpent, Protocol, Suite, load_suite, write_suite
-from pharos.benchmark.budget import generated_curve
 from pharos.benchmark.suite import digest_of_suite, frozen
 from pharos.errors import ParameterError, PharosError
 from pharos.interaction import GymEnv
 from pharos.mdp import TabularMDP
+from pharos.training.budget import generated_curve
 
 pytestmark = pytest.mark.long
 

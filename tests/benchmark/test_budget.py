@@ -13,9 +13,9 @@ import pytest
 
 from pharos import benchmark
 from pharos.benchmark import BenchmarkTask, BudgetSpent, Protocol, Suite
-from pharos.benchmark.budget import CountedEnv, StepBudget, generated_curve
 from pharos.benchmark.suite import digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError
+from pharos.training.budget import CountedEnv, StepBudget, generated_curve
 
 PROTOCOL = Protocol(steps=300, evaluations=3, seeds=2)
 SEA = BenchmarkTask("sea", "deep_sea", {"size": 4, "mapping_seed": 1}, "one_hot")

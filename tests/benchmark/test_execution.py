@@ -17,10 +17,10 @@ from edits import edited_json
 from patience import PATIENCE, wait_for
 from pharos import benchmark, evaluate_policy
 from pharos.benchmark import BenchmarkTask, BudgetSpent, Ladder, Protocol, Suite, write_suite
-from pharos.benchmark.budget import generated_curve
 from pharos.benchmark.suite import EARLIER, digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
 from pharos.system.sources import find, load
+from pharos.training.budget import generated_curve
 
 PROTOCOL = Protocol(steps=300, evaluations=3, seeds=2)
 SEA = {"size": 4, "mapping_seed": 1}

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections import deque
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,9 +20,9 @@ from pharos.agents.batched import lane_width
 from pharos.errors import ParameterError
 from pharos.study import batches as _batches
 from pharos.study import execution as _execution
-from pharos.study.batches import Batches
+from pharos.study.batches import batches
 from pharos.system.storage import cache_directory, sealed
-from pharos.training import ExecutionOptions, read_record, train_config
+from pharos.training import ExecutionOptions, Shapes, read_record, train_config
 
 TESTS = Path(__file__).parents[1]
 
@@ -66,8 +65,20 @@ def test_more_runs_than_a_lane_are_several_batches(tmp_path, sizes):
 
 
 def test_batches_are_larger_where_networks_are_not_on_the_processor(tmp_path):
-    run = specification(seeds=1).runs[0]
-    assert (Batches(tmp_path).width(run), Batches(tmp_path, "cuda").width(run)) == (lane_width(is_image=False), 256)
+    runs = specification(seeds=lane_width(is_image=False) + 2).runs
+    sizes = {device: [len(group) for group in batches(runs, tmp_path, device)] for device in ("cpu", "cuda")}
+    assert sizes == {"cpu": [lane_width(is_image=False), 2], "cuda": [len(runs)]}
+
+
+def test_runs_of_a_checkpoint_stay_together(tmp_path):
+    runs = specification(seeds=5).runs
+    (tmp_path / "old").mkdir()
+    ids = [runs[3].id, runs[1].id, "of-a-run-that-is-over"]
+    (tmp_path / "old" / "batch.json").write_text(json.dumps({"ids": ids}))
+    (tmp_path / "damaged").mkdir()
+    (tmp_path / "damaged" / "batch.json").write_text("[")
+    seeds = [[run.configuration.seed for run in group] for group in batches(runs, tmp_path)]
+    assert seeds == [[0, 2, 4], [1, 3]]
 
 
 @pytest.mark.skipif("forkserver" not in multiprocessing.get_all_start_methods(), reason="nothing is forked here")
@@ -90,7 +101,7 @@ def test_a_gpu_has_one_process_unless_more_are_asked_for(tmp_path, monkeypatch):
     monkeypatch.setattr(_execution, "usable_workers", lambda workers: 7 if workers is None else workers)
 
     def processes(**options):
-        return _execution.Execution(specification(), tmp_path, ExecutionOptions(**options)).num_workers
+        return _execution.StudyExecution(specification(), tmp_path, ExecutionOptions(**options)).num_workers
 
     assert [processes(device=device) for device in ("cpu", "cuda")] == [7, 1]
     assert [processes(device=device, workers=3) for device in ("cpu", "cuda")] == [3, 3]
@@ -171,13 +182,11 @@ def test_a_runner_that_is_killed_leaves_nothing_half_done(tmp_path, sizes):
 def test_the_papers_instances_share_batches_where_shapes_and_numbers_of_states_allow_it():
     paper = study.specification("paper").model_dump(mode="json", exclude_unset=True)
     runs = study.specification({**paper, "engine": "batched"}).runs
-    batches, pending = Batches(Path("nowhere")), deque((0.0, run) for run in runs)
-    units = []
-    while pending:
-        units.append(batches.next_batch(pending.popleft()[1], pending))
-    assert sum(map(len, units)) == len(runs) == 2100 and min(map(len, units)) >= 6
-    for unit in units:
-        assert len({batches.key(run) for run in unit}) == 1 and len(unit) <= batches.width(unit[0])
+    shapes, groups = Shapes(), batches(runs, Path("nowhere"))
+    assert sum(map(len, groups)) == len(runs) == 2100 and min(map(len, groups)) >= 6
+    for group in groups:
+        assert len({shapes.key(run.configuration) for run in group}) == 1
+        assert len(group) <= shapes.width(group[0].configuration)
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 """Executing a study: what is missing runs, failures stay alone, and kill -9 at any moment loses and repeats nothing."""
 
+import importlib
 import json
 import os
 import signal
@@ -21,7 +22,7 @@ from pharos.study import execution as _execution
 from pharos.study import execution as preparing
 from pharos.study import worker as _worker
 from pharos.study.execution import shard_of
-from pharos.system import storage
+from pharos.system import storage, workers
 from refusals import failing
 
 TESTS = Path(__file__).parents[1]
@@ -381,8 +382,8 @@ def test_the_process_that_forks_workers_is_begun_again_when_it_dies(tmp_path, lo
 
 
 def test_a_runner_whose_starts_always_fail_gives_up_in_one_line(tmp_path, log, monkeypatch):
-    monkeypatch.setattr(_execution, "BUSY_SECONDS", 0.0)
-    monkeypatch.setattr(_execution.Execution, "_worker", lambda *_: (_ for _ in ()).throw(EOFError()))
+    monkeypatch.setattr(importlib.import_module("pharos.training.execution"), "BUSY_SECONDS", 0.0)
+    monkeypatch.setattr(workers.Workers, "start", failing(EOFError()))
     with pytest.raises(PharosError, match="the process that starts runs died 11 times in a row"):
         study.run(specification(), tmp_path / "out", runner=fake_training.train, workers=2)
 

@@ -71,7 +71,7 @@ class LearningRun(Protocol):
     Attributes:
         config: its `pharos.training.RunConfig`.
         task: its task, which is made when it is first used.
-        algorithm: name of the agent, or a class of the user's own.
+        algorithm: name of the agent, or a class or function of the user's own.
         hyperparameters: all that are known, those of the configuration first.
         world_mdp: states and rewards without chance and horizon.
     """
@@ -83,7 +83,7 @@ class LearningRun(Protocol):
     def task(self) -> LearningTask: ...
 
     @property
-    def algorithm(self) -> str | type: ...
+    def algorithm(self) -> str | Callable[..., Any]: ...
 
     @property
     def hyperparameters(self) -> dict[str, Any]: ...
@@ -140,7 +140,7 @@ AtPoint = Callable[[int], Mapping[str, Any] | None]
 
 
 class Learner(Protocol):
-    """Learner of N runs.
+    """Learner of N runs. One without `save` begins anew after it was killed.
 
     Attributes:
         episodes: (N,) int64, finished ones; returns: (N,) float64, the sums of their returns.
@@ -156,7 +156,7 @@ class Learner(Protocol):
         """Train until the last of `points`, and call `at_point` at each."""
 
     def policy(self, i: int) -> PolicyLike:
-        """The policy of run i, as `evaluate_agent` takes it."""
+        """The policy of run i, as `evaluate_agent` takes it; or its value, if the learner knows that."""
 
     def greedy_actions(self, places: Sequence[int]) -> dict[int, np.ndarray] | None:
         """(S,) greedy actions by run; None if no policy is a table of states."""
@@ -342,12 +342,7 @@ class TableBasedAgent(Agent):
         return Tables(self.name, [self.table(run) for run in runs])
 
     def load(self, folder: Path, run: LearningRun) -> np.ndarray:
-        file = folder / POLICY
-        try:
-            storage.check_regular(file)
-            return np.load(file, allow_pickle=False)
-        except Exception as error:  # the header is read as Python
-            raise FileFormatError(f"{file}: cannot be read: {error}") from error
+        return read_policy_table(folder)
 
 
 class ArrayLearner:
@@ -445,6 +440,16 @@ def reading_checkpoint(folder: Path) -> Iterator[None]:
             f"{folder}: cannot be resumed from: {first[0] if first else type(error).__name__}; "
             f"delete the folder to start anew"
         ) from error
+
+
+def read_policy_table(folder: Path) -> np.ndarray:
+    """The table that a run has left as POLICY. FileFormatError: it cannot be read."""
+    file = folder / POLICY
+    try:
+        storage.check_regular(file)
+        return np.load(file, allow_pickle=False)
+    except Exception as error:  # the header is read as Python
+        raise FileFormatError(f"{file}: cannot be read: {error}") from error
 
 
 def new_agent(folder: Path) -> Path:

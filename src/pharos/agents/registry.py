@@ -1,11 +1,12 @@
-"""The agents that have a name: a line for each. Any other algorithm is named by its class, `module:Class`."""
+"""The agents that have a name: a line for each. Any other is named by its code, `module:Name`."""
 
 from pharos.agents.a2c import A2C
 from pharos.agents.agent import Agent, agents, register
 from pharos.agents.dqn import DQN
+from pharos.agents.own import OwnAgent
 from pharos.agents.ppo import PPO
 from pharos.agents.q_learning import Q_LEARNING
-from pharos.agents.sb3 import DeepAgent
+from pharos.agents.sb3 import DeepAgent, is_known
 
 register(Q_LEARNING)
 register(DQN)
@@ -14,8 +15,9 @@ register(A2C)
 
 
 def agent_called(name: str) -> Agent:
-    """The agent of a name; any other name is an algorithm for Stable-Baselines3, called by its class."""
-    return agents().get(name) or DeepAgent(name=name, title=name.rpartition(":")[2], path=name)
+    """The agent of a name; any other name is that of a class or function, of a library or the user's own."""
+    kind = DeepAgent if is_known(name) else OwnAgent
+    return agents().get(name) or kind(name=name, title=name.rpartition(":")[2], path=name)
 
 
 def primary_predictors() -> dict[str, str]:

@@ -12,7 +12,7 @@ import inspect
 import json
 import math
 import sys
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,7 +36,7 @@ from pharos.agents.agent import (
 )
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.policies import PolicyLike, deep_policy
-from pharos.system.sources import Source, find, is_reference, load
+from pharos.system.sources import find, is_reference, load
 
 if TYPE_CHECKING:
     from stable_baselines3.common.buffers import ReplayBuffer
@@ -68,7 +68,7 @@ LIBRARIES = ("stable_baselines3", "sb3_contrib")
 """Their algorithms are known by name: they need no trust, and no source in the configuration of a run."""
 
 
-def algorithm(agent: str | type) -> type:
+def algorithm(agent: str | Callable[..., Any]) -> type:
     """The class of an algorithm: the name of an agent, "module:Class" or "file.py:Class"; or a class itself.
 
     Raises:
@@ -82,9 +82,7 @@ def algorithm(agent: str | type) -> type:
     if not colon:
         raise UnknownName("agent", agent, agents())
     if not is_known(path):
-        source = agent_source(path)
-        assert source is not None
-        return _class(agent, load(source))
+        return _class(agent, load(find(path)))
     try:
         target = getattr(importlib.import_module(module), name)
         from stable_baselines3.common.base_class import BaseAlgorithm
@@ -114,7 +112,9 @@ def _class(agent: object, target: object, base: type = object) -> type:
     return target
 
 
-def check_hyperparameters(agent: str | type, hyperparameters: Mapping[str, Any], also: Iterable[str] = ()) -> None:
+def check_hyperparameters(
+    agent: str | Callable[..., Any], hyperparameters: Mapping[str, Any], also: Iterable[str] = ()
+) -> None:
     """Refuse hyperparameters that the algorithm lacks, and values that it would accept silently or fail with late.
 
     Args:
@@ -145,8 +145,8 @@ def check_hyperparameters(agent: str | type, hyperparameters: Mapping[str, Any],
             raise ParameterError(f"agent {name!r}: {hyperparameter} is {value!r}; expected {expected}")
 
 
-def _title(agent: str | type) -> str:
-    return agent if isinstance(agent, str) else agent.__name__
+def _title(agent: str | Callable[..., Any]) -> str:
+    return agent if isinstance(agent, str) else getattr(agent, "__name__", str(agent))
 
 
 def _expected(name: str, value: object) -> str | None:
@@ -179,7 +179,12 @@ def extractor(space: Any) -> type:
 
 
 def make_model(
-    agent: str | type, env: Any, hyperparameters: dict[str, Any], *, seed: int, tensorboard: str | None = None
+    agent: str | Callable[..., Any],
+    env: Any,
+    hyperparameters: dict[str, Any],
+    *,
+    seed: int,
+    tensorboard: str | None = None,
 ) -> Any:
     """A model of Stable-Baselines3 on the CPU, with the network described above unless `policy_kwargs` says otherwise.
 
@@ -239,25 +244,6 @@ def make_model(
 def is_known(name: str) -> bool:
     """Whether an agent comes with pharos or with one of LIBRARIES, so that it is not code of the user's own."""
     return not is_reference(name) or name.partition(":")[0].split(".")[0] in LIBRARIES
-
-
-def agent_source(name: str, folder: str | Path | None = None, *, check: bool = True) -> Source | None:
-    """Place of the code of a user's own agent; None for all others.
-
-    Args:
-        folder: relative files and modules are looked for there first; None: in the current directory.
-        check: whether it is imported, to see that it is a class.
-    Raises:
-        ParameterError: it cannot be imported, or is no class.
-    """
-    if is_known(name):
-        return None
-    source = find(name, folder)
-    if check and not isinstance(load(source), type):
-        raise ParameterError(
-            f"{name!r}: found {load(source)!r}; expected the class of an algorithm for Stable-Baselines3"
-        )
-    return source
 
 
 # Agents ---------------------------------------------------------------------------------------------------------------
@@ -417,7 +403,7 @@ class Deep:
 
     def __init__(
         self,
-        agent: str | type,
+        agent: str | Callable[..., Any],
         task: LearningTask,
         hyperparameters: dict[str, Any],
         steps: int,

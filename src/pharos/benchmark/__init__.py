@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from pharos.system import lazy
 
 if TYPE_CHECKING:
-    from pharos.benchmark.budget import BudgetSpent
     from pharos.benchmark.comparison import AxisComparison, Comparison, Difference, Power, compare, power
     from pharos.benchmark.entry import Claim, Entry
     from pharos.benchmark.execution import run
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from pharos.benchmark.submission import Submission, read, submit
     from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite, frozen, load_suite, write_suite
     from pharos.benchmark.verification import EntryVerdict, SubmissionVerdict, verify
+    from pharos.training import BudgetSpent
 
 __all__ = [
     "AgentResults",

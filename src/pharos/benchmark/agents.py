@@ -21,9 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import agent_called, agents, check_hyperparameters, is_known
-from pharos.benchmark.budget import Learn, generated_curve, uniform_policy
-from pharos.benchmark.jax_agents import LearnCompiled, compiled_curves
+from pharos.agents import COMPILED, agent_called, agents, check_hyperparameters, form_of, is_known
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
 from pharos.system.sources import Source, find, is_reference, load, source_of
@@ -31,20 +29,23 @@ from pharos.system.wording import in_one_line
 from pharos.system.workers import Workers, one_thread
 from pharos.training import (
     Curve,
+    Learn,
+    LearnCompiled,
     RunConfig,
     Task,
     TaskCache,
     check_agent,
     clear_run,
+    compiled_curves,
     dealt,
     evaluate_agent,
-    plan,
+    generated_curve,
     read_record,
     read_rows,
     regret,
     run_id,
     train_configs,
-    train_parts,
+    uniform_policy,
     write_curve,
     write_policy,
     write_record,
@@ -161,17 +162,14 @@ class TrainedForm(Form):
             if not agent_called(self.label).resumes_exactly(config.engine):
                 clear_run(job.folder)
         folders, seconds = [job.folder for job in jobs], [job.task.seconds.get(self.label, 1.0) for job in jobs]
-        parts = plan(configs, workers=workers, seconds=seconds)
 
         def progress(now: Any) -> None:
             failures = f", {now.failed} failed" if now.failed else ""
             tell(now.done / now.total, f"{now.finished} of {len(jobs)} runs{failures}")
 
-        if len(parts) > 1:
-            train_parts(configs, folders, parts, checkpoints=checkpoints, device="cpu", progress=progress)
-            return
         tasks = TaskCache(trust=True)  # the user has named the code
-        train_configs(configs, folders, checkpoints=checkpoints, progress=progress, tasks=tasks)
+        options: dict[str, Any] = {"progress": progress, "tasks": tasks, "workers": workers, "seconds": seconds}
+        train_configs(configs, folders, checkpoints=checkpoints, **options)
 
     def _config(self, job: Job, protocol: Protocol) -> RunConfig:
         task, agent = job.task.training_task(protocol), agent_called(self.label)
@@ -191,31 +189,16 @@ class TrainedForm(Form):
 # Generators -----------------------------------------------------------------------------------------------------------
 
 
-def _function(code: object, source: Source | None, setting: Mapping[str, Any]) -> Form:
+def _function(code: Callable[..., Any], source: Source | None, setting: Mapping[str, Any]) -> Form:
     name = source.name if source is not None else getattr(code, "__qualname__", repr(code))
-    if code is None and source is not None:
-        where, _, attribute = source.name.rpartition(":")
-        raise ParameterError(f"agent {name!r}: {where} has no {attribute!r}; expected the name of a class or function")
-    if not callable(code):
-        raise ParameterError(
-            f"agent {name!r} is {code!r}; expected a class for Stable-Baselines3, or a function learn(env, steps, seed)"
-        )
+    form = form_of(name, code)
     if setting:
         raise ParameterError(
             f"agent {name!r} is a function, which has its hyperparameters in its code; found {', '.join(setting)}"
         )
     checksum = sha256(source.file) if source is not None else _text_checksum(code)
-    with contextlib.suppress(TypeError, ValueError):
-        inspect.signature(code).bind(None, None, 0, None)
-        return CompiledForm(name, "jax", source=source, checksum=checksum, learn=code)
-    try:
-        inspect.signature(code).bind(None, 0, 0)
-    except (TypeError, ValueError) as error:
-        raise ParameterError(
-            f"agent {name!r}: {error}; expected a function learn(env, steps, seed), or learn(env, params, steps, key) "
-            f"of JAX"
-        ) from None
-    return GeneratedForm(name, "generator", source=source, checksum=checksum, learn=code)
+    kind = CompiledForm if form == COMPILED else GeneratedForm
+    return kind(name, form, source=source, checksum=checksum, learn=code)
 
 
 def _text_checksum(code: Callable[..., Any]) -> str:

@@ -184,6 +184,11 @@ def _network(run: Path) -> dict[str, np.ndarray]:
     except ImportError as error:
         raise MissingExtra("reading what a network has learnt", "torch", "agents") from error
     file = run / "agent" / "parameters.pt"
+    if not file.exists():
+        raise ParameterError(
+            f"{run}: its agent is a function; expected a table or a network: run it by `pharos benchmark run`, whose "
+            f"folder can be submitted"
+        )
     try:
         stored: dict[str, Any] = torch.load(file, weights_only=True, map_location="cpu")["policy"]  # noqa: TID251
         return {name: tensor.numpy() for name, tensor in sorted(stored.items())}

@@ -19,14 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from pharos.benchmark.budget import Snapshots
 from pharos.benchmark.entry import WHAT, Entry, stored_table
 from pharos.benchmark.results import AgentResults, entries_of
 from pharos.benchmark.scores import check_suite
 from pharos.benchmark.suite import Suite, load_suite
 from pharos.errors import FileFormatError, ParameterError
 from pharos.system.sealed import SUFFIX, read_sealed, write_sealed
-from pharos.training import Task, check_agent, load_agent
+from pharos.training import Snapshots, Task, check_agent, load_agent
 
 ProgressCallback = Callable[[int, int, str], None]
 """Called with how many are done, how many there are, and the next one."""

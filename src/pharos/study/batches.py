@@ -9,12 +9,8 @@ values of the optimal, the uniform and the worst policy only where episodes star
 each run would take longer than some training.
 """
 
-import contextlib
 import json
 import math
-import shutil
-import time
-from collections import deque
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,10 +18,9 @@ from typing import TYPE_CHECKING, Any
 from pharos.environments import start_distribution
 from pharos.regret import ReferenceValues
 from pharos.study.blocks import Run
-from pharos.study.worker import BATCHES
-from pharos.system import storage
+from pharos.study.worker import HalfAsMany
 from pharos.system.storage import ResultCache, cache_directory
-from pharos.training import RunConfig, Shapes, halves, lanes
+from pharos.training import RunConfig, Shapes, lanes, stored_batches
 
 if TYPE_CHECKING:
     from pharos.training import Task
@@ -90,86 +85,43 @@ def _dependencies(config: Mapping[str, Any]) -> dict[str, Any]:
 def train_batch(
     configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], checkpoints: Path, *, device: str = "cpu"
 ) -> list[str | None]:
-    """Train runs by `pharos.training.train_configs`, with the values that the study has solved already."""
-    from pharos.training import FailedRun, RunConfig, TaskCache, TaskValues, train_configs
+    """Train runs in this process, with the values that the study has solved already."""
+    from pharos.training import FailedRun, PreparedRun, TaskCache, TaskValues, train_group
 
     def values(config: RunConfig) -> TaskValues | None:
         stored = stored_values(config.to_dict())
         return None if stored is None else TaskValues.from_dict(stored)
 
     tasks = TaskCache(values, trust=True, strict=True, device=device)
-    ends = train_configs(configs, folders, checkpoints=checkpoints, tasks=tasks)
-    return [end.error if isinstance(end, FailedRun) else None for end in ends]
+    errors: list[str | None] = [None] * len(configs)
+
+    def tell(message: tuple[Any, ...]) -> None:
+        match message:
+            case "end", place, FailedRun() as end:
+                errors[place] = end.error
+            case "halve", places, reason:
+                together = HalfAsMany(reason)
+                for place in places:
+                    errors[place] = together
+
+    runs = [PreparedRun(i, RunConfig.from_dict(config), folders[i], tasks) for i, config in enumerate(configs)]
+    train_group(runs, checkpoints, tell, is_single=len(runs) == 1)
+    return errors
 
 
-class Batches:
-    """Batches of the missing runs of a study: which runs are trained as one program.
+def batches(runs: Sequence[Run], checkpoints: Path, device: str = "cpu") -> list[list[Run]]:
+    """Return the runs by process, in the order of the first: those of a checkpoint as they were, others by lanes.
 
     Args:
-        folder: of the study.
-        device: where networks are trained.
+        checkpoints: folder of those of batches. device: where networks are trained.
     """
-
-    def __init__(self, folder: Path, device: str = "cpu"):
-        self.folder = folder / BATCHES
-        self.sizes: dict[str, int] = {}  # id -> largest batch of a run whose batch was too large for memory
-        self.shapes = Shapes(device)
-        self.keys: dict[str, Hashable | None] = {}  # by id, as widths
-        self.widths: dict[str, int] = {}
-        self.stored: dict[str, frozenset[str]] = {}
-        self.scan_checkpoints()
-
-    def scan_checkpoints(self) -> None:
-        """Read which batches have checkpoints: their runs stay together."""
-        self.stored = {id: ids for ids in self._checkpoints().values() for id in ids}
-
-    def _checkpoints(self) -> dict[Path, frozenset[str]]:
-        """Folder -> ids of the runs of the batch."""
-        batches = {}
-        for file in self.folder.glob("*/batch.json"):
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                batches[file.parent] = frozenset(storage.read_json(file)["ids"])
-        return batches
-
-    def next_batch(self, run: Run, pending: "deque[tuple[float, Run]]") -> tuple[Run, ...]:
-        """The batch of a run: itself and the runs that are trained with it, which are taken from `pending`."""
-        if run.engine != "batched":
-            return (run,)
-        if (stored := self.stored.get(run.id)) is not None:
-            entries = [entry for entry in pending if entry[1].id in stored]
-        else:
-            now = time.monotonic()
-            ready = [
-                (due, other)
-                for due, other in pending
-                if due <= now and other.id not in self.stored and other.engine == "batched"
-            ]
-            runs = [run, *(other for _, other in ready)]
-            widths = [self.width(each) for each in runs]
-            keys = [self.key(each) for each in runs]
-            keyed = [None if key is None else (width, key) for width, key in zip(widths, keys, strict=True)]
-            entries = [ready[i - 1] for i in lanes(keyed, widths)[0][1:]]
-        for entry in entries:
-            pending.remove(entry)
-        return run, *(other for _, other in entries)
-
-    def width(self, run: Run) -> int:
-        """Largest number of runs in a batch with this one."""
-        if run.id not in self.widths:
-            self.widths[run.id] = self.shapes.width(run.configuration)
-        return min(self.widths[run.id], self.sizes.get(run.id, self.widths[run.id]))
-
-    def key(self, run: Run) -> Hashable | None:
-        """Key of a run: runs with equal keys fit together; None: it is alone."""
-        if run.id not in self.keys:
-            self.keys[run.id] = self.shapes.key(run.configuration)
-        return self.keys[run.id]
-
-    def halve(self, batch: Sequence[Run]) -> None:
-        """Halve a batch whose process was killed too often: its runs start anew, in batches of half its size."""
-        ids = {run.id for run in batch}
-        self.sizes |= {run.id: len(half) for half in halves(batch) for run in half}
-        for folder, others in self._checkpoints().items():
-            if ids & others:
-                shutil.rmtree(folder, ignore_errors=True)
-        self.scan_checkpoints()
+    shapes, stored = Shapes(device), {id: ids for ids in stored_batches(checkpoints).values() for id in ids}
+    keys: list[Hashable | None] = []
+    widths: list[int] = []
+    for run in runs:
+        config, is_stored = run.configuration, run.id in stored
+        width = 1 if run.engine != "batched" else len(runs) if is_stored else shapes.width(config)
+        key = None if run.engine != "batched" else stored[run.id] if is_stored else shapes.key(config)
+        keys.append(None if key is None else (width, key))
+        widths.append(width)
+    return [[runs[i] for i in lane] for lane in lanes(keys, widths)]

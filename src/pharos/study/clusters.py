@@ -5,8 +5,7 @@ may be killed, repeated, or followed by another.
 """
 
 import os
-import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,22 +13,11 @@ from typing import Any
 from pharos.errors import MissingExtra, ParameterError
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run
-from pharos.study.execution import (
-    ATTEMPTS,
-    BUSY_SECONDS,
-    STATUS_SECONDS,
-    Execution,
-    Status,
-    claim,
-    opened,
-    run,
-    shard_of,
-    train,
-)
+from pharos.study.execution import Status, StudyExecution, claim, opened, run, shard_of, train
 from pharos.study.specification import Source, specification
 from pharos.system.records import takes
 from pharos.system.wording import in_one_line
-from pharos.training import ExecutionOptions
+from pharos.training import ATTEMPTS, ExecutionOptions
 
 
 @takes(ExecutionOptions, workers=1)
@@ -123,54 +111,51 @@ def run_on_ray(
         raise MissingExtra("running on Ray", "ray", "ray") from error
     study, place = opened(source, folder)
     own = replace(ExecutionOptions(**options), workers=None)
-    execution = Execution(study, place.absolute(), own, runner, batch_runner, progress)
-    ours = not ray.is_initialized()
-    if ours:
-        ray.init(address=address, log_to_driver=False, include_dashboard=False if address is None else None)
-    try:
-        return _follow(ray, ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_attempt), execution)
-    finally:
-        if ours:
-            ray.shutdown()
+    pool = RayTasks(ray, address)
+    return StudyExecution(study, place.absolute(), own, runner, batch_runner, progress, pool).run()
 
 
-def _attempt(*job: Any) -> None:
-    """Execute one run or a batch, but for runs that another process holds."""
-    _worker.use_one_thread()
-    *arguments, again, resume = job
-    _worker.attempt(*arguments, again=again, resume=resume)
+class RayTasks:
+    """A pool of tasks on a Ray cluster, one processor each, which Ray begins again when their processes die."""
 
+    def __init__(self, ray: Any, address: str | None):
+        self.ray, self.address = ray, address
+        self.is_ours = not ray.is_initialized()
+        self._running: dict[Any, str] = {}
 
-def _follow(ray: Any, remote: Any, execution: Execution) -> Status:
-    """Start every run or batch, and await them one by one.
+    def __enter__(self) -> None:
+        if self.is_ours:
+            dashboard = None if self.address else False
+            self.ray.init(address=self.address, log_to_driver=False, include_dashboard=dashboard)
 
-    A batch whose process died too often goes on in halves; a run has failed.
-    """
-    started: dict[Any, tuple[Run, ...]] = {}
+    def __exit__(self, *_: object) -> None:
+        if self.is_ours:
+            self.ray.shutdown()
 
-    def start() -> None:
-        while execution.pending:
-            batch = execution.next_batch(execution.pending.popleft()[1])
-            started[remote.remote(*execution.job(batch))] = batch
+    def start(self, key: str, function: Any, arguments: Sequence[Any], definitions: Sequence[object] = ()) -> None:
+        remote = self.ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_attempt)
+        self._running[remote.remote(*arguments)] = key
 
-    start()
-    while started:
-        for reference in ray.wait(list(started), num_returns=1, timeout=STATUS_SECONDS)[0]:
-            batch = started.pop(reference)
-            error = None
+    def events(self, seconds: float | None = None) -> Iterator[tuple[str, Any]]:
+        """Yield what tasks have sent, and how they ended: an exit code, or the error of Ray."""
+        for reference in self.ray.wait(list(self._running), num_returns=1, timeout=seconds)[0]:
+            key = self._running.pop(reference)
             try:
-                ray.get(reference)
-            except Exception as raised:  # of Ray: `attempt` keeps those of the run itself
-                error = raised
-            left = [run for run in batch if not execution.record_result(run)]
-            if error is not None and len(left) > 1:
-                execution.batches.halve(left)
-            elif error is not None:
-                for run in left:
-                    execution.fail(run, in_one_line(error))
-            if left and (error is None or len(left) > 1):
-                time.sleep(BUSY_SECONDS)  # another process may be at them
-                execution.pending.extend((0.0, run) for run in left)
-            start()
-        execution.report()
-    return execution.report(final=True)
+                *messages, code = self.ray.get(reference)
+            except Exception as error:  # of Ray: `attempt` keeps those of the run itself
+                messages, code = [], in_one_line(error)
+            for event in (*messages, code):
+                yield key, event
+
+    def kill(self, key: str) -> None:
+        """Ray has no timeout."""
+
+
+def _attempt(*job: Any) -> list[Any]:
+    """Execute one run or a batch; return what `worker.main` sends, and its exit code."""
+    sent: list[Any] = []
+    try:
+        _worker.main(*(*job, sent.append))
+    except SystemExit as end:
+        return [*sent, end.code]
+    return [*sent, 0]

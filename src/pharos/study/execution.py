@@ -12,13 +12,13 @@ import os
 import shutil
 import socket
 import time
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, PharosError, StateSpaceLocked
+from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, StateSpaceLocked
 from pharos.state_space import build
 from pharos.study import batches as _batches
 from pharos.study import worker as _worker
@@ -27,24 +27,14 @@ from pharos.study.specification import Source
 from pharos.study.status import Forecast, Status, claim, duration, opened, status
 from pharos.system.records import takes
 from pharos.system.storage import replace_json
-from pharos.system.wording import in_one_line, pluralize
-from pharos.system.workers import Workers, one_thread, usable_workers
-from pharos.training import ExecutionOptions
+from pharos.system.workers import Workers, usable_workers
+from pharos.training import Execution, ExecutionOptions, Pool, Work
 
-__all__ = ["Execution", "Status", "claim", "duration", "opened", "run", "shard_of", "status"]
+__all__ = ["Status", "StudyExecution", "claim", "duration", "opened", "run", "shard_of", "status"]
 
-ATTEMPTS = 3
 STATUS_SECONDS = 2.0
-BUSY_SECONDS = 0.5
 # Between two counts of the runs that other runners have finished in the same folder
 OTHERS_SECONDS = 20.0
-# How often in a row the process that forks workers is begun again, and the exit code that multiprocessing gives a
-# worker whose server is gone
-LOST_SERVERS = 10
-SERVER_LOST = 255
-
-
-Job = tuple[_worker.BatchRunner, list[dict[str, Any]], list[str], Path, set[str], bool]
 
 
 def train(config: Mapping[str, Any], folder: Path) -> None:
@@ -101,23 +91,28 @@ def run(
             device here.
         AllRunsFailed: every run has failed; its `outcome` is the Status.
     """
-    execution = Execution(*opened(source, folder), ExecutionOptions(**options), runner, batch_runner, progress)
-    if execution.pending and runner is train:
+    execution = StudyExecution(*opened(source, folder), ExecutionOptions(**options), runner, batch_runner, progress)
+    missing = execution.missing
+    if missing and runner is train:
         refuse_missing(execution.options.device)
-    if foretold is not None and execution.pending:
+    if foretold is not None and missing:
         foretold(execution.forecast())
     if prepare is None and runner is train:
         prepare = prepare_instance
-    if prepare is not None:
-        execution.prepare(prepare)
+    if prepare is not None:  # a failure there is left to the runs to tell
+        prepare_instances(prepare, missing, execution.report)
     end = execution.run()
     if end.failed and end.failed == end.total:
         raise AllRunsFailed(execution.folder, end.errors, end)
     return end
 
 
-class Execution:
-    """The loop that starts, awaits and counts worker processes; arguments as for `run`."""
+class StudyExecution(Execution[Run]):
+    """Execution of the runs of a study that are not over; arguments as for `run`.
+
+    Args:
+        pool: None: processes of this machine.
+    """
 
     def __init__(
         self,
@@ -127,11 +122,10 @@ class Execution:
         runner: _worker.Runner = train,
         batch_runner: _worker.BatchRunner | None = None,
         progress: Callable[[Status], None] | None = None,
+        pool: Pool | None = None,
     ):
         self.study, self.folder, self.options, self.progress = study, folder, options, progress
         self.runs = shard_of(study.runs, options.shard)
-        alone = options.workers is None and options.device != "cpu"  # several processes would share a GPU's memory
-        self.num_workers = usable_workers(1 if alone else options.workers)
         claim(study, folder)
         if batch_runner is None and runner is train:
             batch_runner = partial(_batches.train_batch, device=options.device)
@@ -142,39 +136,36 @@ class Execution:
         self.errors: dict[str, str] = {}
         self.damaged: dict[str, str] = {}
         self.repeated: set[str] = set()
-        self.pending: deque[tuple[float, Run]] = deque()
-        self.running: dict[str, tuple[tuple[Run, ...], float]] = {}
+        self.seconds_per_step: dict[tuple, tuple[float, int]] = {}
+        missing = [run for run in self.runs if not self.record_result(run, options.retry_failed)]
+        checkpoints = folder / _worker.BATCHES
+        groups = [[run] for run in missing]
+        if batch_runner is not None:
+            groups = _batches.batches(missing, checkpoints, options.device)
+        if pool is not None:
+            super().__init__(groups, pool, workers=len(self.runs), checkpoints=checkpoints, attempts=1)
+            return
         # Stable-Baselines3 asks whether there is a GPU, and CUDA refuses in what is forked after that
         preload = "pharos.study.warm" if runner is train else "pharos.study.worker"
-        self.workers = Workers(preload if options.device == "cpu" else None)
-        self.batches = _batches.Batches(folder, options.device)
-        self.kills: dict[str, int] = defaultdict(int)
-        self.lost_servers = 0
-        self.seconds_per_step: dict[tuple, tuple[float, int]] = {}
-        for run in self.runs:
-            if not self.record_result(run, options.retry_failed):
-                self.pending.append((0.0, run))
+        pool = Workers(preload if options.device == "cpu" else None)
+        alone = options.workers is None and options.device != "cpu"  # several processes would share a GPU's memory
+        workers = usable_workers(1 if alone else options.workers)
+        super().__init__(groups, pool, workers=workers, checkpoints=checkpoints, timeout=options.timeout)
+
+    @property
+    def missing(self) -> list[Run]:
+        """Runs that wait."""
+        return [run for _, group in self.waiting for run in group]
 
     def forecast(self) -> Forecast:
         """Forecast of the missing runs: their number, their steps, and the seconds that they will take."""
-        steps = sum(run.config["steps"] for _, run in self.pending)
-        return Forecast(len(self.pending), steps, self.num_workers, self._remaining())
-
-    def prepare(self, prepare: Callable[[Mapping[str, Any]], Any]) -> None:
-        """Call `prepare` with one config of each instance that has runs to come; a failure is left to the runs to
-        tell."""
-        prepare_instances(prepare, [run for _, run in self.pending], self.report)
+        steps = sum(run.config["steps"] for run in self.missing)
+        return Forecast(len(self.missing), steps, int(self.num_workers), self._remaining())
 
     def run(self) -> Status:
-        """Execute the pending runs; return the Status at the end."""
+        """Execute the missing runs; return the Status at the end."""
         try:
-            with self.workers:
-                while self.pending or self.running:
-                    if time.monotonic() - self.last_listing >= OTHERS_SECONDS:
-                        self._refresh()
-                    self._start()
-                    self.report()
-                    self._await()
+            self.execute()
         except BaseException:
             self.running.clear()
             self.report(final=True)
@@ -182,117 +173,43 @@ class Execution:
         _clear(self.folder, self.runs)
         return self.report(final=True)
 
-    def _refresh(self) -> None:
-        """Count the runs that other runners have finished, by one listing of the folder."""
-        self.last_listing = time.monotonic()
-        with contextlib.suppress(OSError):
-            ids = set(os.listdir(self.folder / "runs"))
-            self.pending = deque(
-                (due, run)
-                for due, run in self.pending
-                if run.id not in ids or run.id in self.repeated or not self.record_result(run)
-            )
-
-    def _start(self) -> None:
-        for _ in range(len(self.pending)):
-            if not self.pending or len(self.running) >= self.num_workers:
-                return
-            due, run = self.pending.popleft()
-            if due > time.monotonic():
-                self.pending.append((due, run))
-                continue
-            if self.record_result(run, run.id in self.repeated):
-                continue
-            batch = self.next_batch(run)
-            try:
-                self._worker(batch)
-            except (EOFError, ConnectionError) as error:
-                self._server_lost(error)
-                self.pending.extendleft((due, each) for each in reversed(batch))
-                return
-            self.running[run.id] = (batch, time.monotonic())
-
-    def _server_lost(self, error: Exception) -> None:
-        """Wait a little for another process that forks workers, as it is gone; PharosError after LOST_SERVERS times."""
-        self.lost_servers += 1
-        if self.lost_servers > LOST_SERVERS:
-            raise PharosError(
-                f"the process that starts runs died {pluralize(self.lost_servers, 'time')} in a row "
-                f"({in_one_line(error)}); was there memory enough?"
-            ) from error
-        time.sleep(BUSY_SECONDS)
-
-    def _worker(self, batch: tuple[Run, ...]) -> None:
-        of_runs = (each for run in batch for each in run.configuration.definitions)
-        definitions = (self.runner, self.batch_runner, *of_runs)
-        with one_thread():
-            self.workers.start(batch[0].id, _worker.main, self.job(batch), definitions)
-
-    def next_batch(self, run: Run) -> tuple[Run, ...]:
-        """A run and those that the same process executes, which are taken from `pending`."""
-        return (run,) if self.batch_runner is None else self.batches.next_batch(run, self.pending)
-
-    def job(self, batch: Sequence[Run]) -> Job:
-        """The arguments of `worker.main` for these runs."""
+    def work(self, group: Sequence[Run]) -> Work:
         runner, resume = self.batch_runner, True
-        if runner is None or batch[0].engine != "batched":
+        if runner is None or group[0].engine != "batched":
             runner, resume = partial(_worker.run_alone, self.runner), self.options.resume
-        ids = [run.id for run in batch]
-        configs, again = [dict(run.config) for run in batch], self.repeated.intersection(ids)
-        return runner, configs, ids, self.folder.absolute(), again, resume
+        ids = [run.id for run in group]
+        arguments = runner, [dict(run.config) for run in group], ids, self.folder.absolute()
+        of_runs = (each for run in group for each in run.configuration.definitions)
+        again = self.repeated.intersection(ids)
+        return _worker.main, (*arguments, again, resume), (self.runner, self.batch_runner, *of_runs)
 
-    def _await(self) -> None:
-        if not self.running:
-            time.sleep(BUSY_SECONDS)
-            return
-        waiting = BUSY_SECONDS if self.pending and len(self.running) < self.num_workers else STATUS_SECONDS / 2
-        for id, code in self.workers.events(waiting):
-            self._ended(self.running.pop(id)[0], code)
-        for id, (batch, started) in self.running.items():
-            if self.options.timeout is not None and time.monotonic() - started > self.options.timeout * len(batch):
-                self.kills.update({run.id: ATTEMPTS for run in batch})
-                self.workers.kill(id)
+    def is_over(self, run: Run, *, ended: bool = False) -> bool:
+        return self.record_result(run, not ended and run.id in self.repeated)
 
-    def _ended(self, batch: tuple[Run, ...], code: int) -> None:
-        """Count the results of a process that has ended; its other runs are executed again."""
-        is_killed = code not in (0, _worker.EXIT_BUSY)
-        left = [run for run in batch if not self.record_result(run, is_killed and run.id in self.repeated)]
-        if code == SERVER_LOST and left and self.lost_servers < LOST_SERVERS:
-            self.lost_servers += 1  # the worker may well live: the next attempt waits for it
-        elif is_killed or (code == 0 and batch[0].engine != "batched"):
-            self._killed(left, code)
-            return
-        self.pending.extend((time.monotonic() + BUSY_SECONDS, run) for run in left)  # another process is at them
+    def receive(self, key: str, message: tuple[Any, ...]) -> None:
+        """Take ids of runs that cannot be trained together, and why."""
+        ids, reason = message
+        self.halve(key, [run for run in self.running[key][0] if run.id in ids], reason)
 
-    def _killed(self, batch: Sequence[Run], code: int) -> None:
-        """Repeat runs without results up to ATTEMPTS times; then halve their batch, or mark a single run as failed."""
-        for run in batch:
-            self.kills[run.id] += 1
-        most = max((self.kills[run.id] for run in batch), default=0)
-        if most < ATTEMPTS:
-            self.batches.scan_checkpoints()
-        elif len(batch) > 1 and most == ATTEMPTS:
-            self.batches.halve(batch)
-            self.kills.update({run.id: 0 for run in batch})
-        else:
-            for run in batch:
-                self._mark_failed(run, code)
-            return
-        self.pending.extend((0.0, run) for run in batch)
+    def look(self) -> None:
+        """Count the runs that other runners have finished, by one listing of the folder; and report."""
+        if time.monotonic() - self.last_listing >= OTHERS_SECONDS:
+            self.last_listing = time.monotonic()
+            with contextlib.suppress(OSError):
+                ids = set(os.listdir(self.folder / "runs"))
+                for _, group in self.waiting:
+                    group[:] = [
+                        run
+                        for run in group
+                        if run.id not in ids or run.id in self.repeated or not self.record_result(run)
+                    ]
+        self.report()
 
-    def _mark_failed(self, run: Run, code: int) -> None:
-        """Publish a run as failed, because its process was killed too often, or took too long."""
-        if self.kills[run.id] > ATTEMPTS:
-            self.fail(run, f"took longer than {self.options.timeout:g} s")
-        else:
-            how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
-            self.fail(run, f"its process ended {how}, {ATTEMPTS} times; was there memory enough?")
-
-    def fail(self, run: Run, error: str) -> None:
+    def fail(self, run: Run, reason: str) -> None:
         """Publish a run that has failed, with the files that its process has left behind."""
         folder = self.folder / "partial" / run.id
         folder.mkdir(parents=True, exist_ok=True)
-        _worker.write_failure(folder, run.config, run.id, error, 0.0)
+        _worker.write_failure(folder, run.config, run.id, reason, 0.0)
         _worker.publish(folder, self.folder, run.id)
         self.record_result(run, False)
 
@@ -324,10 +241,10 @@ class Execution:
             return None
         pace = {kind: seconds / steps for kind, (seconds, steps) in self.seconds_per_step.items()}
         usual = sum(pace.values()) / len(pace)
-        seconds = sum(run.config["steps"] * pace.get(run.kind, usual) for _, run in self.pending)
-        for batch, started in self.running.values():
-            needed = sum(run.config["steps"] * pace.get(run.kind, usual) for run in batch)
-            seconds += max(0.0, needed - (time.monotonic() - started))
+        seconds = sum(run.config["steps"] * pace.get(run.kind, usual) for run in self.missing)
+        for group, began in self.running.values():
+            needed = sum(run.config["steps"] * pace.get(run.kind, usual) for run in group)
+            seconds += max(0.0, needed - (time.monotonic() - began))
         return seconds / self.num_workers
 
     def report(self, preparing: str = "", *, final: bool = False) -> Status:
@@ -338,7 +255,7 @@ class Execution:
             total=len(self.runs),
             finished=len(self.finished),
             failed=len(self.errors),
-            running=sum(len(batch) for batch, _ in self.running.values()),
+            running=sum(len(group) for group, _ in self.running.values()),
             errors=dict(self.errors),
             elapsed=time.monotonic() - self.began,
             remaining=self._remaining(),
@@ -360,7 +277,7 @@ def _clear(folder: Path, runs: Iterable[Run]) -> None:
     for run in runs:
         for name in (f"partial/{run.id}", f"partial/{run.id}.failed", f"locks/{run.id}"):
             shutil.rmtree(folder / name, ignore_errors=True)
-    for name in ("partial", "locks", _worker.BATCHES):
+    for name in ("partial", "locks"):
         with contextlib.suppress(OSError):
             (folder / name).rmdir()
 

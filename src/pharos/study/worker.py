@@ -24,7 +24,6 @@ from pharos.system import storage
 from pharos.system.wording import in_one_line
 
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
-EXIT_BUSY = 75
 # Seconds in a record that no run can take: ten thousand years
 LONGEST = 3e11
 
@@ -32,7 +31,11 @@ BATCHES = "batches"
 
 Runner = Callable[[Mapping[str, Any], Path], Any]
 BatchRunner = Callable[[Sequence[Mapping[str, Any]], Sequence[Path], Path], Sequence[str | None]]
-"""runner(configs, folders, folder for checkpoints) -> for each run None, or why it failed."""
+"""runner(configs, folders, folder for checkpoints) -> for each run None, or why it failed, or HalfAsMany."""
+
+
+class HalfAsMany(str):
+    """Why runs cannot be trained together, as for want of memory: they have not failed, and go on in halves."""
 
 
 def read_status(folder: Path) -> str | None:
@@ -79,7 +82,8 @@ def attempt(
     again: Container[str] = (),
     resume: bool = False,
 ) -> list[str]:
-    """Execute the runs that are not over; return FINISHED, FAILED or BUSY (held by another process) for each.
+    """Execute the runs that are not over; return FINISHED, FAILED, BUSY (held by another process) or HalfAsMany for
+    each.
 
     A run that raises is FAILED: its error stands in run.json and its log; those in `again` are repeated. With `resume`
     the runner gets what an attempt that was killed left behind, else empty folders.
@@ -107,12 +111,12 @@ def attempt(
                 partial.mkdir(parents=True, exist_ok=True)
                 todo.append((config, id, partial))
         if todo:
-            _execute(runner, todo, folder)
+            ends |= _execute(runner, todo, folder)
         return [ends.get(id) or read_status(folder / "runs" / id) or FAILED for id in ids]
 
 
-def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, Path]], folder: Path) -> None:
-    """Call the runner, and put every run into its place, finished or failed."""
+def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, Path]], folder: Path) -> dict[str, str]:
+    """Call the runner, and put every run into its place, finished or failed; return HalfAsMany by id of the others."""
     began = time.perf_counter()
     first, *others = places = [partial for _, _, partial in todo]
     with log(first / "log.txt"):
@@ -121,14 +125,20 @@ def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, P
         except Exception as error:
             traceback.print_exc()
             errors = [in_one_line(error)] * len(todo)
+    left: dict[str, str] = {
+        id: reason for (_, id, _), reason in zip(todo, errors, strict=True) if isinstance(reason, HalfAsMany)
+    }
     for place in others:
         shutil.copyfile(first / "log.txt", place / "log.txt")
     seconds = (time.perf_counter() - began) / len(todo)
     for (config, id, place), reason in zip(todo, errors, strict=True):
+        if id in left:
+            continue
         if read_status(place) != FINISHED:
             missing = "the runner returned without a finished run.json and a curve"
             write_failure(place, config, id, reason or missing, seconds)
         publish(place, folder, id)
+    return left
 
 
 def run_alone(
@@ -204,16 +214,18 @@ def main(
     folder: Path,
     again: Container[str],
     resume: bool,
-    _: object,
+    send: Callable[[tuple[list[str], str]], None],
 ) -> None:
-    """The body of a worker process."""
+    """The body of a worker process; it sends the ids of runs that cannot be trained together, and why."""
     use_one_thread()
     try:
         ends = attempt(runner, configs, ids, folder, again=again, resume=resume)
     except OSError as error:  # a full disk, on which not even the log can say so
         sys.exit(f"pharos: run {ids[0]}: {error.strerror or error}")
-    if {*ends} == {BUSY}:
-        sys.exit(EXIT_BUSY)
+    for reason in {id(end): end for end in ends if isinstance(end, HalfAsMany)}.values():
+        send(([id for id, end in zip(ids, ends, strict=True) if end is reason], str(reason)))
+    if BUSY in ends:
+        sys.exit(training.EXIT_BUSY)
 
 
 def use_one_thread() -> None:

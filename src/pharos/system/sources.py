@@ -114,6 +114,8 @@ def load(source: Source) -> Any:
     Raises:
         ParameterError: it cannot be imported.
     """
+    if announced(source.name) is not None:
+        return _LOADED[source.name][1]
     try:
         module = _module_of_file(source) if source.module is None else _module_called(source)
         target = getattr(module, source.attribute, None) if source.attribute else None
@@ -177,6 +179,23 @@ def source_of(value: object, attribute: str | None = None) -> Source | None:
     if name in (None, "__main__") or path is None or "<" in attribute or "." in attribute:
         return None
     return Source(f"{name}:{attribute}", str(Path(path).resolve()), _checksum(path))
+
+
+def announce(value: object) -> Source:
+    """The source of a class or function that this process has, which `resolve` then finds here.
+
+    One of a notebook, of the script itself, or within a function has a name and no file: other processes lack it.
+    """
+    name = f"{getattr(value, '__module__', '')}:{getattr(value, '__qualname__', type(value).__name__)}"
+    source = source_of(value) or Source(name, "", "")
+    _LOADED[source.name] = source, value
+    return source
+
+
+def announced(name: str) -> Source | None:
+    """The source of an object without a file that was announced under this name."""
+    source, _ = _LOADED.get(name, (None, None))
+    return source if source is not None and not source.file else None
 
 
 _EXPECTED = "expected 'module:Name' or 'file.py:Name'"

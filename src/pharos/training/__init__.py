@@ -10,10 +10,23 @@ from pharos.system import lazy
 if TYPE_CHECKING:
     from pharos.mdp import ChanceSetting
     from pharos.regret import ReferenceValues, cumulative_expected_regret, regret
-    from pharos.training.batch import TrainingProgress, check_device, train_configs
+    from pharos.training.batch import train_group
+    from pharos.training.budget import BudgetSpent, Learn, Snapshots, generated_curve, uniform_policy
     from pharos.training.curve import Curve, Evaluation, RegretCurve, evaluate_agent
+    from pharos.training.execution import (
+        ATTEMPTS,
+        EXIT_BUSY,
+        Execution,
+        Pool,
+        TrainingProgress,
+        Work,
+        check_device,
+        stored_batches,
+        train_configs,
+    )
+    from pharos.training.jax_agents import LearnCompiled, compiled_curves
     from pharos.training.options import ENGINES, ExecutionOptions, Horizon, TrainingOptions
-    from pharos.training.prepared import FailedRun, TaskCache
+    from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
     from pharos.training.results import (
         TrainingResult,
         check_agent,
@@ -31,7 +44,7 @@ if TYPE_CHECKING:
         write_record,
         write_table,
     )
-    from pharos.training.runs import train, train_config, train_many, train_parts
+    from pharos.training.runs import train, train_config, train_many
     from pharos.training.schedule import Shapes, dealt, halves, lanes, plan
     from pharos.training.task import CELL, RunConfig, Task, TaskValues, run_id
     from pharos.training.tuning import TuningResult, tune

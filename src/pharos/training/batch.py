@@ -1,4 +1,5 @@
-"""Training: runs that fit together learn under one loop, with the exact value of each policy at chosen steps.
+"""Training of one group: runs that fit together learn under one loop, with the exact value of each policy at chosen
+steps.
 
     FOLDER/                      of each run: run.json, curve.csv, and what was learnt
     FOLDER/checkpoint/           of a run that learns alone, while it is trained
@@ -12,315 +13,194 @@ is not trained again; a run that fails is said to have failed, and the others go
 import contextlib
 import shutil
 import time
-import warnings
-from collections import deque
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pharos.agents import Learner, agent_called, is_known
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
+from pharos.policies import PolicyLike
 from pharos.system import compiling
 from pharos.system.sources import is_reference
 from pharos.system.storage import digest_of_json, inside, is_full, lock, read_json, remove_leftovers, replace_json
-from pharos.system.wording import in_one_line, pluralize
+from pharos.system.wording import in_one_line
+from pharos.training import functions  # noqa: F401  (who trains functions)
 from pharos.training import results as _results
-from pharos.training.curve import joint_values
-from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
-from pharos.training.results import Checkpoint, Record, TrainingResult, clear_run, finished_result
-from pharos.training.schedule import halves, lanes
+from pharos.training.curve import Evaluation, joint_values
+from pharos.training.prepared import FailedRun, PreparedRun
+from pharos.training.results import Checkpoint, TrainingResult, clear_run, finished_result
+from pharos.training.schedule import lanes
 from pharos.training.task import RunConfig
 
-
-@dataclass(frozen=True)
-class TrainingProgress:
-    """Progress of the runs of `train_configs` after an evaluation.
-
-    Attributes:
-        done, total: environment steps of all runs together.
-        rows: of the curves, by the place of the run among the configurations; of this evaluation alone.
-        finished, failed: numbers of runs.
-    """
-
-    done: int
-    total: int
-    rows: Mapping[int, Mapping[str, Any]]
-    finished: int
-    failed: int
-
-
-ProgressCallback = Callable[[TrainingProgress], None]
+Tell = Callable[[tuple[Any, ...]], object]
+"""tell(("rows", steps so far of the runs that are trained now, {place: row})), tell(("end", place, result)), or
+tell(("halve", places, why they cannot be trained together))."""
 
 
 class CallbackError(BaseException):
     """An error of the caller's own progress function, which is not one of a run."""
 
 
-def train_configs(
-    configs: Sequence[RunConfig | Mapping[str, Any]],
-    folders: Sequence[Path] | None = None,
+def train_group(
+    runs: Sequence[PreparedRun],
+    checkpoints: Path | None,
+    tell: Tell,
     *,
-    checkpoints: Path | None = None,
-    progress: ProgressCallback | None = None,
-    tasks: TaskCache | None = None,
-    device: str | None = None,
     lane: int | None = None,
-) -> list[TrainingResult | FailedRun]:
-    """Train a run for each configuration; those of the batched engine that fit together train as one program.
+    is_single: bool = False,
+    raises: bool = False,
+    tensorboard: bool = False,
+) -> None:
+    """Train runs in this process: those with equal keys as one program, one program after the other.
 
     Args:
-        folders: of the runs, one for each; None: nothing is written. Finished runs there are returned.
-        checkpoints: folder for those of whole batches; None: none are written. A batch that was killed goes on from
-            there with the runs that it had.
-        progress: called after each evaluation; what it raises ends the training and is raised here.
-        tasks: makes tasks, with values that are known already, and code of the user's own where it is trusted; None:
-            from scratch, trusting none.
-        device: "cpu" or "cuda"; None: that of the tasks, and "cpu" where there are none.
-        lane: the most runs in a batch; None: all that fit together. Changes no result.
-    Returns:
-        The result of each run, or why it has none.
-    Raises:
-        FileFormatError: not the configuration of a run. ParameterError: there is no such device, or the tasks are
-            for another one.
-        MissingExtra: PyTorch is not installed. OSError: the disk is full.
-    """
-    tasks = TaskCache(device=device or "cpu") if tasks is None else tasks
-    if device not in (None, tasks.device):
-        raise ParameterError(f"device is {device!r}, and the tasks are for {tasks.device!r}; expected one device")
-    check_device(tasks.device)
-    run_configs = [config if isinstance(config, RunConfig) else RunConfig.from_dict(config) for config in configs]
-    return TrainingJobs(run_configs, folders, checkpoints, progress, tasks, lane).run()
-
-
-def check_device(device: str) -> None:
-    """Raise ParameterError for a device that torch does not have here."""
-    if device == "cpu":
-        return
-    import torch
-
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:  # torch has a type for each of its builds
-        reason = (str(error).splitlines() or [""])[0]
-        raise ParameterError(f"device is {device!r}, which torch does not have here: {reason}; try cpu") from None
-
-
-class TrainingJobs:
-    """The runs of one call, by their place among the configurations, and their grouping into batches.
-
-    Args:
-        raises: whether errors of runs are raised, instead of being recorded as a FailedRun.
+        runs: none of which was trained before, each with its place.
+        checkpoints: folder for those of programs; None: none are written.
+        tell: called with each evaluation and each end.
+        lane: the most runs in a program; None: all that fit together.
+        is_single: whether the run is the only one of its call.
+        raises: whether errors of runs are raised, and not written down if the run cannot begin.
         tensorboard: whether TensorBoard's logs are written into the folder of a run.
-    Attributes:
-        results: of the runs that have ended, by place.
-        done, total: environment steps of all runs together.
-        reasons: why batches were halved, each told once.
     """
-
-    def __init__(
-        self,
-        configs: Sequence[RunConfig],
-        folders: Sequence[Path] | None,
-        checkpoints: Path | None,
-        progress: ProgressCallback | None,
-        tasks: TaskCache,
-        lane: int | None = None,
-        *,
-        raises: bool = False,
-        tensorboard: bool = False,
-    ):
-        self.configs, self.checkpoints, self.progress, self.tasks = configs, checkpoints, progress, tasks
-        self.folders = [None] * len(configs) if folders is None else [Path(folder) for folder in folders]
-        self.lane, self.raises, self.tensorboard = lane, raises, tensorboard
-        self.results: dict[int, TrainingResult | FailedRun] = {}
-        self.total, self.done = sum(config.steps for config in configs), 0
-        self.reasons: set[str] = set()
-
-    def run(self) -> list[TrainingResult | FailedRun]:
-        """Train all runs; return their results in order."""
-        for group in self._groups():
-            waiting = deque([group])
-            while waiting:
-                runs, before = waiting.popleft(), self.done
-                failure = TrainingGroup(self, runs).train()
-                if failure is not None:
-                    self.done = before
-                    waiting.extendleft(reversed(self._halves(runs, failure)))
-        if self.checkpoints is not None and self.checkpoints.is_dir():
-            for folder in (*self.checkpoints.iterdir(), self.checkpoints):
-                with contextlib.suppress(OSError):  # it is not empty
-                    folder.rmdir()
-        return [self.results[place] for place in range(len(self.configs))]
-
-    def _halves(self, group: list[PreparedRun], failure: Exception) -> list[list[PreparedRun]]:
-        """Halves of a group that needed too much memory, or whose program one run has ended; they begin anew."""
-        parts = halves([PreparedRun(each.place, each.config, each.folder, each.tasks) for each in group])
-        reason = "out of memory" if _is_memory(failure) else in_one_line(failure)
-        if reason not in self.reasons:
-            self.reasons.add(reason)
-            warnings.warn(
-                f"{reason}: {pluralize(len(group), 'run')} at once; "
-                f"goes on with {pluralize(len(parts[0]), 'run')} at once",
-                stacklevel=2,
-            )
-        return parts
-
-    def fail(self, place: int, error: Exception) -> None:
-        """Raise the error of a run that could not begin where `raises` is set, else record it as a FailedRun."""
-        if self.raises:
-            raise error
-        config, folder = self.configs[place], self.folders[place]
-        self.results[place] = FailedRun(config.to_dict(), folder, error)
-        self.done += config.steps
-        if folder is not None and not (folder / _results.RECORD).exists():
-            folder.mkdir(parents=True, exist_ok=True)
-            Record(folder, config, config.hyperparameters).write("failed", error=in_one_line(error))
-
-    def report(self, rows: Mapping[int, Mapping[str, Any]], done: int) -> None:
-        """Call the progress function; CallbackError for what it raises, which is not an error of the runs."""
-        if self.progress is None:
-            return
-        failed = sum(isinstance(each, FailedRun) for each in self.results.values())
+    # Finished runs need no training; others train alone or wait for a program
+    waiting: list[PreparedRun] = []
+    finished: set[str] = set()
+    for run in runs:
         try:
-            self.progress(TrainingProgress(done, self.total, rows, len(self.results) - failed, failed))
-        except BaseException as error:
-            raise CallbackError(error) from error
-
-    # Groups ----------------------------------------------------------------------------------------------------------
-
-    def _groups(self) -> Iterator[list[PreparedRun]]:
-        """Yield runs that train alone; then batches restored from checkpoints, and the rest by what fits together."""
-        alone: list[PreparedRun] = []
-        waiting: dict[int, PreparedRun] = {}
-        keys: dict[int | None, Hashable] = {}
-        # Finished runs need no training; others train alone or wait for a batch
-        for place, config in enumerate(self.configs):
-            try:
-                folder = self.folders[place]
-                done = None if folder is None else finished_result(folder, config)
-            except (ParameterError, FileFormatError) as error:
-                self.fail(place, error)
-                continue
-            if done is not None and folder is not None:
-                clear_run(folder)
-                self.results[place] = done
-                self.done += config.steps
-                continue
-            try:
-                run = PreparedRun(place, config, folder, self.tasks)
-                is_single = len(self.configs) == 1 or (folder is not None and (folder / "checkpoint").exists())
-                key = run.key(is_single=is_single)
-                run.is_alone = key is None
-            except Exception as error:
-                self.fail(place, error)
-                continue
-            if run.is_alone:
-                alone.append(run)
-            else:
-                waiting[place], keys[place] = run, key
-        yield from ([run] for run in alone)
-        yield from self._stored_groups(waiting)
-        # Runs with equal keys, in lanes
-        rest = list(waiting.values())
-        for lane in lanes([keys[run.place] for run in rest], [self.lane or len(rest)] * len(rest)):
-            yield [rest[i] for i in lane]
-
-    def _stored_groups(self, waiting: dict[int, PreparedRun]) -> Iterator[list[PreparedRun]]:
-        """Batches of checkpoints, with the runs that they had, which are taken from `waiting`."""
-        by_id = {run.config.id: place for place, run in waiting.items()}
-        finished = {self.configs[place].id for place, end in self.results.items() if isinstance(end, TrainingResult)}
-        for folder, configs in self._stored_batches():
-            places = [by_id.get(config.id) for config in configs]
-            if all(place is None for place in places):
-                if finished.issuperset(config.id for config in configs):  # it was killed before it removed this
-                    shutil.rmtree(folder, ignore_errors=True)
-                continue
-            if any(place is None and self._is_foreign(config) for place, config in zip(places, configs, strict=True)):
-                continue
-            try:
-                group = [
-                    PreparedRun(None, config, None, self.tasks) if place is None else waiting[place]
-                    for place, config in zip(places, configs, strict=True)
-                ]
-                for run in group:
-                    run.key()
-            except Exception:  # what is wrong with a run is found later, where it fails alone
-                continue
-            for config in configs:
-                if config.id in by_id:
-                    del waiting[by_id.pop(config.id)]
-            yield group
-
-    def _is_foreign(self, config: RunConfig) -> bool:
-        """Whether a run of a checkpoint, which somebody else may have written, names code that no run here names."""
-        names = {"environment": config.environment, "observation": config.observation}
-        if not is_known(config.agent):
-            names["agent"] = config.agent
-        has_no_source = any(is_reference(name) and part not in config.sources for part, name in names.items())
-        ours = [item for each in self.configs for item in each.sources.items()]
-        return has_no_source or any(item not in ours for item in config.sources.items())
-
-    def _stored_batches(self) -> Iterator[tuple[Path, list[RunConfig]]]:
-        for folder in [] if self.checkpoints is None else sorted(self.checkpoints.glob("*")):
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError, PharosError):
-                stored = read_json(folder / "batch.json")
-                yield folder, [RunConfig.from_dict(entry) for entry in stored["configs"]]
+            done = None if run.folder is None else finished_result(run.folder, run.config)
+        except (ParameterError, FileFormatError) as error:
+            _refuse(run, error, tell, raises)
+            continue
+        if done is not None and run.folder is not None:
+            clear_run(run.folder)
+            finished.add(run.id)
+            tell(("end", run.place, done))
+            continue
+        try:
+            run.prepare(is_single=is_single or (run.folder is not None and (run.folder / "checkpoint").exists()))
+        except Exception as error:
+            _refuse(run, error, tell, raises)
+            continue
+        waiting.append(run)
+    # Runs alone, programs of checkpoints, and the rest by what fits together
+    programs = [[run] for run in waiting if run.is_alone]
+    together = {run.place: run for run in waiting if not run.is_alone}
+    programs += _stored_programs(runs, together, finished, checkpoints)
+    rest = list(together.values())
+    programs += [[rest[i] for i in each] for each in lanes([run.key for run in rest], [lane or len(rest)] * len(rest))]
+    for program in programs:
+        Program(program, checkpoints, tell, raises=raises, tensorboard=tensorboard).train()
 
 
-class TrainingGroup:
-    """Runs under one loop: trained, evaluated, resumed, and brought into their folders."""
+def _refuse(run: PreparedRun, error: Exception, tell: Tell, raises: bool) -> None:
+    """Raise the error of a run that could not begin where `raises` is set, else write it down and tell it."""
+    if raises:
+        raise error
+    if run.folder is not None and not (run.folder / _results.RECORD).exists():
+        run.folder.mkdir(parents=True, exist_ok=True)
+        run.hyperparameters = dict(run.config.hyperparameters)
+        run.write("failed", error=in_one_line(error))
+    tell(("end", run.place, FailedRun(run.config.to_dict(), run.folder, error)))
+
+
+def _stored_programs(
+    runs: Sequence[PreparedRun], waiting: dict[int | None, PreparedRun], finished: set[str], checkpoints: Path | None
+) -> Iterator[list[PreparedRun]]:
+    """Yield programs of checkpoints, with the runs that they had, which are taken from `waiting`."""
+    by_id = {run.id: place for place, run in waiting.items()}
+    for folder in [] if checkpoints is None else sorted(checkpoints.glob("*")):
+        try:
+            configs = [RunConfig.from_dict(entry) for entry in read_json(folder / "batch.json")["configs"]]
+        except (OSError, ValueError, KeyError, TypeError, PharosError):
+            continue
+        if not any(config.id in by_id for config in configs):
+            if finished.issuperset(config.id for config in configs):  # it was killed before it removed this
+                shutil.rmtree(folder, ignore_errors=True)
+            continue
+        if any(config.id not in by_id and _is_foreign(config, runs) for config in configs):
+            continue
+        program = [
+            waiting[by_id[config.id]] if config.id in by_id else PreparedRun(None, config, None, runs[0].tasks)
+            for config in configs
+        ]
+        try:
+            for run in program:
+                run.prepare()
+        except Exception:  # what is wrong with a run is said later, where it fails alone
+            continue
+        for config in configs:
+            if config.id in by_id:
+                del waiting[by_id.pop(config.id)]
+        yield program
+
+
+def _is_foreign(config: RunConfig, runs: Sequence[PreparedRun]) -> bool:
+    """Whether a run of a checkpoint, which somebody else may have written, names code that no run here names."""
+    names = {"environment": config.environment, "observation": config.observation}
+    if not is_known(config.agent):
+        names["agent"] = config.agent
+    has_no_source = any(is_reference(name) and part not in config.sources for part, name in names.items())
+    ours = [item for each in runs for item in each.config.sources.items()]
+    return has_no_source or any(item not in ours for item in config.sources.items())
+
+
+class Program:
+    """Runs under one loop: trained, evaluated, resumed, and brought into their folders; arguments as `train_group`."""
 
     learner: Learner  # from when the runs begin; gone where they failed
 
-    def __init__(self, jobs: TrainingJobs, group: list[PreparedRun]):
-        self.jobs, self.group, self.config, self.is_alone = jobs, group, group[0].config, group[0].is_alone
+    def __init__(
+        self, runs: list[PreparedRun], checkpoints: Path | None, tell: Tell, *, raises: bool, tensorboard: bool
+    ):
+        self.runs, self.config, self.is_alone = runs, runs[0].config, runs[0].is_alone
+        self.checkpoints, self.tell, self.raises, self.tensorboard = checkpoints, tell, raises, tensorboard
         self.has_begun = self.holds = False  # whether runs are marked as running; whether checkpoints are this batch's
         self.held = contextlib.ExitStack()  # the folder of checkpoints, or that of a run alone
 
-    def train(self) -> Exception | None:
-        """Train the group. Returns None, or the error that has ended the program of several runs."""
+    def train(self) -> None:
+        """Train the runs, and tell what becomes of them."""
         with self.held:
             try:
                 self._train()
-                return None
+                return
             except CallbackError as stop:
                 (cause,) = stop.args
-                if self.jobs.raises and self.is_alone and isinstance(cause, Exception):
-                    self.group[0].fail(cause)
-                raise cause from None
+                if self.raises and self.is_alone and isinstance(cause, Exception):
+                    self.runs[0].fail(cause)
+                raise
             except Exception as error:
                 if is_full(error):  # which is no fault of these runs, and fewer at once need as much
                     raise
                 failure = error
                 vars(self).pop("learner", None)
                 self._remove_checkpoint()
-        if len(self.group) > 1:
-            return failure
-        self._fail(failure)
-        return None
+        if len(self.runs) == 1:
+            self._fail(failure)
+            return
+        reason = "out of memory" if _is_memory(failure) else in_one_line(failure)
+        self.tell(("halve", [run.place for run in self.runs if run.place is not None], reason))
 
     def _train(self) -> None:
         began, compiled = time.perf_counter(), compiling.seconds()
-        first = self.group[0]
+        first = self.runs[0]
         if self.is_alone and self._is_finished():
             return
-        logs = first.folder / "tensorboard" if self.jobs.tensorboard and first.folder is not None else None
-        self.learner = agent_called(self.config.agent).learner(self.group, self.jobs.tasks.device, logs)
+        logs = first.folder / "tensorboard" if self.tensorboard and first.folder is not None else None
+        self.learner = agent_called(self.config.agent).learner(self.runs, first.tasks.device, logs)
         checkpoint = self._checkpoint()
         if checkpoint is not None:
             entries, spent = checkpoint.restore(self.learner) or ([], 0.0)
             if self.is_alone:
                 first.curve.rows = entries
             else:
-                for run, entry in zip(self.group, entries, strict=False):
+                for run, entry in zip(self.runs, entries, strict=False):
                     run.curve.rows = entry["rows"]
                     run.error = None if entry["error"] is None else PharosError(entry["error"])
             began -= spent
-        for run in self.group:
+        for run in self.runs:
             if run.folder is not None:
                 run.folder.mkdir(parents=True, exist_ok=True)
-            run.record.write("running")
+            run.write("running")
         self.has_begun = True
         self._learn(checkpoint, began)
         self._publish(time.perf_counter() - began, compiling.seconds() - compiled)
@@ -330,13 +210,13 @@ class TrainingGroup:
     @property
     def _folder(self) -> Path | None:
         """The folder for checkpoints of a batch; None for a run alone, or where none are written."""
-        if self.is_alone or self.jobs.checkpoints is None:
+        if self.is_alone or self.checkpoints is None:
             return None
-        return self.jobs.checkpoints / digest_of_json([run.config.id for run in self.group])[:16]
+        return self.checkpoints / digest_of_json([run.id for run in self.runs])[:16]
 
     def _is_finished(self) -> bool:
         """Lock the folder of a run alone; return whether another process has finished it meanwhile."""
-        folder, place = self.group[0].folder, self.group[0].place
+        folder, place = self.runs[0].folder, self.runs[0].place
         if folder is None or place is None:
             return False
         folder.mkdir(parents=True, exist_ok=True)
@@ -345,14 +225,17 @@ class TrainingGroup:
         done = finished_result(folder, self.config)
         if done is not None:
             clear_run(folder)
-            self.jobs.results[place] = done
-            self.jobs.done += self.config.steps
+            self.tell(("end", place, done))
         return done is not None
 
     def _checkpoint(self) -> Checkpoint | None:
-        """The checkpoint of the group; None where it has no folder, or where another process trains the same batch."""
+        """The checkpoint of the group; None if it has no folder, if it cannot be resumed, or if another process trains
+        the same batch.
+        """
+        if not hasattr(self.learner, "save"):
+            return None
         if self.is_alone:
-            folder = self.group[0].folder
+            folder = self.runs[0].folder
             return None if folder is None else Checkpoint(folder / "checkpoint", self.config.id)
         folder = self._folder
         if folder is None:
@@ -362,7 +245,7 @@ class TrainingGroup:
             self.held.enter_context(lock(folder, FolderLocked, "training"))
         except FolderLocked:
             return None
-        configs = [run.config for run in self.group]
+        configs = [run.config for run in self.runs]
         entry = {"ids": [each.id for each in configs], "configs": [each.to_dict() for each in configs]}
         replace_json(folder / "batch.json", entry)
         self.holds = True
@@ -378,18 +261,18 @@ class TrainingGroup:
     def _learn(self, checkpoint: Checkpoint | None, began: float) -> None:
         """Train from the last row of the curves on, with an evaluation at each point."""
         steps, interval = self.config.steps, self.config.evaluation_interval
-        count, before = sum(run.place is not None for run in self.group), self.jobs.done
-        if not any(run.curve.rows for run in self.group):
+        count = sum(run.place is not None for run in self.runs)
+        if not any(run.curve.rows for run in self.runs):
             self._evaluate(0)
         # Steps of the evaluations to come, after those of a checkpoint
-        start = max(run.curve.rows[-1]["step"] for run in self.group if run.curve.rows)
+        start = max(run.curve.rows[-1]["step"] for run in self.runs if run.curve.rows)
         points = [point for point in [*range(interval, steps, interval), steps] if point > start]
 
         def save(step: int) -> None:
             if checkpoint is None or step == steps:
                 return
             curves: list[Any] = [
-                {"rows": run.curve.rows, "error": run.error and in_one_line(run.error)} for run in self.group
+                {"rows": run.curve.rows, "error": run.error and in_one_line(run.error)} for run in self.runs
             ]
             entries = curves[0]["rows"] if self.is_alone else curves
             checkpoint.save(self.learner, entries, time.perf_counter() - began)
@@ -398,69 +281,73 @@ class TrainingGroup:
             rows = self._evaluate(step)
             if not self.is_alone:
                 save(step)
-            places = {place: row for i, row in rows.items() if (place := self.group[i].place) is not None}
-            self.jobs.report(places, before + step * count)
+            places = {place: row for i, row in rows.items() if (place := self.runs[i].place) is not None}
+            self.tell(("rows", step * count, places))
             if self.is_alone:
                 save(step)
             return rows.get(0)
 
         if points:
             self.learner.learn(points, at_point)
-        self.jobs.done = before + steps * count
 
     def _evaluate(self, step: int) -> dict[int, dict[str, Any]]:
         """Evaluate the policies: a row for each run that has not failed, by its place in the group."""
-        rows, values = {}, {} if self.is_alone else joint_values(self.learner, self.group)
+        rows: dict[int, dict[str, Any]] = {}
+        policies: list[PolicyLike | Evaluation] = [self.learner.policy(i) for i in range(len(self.runs))]
+        values = {i: policy for i, policy in enumerate(policies) if isinstance(policy, Evaluation)}
+        if not self.is_alone and not values:
+            values = joint_values(self.learner, self.runs)
         episodes, returns = self.learner.episodes, self.learner.returns
-        for i, run in enumerate(self.group):
+        for i, run in enumerate(self.runs):
             if run.error is not None:
                 continue
-            policy = self.learner.policy(i)
             try:
-                rows[i] = run.curve.add(step, int(episodes[i]), float(returns[i]), policy, values.get(i))
+                rows[i] = run.curve.add(step, int(episodes[i]), float(returns[i]), policies[i], values.get(i))
             except Exception as error:
                 run.fail(error)
-        if all(run.error is not None for run in self.group):
-            raise self.group[0].error or PharosError("no run is left")
+        if all(run.error is not None for run in self.runs):
+            raise self.runs[0].error or PharosError("no run is left")
         return rows
 
     def _publish(self, seconds: float, compiled: float) -> None:
         """Write and keep the result of each run; its seconds are its share of those of the batch."""
-        size = {"runs": len(self.group), "seconds": seconds, "device": self.jobs.tasks.device}
-        share = seconds - compiled if self.is_alone else seconds / len(self.group)
+        size = {"runs": len(self.runs), "seconds": seconds, "device": self.runs[0].tasks.device}
+        share = seconds - compiled if self.is_alone else seconds / len(self.runs)
         entries = {"compiling_seconds": compiled} if self.is_alone else {"batch": size}
-        for i, run in enumerate(self.group):
+        for i, run in enumerate(self.runs):
             if run.place is None:
                 continue
             config, folder, curve = run.config.to_dict(), run.folder, run.curve.rows
             if run.error is not None:
-                self.jobs.results[run.place] = FailedRun(config, folder, run.error)
+                self.tell(("end", run.place, FailedRun(config, folder, run.error)))
                 continue
             result = run.curve.result()
             if folder is not None:
                 self.learner.publish(i, folder)
                 _results.write_curve(folder, curve)
-                run.record.write("finished", seconds=share, **entries, result=result)
+                run.write("finished", seconds=share, **entries, result=result)
             rows = [{name: row[name] for name in _results.COLUMNS} for row in curve]
-            self.jobs.results[run.place] = TrainingResult(config, result, rows, self.learner.policy(i), folder, share)
+            policy = self.learner.policy(i)
+            learnt = None if isinstance(policy, Evaluation) else policy
+            end = TrainingResult(config, result, rows, learnt, folder, share)
+            self.tell(("end", run.place, end))
         self._remove_checkpoint()
-        if self.is_alone and (folder := self.group[0].folder) is not None:
+        if self.is_alone and (folder := self.runs[0].folder) is not None:
             clear_run(folder)
 
     def _fail(self, error: Exception) -> None:
         """Record that the only run of the group has failed."""
-        (run,) = self.group
+        (run,) = self.runs
         if run.place is None:
             return
         if self.is_alone and not self.has_begun:
-            self.jobs.fail(run.place, error)
+            _refuse(run, error, self.tell, self.raises)
             return
         if run.error is None:
             run.fail(error)
-        if self.jobs.raises:
+        if self.raises:
             raise error
-        self.jobs.results[run.place] = FailedRun(run.config.to_dict(), run.folder, error)
-        self.jobs.done += run.config.steps
+        self.tell(("end", run.place, FailedRun(run.config.to_dict(), run.folder, error)))
 
 
 def _is_memory(error: BaseException) -> bool:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from pharos.agents import agent_called
+from pharos.agents import Learner, agent_called
 from pharos.errors import PharosError
 from pharos.policies import (
     Evaluation,
@@ -85,18 +85,6 @@ def evaluate_agent(
     )
 
 
-class PolicyBatch(Protocol):
-    """Policies of several runs, by their places."""
-
-    def greedy_actions(self, places: Sequence[int]) -> dict[int, np.ndarray] | None:
-        """(S,) actions of each of some runs whose policies are tables of states; None where none is."""
-        ...
-
-    def policy(self, i: int) -> PolicyLike:
-        """The policy that run i has learnt."""
-        ...
-
-
 @runtime_checkable
 class BestActions(Protocol):
     """Policies of several runs that act at once."""
@@ -106,7 +94,7 @@ class BestActions(Protocol):
         ...
 
 
-def joint_values(batch: PolicyBatch, runs: "Sequence[PreparedRun]") -> dict[int, Evaluation]:
+def joint_values(batch: Learner, runs: "Sequence[PreparedRun]") -> dict[int, Evaluation]:
     """Values of policies by place in the batch, where computing them at once costs less; others are left out.
 
     These are policies of DQN where nothing is random, and of runs that share a task of few states and see one frame.
@@ -134,7 +122,7 @@ def _frames(run: "PreparedRun") -> int:
     return 1 if agent_called(run.config.agent).has_table else run.task.observer.frames
 
 
-def _values_of_walks(batch: PolicyBatch, runs: "Sequence[PreparedRun]", places: Sequence[int]) -> dict[int, Evaluation]:
+def _values_of_walks(batch: Learner, runs: "Sequence[PreparedRun]", places: Sequence[int]) -> dict[int, Evaluation]:
     """Values by place: an episode of T steps costs T calls of the networks of all runs at once, not of each."""
     if not places:
         return {}
@@ -151,7 +139,7 @@ def _values_of_walks(batch: PolicyBatch, runs: "Sequence[PreparedRun]", places: 
     return dict(zip(places, walk_values(mdps, act, frames=frames), strict=True))
 
 
-def _values_of_tables(batch: PolicyBatch, task: Task, places: Sequence[int]) -> dict[int, Evaluation]:
+def _values_of_tables(batch: Learner, task: Task, places: Sequence[int]) -> dict[int, Evaluation]:
     """Values by place, each policy queried once in every state. One that gives no probabilities is left out."""
     actions = batch.greedy_actions(places)
     if actions is not None:
@@ -189,6 +177,7 @@ class Curve:
     rows: list[dict[str, Any]] = field(default_factory=list)
     table: np.ndarray | None = None
     counted_steps: int | None = None
+    _evaluation: Evaluation | None = field(default=None, init=False, repr=False)  # of the table
 
     def add(
         self,
@@ -201,6 +190,8 @@ class Curve:
         """Add the row of the policy after `step` steps and `episodes` finished episodes, whose returns sum to
         `returns`; the policy is evaluated unless its `evaluation` is there.
         """
+        if evaluation is None and agent is self.table:
+            evaluation = self._evaluation
         if evaluation is None:
             assert agent is not None and not isinstance(agent, Evaluation)
             evaluation = evaluate_agent(agent, self.task, again=True)
@@ -227,6 +218,7 @@ class Curve:
         }
         self.rows.append(row)
         self.table = agent if isinstance(agent, np.ndarray) else None
+        self._evaluation = evaluation if isinstance(agent, np.ndarray) else None
         return row
 
     def result(self) -> dict[str, Any]:

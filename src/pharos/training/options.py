@@ -57,7 +57,8 @@ class TrainingOptions:
     """Options of training: the agent, its task, and the setting in which its policies are measured.
 
     Attributes:
-        agent: q_learning, dqn, ppo, a2c, or module:Class for Stable-Baselines3. A file of one's own is `file.py:Class`.
+        agent: q_learning, dqn, ppo, a2c, module:Class for Stable-Baselines3, or module:learn. Files of one's own are
+            `file.py:Class` and `file.py:learn`.
         observation: vector, simple_image, complex_image, one_hot, index, number, hash, recorded, or your own. That is
             `module:name` or `file.py:name`; tables see the index of the state.
         observation_options: option of the observation, such as size=natural.

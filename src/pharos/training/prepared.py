@@ -2,18 +2,19 @@
 
 import json
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pharos.agents import WORLD, agent_called
 from pharos.agents import hyperparameters as hyperparameters_of
+from pharos.environments import class_called
 from pharos.mdp import TabularMDP
 from pharos.state_space import StateSpace
 from pharos.system.wording import in_one_line
 from pharos.training.curve import Curve
-from pharos.training.results import Record
+from pharos.training.results import FORMAT, versions, write_record
 from pharos.training.task import RunConfig, Task, TaskValues
 
 T = TypeVar("T")
@@ -85,12 +86,13 @@ class TaskCache:
 
 @dataclass(eq=False)
 class PreparedRun:
-    """A run before and while it is trained: a `pharos.agents.LearningRun`, with its curve.
+    """A run before and while it is trained: a `pharos.agents.LearningRun`, with its curve and its record.
 
     Attributes:
         place: among the configurations; None for a run of a checkpoint that nobody asks for.
         tasks: that it shares with other runs.
-        is_alone: whether it has checkpoints in its own folder, and holds that.
+        key: runs with equal keys train together, see `pharos.agents.Agent.prepare`; None: it is alone, has checkpoints
+            in its own folder, and holds that.
         error: why it has failed.
     """
 
@@ -98,15 +100,24 @@ class PreparedRun:
     config: RunConfig
     folder: Path | None
     tasks: TaskCache
-    is_alone: bool = False
+    key: Hashable | None = None
     error: Exception | None = None
-    hyperparameters: dict[str, Any] = field(init=False)
 
-    def __post_init__(self) -> None:
+    @property
+    def id(self) -> str:
+        """The id of its configuration."""
+        return self.config.id
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether it is the only run of its program."""
+        return self.key is None
+
+    @cached_property
+    def hyperparameters(self) -> dict[str, Any]:
+        """All that are known, those of the configuration first."""
         config = self.config
-        self.hyperparameters = hyperparameters_of(
-            config.agent, config.environment, config.observation, config.hyperparameters
-        )
+        return hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
 
     @cached_property
     def curve(self) -> Curve:
@@ -119,8 +130,8 @@ class PreparedRun:
         return self.tasks.task(self.config)
 
     @property
-    def algorithm(self) -> str | type:
-        """The name of its agent, or a class of the user's own."""
+    def algorithm(self) -> str | Callable[..., Any]:
+        """The name of its agent, or a class or function of the user's own."""
         return self.config.algorithm(trust=self.tasks.trust, strict=self.tasks.strict)
 
     @property
@@ -132,18 +143,24 @@ class PreparedRun:
         """Return what `make` returns, made once for all runs whose configurations have the same entries `names`."""
         return self.tasks.shared(what, self.config, names, make)
 
-    def key(self, *, is_single: bool = False) -> Hashable | None:
-        """Key of the run: runs with equal keys train together; None: it is alone. See `pharos.agents.Agent.prepare`."""
-        key = agent_called(self.config.agent).prepare(self, self.tasks.device, is_single=is_single)
+    def prepare(self, *, is_single: bool = False) -> None:
+        """Make the key. Raises what is wrong with the run."""
         config = self.config
-        return None if key is None else (config.agent, config.steps, config.evaluation_interval, key)
+        key = agent_called(config.agent).prepare(self, self.tasks.device, is_single=is_single)
+        self.key = None if key is None else (config.agent, config.steps, config.evaluation_interval, key)
 
-    @property
-    def record(self) -> Record:
-        """The run.json of the run."""
-        return Record(self.folder, self.config, self.hyperparameters)
+    def write(self, status: str, **entries: object) -> None:
+        """Replace run.json where there is a folder: the run is "running", "failed" or "finished"."""
+        if self.folder is None:
+            return
+        config = self.config
+        record = {"format": FORMAT, "id": config.id, "config": config.to_dict(), "versions": versions()}
+        if (rules := class_called(config.environment)) is not None:
+            record["rules_version"] = rules.version
+        record |= {"status": status, "hyperparameters": self.hyperparameters, **entries}
+        write_record(self.folder, record)
 
     def fail(self, error: Exception) -> None:
         """Mark the run as failed; the reason is kept in run.json."""
         self.error = error
-        self.record.write("failed", error=in_one_line(error))
+        self.write("failed", error=in_one_line(error))

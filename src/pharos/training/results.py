@@ -18,12 +18,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.agents import NETWORK, POLICY, agent_called
-from pharos.environments import class_called
+from pharos.agents import NETWORK, POLICY, Learner, agent_called
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, ResultCorrupted, UntrustedCode
 from pharos.system import storage
 from pharos.system.storage import CLAIM, LOCK, check_regular, digest_of_bytes, digest_of_file, read_json, sync
@@ -334,16 +333,6 @@ def write_policy(folder: Path, policy: object) -> None:
 # Checkpoints and agents -----------------------------------------------------------------------------------------------
 
 
-class Stored(Protocol):
-    """An object whose state a checkpoint keeps."""
-
-    def save(self, folder: Path) -> None:
-        """Write the state that `load` goes on from."""
-
-    def load(self, folder: Path) -> None:
-        """Restore the state that `save` wrote."""
-
-
 @dataclass(frozen=True)
 class TrainingResult:
     """Result of a run: its summary, curve and agent.
@@ -369,23 +358,6 @@ class TrainingResult:
         numbers = (f"{name}={result[name]}" for name in ("final_value", "value_optimal", "normalized_regret"))
         place = f"{config['agent']} on {config['environment']}, steps={config['steps']}"
         return f"TrainingResult({place}, {', '.join(numbers)}, seconds={self.seconds:.2f})"
-
-
-class Record:
-    """The file run.json, where there is a folder for results."""
-
-    def __init__(self, folder: Path | None, config: RunConfig, hyperparameters: Mapping[str, Any]):
-        self.folder, self.hyperparameters = folder, hyperparameters
-        self.run = {"format": FORMAT, "id": config.id, "config": config.to_dict(), "versions": versions()}
-        if (rules := class_called(config.environment)) is not None:
-            self.run["rules_version"] = rules.version
-
-    def write(self, status: str, **entries: object) -> None:
-        """Replace run.json: the run is "running", "failed" or "finished"."""
-        if self.folder is None:
-            return
-        record = {**self.run, "status": status, "hyperparameters": self.hyperparameters, **entries}
-        write_record(self.folder, record)
 
 
 def finished_result(folder: Path, config: RunConfig) -> TrainingResult | None:
@@ -439,7 +411,7 @@ class Checkpoint:
         self.folder, self.id = folder, id
         self._next = -math.inf
 
-    def save(self, learner: Stored, rows: list[Any], seconds: float) -> None:
+    def save(self, learner: Learner, rows: list[Any], seconds: float) -> None:
         """Write a checkpoint, unless the last is not ten seconds old, or writing would take more than SHARE_OF_TIME."""
         began = time.monotonic()
         if began < self._next:
@@ -462,7 +434,7 @@ class Checkpoint:
         now = time.monotonic()
         self._next = now + max(CHECKPOINT_SECONDS, (now - began) / SHARE_OF_TIME if CHECKPOINT_SECONDS else 0.0)
 
-    def restore(self, learner: Stored) -> tuple[list[Any], float] | None:
+    def restore(self, learner: Learner) -> tuple[list[Any], float] | None:
         """(rows of the curve, seconds spent) of the last checkpoint, from which the learner goes on; or None.
 
         Raises:

@@ -10,24 +10,21 @@ same curve file.
 """
 
 import os
-import signal
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pharos.agents import agent_called
+from pharos.agents import agent_called, agent_name
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment
-from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, PharosError
+from pharos.errors import AllRunsFailed, ParameterError
 from pharos.observations import own_observation
 from pharos.system.records import split, takes
-from pharos.system.workers import Workers
-from pharos.training import results as _results
-from pharos.training.batch import ProgressCallback, TrainingJobs, TrainingProgress, train_configs
+from pharos.training.execution import ProgressCallback, Training, TrainingProgress, train_configs
 from pharos.training.options import TrainingOptions
 from pharos.training.prepared import FailedRun, TaskCache
-from pharos.training.results import TrainingResult, finished_result
-from pharos.training.schedule import Shapes, plan
+from pharos.training.results import TrainingResult
+from pharos.training.schedule import Shapes
 from pharos.training.task import RunConfig, Task, TaskValues
 
 RunProgress = Callable[[int, int, Mapping[str, Any]], None]
@@ -35,7 +32,7 @@ RunProgress = Callable[[int, int, Mapping[str, Any]], None]
 
 @takes(TrainingOptions)
 def train(
-    agent: str,
+    agent: str | Callable[..., Any],
     environment: Environment | str,
     *,
     seed: int = 0,
@@ -47,8 +44,9 @@ def train(
     """Train an agent, and measure the exact regret of its policy as it learns.
 
     Args:
-        agent: "q_learning", "dqn", "ppo", "a2c", or "module:Class" or "file.py:Class" of an algorithm for
-            Stable-Baselines3.
+        agent: "q_learning", "dqn", "ppo", "a2c"; or "module:Name" or "file.py:Name" of an algorithm for
+            Stable-Baselines3, or of a function learn(env, steps, seed) that yields policies; or such a class or
+            function itself.
         environment: a name, with its parameters as keywords, or an Environment.
         seed: decides everything random.
         out: folder of the run; None: nothing is written. A finished run there is returned, an unfinished one resumed.
@@ -61,7 +59,7 @@ def train(
             suggested.
         MissingExtra: Stable-Baselines3 is not installed.
     """
-    task, (config,) = _runs(environment, {"agent": agent, **options}, [seed])
+    task, (config,) = _runs(environment, {"agent": agent_name(agent), **options}, [seed])
     tasks = TaskCache()
     tasks.adopt(config, task)
     return _train(config, tasks, None if out is None else Path(out), progress, tensorboard)
@@ -69,7 +67,7 @@ def train(
 
 @takes(TrainingOptions, engine="batched")
 def train_many(
-    agent: str,
+    agent: str | Callable[..., Any],
     environment: Environment | str,
     *,
     seeds: Iterable[int],
@@ -89,8 +87,8 @@ def train_many(
         out: a folder, in which each run has its own, seed-0 and so on; None: nothing is written. Finished runs there
             are returned, and what was killed goes on from its last checkpoint.
         progress: called after each evaluation.
-        options: as for `train`. The engine is "batched" unless told otherwise: all runs as one program (dqn, ppo, and
-            q_learning one after the other); "sb3": one after the other.
+        options: as for `train`. The engine is "batched" unless told otherwise, if it has the agent: all runs as one
+            program (dqn, ppo, and q_learning one after the other); "sb3": one after the other.
     Returns:
         The result of each run in the order of the seeds; a run that failed says why, and does not stop the others.
     Raises:
@@ -99,18 +97,17 @@ def train_many(
     numbers = [int(seed) for seed in seeds]
     if not numbers or len(set(numbers)) != len(numbers):
         raise ParameterError(f"seeds are {numbers}; expected at least one, each once")
-    task, configs = _runs(environment, {"agent": agent, "engine": "batched", **options}, numbers)
+    name = agent_name(agent)
+    options = {"agent": name, "engine": agent_called(name).engines[-1], **options}
+    task, configs = _runs(environment, options, numbers)
     folder = None if out is None else Path(out)
     folders = None if folder is None else [folder / f"seed-{seed}" for seed in numbers]
     checkpoints = None if folder is None else folder / "checkpoints"
-    is_alone = Shapes(device).key(configs[0]) is None
-    parts = plan(configs, workers=1 if is_alone else workers, device=device)
-    if folders is not None and len(parts) > 1:
-        results = train_parts(configs, folders, parts, checkpoints=checkpoints, device=device, progress=progress)
-    else:
-        tasks = TaskCache(device=device)
-        tasks.adopt(configs[0], task)
-        results = train_configs(configs, folders, checkpoints=checkpoints, progress=progress, tasks=tasks)
+    tasks = TaskCache(device=device)
+    tasks.adopt(configs[0], task)
+    if Shapes(device).key(configs[0]) is None:
+        workers = 1
+    results = train_configs(configs, folders, checkpoints=checkpoints, progress=progress, tasks=tasks, workers=workers)
     failed = {
         f"seed {seed}": end.error for seed, end in zip(numbers, results, strict=True) if isinstance(end, FailedRun)
     }
@@ -164,8 +161,8 @@ def _train(
             progress(now.rows[0]["step"], config.steps, now.rows[0])
 
     folders, checkpoints = (None, None) if folder is None else ([folder], folder / "checkpoints")
-    jobs = TrainingJobs([config], folders, checkpoints, tell, tasks, raises=True, tensorboard=tensorboard)
-    (end,) = jobs.run()
+    options = {"raises": True, "tensorboard": tensorboard}
+    (end,) = Training([config], folders, [[0]], checkpoints, tell, tasks, **options).results_in_order()
     assert isinstance(end, TrainingResult)
     return end
 
@@ -193,66 +190,3 @@ def _runs(
         hyperparameters = hyperparameters_of(agent, task.env.name, str(task.observation), table=Path(table))
     same = {name: getattr(training, name) for name in ("steps", "evaluation_interval", "engine")}
     return task, [RunConfig.of_task(task, agent, seed=seed, hyperparameters=hyperparameters, **same) for seed in seeds]
-
-
-# Processes: whole lanes of the batched engine each, and files as the only results -------------------------------------
-
-
-def train_parts(
-    configs: Sequence[RunConfig],
-    folders: Sequence[Path],
-    parts: Sequence[Sequence[int]],
-    *,
-    checkpoints: Path | None,
-    device: str,
-    progress: ProgressCallback | None,
-) -> list[TrainingResult | FailedRun]:
-    """Train as `train_configs` does, each part in a process of its own, which ends with this one."""
-    done, finished, failed = [0] * len(parts), [0] * len(parts), [0] * len(parts)
-    total = sum(config.steps for config in configs)
-    with Workers() as workers:
-        for number, part in enumerate(parts):
-            entries = [(configs[place].to_dict(), folders[place]) for place in part]
-            workers.start(str(number), _train_part, (entries, checkpoints, device), configs[0].definitions)
-        while workers:
-            for key, now in workers.events():
-                if isinstance(now, OSError):
-                    raise now
-                if not isinstance(now, TrainingProgress):
-                    continue  # it has ended
-                number = int(key)
-                done[number], finished[number], failed[number] = now.done, now.finished, now.failed
-                if progress is not None:
-                    rows = {parts[number][place]: row for place, row in now.rows.items()}
-                    progress(TrainingProgress(sum(done), total, rows, sum(finished), sum(failed)))
-    return [_end(config, folder) for config, folder in zip(configs, folders, strict=True)]
-
-
-def _train_part(
-    entries: Sequence[tuple[dict[str, Any], Path]],
-    checkpoints: Path | None,
-    device: str,
-    tell: ProgressCallback,
-) -> None:
-    """Body of a process: train its part and send the progress. SIGTERM ends it at once, as there is nothing to clean
-    up, and a repeated call needs its locks."""
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    configs, folders = zip(*entries, strict=True)
-    tasks = TaskCache(trust=True, device=device)  # of code that the process which started this one has imported
-    try:
-        train_configs(configs, folders, checkpoints=checkpoints, progress=tell, tasks=tasks)
-    except OSError as error:  # a full disk, which ends the other parts as well
-        tell(error)  # type: ignore[arg-type]
-
-
-def _end(config: RunConfig, folder: Path) -> TrainingResult | FailedRun:
-    """The result in the folder of a run, or why there is none."""
-    try:
-        done = finished_result(folder, config)
-        if done is not None:
-            return done
-        text = _results.read_record(folder).get("error") if (folder / _results.RECORD).exists() else None
-    except (ParameterError, FileFormatError) as error:
-        return FailedRun(config.to_dict(), folder, error)
-    text = text or f"{folder}: the process that trained it ended without a result; the same command goes on from there"
-    return FailedRun(config.to_dict(), folder, PharosError(text))

@@ -9,7 +9,7 @@ configuration has the same id on every machine.
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
@@ -311,7 +311,7 @@ class RunConfig(TrainingOptions):
         """The configuration of a run on a task; it is evaluated every hundredth of `steps` unless told otherwise.
 
         Args:
-            agent: `module:Class` and `file.py:Class` are looked for in the current directory.
+            agent: `module:Name` and `file.py:Name` are looked for in the current directory.
         """
         observation = task.observation
         sources = {
@@ -409,8 +409,8 @@ class RunConfig(TrainingOptions):
         """The registered class of the environment, and the registration of the observation, where there are any."""
         return (class_called(self.environment), *(registered(self.observation) or ()))
 
-    def algorithm(self, *, trust: bool = False, strict: bool = False) -> "str | type":
-        """The agent of the run: its name, or the class of the user's own.
+    def algorithm(self, *, trust: bool = False, strict: bool = False) -> "str | Callable[..., Any]":
+        """The agent of the run: its name, or the class or function of the user's own.
 
         Raises:
             UntrustedCode: see `make_environment`.

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.agents import agent_called, agents
+from pharos.agents import agent_called, agent_name, agents
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, FolderLocked, MissingExtra, ParameterError
@@ -36,7 +36,7 @@ from pharos.observations import OwnObservation, own_observation
 from pharos.system import storage
 from pharos.system.wording import pluralize
 from pharos.training import results as _results
-from pharos.training.batch import TrainingProgress, train_configs
+from pharos.training.execution import TrainingProgress, train_configs
 from pharos.training.prepared import FailedRun, TaskCache
 from pharos.training.task import RunConfig, Task, run_id
 
@@ -74,7 +74,7 @@ class TuningResult:
 
 
 def tune(  # noqa: PLR0913
-    agent: str,
+    agent: str | Callable[..., Any],
     environments: Environment | str | Sequence[Environment | str],
     *,
     steps: int,
@@ -102,8 +102,8 @@ def tune(  # noqa: PLR0913
         chances: several kinds of chance, such as [{}, {"random": 0.1}, {"reward_delay": 3}], each for every instance;
             in place of `sticky` and `random`.
         seeds: of the runs of a trial; keep them apart from the seeds of the experiment that follows.
-        space: what is searched: of each hyperparameter ("log", low, high), ("linear", low, high) or ("one of", value,
-            ...); None: the agent's own (`pharos.agents.Agent.space`).
+        space: what is searched: of each hyperparameter (of a function: a keyword) ("log", low, high), ("linear", low,
+            high) or ("one of", value, ...); None: the agent's own (`pharos.agents.Agent.space`).
         search_seed: of the search.
         engine: "sb3": the runs of a trial one after the other; "batched": at once.
         shortlist, predicted: of so many proposals the one is tried whose hyperparameters this function gives the least
@@ -120,6 +120,7 @@ def tune(  # noqa: PLR0913
     except ImportError as error:
         raise MissingExtra("tuning", "optuna", "agents") from error
 
+    agent = agent_name(agent)
     listed = [environments] if isinstance(environments, Environment | str) else list(environments)
     instances = [make(each) if isinstance(each, str) else each for each in listed]
     seeds = [int(seed) for seed in seeds]

@@ -30,7 +30,8 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.interaction import GymEnv
 from pharos.policies import PolicyAnswers, PolicyLike, RecurrentPolicy, SB3Model, deep_policy
-from pharos.training import Curve, Evaluation, Task, evaluate_agent
+from pharos.training.curve import Curve, Evaluation, evaluate_agent
+from pharos.training.task import Task
 
 BLOCK = 4096  # observations that a policy is asked about at once
 LARGEST = 100_000  # states that it is asked about in advance
@@ -218,7 +219,7 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
             raise ParameterError(f"learn(env, steps, seed) returned {policies!r}; expected a generator: yield policies")
         for number, policy in enumerate(policies):
             if number and not budget.steps:
-                raise _not_stepped(steps)
+                raise not_stepped(steps)
             num_points = (budget.steps - 1) // budget.interval  # evaluation points before this step
             counting += [last] * (num_points + 1 - len(counting))
             last = snapshots.taken(policy)
@@ -233,11 +234,12 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
         curve.add(place * budget.interval, *ended, counted, values[id(counted)])
     uniform, ended_with = (curve.rows[place]["normalized_regret"] for place in (0, -1))
     if not budget.steps and abs(ended_with - uniform) > TOLERANCE:
-        raise _not_stepped(steps)
+        raise not_stepped(steps)
     return curve
 
 
-def _not_stepped(steps: int) -> ParameterError:
+def not_stepped(steps: int) -> ParameterError:
+    """The error of a function that has learnt without a counted step."""
     return ParameterError(
         f"learn has a policy other than uniform play, and 0 of its {steps:,} steps were counted; expected it to step "
         f"the environment that it was given, or copies of it; {SEVERAL}"

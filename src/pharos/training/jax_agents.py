@@ -21,7 +21,8 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.interaction import to_gymnax
 from pharos.policies import PolicyAnswers
-from pharos.training import Curve, Task, evaluate_agent
+from pharos.training.curve import Curve, evaluate_agent
+from pharos.training.task import Task
 
 BLOCK = 4096  # observations that are made at once
 

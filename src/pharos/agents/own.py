@@ -1,0 +1,149 @@
+"""Agents of the user's own, `module:Name` or `file.py:Name`: what the name stands for says how they are trained.
+
+    class        an algorithm with Stable-Baselines3's interface
+    generator    learn(env, steps, seed), which yields policies as it learns
+    jax          learn(env, params, steps, key) -> (apply, snapshots), which is compiled
+
+What stands behind a `*` in the parameters of a function are its hyperparameters: learn(env, steps, seed, *, rate=0.1).
+A name is recognised here for all, `train`, `tune`, studies and the benchmark; a further form is a line of `form_of`.
+"""
+
+import contextlib
+import inspect
+import json
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pharos.agents.agent import POLICY, Learner, LearningRun, read_policy_table
+from pharos.agents.sb3 import DeepAgent, is_known
+from pharos.errors import FileFormatError, ParameterError, UnknownName
+from pharos.policies import PolicyLike
+from pharos.system.sources import Source, announce, announced, find, load
+
+CLASS, GENERATOR, COMPILED = "class", "generator", "jax"
+FUNCTIONS = "a function learn(env, steps, seed), or learn(env, params, steps, key) of JAX"
+
+FunctionLearner = Callable[[Sequence[LearningRun], Callable[..., Any]], Any]
+_LEARNERS: dict[str, FunctionLearner] = {}
+
+
+def register_form(form: str, learner: FunctionLearner) -> None:
+    """Say who trains the functions of a form; `pharos.training` does, as their policies are evaluated there."""
+    _LEARNERS[form] = learner
+
+
+def form_of(name: str, code: object) -> str:
+    """The form of what an agent's name stands for: CLASS, GENERATOR or COMPILED.
+
+    Raises:
+        ParameterError: it is no agent.
+    """
+    if isinstance(code, type):
+        return CLASS
+    if code is None:
+        where, _, attribute = name.rpartition(":")
+        raise ParameterError(f"agent {name!r}: {where} has no {attribute!r}; expected the name of a class or function")
+    if not callable(code):
+        raise ParameterError(
+            f"agent {name!r} is {code!r}; expected a class for Stable-Baselines3, or a function learn(env, steps, seed)"
+        )
+    with contextlib.suppress(TypeError, ValueError):
+        inspect.signature(code).bind(None, None, 0, None)
+        return COMPILED
+    try:
+        inspect.signature(code).bind(None, 0, 0)
+    except (TypeError, ValueError) as error:
+        raise ParameterError(f"agent {name!r}: {error}; expected {FUNCTIONS}") from None
+    return GENERATOR
+
+
+def agent_source(
+    agent: str | Callable[..., Any], folder: str | Path | None = None, *, check: bool = True
+) -> Source | None:
+    """Place of the code of a user's own agent; None for all others.
+
+    Args:
+        agent: a name; or the class or function itself, which then has this name in this process.
+        folder: relative files and modules are looked for there first; None: in the current directory.
+        check: whether it is imported, to see that it is an agent.
+    Raises:
+        ParameterError: it cannot be imported, or is no agent.
+    """
+    if not isinstance(agent, str):
+        source = announce(agent)
+        form_of(source.name, agent)
+        return source
+    if is_known(agent):
+        return None
+    source = announced(agent) or find(agent, folder)
+    if check:
+        form_of(source.name, load(source))
+    return source
+
+
+def agent_name(agent: str | Callable[..., Any]) -> str:
+    """The name of an agent, under which this process has it."""
+    source = None if isinstance(agent, str) else agent_source(agent)
+    return str(agent) if source is None else source.name
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OwnAgent(DeepAgent):
+    """An agent by its name alone: its code is imported when a run is prepared, if it is trusted."""
+
+    def library_default(self, name: str) -> object:
+        source = agent_source(self.name)
+        assert source is not None
+        code = load(source)
+        if isinstance(code, type):
+            return super().library_default(name)
+        parameter = inspect.signature(code).parameters.get(name)
+        return None if parameter is None or parameter.default is parameter.empty else parameter.default
+
+    def prepare(self, run: LearningRun, device: str, *, is_single: bool) -> Hashable | None:
+        form = form_of(self.name, run.algorithm)
+        if form == CLASS:
+            return super().prepare(run, device, is_single=is_single)
+        _check_keywords(self.name, run.algorithm, run.hyperparameters)
+        if form == GENERATOR or is_single:
+            return None
+        return form, json.dumps({**run.config.to_dict(), "seed": None}, sort_keys=True)
+
+    def learner(self, runs: Sequence[LearningRun], device: str, logs: Path | None = None) -> Learner:
+        code = runs[0].algorithm
+        form = form_of(self.name, code)
+        if form == CLASS:
+            return super().learner(runs, device, logs)
+        if logs is not None:
+            raise ParameterError(
+                f"agent {self.name!r} is a function, which has no logs of TensorBoard; leave tensorboard out"
+            )
+        assert not isinstance(code, str)
+        return _LEARNERS[form](runs, code)
+
+    def load(self, folder: Path, run: LearningRun) -> PolicyLike:
+        if form_of(self.name, run.algorithm) == CLASS:
+            return super().load(folder, run)
+        if not (folder / POLICY).exists():
+            raise FileFormatError(
+                f"{folder}: the policy of the function {self.name} is not kept, as it is no table of states"
+            )
+        return read_policy_table(folder)
+
+
+def _check_keywords(name: str, code: Any, hyperparameters: Mapping[str, Any]) -> None:
+    """Raise UnknownName or ParameterError for hyperparameters that are no keywords of the function."""
+    parameters = inspect.signature(code).parameters.values()
+    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+        return
+    keywords = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
+    unknown = [each for each in hyperparameters if each not in keywords]
+    if unknown and not keywords:
+        raise ParameterError(
+            f"agent {name!r} is a function, which has its hyperparameters in its code; found {', '.join(unknown)}; "
+            f"name them behind a *: learn(env, steps, seed, *, {unknown[0]}=...)"
+        )
+    if unknown:
+        raise UnknownName(f"hyperparameter of {name}", unknown[0], keywords)

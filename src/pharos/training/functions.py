@@ -1,0 +1,147 @@
+"""Learners of agents that are functions: a generator of policies, and a function of JAX; see `pharos.agents.own`.
+
+Neither is resumed: a run that was killed begins anew, and ends with the same bytes if its function has chance by its
+seed alone.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pharos.agents import COMPILED, GENERATOR, register_form
+from pharos.errors import ParameterError
+from pharos.policies import PolicyLike
+from pharos.regret import regret
+from pharos.training.budget import (
+    TOLERANCE,
+    BudgetSpent,
+    CountedEnv,
+    Snapshots,
+    StepBudget,
+    not_stepped,
+    uniform_policy,
+)
+from pharos.training.curve import Evaluation, evaluate_agent
+from pharos.training.jax_agents import compiled_curves
+from pharos.training.results import write_policy
+
+
+class GeneratorLearner:
+    """Learner of one run: learn(env, steps, seed, **hyperparameters) yields policies; the last one counts.
+
+    A policy is asked about all states when it is yielded. It is evaluated at the points after its step, or at it.
+    """
+
+    def __init__(self, runs: Sequence[Any], learn: Callable[..., Any]):
+        (run,) = runs
+        self.run, self.function = run, learn
+        self.budget = StepBudget(run.config.steps, run.config.evaluation_interval)
+        self.in_force: PolicyLike | Evaluation = uniform_policy(run.task)
+        self.ended = (0, 0.0)  # episodes, and the sum of their returns, at the point that is evaluated
+
+    @property
+    def episodes(self) -> np.ndarray:
+        return np.array([self.ended[0]])
+
+    @property
+    def returns(self) -> np.ndarray:
+        return np.array([self.ended[1]])
+
+    def learn(self, points: Sequence[int], at_point: Callable[[int], object]) -> None:
+        """Train until the generator ends or its budget is spent, and call `at_point` at each point.
+
+        Raises:
+            ParameterError: it is no generator; or it has a second policy, or ends with another one than uniform play,
+                when no step was counted; or whatever its code raises.
+        """
+        budget, run, waiting = self.budget, self.run, deque(points)
+
+        def evaluate(step: float) -> None:
+            """Evaluate the policy in force at the points before a step."""
+            while waiting and waiting[0] < step:
+                point = waiting.popleft()
+                number = point // budget.interval
+                is_passed = point % budget.interval == 0 and number <= len(budget.at)
+                self.ended = budget.at[number - 1] if is_passed else (budget.episodes, budget.returns)
+                at_point(point)
+
+        seed, snapshots = run.config.seed, Snapshots(run.task)
+        try:
+            policies = self.function(CountedEnv(run.task, budget, seed), budget.limit, seed, **run.hyperparameters)
+            if not isinstance(policies, Iterator):
+                raise ParameterError(
+                    f"learn(env, steps, seed) returned {policies!r}; expected a generator: yield policies"
+                )
+            for number, policy in enumerate(policies):
+                if number and not budget.steps:
+                    raise not_stepped(budget.limit)
+                evaluate(budget.steps)
+                self.in_force = snapshots.taken(policy)
+        except BudgetSpent:
+            pass
+        run.curve.counted_steps = budget.steps
+        if not budget.steps:
+            self._check_uniform()
+        evaluate(math.inf)
+
+    def _check_uniform(self) -> None:
+        task = self.run.task
+        values = [
+            each.value if isinstance(each, Evaluation) else evaluate_agent(each, task).value
+            for each in (self.in_force, uniform_policy(task))
+        ]
+        last, uniform = (regret(value, task.reference, normalized_by="uniform") for value in values)
+        if abs(last - uniform) > TOLERANCE:
+            raise not_stepped(self.budget.limit)
+
+    def policy(self, i: int) -> PolicyLike | Evaluation:
+        return self.in_force
+
+    def publish(self, i: int, folder: Path) -> None:
+        """Write the last policy if it is a table of the states."""
+        if isinstance(self.in_force, np.ndarray):
+            write_policy(folder, self.in_force)
+
+
+class CompiledLearner:
+    """Learner of runs of one task: a function of JAX, one program for all seeds; neither steps nor episodes count."""
+
+    def __init__(self, runs: Sequence[Any], learn: Callable[..., Any]):
+        self.runs, self.function = runs, learn
+        self.episodes, self.returns = np.zeros(len(runs), np.int64), np.zeros(len(runs))
+        self.values = [evaluate_agent(uniform_policy(runs[0].task), runs[0].task)] * len(runs)
+
+    def learn(self, points: Sequence[int], at_point: Callable[[int], object]) -> None:
+        """Train, then call `at_point` at each point. ParameterError: these are not equally distant."""
+        config, hyperparameters = self.runs[0].config, self.runs[0].hyperparameters
+        if config.steps % config.evaluation_interval:
+            raise ParameterError(
+                f"evaluation_interval is {config.evaluation_interval} of {config.steps} steps; expected a divisor: "
+                f"snapshots of agents in JAX are equally distant"
+            )
+        curves = compiled_curves(
+            partial(self.function, **hyperparameters),
+            self.runs[0].task,
+            steps=config.steps,
+            evaluations=config.steps // config.evaluation_interval,
+            seeds=[run.config.seed for run in self.runs],
+        )
+        for row, point in enumerate(points, start=1):
+            rows = [curve.rows[row] for curve in curves]
+            self.values = [Evaluation(each["value"], each["exact"], each["error_bound"], 0) for each in rows]
+            at_point(point)
+
+    def policy(self, i: int) -> Evaluation:
+        return self.values[i]
+
+    def publish(self, i: int, folder: Path) -> None:
+        """Write nothing: what was learnt has a form of its own."""
+
+
+register_form(GENERATOR, GeneratorLearner)
+register_form(COMPILED, CompiledLearner)
