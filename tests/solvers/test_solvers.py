@@ -189,7 +189,7 @@ def test_undiscounted_values_of_an_mdp_without_cycles_are_exact():
     assert value_iteration(path).v.tolist() == [8.0, 7.0, 4.0]
 
 
-def test_undiscounted_values_that_may_be_infinite_are_refused():
+def test_undiscounted_values_that_are_infinite_are_refused():
     ring = TabularMDP.from_arrays([[1], [0]], [[1.0], [1.0]], gamma=1.0)
     assert "give a horizon" in refusal(DivergenceError, value_iteration, ring)
     assert "cycle through state" in refusal(DivergenceError, evaluate_policy, ring, np.array([0, 0]))

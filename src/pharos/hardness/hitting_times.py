@@ -202,7 +202,8 @@ class HittingTimes:
         if self.choices.is_connected:
             return j, count, None
         sure, reachable = np.empty_like(self.goal), np.empty_like(self.goal)
-        hitting.almost_surely(*self.support, self.goal, sure, reachable)
+        rows = np.arange(len(sure) + 1) * self.support[2]
+        hitting.almost_surely(*self.support[:2], rows, self.goal, sure, reachable, None)
         nodes = self.order[:count][sure[self.order[:count]]]
         self.order[: nodes.size] = nodes
         j[~sure] = TOP  # a choice that may lead there is never the best

@@ -202,32 +202,37 @@ def _difference(high, low, m, value, correction):
 
 @interpreted_first()
 @kernel
-def almost_surely(first, node, num_actions, goal, sure, attractor):
+def almost_surely(first, node, rows, goal, sure, attractor, policy):
     """sure[n] = whether some policy leads from n to the goal with probability 1.
 
-    A greatest fixed point over least ones. attractor (N,) bool is scratch. Source: de Alfaro (1999).
+    Node n has the rows rows[n] to rows[n + 1]. policy (N,), unless it is None: a row of each sure node beyond the goal,
+    such that all of them together lead there. A greatest fixed point over least ones. attractor (N,) bool is scratch.
+    Source: de Alfaro (1999).
     """
     size = len(goal)
     sure[:] = True
     while True:
         # least fixed point: nodes with an action that may enter the attractor and never leaves `sure`
         attractor[:] = goal
-        grew = True
+        grew, backward = True, True
         while grew:
             grew = False
-            for n in range(size):
+            backward = not backward
+            for i in range(size):
+                n = size - 1 - i if backward else i
                 if attractor[n] or not sure[n]:
                     continue
-                for a in range(num_actions):
-                    row = n * num_actions + a
+                for row in range(rows[n], rows[n + 1]):
                     stays, hits = True, False
-                    for i in range(first[row], first[row + 1]):
-                        m = node[i]
+                    for k in range(first[row], first[row + 1]):
+                        m = node[k]
                         stays = stays and sure[m]
                         hits = hits or attractor[m]
                     if stays and hits:
                         attractor[n] = True
                         grew = True
+                        if policy is not None:
+                            policy[n] = row
                         break
         # nodes outside the attractor are not sure; those that need them may now fail, too
         same = True

@@ -37,7 +37,9 @@ if TYPE_CHECKING:
     from pharos.mdp.expanded import ExpandedMDP, executed_actions, mean_of_actions, nodes_of_outcomes, outcomes_of
     from pharos.mdp.matrices import lacking
     from pharos.mdp.reachability import (
+        EndComponents,
         Part,
+        end_components,
         lone_starts,
         mdp_within,
         nodes_after,

@@ -1,4 +1,4 @@
-"""The states of an MDP that can be reached from its start, and MDPs of some of the states.
+"""The states of an MDP that can be reached from its start, MDPs of some of the states, and end components.
 
 A node is what a value belongs to: a state, or under sticky actions a pair of a state and the action executed before.
 """
@@ -6,9 +6,11 @@ A node is what a value belongs to: a state, or under sticky actions a pair of a 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
+from pharos.kernels import end_components as kernels
 from pharos.mdp.actions import Chance, PolicyTable, Selection
 from pharos.mdp.dynamics import Dynamics
 from pharos.mdp.rewards import Rewards
@@ -165,3 +167,58 @@ class Part:
     def selection(self, select: Selection) -> Selection:
         """The selection of actions in the states of this part, of a selection in the whole MDP."""
         return select.of_states(slice(self.start, self.stop)) if isinstance(select, PolicyTable) else select
+
+
+# End components -------------------------------------------------------------------------------------------------------
+
+
+class EndComponents(NamedTuple):
+    """The maximal end components of an MDP.
+
+    Attributes:
+        labels: (S,) integers, under sticky actions (S, A) by the previously executed action: the number of the
+            component that a node is in, from 0 on; -1: in none.
+        pairs: (S, A) bool, under sticky actions (S, A, A): the choices that stay in the component, whatever happens.
+        total: how many components there are.
+    """
+
+    labels: np.ndarray
+    pairs: np.ndarray
+    total: int
+
+
+def end_components(mdp: TabularMDP, pairs: np.ndarray | None = None) -> EndComponents:
+    """The maximal end components of an MDP: where play can stay for ever, and come from any node to any other.
+
+    An end component is a set of nodes and at least one choice for each of them, such that no choice leads out of the
+    set, whatever chance does, and every node can be reached from every other one. Maximal ones do not overlap, and
+    almost surely every episode that does not end is in one of them from some step on, by its choices alone. Terminal
+    states, and choices that may end the episode, are in none.
+
+    Args:
+        pairs: (S, A) bool, under sticky actions also (S, A, A) with the previously executed action second: the choices
+            that may be made; None: all.
+    Cost: a few reads of all transitions, of which only those of nodes in question are looked at again; A + 33 bytes a
+        node. Source: de Alfaro (1997), section 3.3.
+    """
+    width, num_actions = mdp.width, mdp.num_actions
+    num_nodes, dtype = mdp.num_states * width, np.int32 if mdp.num_states * width < 2**31 else np.int64
+    live = ~np.asarray(mdp.terminal)
+    allowed = np.repeat(np.broadcast_to(live[:, None], (mdp.num_states, num_actions)), width, axis=0)
+    if pairs is not None:
+        allowed &= np.repeat(pairs, width, axis=0) if pairs.ndim == 2 else pairs.reshape(num_nodes, num_actions)
+    count = np.count_nonzero(allowed, axis=1).astype(np.int32)
+    transitions, weights = mdp.dynamics.for_kernels, mdp.chance.triple
+    component, path, waiting = (np.empty(num_nodes, dtype) for _ in range(3))
+    leaves, removed = np.empty(num_actions, np.bool_), 1
+    while removed:
+        kernels.number_components(transitions, weights, allowed, count, component, path, waiting)
+        removed, last = 0, 1
+        while last:
+            last = kernels.remove_leaving(transitions, weights, component, allowed, count, leaves)
+            removed += last
+    labels = np.full(num_nodes, -1, np.int64)
+    inside = np.flatnonzero(count)
+    numbers, labels[inside] = np.unique(component[inside], return_inverse=True)
+    shape = (mdp.num_states, width)[: 1 + mdp.is_sticky]
+    return EndComponents(labels.reshape(shape), allowed.reshape(*shape, num_actions), len(numbers))

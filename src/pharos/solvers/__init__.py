@@ -7,6 +7,7 @@ from pharos.system import lazy
 if TYPE_CHECKING:
     from pharos.solvers.options import Solving, SolvingOptions
     from pharos.solvers.policy_iteration import chain
+    from pharos.solvers.reaching import Bounds, Reachability, reach
     from pharos.solvers.solution import Solution
     from pharos.solvers.values import (
         TablePolicy,
@@ -19,9 +20,12 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "Bounds",
+    "Reachability",
     "Solution",
     "Solving",
     "evaluate_policy",
+    "reach",
     "uniform_value",
     "value_iteration",
 ]

@@ -37,7 +37,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike
 
-from pharos.errors import DivergenceError, PrecisionError
+from pharos.errors import PrecisionError
 from pharos.mdp import BellmanEquation, Part, PolicyTable, Selection, TabularMDP
 from pharos.solvers.convergence import SETTLED, SETTLING, Convergence, imprecise, operations, shrinking, sweeps_left
 from pharos.solvers.policy_iteration import PolicyIteration
@@ -163,12 +163,11 @@ def fixed_point(
     progress: Callable[[int, float], None] | None = None,
     x: np.ndarray | None = None,
 ) -> FixedPoint:
-    """Sweep until the proven bound is at most the tolerance.
+    """Sweep until the proven bound is at most the tolerance; at gamma = 1 no state may be visited twice.
 
     Args:
         x: (S + 1, W) of the backup's dtype, where to sweep, from any finite values; None: from zeros.
     Raises:
-        DivergenceError: gamma is 1, and a state can be visited again, so that the value may be infinite.
         PrecisionError: floats cannot reach the tolerance.
     """
     mdp, select = backup.mdp, backup.select
@@ -291,11 +290,7 @@ def _in_one_pass(
     """
     mdp, rho = backup.mdp, backup.factor
     order = mdp.order()
-    if order is None:
-        raise DivergenceError(
-            f"{mdp}: gamma is 1, there is no horizon, and some states can be visited again and again, so the value may "
-            "be infinite; give a horizon (the environment's time limit, say), or gamma < 1"
-        )
+    assert order is not None  # else `goals.py` solves it
     x, backups = backup.zeros() if x is None else x, order.longest + 1
     with np.errstate(over="ignore", invalid="ignore"):
         mdp.dynamics.sweep_once(backup.equation, x, order)

@@ -27,6 +27,8 @@ class Solution:
         x: (S + 1, W) float64, or float32 where it was asked for: values of (state, previously executed action), W = A
             under sticky actions, else 1; row S, the end, is 0.
         next_x: the values of next states: x, or with a horizon those with one step less to go.
+        proper: of total rewards, the policy: (S,) actions, or (S, A + 1) if it must look at the previous action; greedy
+            ones may go round in a circle, as every state of it has the same value.
         all_steps: with a horizon, where they were kept: (T + 1, S), or (T + 1, S, A), row t with t steps to go.
 
     Under sticky actions values belong to pairs: `v` is (S, A), the value of (state, previously executed action), and
@@ -43,6 +45,7 @@ class Solution:
     x: np.ndarray
     next_x: np.ndarray
     all_steps: np.ndarray | None = None
+    proper: np.ndarray | None = None
 
     @property
     def gamma(self) -> float:
@@ -72,7 +75,13 @@ class Solution:
 
     @cached_property
     def policy(self) -> np.ndarray:
-        """The policy: for "optimal" and "worst" (S,) greedy actions, the first among equals; else the one given."""
+        """The policy: for "optimal" and "worst" (S,) greedy actions, the first among equals; else the one given.
+
+        Of total rewards (gamma 1, no horizon) it ends almost surely, unless it stays where nothing is paid; under
+        sticky actions that may take (S, A + 1) actions, by the previous action.
+        """
+        if self.proper is not None:
+            return self.proper
         policy_table = self.given_policy
         if policy_table is not None:
             return policy_table

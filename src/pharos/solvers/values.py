@@ -23,6 +23,7 @@ from pharos.mdp import (
     random_actions,
     require_mdp,
 )
+from pharos.solvers.convergence import imprecise
 from pharos.solvers.fixed_point import (
     MARGIN,
     Backup,
@@ -64,6 +65,9 @@ def value_iteration(mdp: TabularMDP, tolerance: float | Solving = 1e-6, **option
 
     V*(s) = max_a q(s, a), q(s, a) = r(s, a) + gamma E V*(next); with chance, see `random_actions` and `sticky_actions`.
 
+    With gamma 1 and no horizon V* is the total reward: the supremum over policies whose expected sums of positive and
+    of negative rewards are not both infinite. `policy` then reaches the end almost surely, wherever that is optimal.
+
     Args:
         tolerance: every value is within this of the optimal one, proven; in units of return. With a horizon values are
             exact up to rounding, whatever the tolerance. Or all options as one `Solving`.
@@ -71,7 +75,8 @@ def value_iteration(mdp: TabularMDP, tolerance: float | Solving = 1e-6, **option
     Returns:
         A Solution of kind "optimal".
     Raises:
-        DivergenceError: gamma is 1, there is no horizon, and the value may be infinite.
+        DivergenceError: gamma is 1, there is no horizon, and from some state the value is infinite or no policy has
+            one; the states and actions of the cycle are named.
         PrecisionError: 64-bit floats cannot reach the tolerance, or hold the values.
         ParameterError: options that do not go together, see `Solving`; or several processes, and gamma = 1 without a
             horizon. RankFailed: another rank failed.
@@ -116,6 +121,8 @@ def _solution(mdp: TabularMDP, select: Selection, solving: Solving) -> Solution:
         return Solution(
             mdp, result.bound, result.sweeps, watch.seconds, solving.horizon, select, result.x, next_x, steps
         )
+    if mdp.gamma == 1.0 and mdp.order() is None:
+        return _until_the_end(mdp, select, solving, watch)
     mapped = None
     if solving.values is not None:
         mapped = _kept_values(solving.values, (mdp.num_states + 1, mdp.width), solving.dtype)
@@ -125,6 +132,26 @@ def _solution(mdp: TabularMDP, select: Selection, solving: Solving) -> Solution:
     x = result.x if mapped is None else mapped
     bound = within_residual(mdp, result.bound, x)
     return Solution(mdp, bound, result.sweeps, watch.seconds, None, select, result.x, x)
+
+
+def _until_the_end(mdp: TabularMDP, select: Selection, solving: Solving, watch: Stopwatch) -> Solution:
+    """Solution of total rewards: gamma is 1, there is no horizon, and states can be visited again."""
+    from pharos.solvers.goals import total_reward  # which few need
+
+    backup = Backup(mdp, select, dtype=solving.dtype)
+    goals = total_reward(mdp, select, solving.tolerance, solving.progress)
+    x = backup.zeros()
+    x[:-1] = goals.v.reshape(mdp.num_states, mdp.width)
+    largest = float(np.abs(goals.v).max(initial=0.0))
+    bound = (float(goals.error.max(initial=0.0)) + backup.rounding(largest)) * MARGIN
+    if not bound <= solving.tolerance and not any(mdp.residual):
+        raise imprecise(mdp, bound, solving.tolerance, backup.is_single)
+    if solving.values is not None:
+        mapped = _kept_values(solving.values, x.shape, solving.dtype)
+        mapped[:] = x
+        x = mapped
+    proper = None if isinstance(select, PolicyTable) else goals.policy_table(mdp)
+    return Solution(mdp, bound, goals.improvements, watch.seconds, None, select, x, x, proper=proper)
 
 
 def _kept_values(path: str | os.PathLike, shape: tuple[int, int], dtype: DTypeLike = np.float64) -> np.ndarray:
@@ -202,7 +229,7 @@ def evaluate_policy(
         in O(S), exactly up to rounding, whatever the tolerance.
     Raises:
         ParameterError: the policy has the wrong shape, or its rows are not probabilities.
-        DivergenceError: gamma is 1, there is no horizon, and the value is or may be infinite.
+        DivergenceError: gamma is 1, there is no horizon, and the policy goes on for ever where something is paid.
         PrecisionError: 64-bit floats cannot reach the tolerance, or hold the values.
     Source: Puterman (1994), section 6.1.
     """

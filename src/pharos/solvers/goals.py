@@ -1,0 +1,597 @@
+"""Total reward until the end, and probabilities and costs of reaching a target, with bounds from both sides.
+
+Nodes are states, under sticky actions pairs (state, previously executed action). The value of a node is the supremum
+over policies whose expected sums of positive and of negative rewards are not both infinite.
+
+1. End components that pay nothing are collapsed: a policy may stay there for ever, so that each becomes one node with
+   the choices that leave it, and one more that stops and pays 0. No other way of staying for ever has a finite value:
+   whoever stays in a component that pays is paid infinitely often. So policies that end almost surely, *proper* ones,
+   are all that counts; where there is none, there is no finite value.
+2. Policy iteration from a proper policy, where actions are replaced by those that are better beyond rounding alone. If
+   the new policy is not proper, it stays in a component with a positive mean reward, which can be repeated before the
+   end as often as one likes: the value is infinite. With T_a v(n) = r(n, a) + sum_m p(m | n, a) v(m), the mean reward
+   is that of the residuals T_a v - v, none of which is negative.
+3. Bounds. For any u with u >= T_a u everywhere and u = 0 at the end, u >= V: along each proper policy of finite value
+   u plus what was paid does not rise on average. For any l with l <= T_pi l under a proper policy pi, l <= V of pi.
+   Both hold for v + w and v - w with (1 - P_pi) w = twice what the residuals of v and their rounding come to.
+
+Rows sum to 1, so T_a v(n) - v(n) = r(n, a) + sum_m p(m | n, a) (v(m) - v(n)): in this form no rounding error grows
+with v itself, rows that floats do not sum to 1 are taken as divided by their sum, and a choice that stays with
+probability 1 - 1e-12 loses no digit.
+
+Where actions are as good as each other up to rounding, and to mix them would never end, floats cannot tell a value from
+an infinite one. Then policy iteration is repeated in rational numbers (`rational.py`).
+
+Source: Bertsekas and Tsitsiklis (1991), "An analysis of stochastic shortest path problems"; Haddad and Monmege (2018),
+"Interval iteration algorithm for MDPs and IMDPs"; Baier et al. (2018), "Stochastic shortest paths and weight-bounded
+properties in Markov decision processes".
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pharos.errors import DivergenceError, PrecisionError
+from pharos.kernels import hitting
+from pharos.kernels.hitting import UNIT
+from pharos.mdp import PolicyTable, Selection, TabularMDP, end_components, executed_actions, nodes_of_outcomes
+from pharos.solvers.policy_iteration import DENSE, fills_little
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+# Pairs of a cycle that an error names.
+NAMED = 6
+# Improvements of a policy, at most; each changes all nodes that can be.
+MOST_IMPROVEMENTS = 1000
+# Steps of refinement of a linear solve.
+REFINEMENTS = 3
+# Unknowns of the largest system that is eliminated whatever it fills in.
+ELIMINATED = 20_000
+# More than the rounding of the computation of a bound itself.
+MARGIN = 1 + 2.0**-30
+
+
+class Choices(NamedTuple):
+    """Choices of nodes, written out: those of node n are the rows rows[n] to rows[n + 1].
+
+    Attributes:
+        matrix: (R, M + 1) CSR of the outcomes that leave the node; node M is the end.
+        rows: (M + 1,). owner: (R,) the node of each row.
+        rewards: (R,), to be maximised. error: bound on the error of each.
+        origin: (R,) node of the MDP times its choices, plus the choice; -1: to stop where nothing is paid.
+        terms: the most outcomes of a row, and the numbers that a probability was computed from.
+        deviation: how far the probabilities of a row may be from its own, in sum; bounds hold for all of them.
+    """
+
+    matrix: "csr_matrix"
+    rows: np.ndarray
+    owner: np.ndarray
+    rewards: np.ndarray
+    error: float
+    origin: np.ndarray
+    terms: int
+    deviation: float = 0.0
+
+    @property
+    def num_nodes(self) -> int:
+        return len(self.rows) - 1
+
+    def residuals(self, v: np.ndarray, rewards: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """((R,) T_a v - v, by how much each may be off) of v (M + 1,)."""
+        matrix, rewards = self.matrix, self.rewards if rewards is None else rewards
+        counts = np.diff(matrix.indptr)
+        steps = matrix.data * (v[matrix.indices] - np.repeat(v[self.owner], counts))
+        entries = np.repeat(np.arange(len(counts)), counts)
+        total = rewards + np.bincount(entries, steps, minlength=len(counts))
+        size = np.abs(rewards) + np.bincount(entries, np.abs(steps), minlength=len(counts))
+        slack = (self.terms + 24) * UNIT * size
+        return total, slack + self.deviation * 2 * float(np.abs(v).max(initial=0.0)) if self.deviation else slack
+
+
+@dataclass(frozen=True)
+class Goals:
+    """Values with bounds from both sides.
+
+    Attributes:
+        v: (N,) of the nodes of the MDP. error: (N,) each is within this of the true one.
+        policy: (N,) a choice for each node, of a policy that ends almost surely where it does not stay for nothing.
+        improvements: of the policy.
+    """
+
+    v: np.ndarray
+    error: np.ndarray
+    policy: np.ndarray
+    improvements: int
+
+    def policy_table(self, mdp: TabularMDP) -> np.ndarray:
+        """The policy as `Solution.policy` has it: (S,) actions, or (S, A + 1) if it looks at the previous action."""
+        by_node = self.policy.reshape(mdp.num_states, mdp.width)
+        if (by_node == by_node[:, :1]).all():
+            return by_node[:, 0].copy()
+        return np.concatenate([by_node, by_node[:, :1]], axis=1)
+
+
+def total_reward(
+    mdp: TabularMDP, select: Selection, tolerance: float, progress: Callable[[int, float], None] | None = None
+) -> Goals:
+    """The expected sum of rewards until the end of the best, the worst or a given policy.
+
+    Raises:
+        DivergenceError: it is infinite, or there is no policy that has one; the message names a cycle.
+        PrecisionError: floats cannot tell it, or prove no bound within the tolerance.
+    """
+    return Problem.of(mdp, select).solve(tolerance, progress)
+
+
+class Problem:
+    """Nodes of an MDP, their choices, and the same after components that pay nothing are collapsed.
+
+    Attributes:
+        choices: of the collapsed nodes. node_of: (N,) the collapsed node of each node; M: it is over.
+        matrix: (N C, N + 1) the outcomes of all C choices of the nodes; column N: it is over.
+        inside: (N C,) bool, the choices that stay in a collapsed component.
+    """
+
+    def __init__(
+        self,
+        mdp: TabularMDP,
+        sign: float,
+        num_choices: int,
+        choices: Choices,
+        node_of: np.ndarray,
+        matrix: "csr_matrix",
+        inside: np.ndarray,
+    ):
+        self.mdp, self.sign, self.num_choices, self.choices, self.node_of = mdp, sign, num_choices, choices, node_of
+        self.matrix, self.inside = matrix, inside
+
+    @staticmethod
+    def of(mdp: TabularMDP, select: Selection, arrived: np.ndarray | None = None) -> "Problem":
+        """
+        arrived: (S + 1,) bool, the terminal states, and last the end, in which play has arrived. The other ones, and to
+            stay for ever where nothing is paid, then have no value. None: everything counts as arrived.
+        """
+        from scipy import sparse
+
+        sign = -1.0 if select.kind == "worst" else 1.0
+        is_policy = isinstance(select, PolicyTable)
+        num_states, num_actions, width = mdp.num_states, mdp.num_actions, mdp.width
+        nodes = num_states * width
+        owner = np.repeat(np.arange(num_states), width)
+        previous = np.tile(np.arange(width), num_states)
+        if isinstance(select, PolicyTable):
+            table = np.broadcast_to(select.later, (num_states, width, num_actions)).reshape(nodes, num_actions)
+            per_node = 1
+        else:
+            table, per_node = np.tile(np.eye(num_actions), (nodes, 1)), num_actions
+        live = ~np.repeat(np.asarray(mdp.terminal), width)
+        outcomes = nodes_of_outcomes(mdp.dynamics.matrix(~np.asarray(mdp.terminal)), num_actions, width)
+        paid = mdp.rewards.ravel()
+        if is_policy or not mdp.chance.is_none:
+            each = np.repeat(np.arange(nodes), per_node)
+            weights = executed_actions(mdp, table, owner[each], previous[each])
+            matrix = (weights @ outcomes).tocsr()
+            rewards, size = weights @ paid, weights @ np.abs(paid)
+        else:
+            matrix, rewards, size = outcomes, paid, np.abs(paid)
+        # what leads to a terminal state, or to the end, is over: column N, or N + 1 if it has not arrived
+        column = np.full(matrix.shape[1], nodes)
+        column[:nodes][live] = np.flatnonzero(live)
+        if arrived is not None:
+            column[~np.repeat(arrived, width)[: len(column)] & (column == nodes)] = nodes + 1
+        matrix = sparse.csr_matrix((matrix.data, column[matrix.indices], matrix.indptr), (matrix.shape[0], nodes + 2))
+        matrix.sum_duplicates()
+        row_node = np.repeat(np.arange(nodes), per_node)
+        if isinstance(select, PolicyTable):
+            component, inside = recurrent_classes(matrix, live)
+            pays = inside & (size > 0)
+            if pays.any():
+                same = np.flatnonzero(component == component[np.argmax(pays)])
+                raise DivergenceError(
+                    f"{mdp}: under this policy the total reward is infinite or does not exist: it stays for ever in "
+                    f"{_states_in_words(mdp, same)}, which pay; give a horizon, or gamma < 1"
+                )
+        else:
+            shape = (num_states, width, num_actions) if mdp.is_sticky else (num_states, num_actions)
+            free = end_components(mdp, (size == 0).reshape(shape))
+            component, inside = free.labels.ravel(), free.pairs.ravel()
+        # one node for each component, then those in none, a trap without choices, and the end
+        is_collapsed = component >= 0
+        total = int(component.max(initial=-1)) + 1
+        alone = np.flatnonzero(live & ~is_collapsed)
+        trap = total + len(alone)
+        count = trap + (arrived is not None)
+        node_of = np.full(nodes + 2, count)
+        node_of[:-2][is_collapsed] = component[is_collapsed]
+        node_of[alone] = total + np.arange(len(alone))
+        node_of[-1] = trap
+        if arrived is not None:
+            node_of[:-2][np.repeat(~arrived[:-1], width) & ~live] = trap
+        keep = np.flatnonzero(live[row_node] & ~inside)
+        part = matrix[keep]
+        own = node_of[row_node[keep]]
+        after = node_of[part.indices]
+        data = np.where(after == np.repeat(own, np.diff(part.indptr)), 0.0, part.data)
+        joined = sparse.csr_matrix((data, after, part.indptr), shape=(len(keep), count + 1))
+        joined.sum_duplicates()
+        joined.eliminate_zeros()
+        error = mdp.reward_table.rounding
+        if is_policy or not mdp.chance.is_none:
+            error += (num_actions + 8) * UNIT * float(size.max(initial=0.0))
+        terms = int(np.diff(joined.indptr).max(initial=0)) + num_actions + mdp.dynamics.operations
+        choices = _sorted_choices(
+            joined, own, sign * rewards[keep], keep, 0 if arrived is not None else total, error, terms
+        )
+        return Problem(mdp, sign, per_node, choices, node_of, matrix, inside)
+
+    # Solving ----------------------------------------------------------------------------------------------------------
+
+    def solve_in(
+        self, inside: np.ndarray, tolerance: float, progress: Callable[[int, float], None] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """((N,) values, (N,) error of each) where `inside` (M + 1,) bool holds, at the end 0, else infinite.
+
+        From the nodes inside, the end among them, some policy surely ends without leaving them; choices that may leave
+        them are left out.
+        """
+        choices = self.choices
+        counts = np.diff(choices.matrix.indptr)
+        which = np.repeat(np.arange(len(counts)), counts)
+        leaves = np.bincount(which, ~inside[choices.matrix.indices], minlength=len(counts))
+        rows = np.flatnonzero(inside[choices.owner] & (leaves == 0) & (counts > 0))
+        nodes = np.flatnonzero(inside)
+        number = np.cumsum(inside) - 1
+        owner = number[choices.owner[rows]]
+        part = choices._replace(
+            matrix=choices.matrix[rows][:, nodes],
+            rows=np.searchsorted(owner, np.arange(len(nodes))),
+            owner=owner,
+            rewards=choices.rewards[rows],
+            origin=choices.origin[rows],
+        )
+        v, error = np.full(len(inside), np.inf), np.zeros(len(inside))
+        values, errors, _, _ = _values(part, self.proper(part)[1], tolerance, self._infinite, progress)
+        v[nodes], error[nodes] = np.append(self.sign * values, 0.0), np.append(errors, 0.0)
+        return v[self.node_of[:-2]], error[self.node_of[:-2]]
+
+    def solve(self, tolerance: float, progress: Callable[[int, float], None] | None = None) -> Goals:
+        """Policy iteration, then bounds; in rational numbers where floats cannot tell, or are too short."""
+        choices = self._without_idle(self.choices)
+        sure, policy = self.proper(choices)
+        if not sure[:-1].all():
+            raise self._endless(~sure[self.node_of[:-2]])
+        v, error, policy, improvements = _values(choices, policy, tolerance, self._infinite, progress)
+        if any(self.mdp.residual):
+            error = self._within_residual(choices, v, policy)
+        nodes = self.node_of[:-2]
+        return Goals(
+            self.sign * np.append(v, 0.0)[nodes],
+            np.append(error, 0.0)[nodes],
+            self._unfolded(choices.origin[policy]),
+            improvements,
+        )
+
+    def _within_residual(self, choices: Choices, v: np.ndarray, policy: np.ndarray) -> np.ndarray:
+        """(M,) error of v that holds for every MDP within the residual of this one."""
+        residual = self.mdp.residual
+        wider = choices._replace(error=choices.error + residual.rewards, deviation=residual.probabilities)
+        try:
+            values, error, _, _ = _iterated(wider, policy, self._infinite, None)
+        except Undecided:
+            raise PrecisionError(
+                f"{self.mdp}: rows that were off by {residual.probabilities:.2g} and divided by their sums leave no "
+                "bound of the total reward; give probabilities that sum to 1 as floats"
+            ) from None
+        return np.abs(values - v) + error
+
+    def _without_idle(self, choices: Choices) -> Choices:
+        """The choices without those that change nothing and may be repeated for ever."""
+        idle = np.diff(choices.matrix.indptr) == 0
+        if not idle.any():
+            return choices
+        paying = idle & (choices.rewards > 0)
+        if paying.any():
+            raise self._infinite(choices, np.flatnonzero(paying)[:1])
+        keep = np.flatnonzero(~idle)
+        rows = np.searchsorted(choices.owner[keep], np.arange(choices.num_nodes + 1))
+        return choices._replace(
+            matrix=choices.matrix[keep],
+            rows=rows,
+            owner=choices.owner[keep],
+            rewards=choices.rewards[keep],
+            origin=choices.origin[keep],
+        )
+
+    @staticmethod
+    def proper(choices: Choices) -> tuple[np.ndarray, np.ndarray]:
+        """((M + 1,) bool whether some policy surely ends, (M,) the rows of one that does)."""
+        return _proper(choices.matrix, choices.rows)
+
+    def _infinite(self, choices: Choices, rows: np.ndarray) -> DivergenceError:
+        """The error that repeating some rows pays without limit."""
+        pairs = [divmod(int(each), self.num_choices) for each in choices.origin[rows]]
+        return DivergenceError(
+            f"{self.mdp}: the total reward has no {'lower' if self.sign < 0 else 'upper'} limit: a cycle pays again "
+            f"and again: {_pairs_in_words(self.mdp, pairs)}; give a horizon, or gamma < 1"
+        )
+
+    def _endless(self, unsure: np.ndarray) -> DivergenceError:
+        """The error that from some nodes (N,) bool no policy ends or stays for nothing."""
+        components = end_components(self.mdp)
+        labels = components.labels.ravel()
+        inside = components.pairs.reshape(len(labels), -1)
+        stuck = np.flatnonzero(unsure & (labels >= 0))
+        same = np.flatnonzero(labels == labels[stuck[0]]) if len(stuck) else np.flatnonzero(unsure)
+        pairs = [(int(n), int(a)) for n in same[: NAMED + 1] for a in np.flatnonzero(inside[n])[:1]]
+        state = int(np.flatnonzero(unsure)[0]) // self.mdp.width
+        return DivergenceError(
+            f"{self.mdp}: no policy has a finite total reward from state {state}: none ends surely, or stays where "
+            f"nothing is paid; a cycle that pays: {_pairs_in_words(self.mdp, pairs)}; give a horizon, or gamma < 1"
+        )
+
+    def _unfolded(self, origin: np.ndarray) -> np.ndarray:
+        """(N,) choices of the nodes, from those of the collapsed nodes (M,); -1 is to stop."""
+        nodes = len(self.node_of) - 2
+        policy = np.zeros(nodes, np.int64)
+        matrix, inside = self.matrix, self.inside
+        stops = np.append(origin < 0, False)[self.node_of[:-2]]
+        moves = origin[origin >= 0]
+        at = moves // self.num_choices
+        policy[at] = moves % self.num_choices
+        collapsed = np.flatnonzero(inside.reshape(nodes, -1).any(axis=1))
+        if not len(collapsed):
+            return policy
+        goal = np.ones(nodes + 2, np.bool_)
+        goal[collapsed] = False
+        goal[at] = True
+        goal[:nodes][stops] = True
+        rows_in = np.flatnonzero(inside)
+        rows = np.searchsorted(rows_in // self.num_choices, np.arange(nodes + 3))
+        part = matrix[rows_in]
+        sure, scratch = np.empty(nodes + 2, np.bool_), np.empty(nodes + 2, np.bool_)
+        row = np.zeros(nodes + 2, np.int64)
+        first, node = part.indptr.astype(np.int64), part.indices.astype(np.int64)
+        hitting.almost_surely(first, node, rows, goal, sure, scratch, row)
+        towards = np.flatnonzero(~goal)
+        policy[towards] = rows_in[row[towards]] % self.num_choices
+        staying = collapsed[stops[collapsed]]
+        policy[staying] = rows_in[rows[staying]] % self.num_choices
+        return policy
+
+
+def _sorted_choices(
+    matrix: "csr_matrix",
+    owner: np.ndarray,
+    rewards: np.ndarray,
+    origin: np.ndarray,
+    stops: int,
+    error: float,
+    terms: int,
+) -> Choices:
+    """Choices by node, with one more row that stops for each of the first `stops` nodes."""
+    from scipy import sparse
+
+    count = matrix.shape[1] - 1
+    if stops:
+        entries = (np.ones(stops), (np.arange(stops), np.full(stops, count)))
+        matrix = sparse.vstack([matrix, sparse.csr_matrix(entries, shape=(stops, count + 1))], format="csr")
+        owner, rewards = np.append(owner, np.arange(stops)), np.append(rewards, np.zeros(stops))
+        origin = np.append(origin, np.full(stops, -1))
+    order = np.argsort(owner, kind="stable")
+    if (order[1:] < order[:-1]).any():
+        matrix, owner, rewards, origin = matrix[order], owner[order], rewards[order], origin[order]
+    return Choices(matrix, np.searchsorted(owner, np.arange(count + 1)), owner, rewards, error, origin, terms)
+
+
+def recurrent_classes(matrix: "csr_matrix", live: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """((N,) number of the recurrent class of each live node of a Markov chain, -1: none; whether in one).
+
+    matrix (N, N + K): the last columns are nodes that are never left, and no live ones.
+    """
+    from scipy import sparse
+    from scipy.sparse import csgraph
+
+    size = matrix.shape[1]
+    ends = np.append(matrix.indptr, np.full(size - len(live), matrix.nnz))
+    square = sparse.csr_matrix((matrix.data, matrix.indices, ends), (size, size))
+    number, component = csgraph.connected_components(square, connection="strong")
+    row = np.repeat(np.arange(len(live)), np.diff(matrix.indptr))
+    is_recurrent = np.ones(number, np.bool_)
+    is_recurrent[component[row[component[row] != component[matrix.indices]]]] = False
+    inside = is_recurrent[component[: len(live)]] & live
+    numbers = np.full(len(live), -1)
+    numbers[inside] = np.unique(component[: len(live)][inside], return_inverse=True)[1]
+    return numbers, inside
+
+
+def _proper(matrix: "csr_matrix", rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """((M + 1,) bool, (M,) rows), see `Problem.proper`."""
+    size = matrix.shape[1]
+    goal, sure, scratch = (np.zeros(size, np.bool_) for _ in range(3))
+    goal[-1] = True
+    policy = np.zeros(size, np.int64)
+    first, node = matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64)
+    bounds = np.append(rows, rows[-1])
+    hitting.almost_surely(first, node, bounds.astype(np.int64), goal, sure, scratch, policy)
+    return sure, policy[:-1]
+
+
+# Policy iteration -----------------------------------------------------------------------------------------------------
+
+
+Infinite = Callable[[Choices, np.ndarray], DivergenceError]
+
+
+class Undecided(Exception):
+    """Floats cannot tell whether a cycle pays.
+
+    Attributes:
+        policy: (M,) rows of the best proper policy so far.
+    """
+
+    def __init__(self, policy: np.ndarray):
+        super().__init__()
+        self.policy = policy
+
+
+class Chain:
+    """Linear equations (1 - P) x = b of a proper policy (M,), a row for each node."""
+
+    def __init__(self, choices: Choices, policy: np.ndarray):
+        from scipy import sparse
+        from scipy.sparse import linalg
+
+        self.choices, self.policy = choices, policy
+        matrix = choices.matrix[policy]
+        inner = matrix[:, :-1]
+        # 1 minus the probability to stay, as the sum of the others: nothing is subtracted
+        self.leaving = np.asarray(matrix.sum(axis=1)).ravel()
+        system = sparse.diags(self.leaving, format="csr") - inner
+        self._solve: Callable[[np.ndarray], np.ndarray] = lambda right: np.full(len(right), np.nan)
+        count = choices.num_nodes
+        with np.errstate(all="ignore"):
+            try:
+                if count <= DENSE:
+                    inverse = np.linalg.inv(system.toarray())
+                    self._solve = lambda right: inverse @ right
+                elif count <= ELIMINATED or fills_little(system):
+                    self._solve = linalg.splu(system.tocsc()).solve
+            except (np.linalg.LinAlgError, RuntimeError):
+                pass
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """(M + 1,) x, 0 at the end; NaN where the system is singular to the last bit, or too large."""
+        with np.errstate(all="ignore"):
+            x = np.append(self._solve(right), 0.0)
+            rows = self.choices._replace(
+                matrix=self.choices.matrix[self.policy], owner=np.arange(len(right)), rewards=right
+            )
+            least = math.inf
+            for _ in range(REFINEMENTS):
+                left, _ = rows.residuals(x)
+                largest = float(np.abs(left).max(initial=0.0))
+                if not largest < 0.5 * least:
+                    break
+                least = largest
+                x[:-1] += self._solve(left)
+        return x
+
+
+def _values(
+    choices: Choices,
+    policy: np.ndarray,
+    tolerance: float,
+    infinite: Infinite,
+    progress: Callable[[int, float], None] | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """((M,) values, (M,) error of each, (M,) rows, improvements), from a proper policy: by floats, where they can tell
+    and are long enough, else by rational numbers."""
+    try:
+        v, error, policy, improvements = _iterated(choices, policy, infinite, progress)
+        if not error.max(initial=0.0) <= tolerance:
+            raise Undecided(policy)
+        return v, error, policy, improvements
+    except Undecided as undecided:
+        from pharos.solvers.rational import rational_values
+
+        return rational_values(choices, undecided.policy, infinite)
+
+
+def _iterated(
+    choices: Choices, policy: np.ndarray, infinite: Infinite, progress: Callable[[int, float], None] | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """((M,) values, (M,) error of each, (M,) rows, improvements), from a proper policy; `Undecided` if floats cannot
+    tell."""
+    nodes, bonus = np.arange(choices.num_nodes), None
+    if not len(nodes):
+        return np.zeros(0), np.zeros(0), policy, 0
+    for improvements in range(1, MOST_IMPROVEMENTS):
+        chain = Chain(choices, policy)
+        v = chain.solve(choices.rewards[policy])
+        if not np.isfinite(v).all():
+            raise Undecided(policy)
+        total, slack = choices.residuals(v)
+        slack += choices.error
+        own = np.abs(total[policy]) + slack[policy]
+        gain = total - slack
+        better = _best_rows(choices, gain)
+        if bonus is None and (gain[better] > 2 * own).any():
+            changed = np.where(gain[better] > 2 * own, better, policy)
+            if not _proper(choices.matrix[changed], np.arange(len(nodes) + 1))[0].all():
+                stuck = np.flatnonzero(recurrent_classes(choices.matrix[changed], nodes >= 0)[0] == 0)
+                raise infinite(choices, changed[stuck]) if _pays(choices, changed, stuck) else Undecided(policy)
+            policy = changed
+            continue
+        # the best up to rounding: from now on each step pays a bonus of what its actions may gain
+        near = np.abs(total) <= 8 * (slack + own[choices.owner])
+        room = np.maximum.reduceat(np.where(near, np.abs(total) + slack, 0.0), choices.rows[:-1])
+        room = 2 * np.maximum(room, own) + 2.0**-1000
+        bonus = room if bonus is None else np.where(room > bonus, 2 * room, bonus)
+        w = chain.solve(bonus)
+        if not (np.isfinite(w).all() and (w >= 0).all()):
+            raise Undecided(policy)
+        more, rounding = choices.residuals(w, np.zeros(len(total)))
+        above = total + slack + more + rounding
+        below = (total - slack - more - rounding)[policy]
+        if progress is not None:
+            progress(improvements, float(w.max(initial=0.0)))
+        if (above <= 0).all() and (below >= 0).all():
+            return v[:-1], w[:-1] * MARGIN, policy, improvements
+        better = _best_rows(choices, above)
+        changed = np.where(above[better] > 0, better, policy)
+        is_stuck = (
+            np.array_equal(changed, policy) or not _proper(choices.matrix[changed], np.arange(len(nodes) + 1))[0].all()
+        )
+        if is_stuck or improvements > MOST_IMPROVEMENTS // 2:
+            raise Undecided(policy)
+        policy = changed
+    raise Undecided(policy)
+
+
+def _best_rows(choices: Choices, gain: np.ndarray) -> np.ndarray:
+    """(M,) the row of each node whose gain (R,) is largest, the first among equals."""
+    largest = np.maximum.reduceat(gain, choices.rows[:-1])
+    at = np.flatnonzero(gain == largest[choices.owner])
+    best = np.empty(choices.num_nodes, np.int64)
+    best[choices.owner[at[::-1]]] = at[::-1]
+    return best
+
+
+def _pays(choices: Choices, policy: np.ndarray, nodes: np.ndarray) -> bool:
+    """Whether it is proven that the mean reward of a recurrent class is positive: r + P h - h > 0 in it for some h."""
+    rows = choices.matrix[policy[nodes]][:, nodes].toarray()
+    leaving = rows.sum(axis=1)
+    rewards = choices.rewards[policy[nodes]]
+    # g and h with h = 0 at the first node: g + leaving h - P h = r
+    system = np.diag(leaving) - rows
+    system[:, 0] = 1.0
+    with np.errstate(all="ignore"):
+        try:
+            h = np.linalg.solve(system, rewards)
+        except np.linalg.LinAlgError:
+            return False
+    h[0] = 0.0
+    v = np.zeros(choices.num_nodes + 1)
+    v[nodes] = h
+    total, slack = choices.residuals(v)
+    at = policy[nodes]
+    return bool((total[at] - slack[at] - choices.error > 0).all())
+
+
+# Words ----------------------------------------------------------------------------------------------------------------
+
+
+def _pairs_in_words(mdp: TabularMDP, pairs: list[tuple[int, int]]) -> str:
+    """ "state 3 by action 0, state 4 by action 1", of pairs (node, choice)."""
+    texts = [f"state {node // mdp.width} by action {action}" for node, action in pairs[:NAMED]]
+    return ", ".join(dict.fromkeys(texts)) + (", ..." if len(pairs) > NAMED else "")
+
+
+def _states_in_words(mdp: TabularMDP, nodes: np.ndarray) -> str:
+    states = np.unique(nodes // mdp.width)
+    word = "state" if len(states) == 1 else "states"
+    return f"{word} {', '.join(map(str, states[:NAMED].tolist()))}" + (", ..." if len(states) > NAMED else "")
