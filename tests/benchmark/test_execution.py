@@ -612,3 +612,14 @@ def test_the_dqn_of_cleanrl_learns_with_ten_other_lines(tmp_path):
         _, curve = curve_of(load(find(f"{example}:learn")), task, steps=steps)
         assert [row["step"] for row in curve.rows] == [0, steps // 3, 2 * steps // 3, steps]
         assert steps < 4500 or curve.rows[-1]["normalized_regret"] < 0.1
+
+
+@pytest.mark.long
+def test_the_ppo_of_the_page_learns_with_four_environments_that_share_the_budget(tmp_path):
+    pytest.importorskip("torch")
+    example = Path(__file__).parents[2] / "docs" / "examples" / "cleanrl_ppo.py"
+    assert "[env.copy] * args.num_envs" in example.read_text() and example.read_text().count("  # pharos") == 6
+    for task, steps in ((TASKS[0], 9000), (replace(TASKS[0], observation="simple_image"), 1500)):
+        _, curve = curve_of(load(find(f"{example}:learn")), task, steps=steps)
+        assert curve.counted_steps == steps and len(curve.rows) == 4
+        assert steps < 9000 or curve.rows[-1]["normalized_regret"] < 0.2

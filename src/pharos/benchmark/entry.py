@@ -184,6 +184,10 @@ def _network(run: Path) -> dict[str, np.ndarray]:
     except ImportError as error:
         raise MissingExtra("reading what a network has learnt", "torch", "agents") from error
     file = run / "agent" / "parameters.pt"
+    if not file.exists():
+        raise FileFormatError(
+            f"{run}: has no network, so nobody can evaluate its policy again; submit a run of `train`"
+        )
     try:
         stored: dict[str, Any] = torch.load(file, weights_only=True, map_location="cpu")["policy"]  # noqa: TID251
         return {name: tensor.numpy() for name, tensor in sorted(stored.items())}

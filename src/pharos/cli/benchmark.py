@@ -162,6 +162,28 @@ def run(
     return Answer(answer, (f"{results.agent} on {results.suite}", facts), bool(missing))
 
 
+@app.command("check")
+def check(
+    agent: Annotated[str, "AGENT"],
+    *,
+    hyperparameters: Mapping[str, Any] | None = None,
+    workers: Count | None = None,
+    timeout: float = 120.0,
+) -> Answer:
+    """Try an agent on two tiny tasks, and say in one line each what is wrong; exit code 1 if something is.
+
+    Args:
+        agent: As for `benchmark run`, such as file.py:learn.
+        hyperparameters: A hyperparameter, of both tasks.
+        workers: Processes; as many as processors when not given.
+        timeout: Seconds after which a run is ended, and failed.
+    """
+    from pharos import benchmark
+
+    done = benchmark.check_agent(agent, hyperparameters=hyperparameters, workers=workers, timeout=timeout)
+    return Answer(vars(done), str(done), not done)
+
+
 @app.command("report")
 def report(
     results: Annotated[str, "RESULTS"],
