@@ -79,6 +79,8 @@ if TYPE_CHECKING:
     from pharos import (
         validation as validation,
     )
+    from pharos.benchmark import LoopRun as Run
+    from pharos.benchmark import check_agent
     from pharos.environments import Environment, Layer, list_environments, make, register
     from pharos.errors import PharosError
     from pharos.explorer import explore
@@ -103,6 +105,7 @@ __all__ = [
     "GymEnv",
     "Layer",
     "PharosError",
+    "Run",
     "Solution",
     "StateSpace",
     "TabularMDP",
@@ -111,6 +114,7 @@ __all__ = [
     "benchmark",
     "bisimulation",
     "build",
+    "check_agent",
     "check_environment",
     "drawing",
     "environments",

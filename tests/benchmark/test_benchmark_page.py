@@ -4,6 +4,7 @@ import importlib
 import re
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -70,3 +71,36 @@ def test_the_agent_of_the_page_learns(tmp_path):
     outcome = benchmark.run(space["learn"], "v1", out=tmp_path, seeds=[0], tasks=[task.name])
     assert outcome.results.curves[task.name].shape == (1, 15)
     assert outcome.results.curves[task.name][0, -1] < 0.9
+
+
+@pytest.mark.slow
+def test_loops_of_the_pages_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    agents = (ROOT / "docs" / "agents.md").read_text()
+    for page in (PAGE, agents):
+        space = {}
+        exec(re.search(r"## A loop of your own\n.*?```python\n(.*?)```", page, re.DOTALL)[1], space)
+    assert benchmark.read_results("results/mine").curves["deep_sea-8"].shape == (2, 15)
+    assert Path("runs/mine/run.json").exists() and space["row"]["step"] == 3000
+
+
+def test_the_report_says_what_failed_and_what_looks_like_a_mistake(tmp_path):
+    suite = benchmark.load_suite("v1")
+    results = fabricated("mine", suite, 0.3)
+    failed = {f"lake, seed {k}": f"mine on lake, seed {k}: ValueError: <b>no</b> (mine.py, line 3)" for k in range(3)}
+    failed |= {f"sea, seed {k}": f"mine on sea, seed {k}: reason {k}" for k in range(6)}
+    notes = {"no policy": {"lake, seed 4": "yielded no policy", "lake, seed 5": "yielded no policy"}}
+    record = {"steps_used": 1234567, "failed": failed, "notes": notes}
+    (page,) = benchmark.report(replace(results, record=record), tmp_path / "page.html", beside=[])
+    text = page.read_text()
+    for sentence in (
+        "Failed: lake, seed 0 and 2 more: ValueError: &lt;b&gt;no&lt;/b&gt; (mine.py, line 3)",
+        "Failed: sea, seed 3: reason 3",
+        "Failed: 2 runs for other reasons.",
+        "Note: lake, seed 4 and 1 more: yielded no policy.",
+        "1,234,567",
+    ):
+        assert sentence in text, sentence
+    assert "reason 4" not in text and "<b>" not in text
+    (page,) = benchmark.report(replace(results, record={"failed": [1], "notes": 3}), tmp_path / "odd.html", beside=[])
+    assert "Failed" not in page.read_text()

@@ -5,6 +5,7 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from command_line import answer
+from command_line import answer, process
 from edits import edited_json
 from patience import PATIENCE, wait_for
 from pharos import benchmark, evaluate_policy
@@ -324,16 +325,161 @@ def test_a_full_disk_is_said_by_the_runs_of_a_generator(suite, tmp_path):
     assert {*error.value.outcome.missing.values()} == {"No space left on device; the same command goes on"}
 
 
+DEATHS = {
+    "os._exit(3)": "its process ended with exit code 3",
+    "os._exit(78)": "its process ended with exit code 78",  # with which pharos' own workers say something else
+    "os.kill(os.getpid(), signal.SIGSEGV)": "its process ended by SIGSEGV",
+    "os.kill(os.getpid(), signal.SIGKILL)": "its process ended by SIGKILL; was there memory enough?",
+    "sys.exit('no data')": "SystemExit: no data (mine.py, line 7)",
+    "raise KeyboardInterrupt": "KeyboardInterrupt (mine.py, line 7)",
+    "raise MemoryError": "MemoryError (mine.py, line 7)",
+    "raise ValueError('a\\nb\\x1b')": "ValueError: a b\\x1b (mine.py, line 7)",
+}
+
+
 @pytest.mark.slow
-def test_a_process_that_dies_takes_the_run_with_it_that_it_was_at(suite, tmp_path):
-    die = "    import os\n    if seed == 1:\n        os._exit(3)\n"
-    (tmp_path / "mine.py").write_text(LEARN.replace("    draw =", die + "    draw ="))
-    agent = f"{tmp_path / 'mine.py'}:learn"
+@pytest.mark.parametrize("death", DEATHS)
+def test_a_run_that_dies_says_why_stops_no_other_and_is_the_only_one_that_is_repeated(suite, tmp_path, death):
+    write_suite(suite, tmp_path / "small.yaml")
+    code = LEARN.replace("import numpy as np\n", "import os, signal, sys, time\nimport numpy as np\n")
+    code = code.replace(
+        "    draw =", f"    if seed == 1 and not os.path.exists('mended'):\n        {death}\n    draw =", 1
+    )
+    assert code.splitlines()[6].strip() == death
+    (tmp_path / "mine.py").write_text(code)
+    line = "benchmark run --agent mine.py:learn --suite small.yaml --seeds 3 --tasks sea --workers 1 --out out --json"
+    done = process(*line.split(), cwd=tmp_path)
+    assert done.returncode == 1, done.stderr
+    said = json.loads(done.stdout)["failed"]
+    assert list(said) == ["sea, seed 1"] and said["sea, seed 1"].startswith(
+        f"mine.py:learn on sea, seed 1: {DEATHS[death]}"
+    )
+    assert len([line for line in done.stderr.splitlines() if "seed 1" in line]) == 1
+    runs = {path.parent.name: path for path in (tmp_path / "out").glob("runs/sea/*/run.json")}
+    records = {name: json.loads(path.read_text()) for name, path in runs.items()}
+    assert {name: record["status"] for name, record in records.items()} == {
+        "seed-0": "finished",
+        "seed-1": "failed",
+        "seed-2": "finished",
+    }
+    assert records["seed-1"]["error"] == said["sea, seed 1"]
+    (tmp_path / "mended").touch()
+    done = process(*line.split(), cwd=tmp_path)
+    assert done.returncode == 0 and json.loads(done.stdout)["failed"] == {}, done.stderr
+    after = {name: json.loads(path.read_text()) for name, path in runs.items()}
+    assert {name for name in after if after[name] != records[name]} == {"seed-1"}
+
+
+STATEFUL = """
+import os, random, sys, threading
+import numpy as np
+
+memory, times = [], np.zeros(1)
+os.environ["OF_THIS_AGENT"] = os.environ.get("OF_THIS_AGENT", "") + "x"
+
+
+class Agent:
+    runs = 0
+
+
+def learn(env, steps, seed):
+    import fractions
+
+    traces = [len(memory), Agent.runs, times[0], hasattr(fractions, "trace"), threading.active_count() > 2]
+    traces += [len(os.environ["OF_THIS_AGENT"]) > 2, os.getcwd().endswith("elsewhere"), np.geterr()["divide"]]
+    memory.append(seed)
+    Agent.runs += 1
+    times[0] += 1
+    fractions.trace = True
+    os.environ["OF_THIS_AGENT"] = "xxx"
+    os.makedirs("elsewhere", exist_ok=True)
+    os.chdir("elsewhere")
+    np.seterr(divide="ignore")
+    threading.Thread(target=threading.Event().wait, daemon=True).start()
+    print("traces", traces, random.random() + np.random.rand(), file=sys.stderr)
+    env.reset()
+    for _ in range(steps):
+        if any(env.step(0)[2:4]):
+            env.reset()
+    yield lambda seen: np.zeros(len(seen), int)
+"""
+
+
+@pytest.mark.slow
+def test_nothing_of_a_run_reaches_another(suite, tmp_path):
+    """Globals, class attributes, arrays, modules of others, threads, variables, working directory, global settings."""
+    (tmp_path / "mine.py").write_text(STATEFUL)
+    write_suite(suite, tmp_path / "small.yaml")
+    line = "benchmark run --agent mine.py:learn --suite small.yaml --seeds 2 --workers 1 --out out"
+    done = process(*line.split(), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = [line.rpartition(" ") for line in done.stderr.splitlines() if line.startswith("traces")]
+    assert [line[0] for line in lines] == ["traces [0, 0, np.float64(0.0), False, False, False, False, 'warn']"] * 6
+    numbers = [line[2] for line in lines]
+    assert len(set(numbers)) == 2  # global random numbers are those of the seed
+    assert len([*(tmp_path / "out").glob("runs/*/*/run.json")]) == 6
+
+
+@pytest.mark.slow
+def test_what_no_other_process_can_import_has_processes_too(suite, tmp_path):
+    memory = []
+
+    def learn(env, steps, seed):
+        memory.append(seed)
+        env.reset()
+        env.step(0)
+        yield always(len(memory) - 1)  # the same action in each run
+
+    outcome = benchmark.run(learn, suite, out=tmp_path / "out", seeds=range(2), tasks="sea")
+    assert not memory and not outcome.missing
+    assert (outcome.results.curves["sea"][0] == outcome.results.curves["sea"][1]).all()
+
+    lock = threading.Lock()
+
+    def locked(env, steps, seed):
+        yield lock
+
+    with pytest.raises(ParameterError, match=r"locked.*cannot be sent to the process of a run.*file\.py:learn"):
+        benchmark.run(locked, suite, out=tmp_path / "locked", seeds=[0], tasks="sea")
+
+
+@pytest.mark.slow
+def test_a_run_without_an_end_is_ended_by_its_time_limit(suite, file, tmp_path):
+    file.write_text(LEARN.replace("    draw =", "    while seed == 1:\n        pass\n    draw =", 1))
     with pytest.raises(AllRunsFailed) as error:
-        benchmark.run(agent, suite, out=tmp_path / "out", seeds=range(3), tasks="sea", workers=1)
-    assert list(error.value.outcome.missing) == ["sea, seed 1"]
-    runs = sorted(path.parent.name for path in (tmp_path / "out").glob("runs/sea/*/run.json"))
-    assert runs == ["seed-0", "seed-2"]
+        benchmark.run(f"{file}:learn", suite, out=tmp_path / "out", seeds=range(2), tasks="sea", timeout=20.0)
+    (message,) = error.value.outcome.missing.values()
+    assert "seed 1: took longer than 20 s" in message and "--timeout" in message
+
+
+@pytest.mark.slow
+def test_a_run_that_has_ended_may_leave_threads_behind(suite, file, tmp_path, monkeypatch):
+    monkeypatch.setattr("pharos.benchmark.agents.LINGER_SECONDS", 0.5)
+    text = "    import threading\n    threading.Thread(target=threading.Event().wait).start()\n    draw ="
+    file.write_text(LEARN.replace("    draw =", text, 1))
+    assert not benchmark.run(f"{file}:learn", suite, out=tmp_path / "out", seeds=range(2), tasks="sea").missing
+
+
+@pytest.mark.slow
+def test_a_class_for_stable_baselines3_has_a_process_for_each_run(suite, tmp_path):
+    pytest.importorskip("stable_baselines3")
+    text = "import os\nfrom stable_baselines3 import DQN\n\nmade = []\n\n\nclass Mine(DQN):\n"
+    text += "    def __init__(self, *args, seed=None, **options):\n        assert not made\n        made.append(seed)\n"
+    text += (
+        "        if seed == 1:\n            os._exit(9)\n        if seed == 2:\n            raise SystemExit('no')\n"
+    )
+    text += "        super().__init__(*args, seed=seed, **options)\n"
+    (tmp_path / "own.py").write_text(text)
+    with pytest.raises(AllRunsFailed) as error:
+        benchmark.run(
+            f"{tmp_path / 'own.py'}:Mine", suite, out=tmp_path / "out", seeds=range(4), tasks="sea", workers=2
+        )
+    said = error.value.outcome.missing
+    assert list(said) == ["sea, seed 1", "sea, seed 2"]
+    assert "exit code 9" in said["sea, seed 1"] and "SystemExit: no (own.py, line " in said["sea, seed 2"]
+    records = [json.loads((tmp_path / "out/runs/sea" / f"seed-{k}" / "run.json").read_text()) for k in range(4)]
+    assert [record["status"] for record in records] == ["finished", "failed", "failed", "finished"]
+    assert records[1]["error"] == said["sea, seed 1"]
 
 
 @pytest.mark.slow
@@ -466,3 +612,14 @@ def test_the_dqn_of_cleanrl_learns_with_ten_other_lines(tmp_path):
         _, curve = curve_of(load(find(f"{example}:learn")), task, steps=steps)
         assert [row["step"] for row in curve.rows] == [0, steps // 3, 2 * steps // 3, steps]
         assert steps < 4500 or curve.rows[-1]["normalized_regret"] < 0.1
+
+
+@pytest.mark.long
+def test_the_ppo_of_the_page_learns_with_four_environments_that_share_the_budget(tmp_path):
+    pytest.importorskip("torch")
+    example = Path(__file__).parents[2] / "docs" / "examples" / "cleanrl_ppo.py"
+    assert "[env.copy] * args.num_envs" in example.read_text() and example.read_text().count("  # pharos") == 6
+    for task, steps in ((TASKS[0], 9000), (replace(TASKS[0], observation="simple_image"), 1500)):
+        _, curve = curve_of(load(find(f"{example}:learn")), task, steps=steps)
+        assert curve.counted_steps == steps and len(curve.rows) == 4
+        assert steps < 9000 or curve.rows[-1]["normalized_regret"] < 0.2

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 from pharos.system import lazy
 
 if TYPE_CHECKING:
+    from pharos.benchmark.check import AgentCheck, check_agent
     from pharos.benchmark.comparison import AxisComparison, Comparison, Difference, Power, compare, power
     from pharos.benchmark.entry import Claim, Entry
     from pharos.benchmark.execution import run
     from pharos.benchmark.limits import Limits
+    from pharos.benchmark.loop import LoopRun, TaskEnv, task
     from pharos.benchmark.page import report
     from pharos.benchmark.ranking import Board, board, reason
     from pharos.benchmark.results import AgentResults, baselines, read_results
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from pharos.training import BudgetSpent
 
 __all__ = [
+    "AgentCheck",
     "AgentResults",
     "AxisScore",
     "BenchmarkScore",
@@ -29,12 +32,15 @@ __all__ = [
     "BudgetSpent",
     "Comparison",
     "Ladder",
+    "LoopRun",
     "Power",
     "Protocol",
     "Submission",
     "Suite",
+    "TaskEnv",
     "baselines",
     "board",
+    "check_agent",
     "compare",
     "frozen",
     "load_suite",
@@ -45,6 +51,7 @@ __all__ = [
     "run",
     "score",
     "submit",
+    "task",
     "verify",
     "write_suite",
 ]

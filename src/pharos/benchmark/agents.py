@@ -12,34 +12,42 @@
 import contextlib
 import hashlib
 import inspect
+import math
 import os
+import random
+import signal
+import sys
+import time
+import traceback
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
-from pharos.agents import COMPILED, agent_called, agents, check_hyperparameters, form_of, is_known
+from pharos.agents import COMPILED, POLICY, agent_called, agents, check_hyperparameters, form_of, is_known
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
 from pharos.system.sources import Source, find, is_reference, load, source_of
-from pharos.system.wording import in_one_line
-from pharos.system.workers import Workers, one_thread
+from pharos.system.wording import capped, in_one_line, pluralize
+from pharos.system.workers import SERVER_LOST, Terminated, Workers, one_thread
 from pharos.training import (
     Curve,
+    FailedRun,
     Learn,
     LearnCompiled,
+    PolicyRecorder,
     RunConfig,
+    Shapes,
     Task,
     TaskCache,
     check_agent,
     clear_run,
     compiled_curves,
-    dealt,
     evaluate_agent,
-    generated_curve,
+    generate,
     read_record,
     read_rows,
     regret,
@@ -52,9 +60,32 @@ from pharos.training import (
 )
 
 EXACT = ("oracle", "random")
+WARM = ("torch", "stable_baselines3")
+"""Libraries that take long to load: the process that runs are forked from has them if the agent has."""
+POLL_SECONDS = 1.0
+LINGER_SECONDS = 10.0  # that a process may take to end when its run has
+LOST_SERVERS = 3  # in a row
+LONGEST = 500  # letters of an agent's error
 
 Tell = Callable[[float, str], None]
 """tell(share of the steps that are done, text)."""
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings of runs that change no result.
+
+    Attributes:
+        workers: processes at once.
+        checkpoints: folder of those of the batched engine.
+        tell: called with the progress.
+        timeout: seconds after which a run that has its process is ended; None: never.
+    """
+
+    workers: int
+    checkpoints: Path
+    tell: Tell
+    timeout: float | None = None
 
 
 @dataclass(frozen=True)
@@ -85,7 +116,12 @@ class Form:
     checksum: str = ""
     errors: dict[Path, str] = field(default_factory=dict)
 
-    def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
+    @property
+    def learns(self) -> bool:
+        """Whether runs with other seeds are other runs."""
+        return self.kind != "exact"
+
+    def train(self, jobs: Sequence[Job], protocol: Protocol, settings: RunSettings) -> None:
         """Train all runs. Each leaves a finished run.json and a curve in its folder, or a run.json with its error."""
         raise NotImplementedError
 
@@ -93,6 +129,11 @@ class Form:
         """Environment steps of a finished run: as the environment counted them, else those of the protocol."""
         counted = read_record(job.folder)["result"].get("counted_steps")
         return protocol.steps if counted is None else int(counted)
+
+    def notes(self, job: Job) -> dict[str, str]:
+        """Sentences on what looks like a mistake in a finished run, by kind."""
+        notes = read_record(job.folder).get("notes")
+        return {str(kind): str(text) for kind, text in notes.items()} if isinstance(notes, Mapping) else {}
 
     def curve(self, job: Job, protocol: Protocol) -> tuple[np.ndarray, bool]:
         """(evaluations,) normalised regret, and whether all of it is exact.
@@ -155,21 +196,35 @@ def sha256(file: str | os.PathLike) -> str:
 class TrainedForm(Form):
     """An agent that `pharos.training` trains: runs of the batched engine that fit together as one program."""
 
-    def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
-        configs = [self._config(job, protocol) for job in jobs]
-        for job, config in zip(jobs, configs, strict=True):
+    def train(self, jobs: Sequence[Job], protocol: Protocol, settings: RunSettings) -> None:
+        configs, shapes = {job.folder: self._config(job, protocol) for job in jobs}, Shapes()
+        for folder, config in configs.items():
             # Stable-Baselines3 goes on from a checkpoint, but not to the same bytes: a killed run is begun anew
             if not agent_called(self.label).resumes_exactly(config.engine):
-                clear_run(job.folder)
+                clear_run(folder)
+        is_apart = [shapes.key(configs[job.folder]) is None for job in jobs]
+        batched = [job for job, apart in zip(jobs, is_apart, strict=True) if not apart]
+        if batched:
+            self._train_batched(batched, [configs[job.folder] for job in batched], settings)
+
+        def fail(job: Job, reason: str) -> None:
+            _write_failure(configs[job.folder], job, failure(self.label, job, reason))
+
+        if alone := [job for job, apart in zip(jobs, is_apart, strict=True) if apart]:
+            arguments = {job.folder: (self.label, configs[job.folder].to_dict(), settings.checkpoints) for job in alone}
+            run_apart(self, alone, _train_alone, arguments, fail, settings)
+
+    def _train_batched(self, jobs: Sequence[Job], configs: Sequence[RunConfig], settings: RunSettings) -> None:
+        """Train runs of the batched engine and tables, by lanes; they are of pharos' own code."""
         folders, seconds = [job.folder for job in jobs], [job.task.seconds.get(self.label, 1.0) for job in jobs]
 
         def progress(now: Any) -> None:
             failures = f", {now.failed} failed" if now.failed else ""
-            tell(now.done / now.total, f"{now.finished} of {len(jobs)} runs{failures}")
+            settings.tell(now.done / now.total, f"{now.finished} of {len(jobs)} runs{failures}")
 
         tasks = TaskCache(trust=True)  # the user has named the code
-        options: dict[str, Any] = {"progress": progress, "tasks": tasks, "workers": workers, "seconds": seconds}
-        train_configs(configs, folders, checkpoints=checkpoints, **options)
+        options: dict[str, Any] = {"progress": progress, "tasks": tasks, "workers": settings.workers}
+        train_configs(configs, folders, checkpoints=settings.checkpoints, seconds=seconds, **options)
 
     def _config(self, job: Job, protocol: Protocol) -> RunConfig:
         task, agent = job.task.training_task(protocol), agent_called(self.label)
@@ -184,6 +239,33 @@ class TrainedForm(Form):
             hyperparameters=self.hyperparameters,
             engine=agent.engines[-1],
         )
+
+
+def _train_alone(
+    label: str, entry: dict[str, Any], checkpoints: Path, job: Job, send: Callable[[str | OSError | None], None]
+) -> None:
+    """The body of a process: one run of an algorithm of Stable-Baselines3, as the body of `run_apart`."""
+    os.dup2(2, 1)
+    _seed(job.seed)
+    config = RunConfig.from_dict(entry)
+    try:
+        tasks = TaskCache(trust=True)  # the user has named the code
+        (end,) = train_configs([config], [job.folder], checkpoints=checkpoints, tasks=tasks)
+        send(end.error if isinstance(end, FailedRun) else None)
+    except Terminated:
+        raise
+    except OSError as error:
+        send(error)
+    except BaseException as error:
+        message = failure(label, job, error, config.sources["agent"].file if "agent" in config.sources else None)
+        _write_failure(config, job, message)
+        send(message)
+
+
+def _write_failure(config: RunConfig, job: Job, message: str) -> None:
+    record = {"format": 1, "id": config.id, "config": config.to_dict(), "status": "failed", "error": message}
+    job.folder.mkdir(parents=True, exist_ok=True)
+    write_record(job.folder, record)
 
 
 # Generators -----------------------------------------------------------------------------------------------------------
@@ -209,7 +291,7 @@ def _text_checksum(code: Callable[..., Any]) -> str:
 
 @dataclass(frozen=True)
 class GeneratedForm(Form):
-    """A generator, run in processes of its own with one thread each; in this process if no other can import it.
+    """A generator; each run has a process of its own with one thread.
 
     Attributes:
         learn: the function.
@@ -217,96 +299,110 @@ class GeneratedForm(Form):
 
     learn: Learn | None = None
 
-    def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
-        missing, failed = [job for job in jobs if not _is_finished(job)], 0
+    def train(self, jobs: Sequence[Job], protocol: Protocol, settings: RunSettings) -> None:
+        code = self.source or _by_value(self.learn, self.label)
 
-        def report_progress(left: int) -> None:
-            text = f"{len(jobs) - left - failed} of {len(jobs)} runs{f', {failed} failed' * (failed > 0)}"
-            tell(1 - left / len(jobs), text)
+        def fail(job: Job, reason: str) -> None:
+            record_run(self.label, job, protocol, reason)
 
-        report_progress(len(missing))
-        ends = (
-            self._in_processes(missing, protocol, workers) if self.source is not None else self._here(missing, protocol)
-        )
-        for left, error in zip(range(len(missing) - 1, -1, -1), ends, strict=False):
-            failed += error is not None
-            report_progress(left)
-
-    def _here(self, jobs: Sequence[Job], protocol: Protocol) -> Iterator[str | None]:
-        assert self.learn is not None
-        for job in jobs:
-            yield _generate(self.learn, self.label, job, protocol)
-
-    def _in_processes(self, jobs: Sequence[Job], protocol: Protocol, workers: int) -> Iterator[str | None]:
-        """Yield None or an error message for each run, in the order in which the runs end.
-
-        Where a process dies, the run that it was at has failed, and another process goes on with the others.
-        """
-        assert self.source is not None
-        seconds = [job.task.seconds.get(self.label, 1.0) for job in jobs]
-        left = {
-            str(part): deque(jobs[i] for i in sorted(indices)) for part, indices in enumerate(dealt(seconds, workers))
-        }
-        with Workers() as pool, one_thread():
-
-            def start(key: str) -> None:
-                pool.start(key, _generate_all, (self.source, self.label, list(left[key]), protocol), [self.learn])
-
-            for key in left:
-                start(key)
-            while pool:
-                for key, event in pool.events():
-                    if not isinstance(event, int):  # one of its runs has ended
-                        (error,) = event
-                        yield self._ended(left[key].popleft(), error)
-                    elif left[key]:
-                        yield self._ended(left[key].popleft(), f"its process ended with exit code {event}")
-                        if left[key]:
-                            start(key)
-
-    def _ended(self, job: Job, error: str | OSError | None) -> str | None:
-        """Note the error of a run that could not write its own, as of a full disk or a process that is gone."""
-        if isinstance(error, OSError):
-            self.errors[job.folder] = f"{error.strerror or error}; the same command goes on"
-            return in_one_line(error)
-        return error
+        with one_thread():
+            arguments = dict.fromkeys((job.folder for job in jobs), (code, self.label, protocol))
+            run_apart(self, jobs, _generate, arguments, fail, settings)
 
 
-def _generate_all(
-    source: Source, label: str, jobs: Sequence[Job], protocol: Protocol, send: Callable[[tuple[object]], None]
+def _by_value(learn: Learn | None, label: str) -> bytes:
+    """A function that no other process can import, of a notebook or within another one, with what it needs."""
+    import cloudpickle  # which Gymnasium needs; this process sends it to its own processes
+
+    try:
+        return cloudpickle.dumps(learn)
+    except Exception as error:
+        raise ParameterError(
+            f"agent {label!r}: cannot be sent to the process of a run: {in_one_line(error)}; name it in a file, "
+            f"file.py:learn"
+        ) from error
+
+
+def _generate(
+    code: Source | bytes, label: str, protocol: Protocol, job: Job, send: Callable[[str | OSError | None], None]
 ) -> None:
-    """The body of a process: run one job after the other, and send (None,) or (error,) after each.
+    """The body of a process: one run. It writes the run's folder, and sends None or an error message.
 
-    Its standard output goes to standard error.
+    Its standard output goes to standard error. Whatever draws from the global random numbers of Python, NumPy or
+    PyTorch draws others in each run.
     """
     os.dup2(2, 1)
-    for job in jobs:
+    process = os.getpid()
+
+    def end(result: Curve | BaseException, notes: Mapping[str, str], file: str | None = None) -> None:
+        if os.getpid() != process:  # a fork that the agent has made, and that has come back
+            os._exit(1)
         try:
-            send((_generate_from(source, label, job, protocol),))
+            send(record_run(label, job, protocol, result, notes, file))
         except OSError as error:
-            send((error,))
+            send(error)
 
+    def give_up() -> NoReturn:
+        """End an agent that goes on and on after its budget, with the policies that it has."""
+        try:
+            end(recorder.curve(), recorder.notes())
+        except Exception as error:
+            end(error, recorder.notes())
+        os._exit(0)
 
-def _generate_from(source: Source, label: str, job: Job, protocol: Protocol) -> str | None:
+    notes: dict[str, str] = {}
+    result: Curve | BaseException
+    file = code.file if isinstance(code, Source) else None
     try:
-        learn = load(source)
-    except Exception as error:
-        return in_one_line(error)
-    return _generate(learn, label, job, protocol)
-
-
-def _generate(learn: Learn, label: str, job: Job, protocol: Protocol) -> str | None:
-    """Train one run and write its folder. Returns None, or an error message if the run failed."""
-    try:
+        learn = _loaded(code)
+        file = file or getattr(getattr(learn, "__code__", None), "co_filename", None)
+        _seed(job.seed)
         task = job.task.training_task(protocol)
-        curve = generated_curve(learn, task, steps=protocol.steps, evaluations=protocol.evaluations, seed=job.seed)
-    except Exception as error:
-        return _record(label, job, protocol, error)
-    return _record(label, job, protocol, curve)
+        recorder = PolicyRecorder(task, steps=protocol.steps, evaluations=protocol.evaluations, seed=job.seed)
+        recorder.budget.give_up = give_up
+        generate(learn, recorder, job.seed)
+        result, notes = recorder.curve(), recorder.notes()
+    except Terminated:
+        raise
+    except BaseException as error:  # SystemExit and KeyboardInterrupt of an agent end its own run alone
+        result = error
+    end(result, notes, file)
 
 
-def _record(label: str, job: Job, protocol: Protocol, end: Curve | Exception) -> str | None:
-    """Write the result of a run, or its error, into its folder. Returns None, or the error message."""
+def _loaded(code: Source | bytes) -> Learn:
+    if isinstance(code, Source):
+        return load(code)
+    import cloudpickle
+
+    return cloudpickle.loads(code)
+
+
+def _seed(seed: int) -> None:
+    """Seed the global random numbers of Python, NumPy and, if the agent has loaded it, PyTorch.
+
+    A process that was forked has those of the process that it was forked from.
+    """
+    random.seed(seed)
+    np.random.seed(seed % (1 << 32))  # noqa: TID251  (of the agent's own code, which is its own affair)
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(seed)
+
+
+def record_run(
+    label: str,
+    job: Job,
+    protocol: Protocol,
+    end: Curve | BaseException | str,
+    notes: Mapping[str, str] | None = None,
+    file: str | None = None,
+) -> str | None:
+    """Write the result of a run, or its error, into its folder. Returns None, or the error message.
+
+    Args:
+        end: the curve, or why there is none.
+        notes: on what looks like a mistake.
+        file: of the agent's code, whose last line in the traceback the message names.
+    """
     config = {
         "benchmark": {"task": job.task.name, "digest": job.task.digest},
         "agent": label,
@@ -315,19 +411,126 @@ def _record(label: str, job: Job, protocol: Protocol, end: Curve | Exception) ->
         "evaluations": protocol.evaluations,
     }
     job.folder.mkdir(parents=True, exist_ok=True)
-    record = {"format": 1, "id": run_id(config), "config": config}
-    if isinstance(end, Exception):
-        message = f"{label} on {job.task.name}, seed {job.seed}: {type(end).__name__}: {in_one_line(end)}"
+    record: dict[str, Any] = {"format": 1, "id": run_id(config), "config": config}
+    if not isinstance(end, Curve):
+        message = failure(label, job, end, file)
         write_record(job.folder, {**record, "status": "failed", "error": message})
         return message
     if end.table is not None:
         write_policy(job.folder, end.table)
+    else:
+        (job.folder / POLICY).unlink(missing_ok=True)  # of an earlier attempt
     write_curve(job.folder, end.rows)
+    if notes:
+        record["notes"] = dict(notes)
     write_record(job.folder, {**record, "status": "finished", "result": end.result()})
     return None
 
 
-def _is_finished(job: Job) -> bool:
+def failure(label: str, job: Job, end: BaseException | str, file: str | None = None) -> str:
+    """The message of a run that has failed: its agent, task and seed, the error, and the line of the agent's file."""
+    text, place = (end, "") if isinstance(end, str) else (in_one_line(end), line_in(end, file))
+    printable = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in capped(text, LONGEST))
+    return f"{label} on {job.task.name}, seed {job.seed}: {printable.rstrip(': ')}{place}"
+
+
+def line_in(error: BaseException, file: str | None) -> str:
+    """The last line of a file in the traceback of an error, as " (mine.py, line 12)"; empty if there is none."""
+    frames = [each for each in traceback.extract_tb(error.__traceback__) if file and each.filename == file]
+    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+
+
+# Processes ------------------------------------------------------------------------------------------------------------
+
+
+def run_apart(
+    form: Form,
+    jobs: Sequence[Job],
+    body: Callable[..., None],
+    arguments: Mapping[Path, Sequence[Any]],
+    fail: Callable[[Job, str], object],
+    settings: RunSettings,
+) -> None:
+    """Run each job that is not finished in a process of its own, forked from one that has loaded what runs need.
+
+    So nothing of one run, neither of its modules nor of its threads, reaches another one, and a process that dies costs
+    its own run, whose run.json says why.
+
+    Args:
+        form: whose jobs they are; it keeps errors of runs that could not write their own.
+        body: function(*arguments[job.folder], job, send), which writes the folder of a run and sends None, an error
+            message, or the OSError of writing.
+        fail: fail(job, reason) writes the folder of a run whose process could not.
+    """
+    left = deque(job for job in jobs if not is_finished(job))
+    total, failed, lost = len(left), 0, 0
+    running: dict[str, tuple[Job, float]] = {}  # with the time at which it is killed
+    sent: set[str] = set()  # keys of runs that have ended, before their processes have
+
+    def report_progress() -> None:
+        ended = total - len(left) - len(running) + len(sent)
+        text = f"{len(jobs) - total + ended - failed} of {len(jobs)} runs{f', {failed} failed' * (failed > 0)}"
+        settings.tell((len(jobs) - total + ended) / len(jobs), text)
+
+    report_progress()
+    with Workers(*(name for name in WARM if name in sys.modules), "pharos.benchmark.warm") as pool:
+        while left or pool:
+            while left and len(pool) < settings.workers:
+                job = left.popleft()
+                key = str(job.folder)
+                try:
+                    pool.start(key, body, (*arguments[job.folder], job))
+                except (EOFError, ConnectionError) as error:  # the process that forks is gone; another one begins
+                    lost = _server_lost(lost, error)
+                    left.appendleft(job)
+                    continue
+                running[key] = job, time.monotonic() + (settings.timeout or math.inf)
+            for key, event in pool.events(POLL_SECONDS):
+                job, latest = running[key]
+                if event is None or isinstance(event, str | OSError):  # the run has ended
+                    sent.add(key)
+                    running[key] = job, time.monotonic() + LINGER_SECONDS
+                    failed += event is not None
+                    if isinstance(event, OSError):
+                        form.errors[job.folder] = f"{event.strerror or event}; the same command goes on"
+                    continue
+                del running[key]
+                if key in sent:
+                    sent.remove(key)
+                    lost = 0
+                elif event == SERVER_LOST and lost < LOST_SERVERS:
+                    lost += 1
+                    left.append(job)
+                else:
+                    failed += 1
+                    try:
+                        fail(job, _how_it_ended(event, latest, settings.timeout))
+                    except OSError as error:
+                        form.errors[job.folder] = f"{error.strerror or error}; the same command goes on"
+            for key, (_, latest) in running.items():
+                if time.monotonic() > latest:
+                    pool.kill(key)
+            report_progress()
+
+
+def _server_lost(lost: int, error: Exception) -> int:
+    if lost >= LOST_SERVERS:
+        raise PharosError(
+            f"the process that starts runs died {pluralize(lost + 1, 'time')} in a row ({in_one_line(error)}); was "
+            f"there memory enough?"
+        ) from error
+    return lost + 1
+
+
+def _how_it_ended(code: int, latest: float, timeout: float | None) -> str:
+    if code == -signal.SIGKILL and time.monotonic() > latest:
+        return f"took longer than {timeout:g} s; it was ended: raise --timeout, or look for a loop without an end"
+    name = signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
+    advice = "; was there memory enough?" if code == -signal.SIGKILL else "; look at what it wrote to standard error"
+    return f"its process ended {f'by {name}' if code < 0 else f'with exit code {code}'}{advice}"
+
+
+def is_finished(job: Job) -> bool:
     return (job.folder / "run.json").exists() and read_record(job.folder).get("status") == "finished"
 
 
@@ -344,14 +547,14 @@ class CompiledForm(Form):
 
     learn: LearnCompiled | None = None
 
-    def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
+    def train(self, jobs: Sequence[Job], protocol: Protocol, settings: RunSettings) -> None:
         assert self.learn is not None
         groups: dict[str, list[Job]] = defaultdict(list)
         for job in jobs:
             groups[job.task.name].append(job)
         for number, group in enumerate(groups.values()):
-            tell(number / len(groups), f"{number} of {len(groups)} tasks")
-            if all(_is_finished(job) for job in group):
+            settings.tell(number / len(groups), f"{number} of {len(groups)} tasks")
+            if all(is_finished(job) for job in group):
                 continue
             task, seeds = group[0].task.training_task(protocol), [job.seed for job in group]
             ends: Sequence[Curve | Exception]
@@ -362,8 +565,8 @@ class CompiledForm(Form):
             except Exception as error:
                 ends = [error] * len(group)
             for job, end in zip(group, ends, strict=True):
-                _record(self.label, job, protocol, end)
-        tell(1.0, f"{len(groups)} of {len(groups)} tasks")
+                record_run(self.label, job, protocol, end)
+        settings.tell(1.0, f"{len(groups)} of {len(groups)} tasks")
 
 
 # Exact ----------------------------------------------------------------------------------------------------------------
@@ -375,11 +578,14 @@ class ExactForm(Form):
 
     regrets: dict[str, float] = field(default_factory=dict)
 
-    def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
+    def train(self, jobs: Sequence[Job], protocol: Protocol, settings: RunSettings) -> None:
         """Do nothing: there is nothing to learn."""
 
     def steps_used(self, job: Job, protocol: Protocol) -> int:
         return 0
+
+    def notes(self, job: Job) -> dict[str, str]:
+        return {}
 
     def curve(self, job: Job, protocol: Protocol) -> tuple[np.ndarray, bool]:
         if job.task.name not in self.regrets:

@@ -26,6 +26,7 @@ LEARNERS = ("dqn", "ppo")  # idealised, with networks
 RESIDUAL = 0.2
 LATE = 0.2  # of an agent that learns late, by which the final score exceeds the mean one, with its whole interval
 WORSE = 0.05  # the same of one that ends worse than it was, by which the final score is lower
+MOST = 5  # reasons of failures on the page
 LONGEST = 400  # letters of an entry of the record on the page
 PHRASES = {
     "exploration": "explores to",
@@ -258,6 +259,34 @@ def excerpt(value: object) -> str:
         value = ", ".join(f"{name} {each}" for name, each in sorted(value.items()))
     text = value if isinstance(value, str) else json.dumps(storage.plain(value), sort_keys=True)
     return text if len(text) <= LONGEST else text[:LONGEST] + "…"
+
+
+def run_warnings(results: AgentResults) -> list[str]:
+    """Sentences on runs that failed, and on what looks like a mistake of the agent, a reason or a kind each.
+
+    At most MOST of each, with the first run that it holds of.
+    """
+    sentences = []
+    failed = results.record.get("failed")
+    if isinstance(failed, Mapping) and failed:
+        reasons: dict[str, list[str]] = {}
+        for which, reason in failed.items():
+            reasons.setdefault(str(reason).partition(f"{which}: ")[2] or str(reason), []).append(which)
+        sentences = [f"Failed: {_first_of(runs)}: {reason}" for reason, runs in list(reasons.items())[:MOST]]
+        if len(reasons) > MOST:
+            sentences.append(
+                f"Failed: {pluralize(sum(map(len, list(reasons.values())[MOST:])), 'run')} for other reasons."
+            )
+    notes = results.record.get("notes")
+    kinds = list(notes.values())[:MOST] if isinstance(notes, Mapping) else []
+    for runs in kinds:
+        if isinstance(runs, Mapping) and runs:
+            sentences.append(f"Note: {_first_of(list(runs))}: {next(iter(runs.values()))}.")
+    return sentences
+
+
+def _first_of(runs: Sequence[str]) -> str:
+    return f"{runs[0]}{f' and {len(runs) - 1:,} more' * (len(runs) > 1)}"
 
 
 def seeds_text(results: AgentResults) -> str:

@@ -10,7 +10,7 @@ DIR/results.safetensors    all curves of what was asked for, when the runs have 
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib import metadata
 from pathlib import Path
@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from pharos.benchmark.agents import Form, Job, Tell, agent_form
+from pharos.benchmark.agents import Form, Job, RunSettings, Tell, agent_form
 from pharos.benchmark.results import FILE, AgentResults
 from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, score
 from pharos.benchmark.suite import CORE, EARLIER, BenchmarkTask, Suite, load_suite
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError, PharosError, UnknownName
 from pharos.system import storage
-from pharos.system.wording import in_one_line
+from pharos.system.wording import in_one_line, pluralize
 from pharos.system.workers import usable_workers
 from pharos.training import versions
 
@@ -43,6 +43,7 @@ class Outcome:
         missing: "task, seed" -> why that run has no result.
         suite: that was run.
         steps_used: environment steps of all finished runs together.
+        notes: on what looks like a mistake of the agent: kind -> "task, seed" -> sentence.
     """
 
     results: AgentResults
@@ -50,6 +51,7 @@ class Outcome:
     missing: Mapping[str, str]
     suite: Suite
     steps_used: int = 0
+    notes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @cached_property
     def scores(self) -> BenchmarkScore:
@@ -67,7 +69,7 @@ class Outcome:
         return self.scores.axes
 
 
-def run(
+def run(  # noqa: PLR0913
     agent: str | Callable[..., Any],
     suite: str | Path | Suite = "v1",
     *,
@@ -78,6 +80,7 @@ def run(
     name: str | None = None,
     hyperparameters: Mapping[str, Any] | None = None,
     workers: int | None = None,
+    timeout: float | None = None,
     progress: Tell | None = None,
 ) -> Outcome:
     """Run an agent on the tasks of a suite, with one setting for all of them.
@@ -97,19 +100,22 @@ def run(
         name: label of the agent in tables; its own when not given.
         hyperparameters: of all tasks; they go before those of the suite and the agent.
         workers: processes; as many as processors when not given. Changes no result.
+        timeout: seconds after which a run of the user's own code, or of Stable-Baselines3, is ended, and failed; None:
+            never.
         progress: called with the share of all steps that is done, and a text.
     Raises:
         ParameterError: an option is wrong, a task is another one on this installation, or the folder holds another
             agent, setting or suite. AllRunsFailed: no run has finished. FolderLocked: another process is at it.
     Cost: of v1, 30,000 steps a task and seed.
     """
+    folder = Path(out).absolute()  # an agent may change the directory where its file is loaded
     suite = suite if isinstance(suite, Suite) else load_suite(suite)
     form = agent_form(agent, suite, hyperparameters)
     numbers = [int(seed) for seed in seeds][: QUICK if quick else None]
     if not numbers or len(set(numbers)) < len(numbers) or min(numbers) < 0:
         raise ParameterError(f"seeds are {numbers}; expected whole numbers of at least 0, each once")
     entries = selected(suite, CORE if quick and tasks is None else tasks)
-    folder, protocol = Path(out), suite.protocol
+    protocol = suite.protocol
     if protocol.steps % protocol.evaluations:
         raise ParameterError(
             f"suite {suite.name}: {protocol.steps} steps with {protocol.evaluations} evaluations; expected a multiple"
@@ -118,15 +124,19 @@ def run(
         task.check(protocol)
     folder.mkdir(parents=True, exist_ok=True)
     with storage.lock(folder, FolderLocked, "running a benchmark"):
-        record = _claimed(folder, form, suite, name or form.label)
+        record = claimed(folder, form, suite, name or form.label)
         jobs = [
             Job(task, seed, storage.inside(folder, "runs", task.name, f"seed-{seed}"))
             for task in entries
             for seed in numbers
         ]
         checkpoints = storage.inside(folder, "checkpoints")
-        form.train(jobs, protocol, usable_workers(workers), checkpoints, progress or (lambda *_: None))
-        return _collected(folder, form, suite, record, jobs)
+        form.train(
+            jobs,
+            protocol,
+            RunSettings(usable_workers(workers), checkpoints, progress or (lambda *_: None), timeout),
+        )
+        return collected(folder, form, suite, record, jobs)
 
 
 def selected(suite: Suite, tasks: str | Iterable[str] | None) -> tuple[BenchmarkTask, ...]:
@@ -147,7 +157,7 @@ def selected(suite: Suite, tasks: str | Iterable[str] | None) -> tuple[Benchmark
     return tuple(task for task in suite.tasks if task.axis in words or task.name in words)
 
 
-def _claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str, Any]:
+def claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str, Any]:
     """Contents of agent.json for this agent and setting; the file is written if it does not exist.
 
     Raises:
@@ -186,26 +196,35 @@ def _claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str,
     return contents[AGENT]
 
 
-def _collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any], jobs: Iterable[Job]) -> Outcome:
-    """Collect the curves of all runs into one results file, and write the scores."""
+def collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any], jobs: Iterable[Job]) -> Outcome:
+    """Collect the curves of all runs into one results file, and write the scores.
+
+    Its record has the reasons of runs that failed, what looks like mistakes, and the steps of finished runs.
+    """
     curves: dict[str, list[np.ndarray]] = {}
     exact: dict[str, bool] = {}
     missing: dict[str, str] = {}
+    notes: dict[str, dict[str, str]] = {}
     seeds, steps = tuple(dict.fromkeys(job.seed for job in jobs)), 0
     for job in jobs:
-        task = job.task.name
+        task, which = job.task.name, f"{job.task.name}, seed {job.seed}"
         try:
             curve, is_exact = form.curve(job, suite.protocol)
         except PharosError as error:
-            missing[f"{task}, seed {job.seed}"] = in_one_line(error)
+            missing[which] = in_one_line(error)
             continue
         steps += form.steps_used(job, suite.protocol)
+        for kind, text in form.notes(job).items():
+            notes.setdefault(kind, {})[which] = text
         curves.setdefault(task, []).append(curve)
         exact[task] = exact.get(task, True) and is_exact
     whole = {task: np.stack(each) for task, each in curves.items() if len(each) == len(seeds)}
-    full_record = {**record, "exact": {task: exact[task] for task in whole}}
+    if (text := equal_seeds(whole)) and form.learns:
+        notes["equal seeds"] = {f"{len(whole)} tasks": text}
+    full_record = {**record, "exact": {task: exact[task] for task in whole}, "steps_used": steps}
+    full_record |= {name: value for name, value in {"failed": missing, "notes": notes}.items() if value}
     results = AgentResults(str(record["agent"]), suite.name, suite.digest, seeds, whole, full_record)
-    outcome = Outcome(results, folder, missing, suite, steps)
+    outcome = Outcome(results, folder, missing, suite, steps, notes)
     if not whole:
         reason, _ = Counter(missing.values()).most_common(1)[0]
         raise AllRunsFailed(folder, {reason: reason}, outcome)
@@ -213,3 +232,15 @@ def _collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any]
     if outcome.scores.has_core:
         storage.replace_json(folder / SCORE, {"agent": results.agent, "suite": suite.name, **asdict(outcome.scores)})
     return outcome
+
+
+def equal_seeds(curves: Mapping[str, np.ndarray]) -> str:
+    """A sentence if all seeds have equal curves on more than a third of the tasks where any run learns, else ""."""
+    several = [curve for curve in curves.values() if len(curve) > 1 and (curve != curve[:1, :1]).any()]
+    equal = sum((curve == curve[0]).all() for curve in several)
+    if not several or equal <= len(several) / 3:
+        return ""
+    return (
+        f"all seeds have the same curve on {equal} of {pluralize(len(several), 'task')}, so intervals over seeds say "
+        f"nothing; expected learn to use its seed: random numbers, weights, the first reset"
+    )

@@ -40,6 +40,7 @@ from pharos.benchmark.contents import (
     number,
     regret_of,
     residuals,
+    run_warnings,
     seeds_text,
     sentence,
     signed,
@@ -115,6 +116,7 @@ def _lead(contents: Contents) -> list[Element]:
         missing = f", and {pluralize(len(own.missing), 'task')} without results" if own.missing else ""
         text = f"Preliminary: {seeds}{missing}; a result has {contents.suite.protocol.seeds} seeds and all tasks."
         lines.append(element("p", text, class_="warning"))
+    lines += [element("p", text, class_="warning") for text in run_warnings(contents.agent.results)]
     if own.below_random:
         lines.append(element("p", f"Worse than random play on {', '.join(own.below_random)}.", class_="warning"))
     return lines
@@ -305,9 +307,10 @@ def _provenance(contents: Contents) -> Element:
         f"gamma {protocol.gamma:g}, horizon {protocol.horizon}",
         "seeds": ", ".join(map(str, own.seeds)),
         "evaluation": f"exact on {how}" if exact else "see agent.json",
+        **({"steps used": f"{steps:,}"} if isinstance(steps := own.record.get("steps_used"), int) else {}),
         **{f"baseline {each.name}": seeds_text(each.results) for each in contents.beside},
         "division": str(own.record.get("division") or "one setting for all tasks"),
-        **{name: excerpt(value) for name, value in own.record.items() if value and name not in ("exact", "division")},
+        **{name: excerpt(value) for name, value in own.record.items() if value and name not in ON_PAGE},
     }
     claims = [
         "Proven: V* and the value of uniform play of each task, solved when the suite was frozen.",
@@ -330,6 +333,10 @@ SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
     _residuals,
     _provenance,
 )
+
+
+ON_PAGE = ("exact", "division", "steps_used", "failed", "notes")
+"""Entries of the record that the page says in words."""
 
 
 def _section(title: str, text: str, *parts: Element) -> Element:

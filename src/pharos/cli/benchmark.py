@@ -91,6 +91,7 @@ def run(
     tasks: Annotated[list[str] | None, "core|AXIS|NAME"] = None,
     name: str | None = None,
     workers: Count | None = None,
+    timeout: float | None = None,
     trust: Trust = False,
 ) -> Answer:
     """Run an agent on the tasks of a suite. The same command resumes; what is finished stays.
@@ -105,6 +106,7 @@ def run(
         tasks: The core, an axis or a task, and no other; several times for more.
         name: Label in tables; the agent's own when not given.
         workers: Processes; as many as processors when not given.
+        timeout: Seconds after which a run of code of your own, or of Stable-Baselines3, is ended, and failed.
     """
     from pharos import benchmark
 
@@ -122,6 +124,7 @@ def run(
                 name=name,
                 hyperparameters=hyperparameters,
                 workers=workers,
+                timeout=timeout,
                 progress=lambda done, text: show(int(1000 * done), text),
             )
         except AllRunsFailed as all_failed:  # the answer says of each why
@@ -138,6 +141,9 @@ def run(
     if outcome.scores.has_core:
         facts += [("score of the core", f"{outcome.score}{', preliminary' if outcome.scores.preliminary else ''}")]
     facts += [(f"frontier of {axis}", f"{each.frontier} {each.unit}") for axis, each in outcome.axes.items()]
+    for runs in outcome.notes.values():
+        which, text = next(iter(runs.items()))
+        facts.append(("note", f"{which}{f' and {len(runs) - 1:,} more' * (len(runs) > 1)}: {text}"))
     facts.append(("results", out))
     answer = {
         "agent": results.agent,
@@ -150,9 +156,32 @@ def run(
         "tasks": [{"name": task, "score": each.to_dict()} for task, each in outcome.scores.tasks.items()],
         "steps_used": outcome.steps_used,
         "failed": missing,
+        "notes": outcome.notes,
         "folder": out,
     }
     return Answer(answer, (f"{results.agent} on {results.suite}", facts), bool(missing))
+
+
+@app.command("check")
+def check(
+    agent: Annotated[str, "AGENT"],
+    *,
+    hyperparameters: Mapping[str, Any] | None = None,
+    workers: Count | None = None,
+    timeout: float = 120.0,
+) -> Answer:
+    """Try an agent on two tiny tasks, and say in one line each what is wrong; exit code 1 if something is.
+
+    Args:
+        agent: As for `benchmark run`, such as file.py:learn.
+        hyperparameters: A hyperparameter, of both tasks.
+        workers: Processes; as many as processors when not given.
+        timeout: Seconds after which a run is ended, and failed.
+    """
+    from pharos import benchmark
+
+    done = benchmark.check_agent(agent, hyperparameters=hyperparameters, workers=workers, timeout=timeout)
+    return Answer(vars(done), str(done), not done)
 
 
 @app.command("report")

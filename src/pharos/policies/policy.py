@@ -95,6 +95,7 @@ def policy_function(policy: PolicyLike, *, masked: bool = False) -> Callable[...
 
 # Observations in one query of a policy.
 BATCH = 4096
+SINGLE, HALF = 1.1e-4, 1e-2  # by which a sum of probabilities may miss 1, of 32 bits and of 16
 SOME = 1024  # rows that stand for all where these are too many for an exact value
 
 
@@ -520,14 +521,22 @@ class PolicyAnswers(QueriedPolicy):
             raise ParameterError(
                 f"the policy answered NaN for {count} observations; expected probabilities, or actions"
             )
-        if answer.shape != (count, self.num_actions) or not (answer >= 0).all():
+        if answer.shape != (count, self.num_actions):
             raise ParameterError(
                 f"the policy answered with shape {answer.shape} of {kind} for {count} observations; expected "
                 f"({count}, {self.num_actions}) probabilities, or ({count},) actions, which are integers"
             )
+        if not (answer >= 0).all():
+            raise ParameterError(
+                f"the policy answered {answer.min():g}, a {kind}; expected probabilities of at least 0, or actions: of "
+                f"values return the argmax, of logits the softmax"
+            )
         total = answer.sum(axis=1, keepdims=True)
-        if not (np.abs(total - 1) <= 1.1e-4).all():
-            raise ParameterError(f"the policy's probabilities sum to {total.min():g}; expected 1")
+        if not (np.abs(total - 1) <= (HALF if kind == np.float16 else SINGLE)).all():
+            raise ParameterError(
+                f"the policy's probabilities sum to {total.min():g}; expected 1: of values return the argmax, of "
+                f"logits the softmax"
+            )
         if self.deterministic:
             return np.eye(self.num_actions)[answer.argmax(axis=1)]
         return answer / total

@@ -119,7 +119,7 @@ def load(source: Source) -> Any:
     try:
         module = _module_of_file(source) if source.module is None else _module_called(source)
         target = getattr(module, source.attribute, None) if source.attribute else None
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a script may end where it is loaded
         raise ParameterError(f"{source.name!r}: {_in_a_line(error)}; {_EXPECTED}") from error
     _LOADED[source.name] = (source, target)
     return target
@@ -260,5 +260,5 @@ def _checksum(file: str | Path) -> str:
     return digest_of_file(file) if file and Path(file).is_file() else ""
 
 
-def _in_a_line(error: Exception) -> str:
+def _in_a_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -19,6 +19,7 @@ from pharos.system import compiling
 PARENT_GONE = 76  # the exit status of a worker that nobody waits for
 CLEAN_SECONDS = 2.0  # until it ends at once
 TERMINATION_SECONDS = 5.0
+SERVER_LOST = 255  # the exit status of a worker when the process that it was forked from is gone
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -31,6 +32,14 @@ def usable_workers(workers: int | None) -> int:
     return int(workers)
 
 
+class Terminated(SystemExit):
+    """SIGTERM in a worker: its `finally` blocks run, and it ends."""
+
+
+class _Begun:
+    """Message of a worker that has imported what it needs and begins its work."""
+
+
 class Workers:
     """Processes that work for this one, each under a key: what they send, and how they end.
 
@@ -38,16 +47,18 @@ class Workers:
     ended.
 
     Args:
-        preload: a module that one process loads, from which the others are forked, where the system can do that; None:
-            each begins anew.
+        preload: modules that one process loads, from which the others are forked, where the system can do that; none
+            (or None): each begins anew.
     """
 
-    def __init__(self, preload: str | None = None):
+    def __init__(self, *preload: str | None):
         self._context: ForkServerContext | SpawnContext = multiprocessing.get_context("spawn")
-        if preload is not None and "forkserver" in multiprocessing.get_all_start_methods():
+        modules = [each for each in preload if each is not None]
+        if modules and "forkserver" in multiprocessing.get_all_start_methods():
             self._context = multiprocessing.get_context("forkserver")
-            self._context.set_forkserver_preload([preload])
+            self._context.set_forkserver_preload(modules)
         self._running: dict[str, tuple[BaseProcess, connection.Connection]] = {}
+        self._begun: set[str] = set()
 
     def __len__(self) -> int:
         return len(self._running)
@@ -92,6 +103,7 @@ class Workers:
                 with without_interrupts():
                     process.start()
         sender.close()
+        self._begun.discard(key)
         self._running[key] = process, receiver
 
     def events(self, seconds: float | None = None) -> Iterator[tuple[str, Any]]:
@@ -107,7 +119,11 @@ class Workers:
             process, receiver = self._running[key]
             try:
                 while not receiver.closed and receiver.poll():
-                    yield key, receiver.recv()
+                    message = receiver.recv()
+                    if isinstance(message, _Begun):
+                        self._begun.add(key)
+                    else:
+                        yield key, message
             except EOFError:
                 receiver.close()
             if sentinel in ready:
@@ -115,7 +131,8 @@ class Workers:
                 process.join()
                 code = process.exitcode
                 process.close()
-                check_guard(code)
+                if key not in self._begun:
+                    check_guard(code)
                 yield key, code
 
     def kill(self, key: str) -> None:
@@ -150,18 +167,19 @@ def _work(
         except OSError:  # nobody listens any more
             sys.exit(1)
 
+    send(_Begun())  # an exit code is that of the work from here on
     function(*arguments, send)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends by itself: an exception in what is given back is printed
 
 
 def end_cleanly() -> None:
-    """Leave interrupts to the process that started this one; on SIGTERM, raise SystemExit, so that `finally` runs.
+    """Leave interrupts to the process that started this one; on SIGTERM, raise Terminated, so that `finally` runs.
 
     A process that SIGTERM kills leaves its semaphores behind, of which Python then warns.
     """
 
     def leave(*_: object) -> None:
-        sys.exit(128 + signal.SIGTERM)
+        raise Terminated(128 + signal.SIGTERM)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, leave)

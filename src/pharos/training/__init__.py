@@ -11,7 +11,17 @@ if TYPE_CHECKING:
     from pharos.mdp import ChanceSetting
     from pharos.regret import ReferenceValues, cumulative_expected_regret, regret
     from pharos.training.batch import train_group
-    from pharos.training.budget import BudgetSpent, Learn, Snapshots, generated_curve, uniform_policy
+    from pharos.training.budget import (
+        BudgetSpent,
+        CountedEnv,
+        Learn,
+        PolicyRecorder,
+        Snapshots,
+        StepBudget,
+        generate,
+        generated_curve,
+        uniform_policy,
+    )
     from pharos.training.curve import Curve, Evaluation, RegretCurve, evaluate_agent
     from pharos.training.execution import (
         ATTEMPTS,

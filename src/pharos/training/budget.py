@@ -15,21 +15,26 @@ of the generator, and `BudgetSpent`, are the end of training; its last policy co
 
 Every copy of the environment counts against the same budget, or refuses to be made or stepped (`CountedEnv`). So a run
 without a single counted step cannot have learnt: if its policy is better or worse than uniform play, it is refused.
+
+A loop that is no generator uses the same parts: `PolicyRecorder` has the environment, takes policies, and makes the
+curve. What looks like a mistake and is no error is a note (`PolicyRecorder.notes`).
 """
 
+import contextlib
 import copy
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NoReturn, SupportsIndex
+from typing import Any, NoReturn, Protocol, SupportsIndex
 
 import gymnasium
 import numpy as np
 
-from pharos.errors import ParameterError
+from pharos.errors import ParameterError, PharosError
 from pharos.interaction import GymEnv
 from pharos.policies import PolicyAnswers, PolicyLike, RecurrentPolicy, SB3Model, deep_policy
+from pharos.system.wording import in_one_line
 from pharos.training.curve import Curve, Evaluation, evaluate_agent
 from pharos.training.task import Task
 
@@ -37,6 +42,19 @@ BLOCK = 4096  # observations that a policy is asked about at once
 LARGEST = 100_000  # states that it is asked about in advance
 KEPT = 1 << 28  # bytes of observations that are kept between snapshots
 TOLERANCE = 1e-9  # of normalised regret: as far from uniform play a policy without a step may be, by rounding
+IGNORED = 1000
+"""Steps beyond the budget, or policies in a row without a step, after which an agent is ended that goes on."""
+OFTEN = 10
+"""A slip that happens more often than this in a run is noted."""
+SHARE = 0.01
+"""Of steps after the end of an episode that is not noted."""
+SAME = 1e-3
+"""Probabilities that differ by less are the same: a network may round in another way."""
+NETWORK_POLICY = "network(torch.as_tensor(seen)).argmax(dim=1).numpy()"
+CHECKED = 3
+"""First policies of a run that are asked a second time."""
+INFO = ("action_mask", "prob")
+"""Entries of `info` that Gymnasium's own environments give as well; others say what an agent is to find out."""
 SEVERAL = (
     "for several at once: gymnasium.vector.SyncVectorEnv([env.copy] * 4), or DummyVecEnv([env.copy] * 4) of "
     "Stable-Baselines3"
@@ -46,18 +64,25 @@ Learn = Callable[[gymnasium.Env, int, int], Iterator[PolicyLike]]
 """learn(env, steps, seed) -> policies, as it learns."""
 
 
-class BudgetSpent(Exception):
-    """The environment was stepped more often than the budget allows: training is over."""
+class BudgetSpent(BaseException):
+    """The environment was stepped more often than the budget allows: training is over.
+
+    It is no `Exception`, so that an agent that catches those around `step` ends as well.
+    """
 
 
 @dataclass
 class StepBudget:
-    """Steps of all copies of an environment together.
+    """Steps of all copies of an environment together, and slips of whoever steps them.
 
     Attributes:
         limit: steps that may be taken. interval: between evaluation points.
         steps, episodes, returns: taken; finished; the sum of the returns of finished ones, without noise and delay.
         at: episodes and returns at the evaluation points so far.
+        refused: steps that were asked for when none was left.
+        after_end: steps between the end of an episode and the next reset.
+        same_seeds: resets with the seed of the reset before.
+        give_up: called instead of refusing once more when IGNORED steps were refused; it does not return.
         process: the one that counts. lock: held during a step.
     """
 
@@ -67,6 +92,10 @@ class StepBudget:
     episodes: int = 0
     returns: float = 0.0
     at: list[tuple[int, float]] = field(default_factory=list)
+    refused: int = 0
+    after_end: int = 0
+    same_seeds: int = 0
+    give_up: Callable[[], NoReturn] | None = None
     process: int = field(default_factory=os.getpid)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -78,6 +107,15 @@ class StepBudget:
                 f"process {os.getpid()} (AsyncVectorEnv, SubprocVecEnv, a fork); {SEVERAL}"
             )
 
+    def check_left(self) -> None:
+        """Raise BudgetSpent if no step is left, and end an agent that asks for more all the same."""
+        if self.steps < self.limit:
+            return
+        self.refused += 1
+        if self.refused > IGNORED and self.give_up is not None:
+            self.give_up()
+        raise BudgetSpent(f"{self.limit:,} steps are taken")
+
 
 class CountedEnv(gymnasium.Wrapper):
     """The environment of a task, whose steps count against a budget.
@@ -88,20 +126,29 @@ class CountedEnv(gymnasium.Wrapper):
 
     `copy.copy` and `copy.deepcopy` give an environment of its own in the same state, with the same budget. It cannot be
     pickled, nor be used in another process than the one that made it: nobody would count there.
+
+    `info` has nothing of what an agent is to learn: neither the state nor its index, neither the executed action nor
+    what was earned without noise; INFO is what is left. Episodes begin where the task says: `reset` takes no options.
     """
 
     def __init__(self, task: Task, budget: StepBudget, seed: int):
         super().__init__(GymEnv(task.env, **task.interaction))
-        self.task, self.budget, self.seed = task, budget, seed
+        self.budget, self.seed = budget, seed
         self.seeds = np.random.SeedSequence(seed)
         self.action_space.seed(seed)
-        self._return, self._is_seeded = 0.0, False
+        self._task, self._return, self._is_seeded, self._is_over = task, 0.0, False, False
         self._last_seed: int | None = None  # of a reset that no step has followed
+        self._seed_before: int | None = None  # of the last reset that had one
+
+    @property
+    def steps(self) -> int:
+        """Steps that may be taken, of all copies together."""
+        return self.budget.limit
 
     def copy(self) -> "CountedEnv":
         """A new environment of the same task and budget, with random numbers of its own."""
         (child,) = self.seeds.spawn(1)
-        return CountedEnv(self.task, self.budget, int(child.generate_state(1)[0]))
+        return CountedEnv(self._task, self.budget, int(child.generate_state(1)[0]))
 
     def __copy__(self) -> "CountedEnv":
         return self.__deepcopy__({})
@@ -110,6 +157,7 @@ class CountedEnv(gymnasium.Wrapper):
         twin = memo[id(self)] = self.copy()
         if self._is_seeded:  # it has a state
             twin.env, twin._return, twin._is_seeded = copy.deepcopy(self.env, memo), self._return, True
+            twin._is_over = self._is_over
         return twin
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
@@ -123,38 +171,52 @@ class CountedEnv(gymnasium.Wrapper):
 
         Raises:
             ParameterError: it was made in another process; or it was just reset with the seed before, as a vector
-                environment does in which one environment stands several times.
+                environment does in which one environment stands several times; or it has options.
         """
         self.budget.check_process()
+        if options:
+            raise ParameterError(
+                f"reset has the options {', '.join(map(str, options))}; expected none: episodes of the benchmark begin "
+                f"where the task says"
+            )
         if seed is not None and self._last_seed == seed - 1:
             raise ParameterError(
                 f"the environment of the benchmark was reset with seed {self._last_seed}, then with {seed}, without a "
                 f"step between: it stands several times in a vector environment; {SEVERAL}"
             )
         self._last_seed = seed
-        if seed is None and not self._is_seeded:
+        if seed is not None:
+            self.budget.same_seeds += seed == self._seed_before
+            self._seed_before = seed
+        elif not self._is_seeded:
             seed = self.seed
-        self._return, self._is_seeded = 0.0, True
-        return self.env.reset(seed=seed, options=options)
+        self._return, self._is_seeded, self._is_over = 0.0, True, False
+        observation, info = self.env.reset(seed=seed)
+        return observation, _public(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step as in Gymnasium. Raises BudgetSpent if no steps are left, ParameterError in another process."""
         budget = self.budget
         budget.check_process()
         with budget.lock:  # of threads
-            if budget.steps >= budget.limit:
-                raise BudgetSpent(f"{budget.limit:,} steps are taken")
+            budget.check_left()
             observation, reward, terminated, truncated, info = self.env.step(action)
             budget.steps += 1
             self._last_seed = None
             self._return += float(info.get("earned_reward", reward))
-            if terminated or truncated:
+            if self._is_over:
+                budget.after_end += 1
+            elif terminated or truncated:
                 budget.episodes += 1
                 budget.returns += self._return
-                self._return = 0.0
+                self._is_over = True
             if budget.steps % budget.interval == 0:
                 budget.at.append((budget.episodes, budget.returns))
-        return observation, float(reward), terminated, truncated, info
+        return observation, float(reward), terminated, truncated, _public(info)
+
+
+def _public(info: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: info[name] for name in INFO if name in info}
 
 
 class Snapshots:
@@ -163,13 +225,15 @@ class Snapshots:
     def __init__(self, task: Task):
         self.task = task
         self._kept: list[tuple[int, Any]] | None = None
+        self._num_checked = 0
 
     def taken(self, policy: PolicyLike) -> PolicyLike | Evaluation:
         """The current policy as (S, A) probabilities; or its value if it sees more than the state, or there are too
         many states.
 
         Raises:
-            ParameterError: it answers something else than actions or probabilities.
+            ParameterError: it raises, it answers something else than actions or probabilities, or one of the first
+                CHECKED policies answers something else when it is asked again.
         """
         task = self.task
         if isinstance(policy, SB3Model):
@@ -181,7 +245,13 @@ class Snapshots:
         if task.observer.observe.observation.irrelevant:
             states = np.arange(task.mdp.num_states)
             return answers.query(states * answers.width + (answers.width - 1))
-        return np.concatenate([answers.answer(observations, count) for count, observations in self._observations()])
+        tables = []
+        for count, observations in self._observations():
+            tables.append(_answer(answers, policy, observations, count))
+            if len(tables) == 1 and self._num_checked < CHECKED:
+                self._num_checked += 1
+                _check_again(tables[0], _answer(answers, policy, observations, count))
+        return np.concatenate(tables)
 
     def _observations(self) -> Iterator[tuple[int, Any]]:
         """Blocks of observations of all states, kept where they are small."""
@@ -200,6 +270,143 @@ class Snapshots:
             self._kept = blocks
 
 
+def _answer(answers: PolicyAnswers, policy: PolicyLike, observations: Any, count: int) -> np.ndarray:
+    """(N, A) probabilities; ParameterError, one line that says what was asked, for an error in the policy's code."""
+    try:
+        return answers.answer(observations, count)
+    except PharosError:
+        raise
+    except Exception as error:
+        kind = f"{getattr(observations, 'shape', '')} {getattr(observations, 'dtype', '')}".strip()
+        hint = "" if not hasattr(policy, "state_dict") else "; of a network: lambda seen: " + NETWORK_POLICY
+        raise ParameterError(
+            f"the policy raised {in_one_line(error)}, asked about {count} observations, an array {kind}; expected a "
+            f"function of such arrays that returns ({count}, A) probabilities or ({count},) actions{hint}"
+        ) from error
+
+
+def _check_again(table: np.ndarray, again: np.ndarray) -> None:
+    """Raise ParameterError for a policy whose second answer is another one than the first."""
+    differ = np.abs(table - again).max(axis=1) > SAME
+    if differ.any():
+        raise ParameterError(
+            f"the policy was asked twice, and answered otherwise for {differ.sum():,} of {len(table):,} observations; "
+            f"expected the same: return (N, A) probabilities instead of sampled actions, and switch dropout off"
+        )
+
+
+class Recorder(Protocol):
+    """An environment with a budget, and what becomes of the policies that are learnt on it."""
+
+    env: CountedEnv
+    budget: StepBudget
+
+    def record(self, policy: PolicyLike) -> None:
+        """Let a policy be the one in force from this step on."""
+        ...
+
+
+class PolicyRecorder:
+    """A run: an environment with a budget, policies as they are learnt, and the curve that they make.
+
+    A policy is asked about every state when it is recorded; it is evaluated when the curve is asked for.
+
+    Args:
+        task: of the run.
+        steps: that may be taken. evaluations: points of the curve.
+        seed: of the environment.
+    Attributes:
+        env: the environment. budget: its steps so far.
+        count: policies so far.
+    """
+
+    def __init__(self, task: Task, *, steps: int, evaluations: int, seed: int):
+        self.task, self.evaluations = task, evaluations
+        self.budget = StepBudget(steps, steps // evaluations)
+        self.env = CountedEnv(task, self.budget, seed)
+        self.count = 0
+        self._first_step = steps  # of the first policy
+        self._snapshots = Snapshots(task)
+        self._last: PolicyLike | Evaluation = uniform_policy(task)
+        self._in_force: list[PolicyLike | Evaluation] = [self._last]  # at the start, and at each point so far
+        self._values: dict[int, tuple[PolicyLike | Evaluation, Evaluation]] = {}  # of policies by id, kept alive
+
+    def record(self, policy: PolicyLike) -> None:
+        """Let a policy be the one in force from this step on.
+
+        Raises:
+            ParameterError: it is no policy, or the second one and no step was counted.
+        """
+        if self.count and not self.budget.steps:
+            raise not_stepped(self.budget.limit)
+        num_points = (self.budget.steps - 1) // self.budget.interval  # evaluation points before this step
+        self._in_force += [self._last] * (num_points + 1 - len(self._in_force))
+        self._last = self._snapshots.taken(policy)
+        if not self.count:
+            self._first_step = self.budget.steps
+        self.count += 1
+
+    def curve(self) -> Curve:
+        """The curve, with the last policy in force at all points that were not reached.
+
+        Raises:
+            ParameterError: it ends with another policy than uniform play, and no step was counted.
+        """
+        budget = self.budget
+        in_force = self._in_force + [self._last] * (self.evaluations + 1 - len(self._in_force))
+        at = budget.at + [(budget.episodes, budget.returns)] * (self.evaluations - len(budget.at))
+        curve = Curve(self.task, counted_steps=budget.steps)
+        for place, (policy, ended) in enumerate(zip(in_force, [(0, 0.0), *at], strict=True)):
+            if id(policy) not in self._values:
+                value = policy if isinstance(policy, Evaluation) else evaluate_agent(policy, self.task)
+                self._values[id(policy)] = policy, value
+            curve.add(place * budget.interval, *ended, policy, self._values[id(policy)][1])
+        uniform, ended_with = (curve.rows[place]["normalized_regret"] for place in (0, -1))
+        if not budget.steps and abs(ended_with - uniform) > TOLERANCE:
+            raise not_stepped(budget.limit)
+        return curve
+
+    def notes(self) -> dict[str, str]:
+        """Sentences on what looks like a mistake of the agent, by kind: found, expected, what to try."""
+        budget, points = self.budget, self.evaluations
+        notes = {}
+        random = min(points, max(0, -(-self._first_step // budget.interval) - 1))
+        if not self.count:
+            notes["no policy"] = (
+                f"yielded no policy: all {points} evaluations are random play; expected one from time to time, such as "
+                f"every {budget.interval:,} steps"
+            )
+        elif random > points / 2:
+            notes["late policy"] = (
+                f"its first policy came after {self._first_step:,} of {budget.limit:,} steps: {random} of {points} "
+                f"evaluations are random play; expected one about every {budget.interval:,} steps"
+            )
+        if budget.after_end > SHARE * budget.steps:
+            notes["steps after an end"] = (
+                f"{budget.after_end / budget.steps:.0%} of {budget.steps:,} steps came after the end of an episode; "
+                f"expected reset() after a step that is terminated or truncated"
+            )
+        if budget.same_seeds > OFTEN and _has_chance(self.task):
+            notes["same seed"] = (
+                f"{budget.same_seeds:,} resets had the seed of the reset before, so that chance repeats itself; "
+                f"expected a seed in the first reset alone"
+            )
+        if budget.refused > OFTEN:
+            notes["steps beyond the budget"] = (
+                f"asked for {budget.refused:,} steps beyond its {budget.limit:,}, which were refused; expected its "
+                f"loop to end: catch no BudgetSpent (`except:`, `except BaseException`) around step"
+            )
+        if self.count and budget.steps < budget.limit / 2:
+            notes["few steps"] = (
+                f"used {budget.steps:,} of {budget.limit:,} steps; its last policy counts from there on"
+            )
+        return notes
+
+
+def _has_chance(task: Task) -> bool:
+    return bool(task.chance.to_dict()) or task.mdp.dynamics.has_chance or len(task.mdp.start_states) > 1
+
+
 def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, seed: int) -> Curve:
     """Train with a generator, and evaluate the policy in force at each evaluation point, and uniform play before.
 
@@ -209,33 +416,40 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
         ParameterError: it is no generator of policies; or it has a second policy, or ends with another one than uniform
             play, when no step was counted; or whatever its code raises.
     """
-    budget = StepBudget(steps, steps // evaluations)
-    snapshots = Snapshots(task)
-    last: PolicyLike | Evaluation = uniform_policy(task)
-    counting: list[PolicyLike | Evaluation] = [last]
+    recorder = PolicyRecorder(task, steps=steps, evaluations=evaluations, seed=seed)
+    generate(learn, recorder, seed)
+    return recorder.curve()
+
+
+def generate(learn: Callable[..., Any], recorder: Recorder, seed: int) -> None:
+    """Train with a generator, and record its policies until it, or its budget, has ended; raises as `generated_curve`.
+
+    After a refused step one more policy counts. A generator that yields IGNORED policies in a row without a step is
+    refused, or, if its budget is spent, has ended.
+    """
+    budget = recorder.budget
+    before, idle = 0, 0
+    policies = None
     try:
-        policies = learn(CountedEnv(task, budget, seed), steps, seed)
+        policies = learn(recorder.env, budget.limit, seed)
         if not isinstance(policies, Iterator):
             raise ParameterError(f"learn(env, steps, seed) returned {policies!r}; expected a generator: yield policies")
-        for number, policy in enumerate(policies):
-            if number and not budget.steps:
-                raise not_stepped(steps)
-            num_points = (budget.steps - 1) // budget.interval  # evaluation points before this step
-            counting += [last] * (num_points + 1 - len(counting))
-            last = snapshots.taken(policy)
+        for policy in policies:
+            recorder.record(policy)
+            idle = idle + 1 if budget.steps == before else 0
+            before = budget.steps
+            if budget.refused or (idle >= IGNORED and budget.steps == budget.limit):
+                break
+            if idle >= IGNORED:
+                raise ParameterError(
+                    f"learn yielded {idle:,} policies in a row without a step, after {budget.steps:,} of "
+                    f"{budget.limit:,}; expected it to step the environment, or to end"
+                )
     except BudgetSpent:
         pass
-    counting += [last] * (evaluations + 1 - len(counting))
-    budget.at += [(budget.episodes, budget.returns)] * (evaluations - len(budget.at))
-    curve, values = Curve(task, counted_steps=budget.steps), {}
-    for place, (counted, ended) in enumerate(zip(counting, [(0, 0.0), *budget.at], strict=True)):
-        if id(counted) not in values:
-            values[id(counted)] = counted if isinstance(counted, Evaluation) else evaluate_agent(counted, task)
-        curve.add(place * budget.interval, *ended, counted, values[id(counted)])
-    uniform, ended_with = (curve.rows[place]["normalized_regret"] for place in (0, -1))
-    if not budget.steps and abs(ended_with - uniform) > TOLERANCE:
-        raise not_stepped(steps)
-    return curve
+    finally:
+        with contextlib.suppress(Exception, BudgetSpent):  # of its `finally` blocks, or that it goes on
+            getattr(policies, "close", int)()
 
 
 def not_stepped(steps: int) -> ParameterError:

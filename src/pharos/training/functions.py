@@ -6,7 +6,7 @@ seed alone.
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,10 @@ from pharos.policies import PolicyLike
 from pharos.regret import regret
 from pharos.training.budget import (
     TOLERANCE,
-    BudgetSpent,
     CountedEnv,
     Snapshots,
     StepBudget,
+    generate,
     not_stepped,
     uniform_policy,
 )
@@ -41,7 +41,12 @@ class GeneratorLearner:
         (run,) = runs
         self.run, self.function = run, learn
         self.budget = StepBudget(run.config.steps, run.config.evaluation_interval)
+        self.env = CountedEnv(run.task, self.budget, run.config.seed)
+        self.count = 0  # policies so far
         self.in_force: PolicyLike | Evaluation = uniform_policy(run.task)
+        self._snapshots = Snapshots(run.task)
+        self._waiting: deque[int] = deque()  # points to come
+        self._at_point: Callable[[int], object]
         self.ended = (0, 0.0)  # episodes, and the sum of their returns, at the point that is evaluated
 
     @property
@@ -59,35 +64,30 @@ class GeneratorLearner:
             ParameterError: it is no generator; or it has a second policy, or ends with another one than uniform play,
                 when no step was counted; or whatever its code raises.
         """
-        budget, run, waiting = self.budget, self.run, deque(points)
-
-        def evaluate(step: float) -> None:
-            """Evaluate the policy in force at the points before a step."""
-            while waiting and waiting[0] < step:
-                point = waiting.popleft()
-                number = point // budget.interval
-                is_passed = point % budget.interval == 0 and number <= len(budget.at)
-                self.ended = budget.at[number - 1] if is_passed else (budget.episodes, budget.returns)
-                at_point(point)
-
-        seed, snapshots = run.config.seed, Snapshots(run.task)
-        try:
-            policies = self.function(CountedEnv(run.task, budget, seed), budget.limit, seed, **run.hyperparameters)
-            if not isinstance(policies, Iterator):
-                raise ParameterError(
-                    f"learn(env, steps, seed) returned {policies!r}; expected a generator: yield policies"
-                )
-            for number, policy in enumerate(policies):
-                if number and not budget.steps:
-                    raise not_stepped(budget.limit)
-                evaluate(budget.steps)
-                self.in_force = snapshots.taken(policy)
-        except BudgetSpent:
-            pass
-        run.curve.counted_steps = budget.steps
-        if not budget.steps:
+        self._waiting, self._at_point = deque(points), at_point
+        generate(partial(self.function, **self.run.hyperparameters), self, self.run.config.seed)
+        self.run.curve.counted_steps = self.budget.steps
+        if not self.budget.steps:
             self._check_uniform()
-        evaluate(math.inf)
+        self._evaluate(math.inf)
+
+    def record(self, policy: PolicyLike) -> None:
+        """Let a policy be the one in force from this step on. ParameterError: the second one, and no step counted."""
+        if self.count and not self.budget.steps:
+            raise not_stepped(self.budget.limit)
+        self._evaluate(self.budget.steps)
+        self.in_force = self._snapshots.taken(policy)
+        self.count += 1
+
+    def _evaluate(self, step: float) -> None:
+        """Evaluate the policy in force at the points before a step."""
+        budget = self.budget
+        while self._waiting and self._waiting[0] < step:
+            point = self._waiting.popleft()
+            number = point // budget.interval
+            is_passed = point % budget.interval == 0 and number <= len(budget.at)
+            self.ended = budget.at[number - 1] if is_passed else (budget.episodes, budget.returns)
+            self._at_point(point)
 
     def _check_uniform(self) -> None:
         task = self.run.task
