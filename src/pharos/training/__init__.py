@@ -17,7 +17,6 @@ if TYPE_CHECKING:
         ATTEMPTS,
         EXIT_BUSY,
         Execution,
-        Pool,
         TrainingProgress,
         Work,
         check_device,
