@@ -85,7 +85,7 @@ def _dependencies(config: Mapping[str, Any]) -> dict[str, Any]:
 def train_batch(
     configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], checkpoints: Path, *, device: str = "cpu"
 ) -> list[str | None]:
-    """Train runs in this process, with the values that the study has solved already."""
+    """Train runs in this process with values that the study has solved already; the error of a single run is raised."""
     from pharos.training import FailedRun, PreparedRun, TaskCache, TaskValues, train_group
 
     def values(config: RunConfig) -> TaskValues | None:
@@ -105,7 +105,7 @@ def train_batch(
                     errors[place] = together
 
     runs = [PreparedRun(i, RunConfig.from_dict(config), folders[i], tasks) for i, config in enumerate(configs)]
-    train_group(runs, checkpoints, tell, is_single=len(runs) == 1)
+    train_group(runs, checkpoints, tell, is_single=len(runs) == 1, raises=len(runs) == 1)
     return errors
 
 

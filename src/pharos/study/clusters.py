@@ -17,6 +17,7 @@ from pharos.study.execution import Status, StudyExecution, claim, opened, run, s
 from pharos.study.specification import Source, specification
 from pharos.system.records import takes
 from pharos.system.wording import in_one_line
+from pharos.system.workers import Workers
 from pharos.training import ATTEMPTS, ExecutionOptions
 
 
@@ -115,18 +116,19 @@ def run_on_ray(
     return StudyExecution(study, place.absolute(), own, runner, batch_runner, progress, pool).run()
 
 
-class RayTasks:
+class RayTasks(Workers):
     """A pool of tasks on a Ray cluster, one processor each, which Ray begins again when their processes die."""
 
     def __init__(self, ray: Any, address: str | None):
         self.ray, self.address = ray, address
         self.is_ours = not ray.is_initialized()
-        self._running: dict[Any, str] = {}
+        self.tasks: dict[Any, str] = {}
 
-    def __enter__(self) -> None:
+    def __enter__(self) -> "RayTasks":
         if self.is_ours:
             dashboard = None if self.address else False
             self.ray.init(address=self.address, log_to_driver=False, include_dashboard=dashboard)
+        return self
 
     def __exit__(self, *_: object) -> None:
         if self.is_ours:
@@ -134,12 +136,12 @@ class RayTasks:
 
     def start(self, key: str, function: Any, arguments: Sequence[Any], definitions: Sequence[object] = ()) -> None:
         remote = self.ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_attempt)
-        self._running[remote.remote(*arguments)] = key
+        self.tasks[remote.remote(*arguments)] = key
 
     def events(self, seconds: float | None = None) -> Iterator[tuple[str, Any]]:
         """Yield what tasks have sent, and how they ended: an exit code, or the error of Ray."""
-        for reference in self.ray.wait(list(self._running), num_returns=1, timeout=seconds)[0]:
-            key = self._running.pop(reference)
+        for reference in self.ray.wait(list(self.tasks), num_returns=1, timeout=seconds)[0]:
+            key = self.tasks.pop(reference)
             try:
                 *messages, code = self.ray.get(reference)
             except Exception as error:  # of Ray: `attempt` keeps those of the run itself

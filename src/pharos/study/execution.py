@@ -28,7 +28,7 @@ from pharos.study.status import Forecast, Status, claim, duration, opened, statu
 from pharos.system.records import takes
 from pharos.system.storage import replace_json
 from pharos.system.workers import Workers, usable_workers
-from pharos.training import Execution, ExecutionOptions, Pool, Work
+from pharos.training import Execution, ExecutionOptions, Work
 
 __all__ = ["Status", "StudyExecution", "claim", "duration", "opened", "run", "shard_of", "status"]
 
@@ -39,11 +39,7 @@ OTHERS_SECONDS = 20.0
 
 def train(config: Mapping[str, Any], folder: Path) -> None:
     """Train a run as `config` says, and write run.json and curve.csv into `folder`: the runner of studies."""
-    from pharos.training import TaskValues, train_config
-
-    values = _batches.stored_values(config)
-    task_values = None if values is None else TaskValues.from_dict(values)
-    train_config(config, folder, values=task_values, trust=True, strict=True)
+    _batches.train_batch([config], [folder], folder)
 
 
 def shard_of(runs: Sequence[Run], shard: str | tuple[int, int] | None) -> tuple[Run, ...]:
@@ -122,7 +118,7 @@ class StudyExecution(Execution[Run]):
         runner: _worker.Runner = train,
         batch_runner: _worker.BatchRunner | None = None,
         progress: Callable[[Status], None] | None = None,
-        pool: Pool | None = None,
+        pool: Workers | None = None,
     ):
         self.study, self.folder, self.options, self.progress = study, folder, options, progress
         self.runs = shard_of(study.runs, options.shard)

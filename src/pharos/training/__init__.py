@@ -27,7 +27,6 @@ if TYPE_CHECKING:
         ATTEMPTS,
         EXIT_BUSY,
         Execution,
-        Pool,
         TrainingProgress,
         Work,
         check_device,

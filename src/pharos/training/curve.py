@@ -8,7 +8,7 @@ import os
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -85,22 +85,13 @@ def evaluate_agent(
     )
 
 
-@runtime_checkable
-class BestActions(Protocol):
-    """Policies of several runs that act at once."""
-
-    def best_actions(self, states: np.ndarray) -> np.ndarray:
-        """(N,) the greedy action of each run in its own state (N,), or history (N, k)."""
-        ...
-
-
 def joint_values(batch: Learner, runs: "Sequence[PreparedRun]") -> dict[int, Evaluation]:
     """Values of policies by place in the batch, where computing them at once costs less; others are left out.
 
     These are policies of DQN where nothing is random, and of runs that share a task of few states and see one frame.
     """
     walks: list[int] = []
-    if isinstance(batch, BestActions):
+    if hasattr(batch, "best_actions"):
         walks = [i for i, each in enumerate(runs) if each.error is None and _walks(each)]
     values = _values_of_walks(batch, runs, walks)
     tasks = defaultdict(list)
@@ -126,8 +117,7 @@ def _values_of_walks(batch: Learner, runs: "Sequence[PreparedRun]", places: Sequ
     """Values by place: an episode of T steps costs T calls of the networks of all runs at once, not of each."""
     if not places:
         return {}
-    assert isinstance(batch, BestActions)
-    best_actions = batch.best_actions
+    best_actions = getattr(batch, "best_actions")  # noqa: B009  (which not every learner has)
     frames = _frames(runs[places[0]])
     states = np.zeros((len(runs), frames) if frames > 1 else len(runs), np.int64)
 

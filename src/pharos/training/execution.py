@@ -12,7 +12,7 @@ import signal
 import time
 import warnings
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -52,22 +52,6 @@ Work = tuple[Callable[..., Any], Sequence[Any], Sequence[object]]
 """function, its arguments but for the last, `send(message)`, and the classes and functions that it needs."""
 
 
-class Pool(Protocol):
-    """Processes, as `pharos.system.workers.Workers`."""
-
-    def __enter__(self) -> object: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def start(
-        self, key: str, function: Callable[..., Any], arguments: Sequence[Any], definitions: Sequence[object] = ()
-    ) -> None: ...
-
-    def events(self, seconds: float | None = None) -> Iterator[tuple[str, Any]]: ...
-
-    def kill(self, key: str) -> None: ...
-
-
 class Execution(Generic[R]):
     """Groups of runs that wait, are trained, and end; a subclass says what a run is, and where its result lies.
 
@@ -88,7 +72,7 @@ class Execution(Generic[R]):
     def __init__(
         self,
         groups: Iterable[Sequence[R]],
-        pool: Pool | None,
+        pool: Workers | None,
         *,
         workers: float,
         checkpoints: Path | None,

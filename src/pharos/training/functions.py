@@ -16,7 +16,6 @@ import numpy as np
 from pharos.agents import COMPILED, GENERATOR, register_form
 from pharos.errors import ParameterError
 from pharos.policies import PolicyLike
-from pharos.regret import regret
 from pharos.training.budget import (
     TOLERANCE,
     CountedEnv,
@@ -67,9 +66,10 @@ class GeneratorLearner:
         self._waiting, self._at_point = deque(points), at_point
         generate(partial(self.function, **self.run.hyperparameters), self, self.run.config.seed)
         self.run.curve.counted_steps = self.budget.steps
-        if not self.budget.steps:
-            self._check_uniform()
         self._evaluate(math.inf)
+        first, last = (self.run.curve.rows[place]["normalized_regret"] for place in (0, -1))
+        if not self.budget.steps and abs(last - first) > TOLERANCE:
+            raise not_stepped(self.budget.limit)
 
     def record(self, policy: PolicyLike) -> None:
         """Let a policy be the one in force from this step on. ParameterError: the second one, and no step counted."""
@@ -88,16 +88,6 @@ class GeneratorLearner:
             is_passed = point % budget.interval == 0 and number <= len(budget.at)
             self.ended = budget.at[number - 1] if is_passed else (budget.episodes, budget.returns)
             self._at_point(point)
-
-    def _check_uniform(self) -> None:
-        task = self.run.task
-        values = [
-            each.value if isinstance(each, Evaluation) else evaluate_agent(each, task).value
-            for each in (self.in_force, uniform_policy(task))
-        ]
-        last, uniform = (regret(value, task.reference, normalized_by="uniform") for value in values)
-        if abs(last - uniform) > TOLERANCE:
-            raise not_stepped(self.budget.limit)
 
     def policy(self, i: int) -> PolicyLike | Evaluation:
         return self.in_force
