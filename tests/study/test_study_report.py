@@ -259,6 +259,13 @@ def test_a_report_begins_with_who_won_by_how_much_and_how_sure_that_is(tmp_path,
     assert re.search(r"PPO, \w+: \d\.\d\d, \d\.\d\d more on \d tasks? \(95 % interval .* p [<=] ", first)
 
 
+def test_a_report_says_where_chance_is_of_the_world(tmp_path, sketched):
+    slippery = {"name": "frozen_lake", "parameters": {"slippery": True}}
+    _, page = report_of(tmp_path, agents=["ppo"], environments=[slippery, "frozen_lake/4x4"])
+    text = " ".join(page.text)
+    assert "of the world" in text and "plain" in text
+
+
 def test_estimated_regret_is_marked_and_its_half_width_stands_in_the_summary(tmp_path, sketched):
     def estimate(spec):
         file = tmp_path / "runs" / spec.runs[0].id / "curve.parquet"

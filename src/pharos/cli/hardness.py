@@ -165,7 +165,7 @@ def _setting(mdp: "TabularMDP", horizon: int | None, chance: Chance) -> str:
 
 
 # Widths of the column of values: of all, and of measures whose values are several numbers.
-VALUE, LONG_VALUES = 28, {**dict.fromkeys(IDEALISED, 50), "stationary_effective_horizon": 36, "covering": 68}
+VALUE, LONG_VALUES = 28, {**dict.fromkeys(IDEALISED, 50), "stationary_effective_horizon": 30, "covering": 68}
 
 
 class _Table:

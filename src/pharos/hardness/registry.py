@@ -82,7 +82,7 @@ class Problem:
                 self.mdp,
                 self.tolerance,
                 keep_all=self.mdp.horizon is not None and self._is_small,
-                progress=self.of_solver("the optimal values"),
+                progress=self._on_sweep,
                 values=None if self.folder is None or self.mdp.horizon is not None else self.folder / "optimal.npy",
             )
         except MeasureUnfinished as error:
@@ -120,9 +120,8 @@ class Problem:
             self.clock.check(line)
         self._show(what, line)
 
-    def of_solver(self, what: str) -> Callable[[int, float], None]:
-        """Progress callback of a solver, which keeps to the budget."""
-        return lambda sweeps, bound: self.report(what, f"sweep {sweeps} of {what}, error at most {bound:.2g}")
+    def _on_sweep(self, sweeps: int, bound: float) -> None:
+        self.report("values", f"sweep {sweeps} of the optimal values, error at most {bound:.2g}")
 
     def reporter(self, what: str) -> Callable[[str], None]:
         """Progress callback of a measure, which keeps to the budget."""

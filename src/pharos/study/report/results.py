@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pharos.agents import TABULAR_OBSERVATION
+from pharos.errors import PharosError
 from pharos.study.aliasing import aliasing_table, with_aliasing
 from pharos.study.analysis import PAPER_AGENTS, REGRETS, Models, PaperComparison, compare, intervals, models
 from pharos.study.findings import findings
@@ -59,6 +61,18 @@ class Results:
     def agents(self) -> list[str]:
         """Agents that see observations, DQN first; those that see the index of the state have no models."""
         return observing_agents(self.runs)
+
+    @cached_property
+    def chances(self) -> dict[tuple[str, str], str]:
+        """Kinds of chance in words by instance and kind: "of the world" where the rules have chance."""
+        words: dict[tuple[str, str], str] = {}
+        for run in self.study.runs:
+            if (key := (run.instance, run.chance)) not in words:
+                try:
+                    words[key] = run.chance_in_words
+                except PharosError:  # of a class that is not there
+                    words[key] = run.chance
+        return words
 
     @property
     def notes(self) -> list[str]:

@@ -139,7 +139,8 @@ def _other_winners(results: Results) -> list[str]:
     row = tasks.loc[(tasks["most_regret"] - tasks["least_regret"]).idxmax()]
     many = pluralize(results.other_winners.attrs["tasks"], "task")
     return [
-        f"Returns and regret order them differently in {len(tasks)} of {many}. On {row['instance']} ({row['chance']}) "
+        f"Returns and regret order them differently in {len(tasks)} of {many}. On {row['instance']} "
+        f"(chance: {results.chances[row['instance'], row['chance']]}) "
         f"{label(*row['most'])} has the highest return ({row['most_return']:.2f}) and a regret of "
         f"{row['most_regret']:.2f}; {label(*row['least'])} has the least regret ({row['least_regret']:.2f}) and a "
         f"return of {row['least_return']:.2f}. Returns are of episodes played while learning, exploration included; "
@@ -307,12 +308,18 @@ def _hardness(results: Results) -> Section:
         "Hardness of the instances",
         "hardness",
         table=table(
-            results.hardness,
+            _worded(results, results.hardness),
             "The tabular measures of each instance under each kind of chance, as they enter the models; notes say "
             "where one is of the instance without chance, or stands for a proven interval.",
         ),
         complete=complete,
     )
+
+
+def _worded(results: Results, rows: "pd.DataFrame") -> "pd.DataFrame":
+    """Rows with their kinds of chance in words."""
+    keys = zip(rows["instance"], rows["chance"], strict=True)
+    return rows.assign(chance=[results.chances.get(key, key[1]) for key in keys])
 
 
 def _returns(results: Results) -> Section:
@@ -322,7 +329,8 @@ def _returns(results: Results) -> Section:
         wide = wide_returns(results.cells, environment, _return).fillna("")
         wide.columns = [label(*key) for key in wide]
         latex = returns_table(results.cells, environment)
-        parts.append({"title": in_words(environment), "table": table(wide.reset_index()), "latex": latex})
+        shown = _worded(results, wide.reset_index())
+        parts.append({"title": in_words(environment), "table": table(shown), "latex": latex})
     return Section("Returns", "returns", parts=parts)
 
 
