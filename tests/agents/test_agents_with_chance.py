@@ -62,7 +62,7 @@ def test_networks_learn_and_their_regret_is_that_of_the_policy_read_off_them(age
     assert run.curve[-1]["expected_regret"] == pytest.approx(result["final_regret"], abs=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_policies_over_observations_are_worth_what_their_tables_are(task):
     policy = np.random.default_rng(0).dirichlet(np.ones(4), task.space.num_states)
     vectors = pharos.observe(task.env, "vector")(task.space.states())

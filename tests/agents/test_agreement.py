@@ -52,6 +52,7 @@ def test_both_studies_have_the_same_cells(agreement):
     assert {run.engine for run in both[1]} == {"batched"} and not {a.id for a in both[0]} & {b.id for b in both[1]}
 
 
+@pytest.mark.long
 def test_as_many_runs_as_needed_show_equal_means_with_the_power_that_is_said(agreement):
     deviation, generator = 0.1, np.random.default_rng(0)
     runs_sb3 = round(agreement.runs_needed(deviation) / agreement.RESERVE)

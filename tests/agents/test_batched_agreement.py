@@ -64,7 +64,7 @@ def task(request):
     return Task.of(make("frozen_lake/4x4"), observation=request.param)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("max_grad_norm", (0.05, 10.0))
 def test_updates_of_dqn_are_those_of_stable_baselines3(task, max_grad_norm):
     check_updates_of_dqn(task, {**DQN, "max_grad_norm": max_grad_norm}, 6)

@@ -63,6 +63,7 @@ def test_commands_of_the_page_are_there():
         assert all(word in options for word in words if word.startswith("--")), line
 
 
+@pytest.mark.long
 def test_the_agent_of_the_page_learns(tmp_path):
     code = re.search(r"```python\n(# mine.py\n.*?)```", PAGE, re.DOTALL)[1]
     space = {}

@@ -111,7 +111,7 @@ def test_differences_of_frontiers_beyond_the_ladder():
     assert frontier_difference(inside, below) == ConfidenceInterval(4.0, 4 - math.hypot(1, 1), math.inf, "above")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_agent_differs_from_itself_in_one_of_twenty_comparisons():
     found = [compared(drawn(2 * seed), drawn(2 * seed + 1)) for seed in range(1000)]
     for p_values in ([each.core.p_value for each in found], [each.axes["noise"].score.p_value for each in found]):

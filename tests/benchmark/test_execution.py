@@ -301,7 +301,7 @@ def test_what_is_no_generator_is_refused(suite, tmp_path):
 # Folders --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_file_runs_in_processes_to_the_same_bytes(suite, file, tmp_path):
     found = [
         benchmark.run(f"{file}:learn", suite, out=tmp_path / str(workers), seeds=range(2), workers=workers)
@@ -314,7 +314,7 @@ def test_a_file_runs_in_processes_to_the_same_bytes(suite, file, tmp_path):
     assert agent["source"]["sha256"] == benchmark.agents.sha256(file)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_full_disk_is_said_by_the_runs_of_a_generator(suite, tmp_path):
     full = "raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), '/results/curve.csv')"
     text = f"import errno, os\nfrom pharos.benchmark import agents\n\ndef write(*_):\n    {full}\n\n"
@@ -482,7 +482,7 @@ def test_a_class_for_stable_baselines3_has_a_process_for_each_run(suite, tmp_pat
     assert records[1]["error"] == said["sea, seed 1"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_streams_may_be_closed_and_a_folder_need_not_be_of_utf8(suite, file, tmp_path):
     """As a job scheduler begins it; processes of the generator have closed streams as well."""
     write_suite(suite, tmp_path / "small.yaml")
@@ -546,7 +546,7 @@ def test_quick_is_three_seeds_of_the_core(suite, tmp_path):
 # What pharos trains ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_q_learning_leaves_run_folders_of_training(suite, tmp_path):
     found = benchmark.run("q_learning", suite, out=tmp_path, seeds=range(2), workers=1)
     assert (found.results.curves["sea"][:, -1] < 1).all()

@@ -47,6 +47,7 @@ def test_the_lag_of_an_advantage_is_that_of_rewards_along_two_walks(scripts, env
     assert scripts[0].advantage_lag(made, learnt) == pytest.approx(max(lags))
 
 
+@pytest.mark.long
 def test_an_umbrella_waits_for_the_end_and_a_memory_does_not(scripts):
     assert scripts[0].advantage_lag(*task("umbrella_chain", chain_length=9)) == pytest.approx(8)
     assert scripts[0].advantage_lag(*task("memory_chain", memory_length=9)) == 0

@@ -182,6 +182,7 @@ def digest_of(monkeypatch):
     return digest
 
 
+@pytest.mark.long
 def test_every_array_of_the_world_counts(digest_of):
     digests = [
         digest_of(),

@@ -514,7 +514,7 @@ def test_a_solve_that_is_terminated_says_that_the_same_command_goes_on(cache, tm
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_the_environment_lacks_or_forbids_is_a_line(cache):
     for name, value in (("NUMBA_DISABLE_JIT", 1), ("NUMBA_NUM_THREADS", 0)):
         done = command_line.process("solve", "frozen_lake/4x4", environment={"PHAROS_CACHE_DIR": cache, name: value})
@@ -535,7 +535,7 @@ def test_help_and_list_load_nothing_heavy(words):
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_build_with_chance_says_how_many_outcomes_there_are(pharos, tmp_path):
     words = ("build", "frozen_lake", "slippery=true", "--out", tmp_path / "space")
     assert "outcomes     at most 3 of an action, 152 in all" in pharos(*words).stdout
@@ -570,6 +570,7 @@ def test_hardness_tells_how_many_gaps_are_ties_and_at_which_tolerance(pharos):
     assert f"{gaps.ties} ties at a tolerance of {gaps.tie_tolerance:.2g}, {proven} proven" in told
 
 
+@pytest.mark.long
 def test_check_says_whether_there_is_anything_to_learn(tmp_path, monkeypatch):
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path / "cache"))
     said = command_line.run("check", "river_swim", "length=5")

@@ -68,6 +68,7 @@ def test_values_of_any_policy_are_drawn(folders, tmp_path, policy):
     assert found["bytes"] > 5000
 
 
+@pytest.mark.long
 def test_growth_and_the_plane_are_drawn(tmp_path):
     targets = ("frozen_lake/4x4", "simple_grid/4x4-plain")
     grown = answer("plot", "growth", *targets, "--out", tmp_path / "g.png")

@@ -104,7 +104,7 @@ def runs_of(lab):
     return {record["config"]["observation"]: record for record in records}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_study_keeps_where_its_code_comes_from(lab):
     records = runs_of(lab)
     assert set(records) == {"index", "corner", "pair"}
@@ -442,7 +442,7 @@ def test_where_all_runs_fail_it_is_raised(tmp_path):
         pharos.train_many("dqn", "frozen_lake/4x4", seeds=[3], steps=10, hyperparameters={"net_arch": [-1]})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_packed_study_says_nothing_of_the_machine_and_is_unpacked_beside_its_code(lab, tmp_path):
     import pyarrow.parquet as pq
 

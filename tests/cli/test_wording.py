@@ -32,6 +32,7 @@ def test_names_are_spelt_as_prose_is():
     assert in_words("normalized_regret") == "normalised regret"
 
 
+@pytest.mark.long
 def test_prose_of_source_and_pages_has_one_spelling():
     source, docs = Path(pharos.__file__).parent, Path(__file__).parents[2] / "docs"
     prose = {path: path.read_text() for pattern in ("*.md", "*.ipynb") for path in docs.rglob(pattern)}

@@ -18,7 +18,7 @@ def script(name, monkeypatch):
     return importlib.import_module(name)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_tables_are_those_of_the_packed_runs(monkeypatch):
     article = script("article", monkeypatch)
     tables = {name: table() for name, table in article.TABLES.items()}

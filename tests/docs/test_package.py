@@ -198,6 +198,7 @@ def test_pages_say_how_to_install_what_is_not_released_yet():
             assert "Before the first release: `pip install .` in a clone" in (ROOT / page).read_text(), page
 
 
+@pytest.mark.long
 def test_files_that_docstrings_name_are_there():
     there = {path.name for path in ROOT.rglob("*.py")} | {"file.py", "my_file.py"}
     for path in (ROOT / "src").rglob("*.py"):

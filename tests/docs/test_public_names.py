@@ -102,7 +102,7 @@ def test_every_part_has_its_place_in_the_order():
     assert parts - set(ORDER) <= {"__init__"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_imports_point_to_what_comes_before():
     upward, used = set(), set()
     for path, name, _ in imports():

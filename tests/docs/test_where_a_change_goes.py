@@ -160,6 +160,7 @@ def add(file, before, line):
     file.write_text("\n".join([*lines[:index], line, *lines[index:], ""]))
 
 
+@pytest.mark.long
 def test_no_file_outside_of_agents_compares_with_the_name_of_an_agent():
     compared = set()
     for file in sorted(SOURCE.rglob("*.py")):

@@ -118,7 +118,7 @@ def test_a_class_does_not_take_the_id_of_another(corridor):
     assert gymnasium.make("pharos/Breakout-v0").unwrapped.environment == breakout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_all_its_looks_are_drawn(corridor):
     assert text_drawing(corridor, (1,)) == ".W..G"
     picture = human(corridor, (1,), cell=8)

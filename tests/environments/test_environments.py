@@ -303,7 +303,7 @@ def test_freeway_hit_sends_the_player_back(restart, row):
     assert env.reward(state, 1, following) == -1.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_freeway_clock_counts_the_states():
     """All cars together are a clock with lane_length * lcm(periods) phases; rows and hits do the rest."""
     env = pharos.make("freeway", num_cars=3, lane_length=4, car_speeds="1,2,3")

@@ -73,7 +73,7 @@ def test_each_form_of_a_table_is_the_same_environment(folders):
             assert reached[0] == pytest.approx(reached[1], abs=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_built_spaces_have_the_values_of_the_table(folders):
     mdp = in_every_form()["matrices"]
     space = pharos.build(pharos.make(str(folders["matrices"])), progress=False)
@@ -82,6 +82,7 @@ def test_built_spaces_have_the_values_of_the_table(folders):
     assert found.value_at_start == pytest.approx(pharos.value_iteration(mdp, 1e-10).value_at_start, abs=2e-10)
 
 
+@pytest.mark.long
 def test_steps_of_many_environments_have_the_probabilities_of_the_table(folders):
     env = pharos.make_vec(pharos.make(str(folders["matrices"])), 4000, autoreset_mode="DISABLED", time_limit=None)
     env.reset(seed=3)

@@ -137,7 +137,7 @@ def test_the_fifteen_puzzle_takes_one_word():
     assert layout_of(pharos.make("sliding_tiles", rows=4, columns=4).components).num_words == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_two_positions_share_an_image():
     env = pharos.make("sliding_tiles/2x2")
     _, positions = naive_counts(2, 2)

@@ -123,7 +123,7 @@ def test_taxi_has_gymnasiums_table(rain):
     assert {theirs.encode(*state[:4]) for state in states} == set(np.flatnonzero(theirs.initial_state_distrib))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_404_of_500_states_of_the_taxi_can_be_reached():
     space = pharos.build("taxi", progress=False)
     assert (space.num_states, space.num_terminal_states) == (404, 4)
@@ -203,6 +203,7 @@ def blackjack():
     return space, pharos.value_iteration(space.mdp(gamma=1.0), horizon=100)
 
 
+@pytest.mark.long
 def test_the_optimal_policy_of_blackjack_is_that_of_the_book(blackjack):
     """Sutton and Barto (2018), figure 5.2, without and with a usable ace; it is drawn from a total of 11 on."""
     space, solution = blackjack

@@ -120,7 +120,7 @@ def test_the_compiled_analysis_is_the_other_one(mdp, steps):
         assert one[name] == pytest.approx(other[name], rel=1e-12, abs=1e-12), name
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_compiled_analysis_of_key_corridor_is_the_published_one():
     found = parts_of(LargeHorizon(key_corridor(), 100, TIE))
     expected = published("_analyzed")

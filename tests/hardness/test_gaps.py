@@ -190,7 +190,7 @@ def check_against_exact(mdp, result):
 tiny = st.sampled_from([0.0, 1.0, 1.0 + 2.0**-40, 2.0**-30, 2.0**-38, 2.0**-45, 2.0**-70, 1e12, 1e12 + 2.0**-10, -1.0])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(300, deterministic_mdps(rewards=tiny), st.sampled_from([0.0, 0.5, 0.99, 1 - 2.0**-13, 1 - 2.0**-20]))
 def test_intervals_of_gaps_hold_the_exact_fractions(mdp, gamma):
     """Gaps below 1e-9, values of 1e12 and more, gamma near 1."""

@@ -463,7 +463,7 @@ def test_a_report_has_them_where_there_is_a_representation_and_keeps_them(grid):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_line_has_them(grid):
     target = ["hardness", "simple_grid", "height=3", "width=4", "--measures", ",".join(MEASURES)]
     answer = json.loads(run(*target, "--observation", "simple_image", "--network", "cnn16", "--json").stdout)

@@ -66,7 +66,7 @@ def analysis(mdp, steps):
     return first_greedy(explored), first_greedy(R), found, lists
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(120, small_mdps(max_states=4, max_actions=2), st.integers(1, 8))
 def test_it_is_what_its_definition_says(mdp, steps):
     found = hardness.stationary_effective_horizon(mdp, steps=steps, tie_tolerance=TIE)

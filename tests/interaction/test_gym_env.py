@@ -372,6 +372,7 @@ def test_actions_have_meanings():
     assert pharos.make_vec("frozen_lake", 2).get_action_meanings() == ["left", "down", "right", "up"]
 
 
+@pytest.mark.long
 def test_the_observation_index_builds_its_state_space_so_that_a_specification_survives_json(tmp_path, monkeypatch):
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
     env = gymnasium.make("pharos/FrozenLake-v0", observation="index")

@@ -108,6 +108,7 @@ def of_a_table(states):
     return POLICY[states[-1]]
 
 
+@pytest.mark.long
 def test_a_lazy_step_and_an_outcome_say_how_probable_they_were(space):
     expected = {}
     outcomes = paid_outcomes(lazy_actions(space.mdp(), 0.3))

@@ -42,7 +42,7 @@ def assert_values_are_kept(mdp, found):
     assert merged.value_at_start == pytest.approx(whole.value_at_start, abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, deterministic_mdps(max_states=7, max_actions=2))
 def test_classes_are_those_of_the_greatest_bisimulation(mdp):
     classes = minimize(mdp).classes
@@ -177,6 +177,7 @@ def long_river(length):
     return TabularMDP.from_outcomes(successors, np.broadcast_to([0.8, 0.2], successors.shape).copy(), rewards)
 
 
+@pytest.mark.long
 def test_a_river_of_twenty_thousand_states_takes_as_many_rounds_and_no_longer_than_a_second():
     minimize(long_river(3))  # compiles
     started = time.process_time()

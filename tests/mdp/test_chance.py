@@ -77,6 +77,7 @@ def small_blocks(monkeypatch):
     monkeypatch.setattr(search, "WIDE", 50)
 
 
+@pytest.mark.long
 def test_files_do_not_depend_on_threads_or_blocks(tmp_path, undisturbed, small_blocks):
     folder = build(WORLD, tmp_path / "space", workers=3, checkpoint_seconds=0.0).folder
     assert files_of(folder) == undisturbed
@@ -214,6 +215,7 @@ def test_growth_counts_states_by_their_distance(tmp_path):
         assert states_by_depth(space).tolist() == np.bincount(twin.levels).tolist()
 
 
+@pytest.mark.long
 def test_the_arrays_that_a_space_does_not_have_are_refused_in_one_line(tmp_path):
     lake, grid = (build(pharos.make(name), tmp_path / name) for name in ("frozen_lake", "simple_grid"))
     slippery = build(pharos.make("frozen_lake", slippery=True), tmp_path / "slippery")
@@ -246,6 +248,7 @@ def test_the_mdp_of_a_class_with_an_age_is_solved_in_one_pass(tmp_path):
     assert build(pharos.make("frozen_lake/4x4"), tmp_path / "lake").mdp().age is None
 
 
+@pytest.mark.long
 def test_an_age_without_chance_is_checked_too(tmp_path):
     @dataclass(frozen=True, kw_only=True)
     class Steps(Row):

@@ -195,7 +195,7 @@ def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
     assert ((fast > 0) == (slow > 0))[live].all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "layout", ["table", *(pytest.param(layout, marks=pytest.mark.long) for layout in ("lazy", *LAYOUTS))]
 )
@@ -321,6 +321,7 @@ def test_pairs_within_some_steps_end_with_those_of_the_last_step(sticky, steps, 
     assert pairs_within(sticky_actions(one_way, sticky), steps).tolist() == pairs
 
 
+@pytest.mark.long
 @examples(80, probabilities, probabilities, st.integers(0, 2**32))
 def test_weights_executed_choices_and_adjoints_of_chance_agree(sticky, random, seed):
     rng = np.random.default_rng(seed)

@@ -100,6 +100,7 @@ def test_a_lazy_mdp_copies_no_transitions(lake):
 # What staying pays ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_rules_say_what_staying_pays(grid):
     env, mdp = grid.environment, grid.mdp(gamma=0.9)
     states, p = [tuple(each) for each in grid.states().tolist()], 0.25
@@ -137,7 +138,7 @@ def test_a_probability_is_at_least_0_and_below_1(p):
 # Colosseum ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_lazy_and_random_actions_are_p_lazy_and_p_rand_of_colosseum():
     """The classes after Colosseum have its two parameters in their rules, which tests compare with its figures."""
     size = {"size": 5, "n_starting_states": 2}
@@ -265,6 +266,7 @@ def test_interaction_refuses_a_laziness_of_1(lake):
 # Runs -----------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_run_with_lazy_actions_has_exact_values_and_an_id_of_its_own(lake, tmp_path):
     run = pharos.train(
         "q_learning", lake.environment, steps=400, lazy=0.2, out=tmp_path / "run", evaluation_interval=200
@@ -298,7 +300,7 @@ def test_exported_tables_have_the_chance_of_staying_and_its_pay(grid, slippery):
     assert "deterministic MDPs" in refusal(ParameterError, exporters.bridge, lazy_actions(RING, 0.1), "ring.npz")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_line_and_studies_take_the_knobs():
     knobs = ["--lazy", "0.25", "--reward-noise", "0.5", "--reward-delay", "2"]
     done = command_line.run("train", "frozen_lake/4x4", "--steps", "200", *knobs)

@@ -88,7 +88,7 @@ def lazy_mdps_as_given(draw):
     return lazy, naive_exact.AsGiven(lazy, given.rewards, given.laziness, mdp)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, lazy_mdps_as_given(), st.integers(0, 2**32))
 def test_values_of_lazy_actions_are_within_their_bounds(drawn, seed):
     assert_values_are_within_their_bounds(*drawn, seed)
@@ -155,7 +155,7 @@ def means_as_given(draw):
     return mdp, naive_exact.AsGiven(mdp, means)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(100, means_as_given(), st.integers(0, 2**32))
 def test_values_of_rewards_averaged_over_outcomes_are_within_their_bounds(drawn, seed):
     assert_values_are_within_their_bounds(*drawn, seed)
@@ -206,6 +206,7 @@ def test_means_by_the_rules_count_their_rounding(engine, monkeypatch, tmp_path):
     assert ranged.of(slice(0, 1)).rounding == ranged.rounding == mdp.reward_table.rounding
 
 
+@pytest.mark.long
 def test_rewards_that_are_given_have_no_rounding(tmp_path):
     assert TabularMDP.from_arrays([[0]], [[0.1]]).reward_table.rounding == 0.0
     for name in ("frozen_lake/4x4", "cliff_walking"):

@@ -54,6 +54,7 @@ def engine(request, monkeypatch):
     return request.param
 
 
+@pytest.mark.long
 def test_the_mdp_pays_the_mean_and_an_episode_what_is_drawn(engine, tmp_path):
     space = pharos.build(Toll(), tmp_path / engine, progress=False)
     going = ~np.asarray(space.terminal)

@@ -256,6 +256,7 @@ def test_the_bound_of_an_example_by_hand():
     assert mdp.with_rewards([[2.0]]).residual == (mdp.residual.probabilities, 0.0)
 
 
+@pytest.mark.long
 def test_folders_and_environments_keep_what_the_rows_leave_open(tmp_path):
     mdp = importers.gymnasium(chain(0.3333333), gamma=0.9)
     bound = pharos.value_iteration(mdp).error_bound

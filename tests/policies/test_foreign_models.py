@@ -260,6 +260,7 @@ def of_gymnasium():
     return ppo(gymnasium.make("FrozenLake-v1", is_slippery=False), learning_rate=1e-2).learn(256)
 
 
+@pytest.mark.long
 def test_a_model_of_gymnasium_has_the_same_exact_value_by_every_way(lake, imported, of_gymnasium, tmp_path):
     table = probabilities(of_gymnasium, np.arange(16))
     expected = pytest.approx(solvers.evaluate_policy(imported, table).value_at_start, abs=1e-6)

@@ -11,6 +11,7 @@ from pharos.solvers import evaluate_policy, value_iteration
 from strategies import examples, small_mdps
 
 
+@pytest.mark.long
 @examples(60, small_mdps(), st.integers(0, 2**32 - 1))
 def test_losses_of_all_states_sum_to_the_regret(mdp, seed):
     mdp = mdp.with_horizon(None)

@@ -211,7 +211,7 @@ def test_a_memory_goes_with_no_values_of_states_and_no_frames():
 # sb3-contrib ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_recurrent_ppo_is_worth_what_it_plays_over_all_histories(tmp_path):
     """Trained, against the twin that feeds its LSTM one history after the other; and read back from its folder."""
     pytest.importorskip("sb3_contrib")

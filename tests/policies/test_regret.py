@@ -73,7 +73,7 @@ def test_the_references_are_at_zero_and_one_or_nowhere(mdp):
             assert ends.tolist() == [0.0, 1.0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(80, deterministic_mdps(ends=False), st.sampled_from([0.5, 2.0, 30.0]), st.sampled_from([-3.0, 0.0, 7.0]))
 def test_normalised_regret_does_not_change_with_the_unit_or_the_zero_of_rewards(mdp, unit, zero):
     never = np.zeros(mdp.num_states, bool)  # no state ends the episode, so that `zero` is paid on every step
@@ -257,7 +257,7 @@ def whole_run_by_place(run, spec, study_folder):
     return learnt, played
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("values", [{}, {"base": 1e6, "gain": 1e-6}], ids=["apart", "within the errors"])
 def test_normalised_regret_agrees_in_all_places_at_once(tmp_path, monkeypatch, values):
     """A world whose policies are apart, and one whose values differ by 2e-6, less than their errors of 8e-6."""

@@ -91,7 +91,7 @@ def test_agents_without_published_runs_are_refused():
         pharos.predict("river_swim", agent="a2c")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_dqn_is_predicted_by_the_sampled_learner_with_its_schedule():
     answer = pharos.predict("river_swim", ["vector", ("hash", {"bits": 8})], length=5, sticky=0.1, **OPTIONS)
     space = pharos.build(pharos.make("river_swim", length=5))
@@ -158,7 +158,7 @@ def test_noise_of_rewards_makes_it_harder_to_learn():
     assert loud > quiet + 0.2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_imported_tables_are_predicted(tmp_path, monkeypatch):
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
     mdp = pharos.TabularMDP.from_arrays([[1, 0], [1, 0]], [[0.0, 0.1], [1.0, 0.0]], gamma=0.9, horizon=20)

@@ -61,7 +61,7 @@ def filled(tmp_path_factory):
     return folder / "cache"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_truth_is_a_reward(cache, filled, tmp_path):
     shutil.copytree(filled, cache)
     env = corridor_class()()
@@ -95,7 +95,7 @@ def test_rules_that_mention_a_private_attribute_run_interpreted(cache, tmp_path)
         assert space.mdp().rewards[0].tolist() == [1.5, 1.5]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("outcomes", [pytest.param(1, marks=pytest.mark.long), 2])
 def test_what_numba_says_of_a_rule_is_the_reason(cache, tmp_path, outcomes):
     """A parameter that is a word is not handed to compiled rules."""
@@ -115,7 +115,7 @@ def test_what_numba_says_of_a_rule_is_the_reason(cache, tmp_path, outcomes):
 # The cache -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_damaged_files_are_compiled_again(cache, filled, tmp_path):
     shutil.copytree(filled, cache)
     before = files_of(cache)

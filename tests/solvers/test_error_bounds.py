@@ -83,7 +83,7 @@ def test_values_of_a_stochastic_policy_are_within_their_bound(mdp, seed):
     assert_policy_is_within_its_bound(mdp, drawn_policy(mdp, seed))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, hard_mdps(), st.integers(0, 2**32), st.sampled_from([1.0, 1 + 8e-7, 1 - 8e-7]))
 def test_rows_that_nearly_sum_to_1_are_normalised_and_the_bound_counts_it(mdp, seed, factor):
     """Those of a softmax in float32, and rows that somebody multiplied."""

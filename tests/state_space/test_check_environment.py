@@ -366,7 +366,7 @@ def test_a_value_in_between_must_stay_in_the_range_too():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rules_that_numba_cannot_compile_are_noted():
     def transition(self, state, action, out):
         out[0] = max(0, state[0] + eval("2 * action - 1"))
@@ -426,6 +426,7 @@ def test_rewards_that_no_action_changes_are_noted():
     assert report.notes[0] == "no policy beats another: at discount 0.99, V* is the value of uniform play"
 
 
+@pytest.mark.long
 def test_attributes_that_can_change_are_noted_where_rules_read_them():
     reward = lambda self, state, action, next_state: float(self.prizes[next_state[0]])  # noqa: E731
     notes = pharos.check_environment(corridor(prizes=[0, 0, 0, 0, 1], reward=reward)).notes

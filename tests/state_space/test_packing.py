@@ -125,7 +125,7 @@ def test_the_compiled_view_reads_and_writes_components(ranges, seed, data):
     assert (found, cleared, source) == (0, 0, 0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(200, few, st.integers(0, 2**32), st.data())
 def test_a_value_out_of_range_is_noted_and_leaves_the_neighbours_alone(ranges, seed, data):
     components = components_of(ranges)

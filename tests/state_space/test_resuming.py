@@ -154,7 +154,7 @@ def _build_and_die_at(call: int, env, folder):
     build(env, folder, checkpoint_seconds=0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_build_that_dies_at_any_step_of_a_checkpoint_ends_in_the_same_files(tmp_path, undisturbed, monkeypatch):
     monkeypatch.setattr(search, "CHUNK", 4096)
     for call in range(1, 30):

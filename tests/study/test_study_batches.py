@@ -91,6 +91,7 @@ def test_what_trains_on_a_gpu_is_not_forked(tmp_path, sizes, monkeypatch, device
     assert (parents.read_text() == f"{os.getpid()}\n") == (device == "cuda")
 
 
+@pytest.mark.long
 def test_a_device_that_is_not_there_is_refused_before_any_run(tmp_path):
     with pytest.raises(ParameterError, match=r"device is 'tpu', which torch does not have here: .*; try cpu"):
         study.run(specification(seeds=1), tmp_path, device="tpu")

@@ -43,7 +43,7 @@ def folder(tmp_path_factory):
     return place
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_results_are_in_studies_name_and_the_folder_stands_for_the_study(folder):
     assert len(list((folder / "studies" / "lake" / "runs").glob("*/run.json"))) == 2
     for what in ("lake.yaml", "studies/lake"):
@@ -51,7 +51,7 @@ def test_results_are_in_studies_name_and_the_folder_stands_for_the_study(folder)
         assert (done.returncode, done.stdout) == (0, "lake: 2 of 2 runs finished\n")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_show_counts_the_runs(folder):
     answer = json.loads(pharos("show", "lake.yaml", "--json", cwd=folder).stdout)
     assert answer["num_runs"] == 2 and answer["steps"] == 400

@@ -311,7 +311,7 @@ DAMAGES = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_bit_in_a_page_of_a_curve_is_noticed_and_the_run_made_again(tmp_path):
     spec = fake_training.specification(steps=60, seeds=2)
     study.run(spec, tmp_path, workers=2)
@@ -324,7 +324,7 @@ def test_a_bit_in_a_page_of_a_curve_is_noticed_and_the_run_made_again(tmp_path):
     assert file.read_bytes() == whole
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "damage", [each if each == "a cut record" else pytest.param(each, marks=pytest.mark.long) for each in DAMAGES]
 )

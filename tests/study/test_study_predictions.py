@@ -179,7 +179,7 @@ def made_up(noise, classes=8, instances=3, slope=1.0, seed=0):
     return frame, cells
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_line_without_noise_is_predicted_on_unseen_classes():
     judged = validation(*made_up(0.0), permutations=19).set_index("predictor")
     best = judged.loc["kernel_regret"]
@@ -267,7 +267,7 @@ def test_parts_of_a_study_are_predicted_alone_and_wrong_parts_named(tmp_path):
         study.predict(SPEC, tmp_path, observations=["one_hot"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_measure_of_the_users_own_is_a_predictor_beside_ours(tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "_MEASURES", dict(registry._MEASURES))
     hardness.register("rows", lambda problem: float(problem.mdp.num_states), definition="number of rows")

@@ -93,7 +93,7 @@ def read(page):
     return reader
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_is_well_formed_and_loads_nothing_from_outside(written):
     page = written[1].html.read_text()
     reader = read(page)
@@ -115,7 +115,7 @@ def test_every_section_is_there_and_every_link_leads_to_one(written):
         assert f'id="{link[1:]}"' in page
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_failed_and_missing_runs_and_models_without_rows_are_told(written):
     page = written[1].html.read_text()
     assert "28 of 30 runs are finished, 1 failed" in page and "1 run missing" in page
@@ -178,7 +178,7 @@ def test_numbers_are_short():
     ]  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_prints_where_the_report_is(written, again):
     assert json.loads(again[1])["html"] == str(again[0] / "report.html")
     status = process("study", "status", written[0])

@@ -73,7 +73,7 @@ def test_samples_of_classes_count_each_as_often_as_it_was_drawn():
         assert correlation == pytest.approx(spearman(predicted, aims))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_intervals_over_classes_cover_the_rank_correlation():
     """Classes differ in the predictor and by a part that it does not tell; the truth is that of 20,000 classes."""
 

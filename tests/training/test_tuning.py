@@ -186,6 +186,7 @@ def told(result):
     return [[trial[name] for name in TOLD] for trial in result.trials]
 
 
+@pytest.mark.long
 def test_a_search_that_was_killed_goes_on_as_it_would_have(tmp_path):
     options = {"steps": 200, "seeds": [0], "search_seed": 5}
     once = tune("q_learning", LAKE, trials=20, out=tmp_path / "once", **options)
