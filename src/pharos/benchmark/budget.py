@@ -29,6 +29,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.interaction import GymEnv
+from pharos.mdp import uniform_choice
 from pharos.policies import PolicyAnswers, PolicyLike, RecurrentPolicy, SB3Model, deep_policy
 from pharos.training import Curve, Evaluation, Task, evaluate_agent
 
@@ -246,4 +247,4 @@ def _not_stepped(steps: int) -> ParameterError:
 
 def uniform_policy(task: Task) -> np.ndarray:
     """(S, A) probabilities of uniform play."""
-    return np.full((task.mdp.num_states, task.mdp.num_actions), 1 / task.mdp.num_actions)
+    return uniform_choice(task.mdp)

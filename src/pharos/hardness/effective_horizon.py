@@ -34,6 +34,7 @@ from pharos.mdp import (
     ExpandedMDP,
     TabularMDP,
     mdp_within,
+    most_actions,
     require_mdp,
     states_within,
     whole_number,
@@ -108,7 +109,8 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
         m_k = max over states met of max(1, ceil(16 max_a var^k / gap_k^2 ln(2 T A^k))),  H = min_k k + log_A m_k
 
     gap_k is the difference between the largest Q^k and the largest Q^k of an action that is not optimal; states met are
-    those that actions better than all of the latter lead to. k fails where that difference is exactly 0.
+    those that actions better than all of the latter lead to. k fails where that difference is exactly 0. Where some
+    actions are not available, the uniform policy takes those that are, and A is the largest number of them in a state.
 
     Args:
         horizon: T; None: that of the MDP.
@@ -139,7 +141,7 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
 
 def parts_of(values: "SmallHorizon | LargeHorizon") -> dict[str, Any]:
     """Fields of an `EffectiveHorizon`, but for `tight` and `conventions`."""
-    ahead, greedy = look_ahead(values, values.steps, values.num_actions, values.greedy_return)
+    ahead, greedy = look_ahead(values, values.steps, values.most_actions, values.greedy_return)
     returns = dict(zip(("optimal_return", "random_return", "worst_return"), values.returns, strict=True))
     return {**vars(ahead), **returns, "greedy_returns": greedy, "num_states": values.num_visitable}
 
@@ -272,7 +274,7 @@ _PARTS = 0.6  # of the memory that is free
 
 def applies(mdp: TabularMDP) -> bool:
     """Whether the MDP has one next state for each state and action."""
-    return mdp.is_deterministic and mdp.num_actions <= 64
+    return mdp.is_deterministic and mdp.num_actions <= 64 and mdp.available is None
 
 
 class LargeHorizon:
@@ -287,7 +289,7 @@ class LargeHorizon:
     def __init__(self, mdp: TabularMDP, steps: int, tie: float):
         from pharos.kernels import horizon as kernels
 
-        self.kernels, self.steps, self.num_actions = kernels, steps, mdp.num_actions
+        self.kernels, self.steps, self.most_actions = kernels, steps, mdp.num_actions
         states = mdp.num_states
         bits = next(
             kind for kind in (np.uint8, np.uint16, np.uint32, np.uint64) if mdp.num_actions <= 8 * kind(0).itemsize
@@ -452,7 +454,7 @@ def stationary_effective_horizon(
         )
     slack = max(1e-12, 2 * floor)
     nodes.compare(tie, slack)
-    ahead, _ = look_ahead(nodes, limit, mdp.num_actions, tell=tell)
+    ahead, _ = look_ahead(nodes, limit, most_actions(mdp), tell=tell)
     conventions = {
         "gamma": mdp.gamma,
         "steps": limit,
