@@ -12,7 +12,7 @@ from typing import TextIO
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP, paid_outcomes, require_mdp
+from pharos.mdp import TabularMDP, paid_outcomes, require_all_actions, require_mdp
 from pharos.system import storage
 
 __all__ = ["bridge", "drn", "gym_p"]
@@ -40,7 +40,8 @@ def drn(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     file = io.StringIO()
     several = len(mdp.start_states) > 1
     file.write("@type: MDP\n@parameters\n\n@reward_models\nreward\n")
-    file.write(f"@nr_states\n{end + 1 + several}\n@nr_choices\n{(end + 1) * mdp.num_actions + several}\n@model\n")
+    choices = sum(map(len, table.values())) + several
+    file.write(f"@nr_states\n{end + 1 + several}\n@nr_choices\n{choices}\n@model\n")
     if several:
         file.write("state 0 [0] init\n\taction start [0]\n")
         for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True):
@@ -48,7 +49,7 @@ def drn(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     for s in range(end + 1):
         init = " init" if not several and s == int(mdp.start_states[0]) else ""
         file.write(f"state {s + several} [0]{init}{' terminal' if s in absorbing else ''}\n")
-        for a in range(mdp.num_actions):
+        for a in table[s]:
             _choice(file, table[s][a], a, s in absorbing, mdp.gamma, s, end, several)
     storage.replace_file(path, file.getvalue(), follow=True)
     return path
@@ -84,9 +85,9 @@ Outcome = tuple[float, int, float, bool]
 def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
     """Return P[s][a] = [(probability, next state, reward, terminated), ...], as Gymnasium's toy texts have it.
 
-    The implicit end becomes one more state S, where there is one. Random actions are written out as outcomes. Each
-    outcome has its own reward where the MDP is of an environment and has its rewards; else the expected one of what is
-    executed.
+    A state has the actions that are available there. The implicit end becomes one more state S, where there is one.
+    Random actions are written out as outcomes. Each outcome has its own reward where the MDP is of an environment and
+    has its rewards; else the expected one of what is executed.
 
     Raises:
         ParameterError: under sticky actions the state is a pair, which this table has no room for.
@@ -107,10 +108,11 @@ def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
             table[s] = {a: [(1.0, s, 0.0, True)] for a in range(num_actions)}
             continue
         executed = rows[s * num_actions : (s + 1) * num_actions]
-        mixed = [(uniform / num_actions * p, t, r, e) for each in executed for p, t, r, e in each] if uniform else []
+        actions = range(num_actions) if mdp.available is None else np.flatnonzero(mdp.available[s]).tolist()
+        shares = [(uniform / len(actions) * p, t, r, e) for a in actions for p, t, r, e in executed[a]]
+        mixed = shares if uniform else []
         table[s] = {
-            a: ([(chosen * p, t, r, e) for p, t, r, e in executed[a]] if chosen else []) + mixed
-            for a in range(num_actions)
+            a: ([(chosen * p, t, r, e) for p, t, r, e in executed[a]] if chosen else []) + mixed for a in actions
         }
     if mdp.has_ends:
         table[end] = {a: [(1.0, end, 0.0, True)] for a in range(num_actions)}
@@ -134,6 +136,7 @@ def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     path = Path(path)
     if path.suffix != ".npz":
         raise ParameterError(f"{path}: expected a name that ends in .npz")
+    require_all_actions(mdp, f"{path}: BRIDGE's files")
     if not mdp.is_deterministic or len(mdp.start_states) != 1:
         raise ParameterError(f"{mdp}: BRIDGE's files hold deterministic MDPs with one start state; expected such a one")
     table = np.array(mdp.dynamics.deterministic_table(), np.int64)

@@ -21,7 +21,6 @@ from pharos.mdp import (
     PolicyTable,
     Table,
     TabularMDP,
-    chosen_mass,
     lazy_actions,
     pairs_within,
     random_actions,
@@ -110,7 +109,7 @@ def backed_up(dynamics, equation, x):
 def moved(dynamics, play, now, width):
     """The mass one step later, as the formula has it."""
     mass = np.where(play.live[:, None], now, 0.0)
-    return dynamics.push_forward(play.chance.executed(mass, chosen_mass(play.policy, mass)), width)
+    return dynamics.push_forward(play.chance.executed(mass, play.policy), width)
 
 
 def as_matrices(mdp):
@@ -350,7 +349,7 @@ def test_weights_executed_choices_and_adjoints_of_chance_agree(sticky, random, s
     if chance.is_sticky:
         mass, later = rng.random((2, num_actions)), rng.dirichlet(np.ones(num_actions), 2)
         values = rng.normal(size=(2, num_actions))
-        executed = chance.executed(mass, later * mass.sum(axis=1, keepdims=True))
+        executed = chance.executed(mass, later[:, None])
         of_choice = chance.choice(values, (later * values).sum(axis=1, keepdims=True))
         assert (executed * values).sum() == pytest.approx((mass * of_choice).sum())
 

@@ -84,10 +84,6 @@ def test_rows_that_sum_to_1_up_to_rounding_keep_every_bit():
     [
         (np.stack([[[0.5, 0.1]], [[0.0, 1.0]]]), "if the rest ends the episode, say ends=True"),
         (np.stack([[[0.0, 0.0]], [[0.0, 1.0]]]), "the state has no outcomes; if it is terminal, say ends=True"),
-        (
-            [np.eye(2), np.diag([1.0, 0.0])],
-            "state 1, action 1 sums to 0; expected 1: is the action not available",
-        ),
         (np.stack([[[0.499, 0.5]], [[0.0, 1.0]]]), "were they rounded, or computed in float32?"),
         ([matrix.T for matrix in FOREST], "its columns do; transpose the matrix of each action"),
     ],

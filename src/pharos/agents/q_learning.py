@@ -10,6 +10,7 @@ from pharos.agents.agent import LearningRun, TableBasedAgent
 from pharos.agents.idealised import Idealised
 from pharos.errors import ParameterError, UnknownName
 from pharos.mdp import TabularMDP
+from pharos.system.arrays import read_only
 
 DEFAULTS: dict[str, Any] = {
     "learning_rate": 0.1,
@@ -98,6 +99,7 @@ class QLearning:
         mdp, options = self.mdp, self.options
         cumulative = np.cumsum(mdp.start_probabilities)
         cumulative[-1] = 1.0
+        sets = () if mdp.available is None else (read_only(mdp.available),)
         schedule = (
             float(options["learning_rate"]),
             float(options["visits_exponent"]),
@@ -114,7 +116,7 @@ class QLearning:
             np.asarray(mdp.terminal, np.bool_),
             mdp.start_states,
             cumulative,
-            (*mdp.chance.triple, float(mdp.chance.first_chosen)),
+            (*mdp.chance.triple, float(mdp.chance.first_chosen), *sets),
             int(self.limit),
             schedule,
             self.q,
@@ -136,7 +138,10 @@ class QLearning:
 
         In the second form [s, b] is the policy after executing b, b = A standing for no previous action.
         """
-        greedy = self.q.argmax(axis=1)
+        q, sets = self.q, self.mdp.available
+        if sets is not None:
+            q = np.where(np.repeat(sets, len(q) // len(sets), axis=0), q, -np.inf)
+        greedy = q.argmax(axis=1)
         if not self.options["sees_previous_action"]:
             return greedy
         num_actions = self.mdp.num_actions

@@ -28,7 +28,7 @@ from pharos.cli.options import (
     parse_parameters,
 )
 from pharos.errors import ParameterError
-from pharos.mdp import ChanceSetting
+from pharos.mdp import ChanceSetting, uniform_choice
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -163,7 +163,7 @@ def policies(
     agents: dict[str, Any] = {name: agent for name, (_, agent) in loaded.items()}
     best = value_iteration(task.mdp.with_horizon(None).with_gamma(gamma))
     agents["optimal"] = best.policy
-    agents["random"] = np.full((task.mdp.num_states, task.mdp.num_actions), 1 / task.mdp.num_actions)
+    agents["random"] = uniform_choice(task.mdp)
     plots.policies(task, agents, out, steps=min(steps, task.time_limit), seed=seed)
     return _answer(out, {"policies": list(agents)})
 

@@ -34,7 +34,7 @@ from pharos.explorer.states import (
     probabilities,
 )
 from pharos.hardness import discounted_visits, occupancy
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, uniform_choice
 from pharos.observations import num_values
 from pharos.policies import state_losses
 from pharos.solvers import Solution, uniform_value, value_iteration
@@ -55,7 +55,7 @@ class DiscountedVisits:
             return occupancy(mdp, table).visits
         visits = self.of(policy)
         if table is None:
-            return np.repeat(visits[:, None] / mdp.num_actions, mdp.num_actions, axis=1)
+            return visits[:, None] * uniform_choice(mdp)
         return visits[:, None] * (np.eye(mdp.num_actions)[table] if table.ndim == 1 else table)
 
     def of(self, policy: str) -> np.ndarray:
@@ -79,7 +79,7 @@ class DiscountedVisits:
         table = np.asarray(self.exploration.solutions[policy].policy)
         if table.dtype.kind != "f" or not np.isnan(table).any():
             return table
-        return np.where(np.isnan(table), 1 / self.exploration.mdp.num_actions, table)
+        return np.where(np.isnan(table), uniform_choice(self.exploration.mdp), table)
 
 
 LONGEST_PATH = 2_000  # steps that are shown
@@ -153,19 +153,25 @@ class Exploration:
     def chosen_values(self, name: str, states: np.ndarray, previous: int | None = None) -> np.ndarray:
         """(N, A) values of choosing each action, and following a policy afterwards."""
         executed = self.solutions[name].q_of(states)
-        return self.mdp.chance.chosen_values(executed, self._before(states, previous))
+        return self.mdp.chance.at(states).chosen_values(executed, self._before(states, previous))
 
     def chances(self, name: str, states: np.ndarray, q: np.ndarray, previous: int | None = None) -> np.ndarray:
         """(N, A) how often a policy chooses each action; `q`: optimal values of choosing, for the optimal one."""
         if name == UNIFORM:
-            return np.full(q.shape, 1 / self.mdp.num_actions)
+            return uniform_choice(self.mdp)[states]
         if name == LEARNT:
             return probabilities(self.solutions[LEARNT], states, self._before(states, previous))
-        return np.eye(self.mdp.num_actions)[self.best_actions(q)]
+        return np.eye(self.mdp.num_actions)[self.best_actions(q, states)]
 
-    def best_actions(self, q: np.ndarray) -> np.ndarray:
+    def best_actions(self, q: np.ndarray, states: np.ndarray) -> np.ndarray:
         """(N,) the first of the actions whose values (N, A) are within the tie tolerance of the best."""
-        return (q >= q.max(axis=1, keepdims=True) - self.tie_tolerance).argmax(axis=1)
+        is_best = q >= q.max(axis=1, keepdims=True) - self.tie_tolerance
+        return (is_best & self.available(states)).argmax(axis=1)
+
+    def available(self, states: np.ndarray) -> np.ndarray:
+        """(N, A) bool, the actions that are available in states."""
+        sets = self.mdp.available
+        return np.ones((len(states), self.mdp.num_actions), np.bool_) if sets is None else sets[states]
 
     def _before(self, states: np.ndarray, previous: int | None) -> np.ndarray:
         return np.full(len(states), self.mdp.num_actions if previous is None else previous)
@@ -186,9 +192,9 @@ class Exploration:
         Returns:
             state, previous, values (of its variables), terminal, layer, start (probability that an episode starts
             there), v (policy -> value), the drawing as `Pictures.of` has it, and for each action: `q` and `gap`, of
-            choosing it; `best`, whether the gap is a tie; of each policy, `policies` (how often it chooses it) and
-            `q_of` (the value of choosing it, and following the policy afterwards); `reward`, expected; `outcomes`: a
-            list of state (None for the end), previous action, probability, reward.
+            choosing it; `available`, whether it is; `best`, whether the gap is a tie; of each policy, `policies` (how
+            often it chooses it) and `q_of` (the value of choosing it, and following the policy afterwards); `reward`,
+            expected; `outcomes`: a list of state (None for the end), previous action, probability, reward.
         Raises:
             ParameterError: there is no such state or action.
         """
@@ -213,14 +219,16 @@ class Exploration:
         chances = {name: self.chances(name, here, q[OPTIMAL], previous)[0] for name in self.solutions}
         best = float(q[OPTIMAL].max())
         answer["v"] = {name: best if name == OPTIMAL else number(chances[name] @ q[name][0]) for name in self.solutions}
-        for action, executed in enumerate(self._executed(previous)):
+        sets = self.available(here)[0]
+        for action, executed in enumerate(self._executed(state, previous)):
             gap = best - float(q[OPTIMAL][0, action])
             outcomes = self._outcomes(state, executed)
             answer["actions"].append(
                 {
                     "q": best - gap,
                     "gap": gap,
-                    "best": gap <= self.tie_tolerance,
+                    "available": bool(sets[action]),
+                    "best": gap <= self.tie_tolerance and bool(sets[action]),
                     "policies": {name: number(chances[name][action]) for name in self.solutions},
                     "q_of": {name: number(q[name][0, action]) for name in self.solutions},
                     "reward": sum(probability * reward for _, _, probability, reward in outcomes),
@@ -229,10 +237,10 @@ class Exploration:
             )
         return answer
 
-    def _executed(self, previous: int | None) -> np.ndarray:
-        """(A, A) the probability that each action is executed, of choosing each."""
-        choices = np.eye(self.mdp.num_actions)
-        return self.mdp.chance.weights(choices, self._before(choices, previous))
+    def _executed(self, state: int, previous: int | None) -> np.ndarray:
+        """(A, A) the probability that each action is executed in a state, of choosing each."""
+        choices, here = np.eye(self.mdp.num_actions), np.full(self.mdp.num_actions, state)
+        return self.mdp.chance.at(here).weights(choices, self._before(choices, previous))
 
     def _outcomes(self, state: int, executed: np.ndarray) -> list[list[Any]]:
         """(state, previous, probability, reward) of possible outcomes, likeliest first; executed: (A,) chances."""
@@ -319,7 +327,7 @@ class Exploration:
                 why = "unknown"
                 break
             action = int(chances[0].argmax())
-            outcomes = self._outcomes(at[0], self._executed(at[1])[action])
+            outcomes = self._outcomes(at[0], self._executed(at[0], at[1])[action])
             new = next((each for each in outcomes if (each[0], each[1]) not in pairs), None)
             if new is None:
                 why = "circle"

@@ -60,7 +60,7 @@ def quantity(world: Exploration, name: str, states: np.ndarray) -> np.ndarray:
         q = world.chosen_values(OPTIMAL, states)
         gaps = q.max(axis=1, keepdims=True) - q
         if name == "best_action":
-            result = world.best_actions(q).astype(np.float64)
+            result = world.best_actions(q, states).astype(np.float64)
         elif name == "largest_gap":
             result = gaps.max(axis=1)
         else:

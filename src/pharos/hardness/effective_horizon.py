@@ -34,6 +34,7 @@ from pharos.mdp import (
     ExpandedMDP,
     TabularMDP,
     mdp_within,
+    most_actions,
     require_mdp,
     states_within,
     whole_number,
@@ -114,7 +115,8 @@ def effective_horizon(
         m_k = max over states met of max(1, ceil(16 max_a var^k / gap_k^2 ln(2 T A^k))),  H = min_k k + log_A m_k
 
     gap_k is the difference between the largest Q^k and the largest Q^k of an action that is not optimal; states met are
-    those that actions better than all of the latter lead to. k fails where that difference is exactly 0.
+    those that actions better than all of the latter lead to. k fails where that difference is exactly 0. Where some
+    actions are not available, the uniform policy takes those that are, and A is the largest number of them in a state.
 
     Args:
         horizon: T; None: that of the MDP.
@@ -147,7 +149,7 @@ def effective_horizon(
 
 def parts_of(values: "SmallHorizon | LargeHorizon") -> dict[str, Any]:
     """Fields of an `EffectiveHorizon`, but for `tight` and `conventions`."""
-    ahead, greedy = look_ahead(values, values.steps, values.num_actions, values.greedy_return, values.tell)
+    ahead, greedy = look_ahead(values, values.steps, values.most_actions, values.greedy_return, values.tell)
     returns = dict(zip(("optimal_return", "random_return", "worst_return"), values.returns, strict=True))
     return {**vars(ahead), **returns, "greedy_returns": greedy, "num_states": values.num_visitable}
 
@@ -280,7 +282,7 @@ _PARTS = 0.6  # of the memory that is free
 
 def applies(mdp: TabularMDP) -> bool:
     """Whether the MDP has one next state for each state and action."""
-    return mdp.is_deterministic and mdp.num_actions <= 64
+    return mdp.is_deterministic and mdp.num_actions <= 64 and mdp.available is None
 
 
 class LargeHorizon:
@@ -295,7 +297,7 @@ class LargeHorizon:
     def __init__(self, mdp: TabularMDP, steps: int, tie: float, tell: Callable[[str], object] = str):
         from pharos.kernels import horizon as kernels
 
-        self.kernels, self.steps, self.num_actions, self.tell = kernels, steps, mdp.num_actions, tell
+        self.kernels, self.steps, self.most_actions, self.tell = kernels, steps, mdp.num_actions, tell
         states = mdp.num_states
         bits = next(
             kind for kind in (np.uint8, np.uint16, np.uint32, np.uint64) if mdp.num_actions <= 8 * kind(0).itemsize
@@ -463,7 +465,7 @@ def stationary_effective_horizon(
         )
     slack = max(1e-12, 2 * floor)
     nodes.compare(tie, slack)
-    ahead, _ = look_ahead(nodes, limit, mdp.num_actions, tell=tell)
+    ahead, _ = look_ahead(nodes, limit, most_actions(mdp), tell=tell)
     conventions = {
         "gamma": mdp.gamma,
         "steps": limit,

@@ -91,31 +91,44 @@ def _gaps_of_step(mdp: TabularMDP, step: Step, number: int, everywhere: bool) ->
         block = slice(first, min(first + _BLOCK, mdp.num_states))
         states = np.arange(block.start, block.stop)
         rewards = mdp.reward_table.rows(block)
-        next_values = mdp.dynamics.expected(step.next_x, block)
+        next_values = mdp.acting(mdp.dynamics.expected(step.next_x, block), block)
         difference = kernels.differences(rewards, next_values, mdp.gamma)
         live = ~np.asarray(mdp.terminal[block])
         later = step.later[block].astype(np.int64)
         weight = later + (everywhere & (later == 0))
         arrays = (number, states, rewards, next_values)
         gap = difference if chance.chosen == 1.0 else chance.chosen * difference
-        yield GapBlock(step, *arrays, gap, chance.chosen, weight, np.where(live, later, 0))
-        if step.first[block].any():
-            some = np.flatnonzero(step.first[block])
+        sets = None if mdp.available is None else mdp.available[block]
+        yield GapBlock(step, *arrays, _of_sets(gap, sets), chance.chosen, weight, np.where(live, later, 0))
+        times = step.first[block].astype(np.int64)
+        if times.any():
+            some = np.flatnonzero(times)
             arrays = (number, states[some], rewards[some], next_values[some])
-            once = np.ones(some.size, np.int64)
-            gap = chance.first_chosen * difference[some]
-            yield GapBlock(step, *arrays, gap, chance.first_chosen, once, live[some] * once, False)
+            gap = _of_sets(chance.first_chosen * difference[some], None if sets is None else sets[some])
+            yield GapBlock(step, *arrays, gap, chance.first_chosen, times[some], live[some] * times[some], False)
+
+
+def _of_sets(gap: np.ndarray, sets: np.ndarray | None) -> np.ndarray:
+    """Gaps (N, A), infinite for actions that are not available, so that their reciprocals are 0."""
+    return gap if sets is None else np.where(sets, gap, np.inf)
 
 
 def steps_of(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
     """Yield the values of each step t = 1, ..., T, or once, and how many times each state counts.
 
     later (S,): 1 for a reachable state, under sticky actions the number of actions by which it can be
-    reached; first (S,) bool: start states, which count once more under sticky actions, without a previous action.
+    reached; first (S,): 1 for start states, which count once more under sticky actions, without a previous action, and
+    previous actions that are not available in the state, which count as none.
     """
     lone = lone_starts(mdp)
+
+    def counts(nodes: np.ndarray, lone: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if mdp.available is None or not mdp.is_sticky:
+            return nodes.sum(axis=1), lone
+        return (nodes & mdp.available).sum(axis=1), lone + (nodes & ~mdp.available).sum(axis=1)
+
     if solution.horizon is None:
-        yield Step(solution.x, solution.x, nodes_within(mdp).sum(axis=1), lone)
+        yield Step(solution.x, solution.x, *counts(nodes_within(mdp), lone))
         return
     all_steps = _all_steps(mdp, solution)
     nodes = np.zeros((mdp.num_states, mdp.width), np.bool_)
@@ -123,7 +136,7 @@ def steps_of(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
     for step in range(1, solution.horizon + 1):
         to_go = solution.horizon - step + 1
         own, next_x = (_with_end(all_steps[n]) for n in (to_go, to_go - 1))
-        yield Step(own, next_x, nodes.sum(axis=1), lone)
+        yield Step(own, next_x, *counts(nodes, lone))
         nodes, lone = nodes_after(mdp, nodes, lone), np.zeros_like(lone)
 
 
@@ -164,6 +177,7 @@ class TieProof:
 
     def __init__(self, mdp: TabularMDP):
         self.holds = mdp.dynamics.is_deterministic and not mdp.is_random
+        self.holds &= mdp.available is None or not mdp.is_sticky
         self._step = -1
 
     def add_block(self, part: GapBlock, own: np.ndarray) -> None:
@@ -503,7 +517,9 @@ def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
     shape = (mdp.num_states, mdp.num_actions)
     solution_shape = (solution.mdp.num_states, solution.mdp.num_actions)
     chance, other = ((each.chance, each.laziness) for each in (mdp, solution.mdp))
-    if solution.kind != "optimal" or solution_shape != shape or chance != other:
+    sets, other_sets = mdp.available, solution.mdp.available
+    is_same = sets is other_sets or np.array_equal(sets, other_sets)  # type: ignore[arg-type]  # None is none
+    if solution.kind != "optimal" or solution_shape != shape or chance != other or not is_same:
         raise ParameterError(
             f"solution is of kind {solution.kind!r} for {solution.mdp}; expected the optimal one of {mdp}"
         )
@@ -567,7 +583,7 @@ def _conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[
 def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) -> Gaps:
     error = _error(mdp, solution)
     tolerance = _tolerance(tie_tolerance, error)
-    ties, added = UnresolvedTies(mdp, tolerance, error, tie_tolerance is not None), _Sums()
+    ties, added = UnresolvedTies(mdp, tolerance, error, tie_tolerance is not None), _Sums(mdp.available is not None)
     for part in weighted_gaps(mdp, solution):
         ties.add_block(part, *added.add(part, tolerance, error))
     unresolved = ties.unresolved(weighted_gaps(mdp, solution))
@@ -581,7 +597,7 @@ def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) ->
         regularized=regularized,
         minimal=added.minimal,
         count=count,
-        ties=added.num_rows * mdp.num_actions - count,
+        ties=added.num_pairs - count,
         unresolved=unresolved,
         small=ties.small,
         histogram=added.histogram[first : last + 1].copy(),
@@ -596,19 +612,27 @@ class _Sums:
     """Sums over the gaps of states, a block at a time; the arrays are those of `kernels.gaps`.
 
     Attributes:
-        minimal: the smallest gap above the tolerance. num_rows: how many rows count.
+        minimal: the smallest gap above the tolerance. num_pairs: how many gaps count.
+    Args:
+        has_sets: whether gaps that are infinite are of actions that are not available, and do not count.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, has_sets: bool) -> None:
+        self.has_sets = has_sets
         self.sums, self.counts = kernels.empty_sums(), kernels.empty_counts()
         self.histogram = kernels.empty_histogram()
-        self.minimal, self.num_rows = math.inf, 0
+        self.minimal, self.num_pairs = math.inf, 0
 
     def add(self, part: GapBlock, tolerance: float, error: float) -> tuple[int, int]:
         """Add a block; return how many of its ties are small, and how many equal."""
         previous = self.counts.copy()
         arguments = (tolerance, error, REGULARIZER, self.sums, self.counts, self.histogram)
         self.minimal = kernels.add_up(part.gap, part.weight, part.counted, self.minimal, *arguments)
-        self.num_rows += int(part.counted.sum())
+        self.num_pairs += int(part.counted.sum()) * part.gap.shape[1]
+        if self.has_sets:
+            missing = int(part.counted @ (part.gap == math.inf).sum(axis=1))
+            self.num_pairs -= missing
+            self.counts[0] -= missing  # the kernel has counted them as large ones
+            self.histogram[kernels.bin_of(math.inf)] -= missing
         small, equal = (self.counts - previous)[1:].tolist()
         return small, equal

@@ -212,6 +212,8 @@ def _completions(
 
 
 def _needs_one_outcome(name: str, mdp: TabularMDP) -> None:
+    if mdp.available is not None:
+        raise UndefinedMeasure(f"{name} is defined for MDPs in which every action is available everywhere: {mdp}")
     if not mdp.is_deterministic:
         raise UndefinedMeasure(f"{name} is defined for deterministic MDPs: {mdp} has chance; take the MDP without it")
 

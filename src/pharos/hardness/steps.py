@@ -13,7 +13,17 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import PrecisionError, UndefinedMeasure
-from pharos.mdp import STEPS, ExpandedMDP, PolicyTable, TabularMDP, mean_of_actions, require_mdp, whole_number
+from pharos.mdp import (
+    STEPS,
+    ExpandedMDP,
+    PolicyTable,
+    TabularMDP,
+    mean_of_actions,
+    most_actions,
+    require_mdp,
+    uniform_choice,
+    whole_number,
+)
 from pharos.solvers import TablePolicy
 
 # In units of return: an action is optimal if its value is within this of the best (theirs).
@@ -63,8 +73,12 @@ class FiniteHorizonValues:
             )
         choices = ExpandedMDP.of(mdp, restart=False)
         self.choices, self.num_actions, self.steps = choices, mdp.num_actions, steps
+        self.most_actions = most_actions(mdp)
         self.num_nodes, self.starts, self.table = len(choices.underlying), choices.starts, choices.table
         self.rewards = choices.rewards(mdp)
+        sets = (
+            None if mdp.available is None else uniform_choice(mdp)[np.minimum(choices.underlying, mdp.num_states - 1)]
+        )
         shape = (steps, self.num_nodes, self.num_actions)
         self.best, self.worst, self.explored = (np.empty(shape) for _ in range(3))
         self.explored_value = np.empty(shape[:2])
@@ -75,7 +89,7 @@ class FiniteHorizonValues:
                 self.best[t] = self.backup(self.best[t + 1].max(axis=1))
                 self.worst[t] = self.backup(self.worst[t + 1].min(axis=1))
                 self.explored[t] = self.backup(self.explored_value[t + 1])
-            mean = mean_of_actions(self.explored[t])
+            mean = mean_of_actions(self.explored[t]) if sets is None else (self.explored[t] * sets).sum(axis=1)
             self.explored_value[t] = mean.clip(self.worst[t].min(axis=1), self.best[t].max(axis=1))
         self.optimal = self.best >= self.best.max(axis=2, keepdims=True) - TIE
         self.first = np.zeros(self.num_nodes, np.bool_)

@@ -308,6 +308,8 @@ class TargetBounds:
 
     def bound_others(self, hub: int, times: np.ndarray) -> None:
         """Bound all targets by way of one whose hitting times are bounded by `times` (nodes,)."""
+        if self.mdp.available is not None and not self.mdp.chance.is_none:
+            return  # the bounds are of chance that is the same in all states
         if self._travel is None:
             self._travel = HubBounds(self.mdp, self.restart)
         by_state = np.zeros(self.choices.num_targets)

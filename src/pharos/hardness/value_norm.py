@@ -70,10 +70,15 @@ def certified_value_norm(
         progress(f"state {number * _BLOCK:,} of {states.size:,}")
         means, within = _outcomes(mdp, solution.x, block, scale)
         first = lone[block]
-        largest = max(largest, _largest_variance(mdp.chance.first, means[first], within[first], 0))
+        largest = max(largest, _largest_variance(mdp.chance.first.at(block[first]), means[first], within[first], 0))
         for previous in range(mdp.width):
             is_node = nodes[block, previous]
-            largest = max(largest, _largest_variance(mdp.chance, means[is_node], within[is_node], previous))
+            if mdp.available is not None and mdp.is_sticky:  # as on the first step
+                is_free = is_node & ~mdp.available[block, previous]
+                here = mdp.chance.first.at(block[is_free]), means[is_free], within[is_free]
+                largest, is_node = max(largest, _largest_variance(*here, previous)), is_node & ~is_free
+            here = mdp.chance.at(block[is_node]), means[is_node], within[is_node]
+            largest = max(largest, _largest_variance(*here, previous))
     value = math.sqrt(largest) * scale
     error = solution.error_bound + (3 * mdp.num_actions + mdp.dynamics.operations + 16) * _UNIT * size
     lower, upper = max(0.0, value - error), value + error
@@ -92,6 +97,7 @@ def _outcomes(mdp: TabularMDP, x: np.ndarray, states: np.ndarray, scale: float) 
         column = actions[outcomes.which] if x.shape[1] > 1 else 0
         apart = x[outcomes.states, column] / scale - means.ravel()[outcomes.which]
         within = np.bincount(outcomes.which, outcomes.probabilities * apart**2, means.size).reshape(means.shape)
+    means, within = mdp.acting(means, states), mdp.acting(within, states)
     return means - means.mean(axis=1, keepdims=True), within
 
 
@@ -99,12 +105,12 @@ def _largest_variance(chance: Chance, means: np.ndarray, within: np.ndarray, pre
     """The largest variance of the next state's value after a choice: within the outcomes of executed actions, and
     between their means."""
     repeated = means[:, previous : previous + 1]
-    mean = chance.chosen * means + chance.uniform * means.mean(axis=1, keepdims=True) + chance.previous * repeated
+    mean = chance.chosen * means + chance.uniform * chance.mean(means) + chance.previous * repeated
     result = chance.chosen * (within + (means - mean) ** 2)
     if chance.uniform:
-        centred = means - means.mean(axis=1, keepdims=True)
-        spread = (within + centred**2).mean(axis=1, keepdims=True)
-        result += chance.uniform * (spread + (mean - means.mean(axis=1, keepdims=True)) ** 2)
+        middle = chance.mean(means)
+        spread = chance.mean(within + (means - middle) ** 2)
+        result += chance.uniform * (spread + (mean - middle) ** 2)
     if chance.previous:
         result += chance.previous * (within[:, previous : previous + 1] + (repeated - mean) ** 2)
     return float(result.max(initial=0.0))

@@ -31,8 +31,8 @@ from pharos.mdp import (
     PolicyStep,
     PolicyTable,
     TabularMDP,
-    chosen_mass,
     require_mdp,
+    uniform_choice,
     whole_number,
 )
 from pharos.solvers import Solution, TablePolicy, value_iteration
@@ -270,9 +270,8 @@ class Propagation:
     def executed(self, started: np.ndarray, visits: np.ndarray) -> np.ndarray:
         """(S, A): the mass that executes each action: of started (S,) by the rules of the first step, of visits (S, W)
         by those of later ones."""
-        later = self.later.chance.executed(visits, chosen_mass(self.later.policy, visits))
-        first = started[:, None]
-        return later + self.first.chance.executed(first, chosen_mass(self.first.policy, first))
+        later = self.later.chance.executed(visits, self.later.policy)
+        return later + self.first.chance.executed(started[:, None], self.first.policy)
 
     def discounted(self, tolerance: float, tell: Callable[[str], object] = str) -> tuple[np.ndarray, np.ndarray, float]:
         """((S,), (S, W), bound): discounted visits of the first step, under sticky actions alone; of the others; and a
@@ -312,7 +311,7 @@ class Propagation:
     ) -> None:
         """Add the mass of pairs (state, action) of one step to `total`, times `scale`, and raise `largest` to it."""
         step = self.first if first else self.later
-        weights = (step.chance if executed else Chance()).triple
+        weights = (step.chance if executed else Chance()).for_kernels
         kernels.record(self.live, step.policy, weights, mass, scale, total, largest)
 
     def _push(self, now: np.ndarray, first: bool, after: np.ndarray) -> float:
@@ -421,13 +420,13 @@ def exploration_time(
     mass = np.zeros((mdp.num_states, 1))
     np.add.at(mass[:, 0], mdp.start_states, mdp.start_probabilities)
     probability = length = 0.0
-    chance, tell = mdp.chance.first, progress or str
+    chance, play, tell = mdp.chance.first, uniform_choice(mdp)[:, None], progress or str
     for t in range(steps):
         tell(f"step {t} of {steps}")
         mass[~live] = 0.0
         total = mass.sum(axis=1, keepdims=True)
         length += float(total.sum())
-        executed = chance.executed(mass, np.repeat(total / mdp.num_actions, mdp.num_actions, axis=1))
+        executed = chance.executed(mass, play)
         probability += float(executed[is_large].sum())
         executed[is_large] = 0.0
         if not executed.any():
@@ -477,7 +476,7 @@ def covering(
     """Return how rarely random play meets the rarest state and action.
 
         mu_t(s, a) = P(s_t = s, a_t = a) for uniform play from the start;  L <= ln(2 S A) / min over s, a of max over t
-        of mu_t(s, a)
+        of mu_t(s, a); where actions are not available everywhere, S A is the number of pairs that there are
 
     Pairs run over the states that can be met within T steps and are not terminal; under sticky actions over pairs
     (state, previously executed action), and a start without one.
@@ -492,30 +491,35 @@ def covering(
     Source: Laidlaw, Russell and Dragan (2023), section 3 and appendix; the bound: Even-Dar and Mansour (2003).
     """
     steps = steps_of("covering", mdp, horizon)
-    largest, total = _occupied(mdp, steps, progress or str)
+    largest, total, pairs = _occupied(mdp, steps, progress or str)
     states = len(total)
     if not states:
         raise UndefinedMeasure("covering: every start state is terminal, so that nothing is played")
-    omega_max = float(largest.min()) / mdp.num_actions
-    omega_sum = float(total.min()) / mdp.num_actions
-    length = math.log(2 * states * mdp.num_actions) / omega_max
+    omega_max, omega_sum = float(largest.min()), float(total.min())
+    length = math.log(2 * pairs) / omega_max
     return Covering(omega_max, omega_sum, length, states, {"horizon": steps, "exploration": "uniform"})
 
 
-def _occupied(mdp: TabularMDP, steps: int, tell: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray]:
-    """(max over t, sum over t) of the probability of each node that uniform play meets and that is not terminal."""
+def _occupied(mdp: TabularMDP, steps: int, tell: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray, int]:
+    """(max over t, sum over t) of the probability of each action in each node that uniform play meets and that is not
+    terminal, and the number of these pairs."""
     walk = Propagation(mdp, None, steps)
     largest, total = np.zeros((mdp.num_states, walk.width)), np.zeros((mdp.num_states, walk.width))
     alone = np.zeros((0, 1))  # under sticky actions a start has no previous action: nodes of their own
     for t, (now, first, _) in enumerate(walk.distributions()):
         tell(f"step {t} of {steps}")
         if first and mdp.is_sticky:
-            alone = now[walk.live]
+            alone = now.copy()
             continue
         np.maximum(largest, now, out=largest)
         total += now
-    most, often = (np.append(each[walk.live], alone) for each in (largest, total))
-    return most[often > 0], often[often > 0]
+    sizes = np.full(mdp.num_states, mdp.num_actions) if mdp.available is None else mdp.available.sum(axis=1)
+    sizes = sizes[walk.live, None]
+    alone = alone[walk.live] / sizes if len(alone) else np.empty((0, 1))
+    most, often = (np.append(each[walk.live] / sizes, alone) for each in (largest, total))
+    counts = np.append(np.broadcast_to(sizes, (len(sizes), walk.width)), sizes[:, 0] if len(alone) else [])
+    is_met = often > 0
+    return most[is_met], often[is_met], int(counts[is_met].sum())
 
 
 # Mixing ---------------------------------------------------------------------------------------------------------------

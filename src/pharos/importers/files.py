@@ -23,7 +23,7 @@ import numpy as np
 
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
 from pharos.importers.folder import ImportedOutcomes
-from pharos.mdp import Residual, TabularMDP, lacking, normalized_rows, whole_number
+from pharos.mdp import Residual, TabularMDP, lacking, normalized_rows, whole_number, with_sets
 from pharos.system import storage
 from pharos.system.wording import capped
 
@@ -178,9 +178,8 @@ def storm(
 ) -> TabularMDP:
     """Return the MDP of a model of discrete time: MDPs, and Markov chains, which have one action.
 
-    A state with fewer choices than others does its first one by the actions beyond them: the best and the worst value
-    stay what they are, that of the uniform policy counts the first choice more often. State s of the MDP is state s of
-    Storm.
+    Action a of a state is its choice number a. A state with fewer choices than others has fewer actions: those beyond
+    are not available there. State s of the MDP is state s of Storm.
 
     Args:
         path: a model in PRISM's language (.prism, .nm, .pm), in JANI (.jani), or an explicit one (.drn).
@@ -244,8 +243,10 @@ def storm_recording(
     of = np.repeat(np.arange(len(outcomes.offsets) - 1), np.diff(outcomes.offsets))
     probabilities, residuals = normalized_rows(outcomes.probabilities, of, len(outcomes.offsets) - 1, refuse)
     outcomes = outcomes._replace(probabilities=probabilities)
+    mdp = _mdp(model, outcomes, gamma, horizon)
+    counts = np.array([len(_choices(model, s)) for s in range(model.nr_states)])
     mdp = replace(
-        _mdp(model, outcomes, gamma, horizon),
+        with_sets(mdp, np.arange(actions) < counts[:, None]),
         residual=Residual.of(residuals, np.maximum.reduceat(np.abs(outcomes.rewards), outcomes.offsets[:-1])),
     )
     return mdp, outcomes if _differ(outcomes) else None
@@ -254,16 +255,15 @@ def storm_recording(
 def _outcomes(model: Any, ended: np.ndarray, reward_model: Any) -> ImportedOutcomes:
     """Outcomes of every state and action with their rewards; states in `ended` lead to the end of the episode."""
     matrix, states = model.transition_matrix, model.nr_states
-    first = [matrix.get_row_group_start(s) for s in range(states)]
-    last = [matrix.get_row_group_end(s) for s in range(states)]
-    actions = max(stop - start for start, stop in zip(first, last, strict=True))
+    choices = [_choices(model, s) for s in range(states)]
+    actions = max(map(len, choices))
     offsets: list[int] = [0]
     successors: list[int] = []
     probabilities: list[float] = []
     rewards: list[float] = []
     for s in range(states):
         for a in range(actions):
-            choice = first[s] + a if first[s] + a < last[s] else first[s]
+            choice = choices[s][a] if a < len(choices[s]) else choices[s][0]  # an action that is not available
             row = [] if ended[s] else [(int(entry.column), float(entry.value)) for entry in matrix.get_row(choice)]
             row = row or [(-1, 1.0)]
             successors += [successor for successor, _ in row]
@@ -273,6 +273,12 @@ def _outcomes(model: Any, ended: np.ndarray, reward_model: Any) -> ImportedOutco
     return ImportedOutcomes(
         np.array(offsets), np.array(successors, np.int64), np.array(probabilities), np.array(rewards, np.float64)
     )
+
+
+def _choices(model: Any, state: int) -> range:
+    """The choices of a state, as rows of Storm's matrix."""
+    matrix = model.transition_matrix
+    return range(matrix.get_row_group_start(state), matrix.get_row_group_end(state))
 
 
 def _rewards(reward_model: Any, state: int, choice: int, successors: list[int], ended: np.ndarray) -> list[float]:

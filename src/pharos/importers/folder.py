@@ -11,7 +11,7 @@ import numpy as np
 
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, FolderLocked, ParameterError
-from pharos.mdp import OutcomeTable, Residual, TabularMDP, lacking, whole_number
+from pharos.mdp import OutcomeTable, Residual, TabularMDP, checked_sets, lacking, whole_number, with_sets
 from pharos.system import mdp_files, storage
 from pharos.system.mdp_files import (
     AGAIN,
@@ -86,6 +86,7 @@ def save(
     shown = {} if observations is None else {OBSERVATIONS: np.asarray(observations)}
     arrays = _arrays_of(mdp) | shown | outcome_arrays
     version = mdp_files.PAID_VERSION if outcome_arrays else mdp_files.OBSERVED_VERSION if shown else mdp_files.VERSION
+    version = version if mdp.available is None else mdp_files.SETS_VERSION
     with storage.waiting_lock(folder, FolderLocked, "importing", _warn):
         if _is_foreign(folder):
             raise ParameterError(f"{folder}{FOREIGN}")
@@ -203,6 +204,7 @@ def _arrays_of(mdp: TabularMDP) -> dict[str, np.ndarray]:
         "terminal": np.asarray(mdp.terminal),
         "start_states": mdp.start_states,
         "start_probabilities": mdp.start_probabilities,
+        **({} if mdp.available is None else {mdp_files.AVAILABLE: mdp.available}),
         **mdp.dynamics.arrays(),
     }
 
@@ -229,6 +231,14 @@ def load(folder: str | os.PathLike) -> TabularMDP:
 
 def _mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> TabularMDP:
     """The MDP of arrays read from a folder; ValueError if they do not fit each other."""
+    mdp = _filled_mdp(manifest, arrays)
+    if mdp_files.AVAILABLE not in arrays:
+        return mdp
+    return with_sets(mdp, checked_sets(arrays[mdp_files.AVAILABLE], mdp.reward_table.shape))
+
+
+def _filled_mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> TabularMDP:
+    """The MDP of the arrays as if all actions were available: the others are filled."""
     rewards = arrays["rewards"]
     if rewards.shape != (manifest["num_states"], manifest["num_actions"]):
         raise ValueError(
@@ -239,7 +249,8 @@ def _mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Tabul
     if TABLE[0] in arrays:
         return TabularMDP.from_arrays(arrays[TABLE[0]], rewards, terminal=arrays["terminal"], **options)
     if OUTCOMES[0] in arrays:
-        parts = {name: array for name, array in arrays.items() if name not in (*COMMON, *PAID)}
+        others = (*COMMON, *PAID, mdp_files.AVAILABLE)
+        parts = {name: array for name, array in arrays.items() if name not in others}
         dynamics = OutcomeTable(num_actions=rewards.shape[1], **parts)
         dynamics.check()
         return TabularMDP.from_outcome_table(dynamics, rewards, terminal=arrays["terminal"], **options)

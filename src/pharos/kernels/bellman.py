@@ -4,7 +4,9 @@ mdp/dynamics.py says what they mean, solvers/ proves their bounds.
 
 Common arguments: transitions: see kernels/outcomes.py; table, palette: see mdp/rewards.py; v (S + 1,) float64, under
 sticky actions (S + 1, A) by the previously executed action, with row S 0, so that index -1 reads 0; weights: (chosen,
-previous, uniform); choice: 1.0 maximises, -1.0 minimises, (S,) integers are the actions of a policy; actions: A zeros,
+previous, uniform), where some actions are not available and chance depends on that with first_chosen and the sets (S,
+A) bool behind (`uniform` with the sets): means are over the available ones then, and a step after one that is not is
+as the first one; choice: 1.0 maximises, -1.0 minimises, (S,) integers are the actions of a policy; actions: A zeros,
 see `actions_of`. Each sweep goes from the last state to the first, of an order (S,) or, where that is None, of their
 numbers, and returns the largest change of an entry.
 
@@ -143,6 +145,59 @@ def _reward_at(table, palette, s, a):
     return lambda table, palette, s, a: table[uint64(s), uint64(a)]
 
 
+def set_has(weights, s, a):
+    """Whether action a is available in state s, by weights with sets behind; True where they have none."""
+
+
+@overload(set_has, jit_options={"forceinline": True})
+def _set_has(weights, s, a):
+    if isinstance(weights, types.Float | types.UniTuple):
+        return lambda weights, s, a: True
+    last = len(weights) - 1
+    return lambda weights, s, a: weights[last][uint64(s), uint64(a)]
+
+
+def set_size(weights, s, actions):
+    """The number of actions that are available in state s, of the entries of `actions`."""
+
+
+@overload(set_size, jit_options={"forceinline": True})
+def _set_size(weights, s, actions):
+    if isinstance(weights, types.Float | types.UniTuple):
+        return lambda weights, s, actions: len(actions)
+
+    last = len(weights) - 1
+
+    def counted(weights, s, actions):
+        count = 0
+        for a in range(len(actions)):
+            if weights[last][uint64(s), uint64(a)]:
+                count += 1
+        return count
+
+    return counted
+
+
+def as_first(weights, chosen, mean):
+    """The value of a step as the first one, from that of the choice and the mean over available actions."""
+
+
+@overload(as_first, jit_options={"forceinline": True})
+def _as_first(weights, chosen, mean):
+    if isinstance(weights, types.UniTuple):
+        return lambda weights, chosen, mean: chosen
+    return lambda weights, chosen, mean: weights[3] * chosen + (1.0 - weights[3]) * mean
+
+
+def weight_of(uniform):
+    """The weight of a uniform action, without the sets."""
+
+
+@overload(weight_of, jit_options={"forceinline": True})
+def _weight_of(uniform):
+    return (lambda uniform: uniform) if isinstance(uniform, types.Float) else (lambda uniform: uniform[0])
+
+
 def _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s):
     """(1 - uniform) q(s, choice) + uniform mean_a q(s, a): the backup of v at s."""
 
@@ -152,14 +207,15 @@ def _backup_of(transitions, table, palette, gamma, uniform, choice, v, actions, 
     if isinstance(choice, types.Float):
 
         def of_extreme(transitions, table, palette, gamma, uniform, choice, v, actions, s):
-            best = -np.inf
-            if uniform > 0.0:
+            best, weight = -np.inf, weight_of(uniform)
+            if weight > 0.0:
                 total = 0.0
                 for a in range(len(actions)):
                     q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
                     best = max(best, choice * q)
-                    total += q
-                return (1.0 - uniform) * (choice * best) + uniform * total / len(actions)
+                    if set_has(uniform, s, a):
+                        total += q
+                return (1.0 - weight) * (choice * best) + weight * total / set_size(uniform, s, actions)
             for a in range(len(actions)):
                 q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
                 best = max(best, choice * q)
@@ -170,11 +226,13 @@ def _backup_of(transitions, table, palette, gamma, uniform, choice, v, actions, 
     def of_policy(transitions, table, palette, gamma, uniform, choice, v, actions, s):
         action = np.int64(choice[s])
         q = reward_at(table, palette, s, action) + gamma * expectation(transitions, v, s, action)
-        if uniform > 0.0:
+        weight = weight_of(uniform)
+        if weight > 0.0:
             total = 0.0
             for a in range(len(actions)):
-                total += reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
-            return (1.0 - uniform) * q + uniform * total / len(actions)
+                if set_has(uniform, s, a):
+                    total += reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
+            return (1.0 - weight) * q + weight * total / set_size(uniform, s, actions)
         return q
 
     return of_policy
@@ -208,13 +266,35 @@ def optimal_backup(transitions, table, palette, gamma, uniform, choice, v, out, 
 
 
 @njit(forceinline=True)
-def _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s):
-    """q[a] = r(s, a) + gamma v(next, a). Returns (q of the choice, sum of q)."""
+def _sticky_values(transitions, table, palette, gamma, weights, choice, v, actions, q, s):
+    """q[a] = r(s, a) + gamma v(next, a). Returns (q of the choice, sum of q of available actions)."""
     total = 0.0
     for a in range(len(actions)):
         q[a] = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
-        total += q[a]
+        if set_has(weights, s, a):
+            total += q[a]
+    act_as_first(weights, q, actions, s)
     return _choice_value(choice, q, actions, s), total
+
+
+def act_as_first(weights, q, actions, s):
+    """Replace entries of q (A,) of actions that are not available by that of the first one that is."""
+
+
+@overload(act_as_first, jit_options={"forceinline": True})
+def _act_as_first(weights, q, actions, s):
+    if isinstance(weights, types.UniTuple):
+        return lambda weights, q, actions, s: None
+
+    def replaced(weights, q, actions, s):
+        first = 0
+        while not set_has(weights, s, first):
+            first += 1
+        for a in range(len(actions)):
+            if not set_has(weights, s, a):
+                q[a] = q[first]
+
+    return replaced
 
 
 def _choice_value(choice, q, actions, s):
@@ -242,16 +322,18 @@ def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions
 
     v (S + 1, A); q (A,) scratch; for places [start, stop) of the order.
     """
-    chosen_weight, previous_weight, uniform_weight = weights
+    chosen_weight, previous_weight, uniform_weight = weights[0], weights[1], weights[2]
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
         if i >= start + AHEAD:
             fetch_values(transitions, v, actions, state_at(order, i - AHEAD))
         s = state_at(order, i)
-        best, total = _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s)
-        shared = chosen_weight * best + uniform_weight * total / len(actions)
+        best, total = _sticky_values(transitions, table, palette, gamma, weights, choice, v, actions, q, s)
+        shared = chosen_weight * best + uniform_weight * total / set_size(weights, s, actions)
         for b in range(len(actions)):
             value = shared + previous_weight * q[b]
+            if not set_has(weights, s, b):
+                value = as_first(weights, best, total / set_size(weights, s, actions))
             change = max(change, abs(value - v[uint64(s), b]))
             v[uint64(s), b] = value
     return change
@@ -261,26 +343,28 @@ def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions
 @kernel(makes_arrays=False)
 def sticky_backup(transitions, table, palette, gamma, weights, choice, v, out, actions, q, runs):
     """out[s, b] = the backup of v for s of some runs (R, 2), not in place; terms as in `sticky_sweep`."""
-    chosen_weight, previous_weight, uniform_weight = weights
+    chosen_weight, previous_weight, uniform_weight = weights[0], weights[1], weights[2]
     for i in range(len(runs)):
         stop = runs[i, 1]
         for s in range(runs[i, 0], stop):
             if s + AHEAD < stop:
                 fetch_values(transitions, v, actions, s + AHEAD)
-            best, total = _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s)
-            shared = chosen_weight * best + uniform_weight * total / len(actions)
+            best, total = _sticky_values(transitions, table, palette, gamma, weights, choice, v, actions, q, s)
+            shared = chosen_weight * best + uniform_weight * total / set_size(weights, s, actions)
             for b in range(len(actions)):
                 out[uint64(s), b] = shared + previous_weight * q[b]
+                if not set_has(weights, s, b):
+                    out[uint64(s), b] = as_first(weights, best, total / set_size(weights, s, actions))
 
 
 @njit(forceinline=True)
 def _policy_value(transitions, table, palette, gamma, weights, policy, v, actions, s):
     """sum_a (chosen policy[s, a] + uniform / A) q(s, a): the backup of v at s."""
-    chosen_weight, uniform_share = weights[0], weights[2] / len(actions)
+    chosen_weight, uniform_share = weights[0], weights[2] / set_size(weights, s, actions)
     value = 0.0
     for a in range(len(actions)):
         q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
-        value += (chosen_weight * policy[s, a] + uniform_share) * q
+        value += (chosen_weight * policy[s, a] + (uniform_share if set_has(weights, s, a) else 0.0)) * q
     return value
 
 
@@ -309,19 +393,24 @@ def policy_backup(transitions, table, palette, gamma, weights, policy, v, out, a
 @njit(forceinline=True)
 def _sticky_policy_values(transitions, table, palette, gamma, weights, policy, v, actions, q, values, s):
     """values[b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b); q (A,) scratch."""
-    chosen_weight, previous_weight, uniform_weight = weights
-    uniform_share = uniform_weight / len(actions)
+    chosen_weight, previous_weight, uniform_weight = weights[0], weights[1], weights[2]
+    uniform_share = uniform_weight / set_size(weights, s, actions)
     looks_back = policy.shape[1] > 1
     for a in range(len(actions)):
         q[a] = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
     # the mean under the policy, once where it does not depend on the previous action b
-    shared = 0.0
+    shared, chosen, total = 0.0, 0.0, 0.0
     for b in range(len(actions)):
         if b == 0 or looks_back:
-            shared = 0.0
+            shared, chosen, total = 0.0, 0.0, 0.0
             for a in range(len(actions)):
-                shared += (chosen_weight * policy[s, b, a] + uniform_share) * q[a]
+                has = set_has(weights, s, a)
+                shared += (chosen_weight * policy[s, b, a] + (uniform_share if has else 0.0)) * q[a]
+                chosen += policy[s, b, a] * q[a]
+                total += q[a] if has else 0.0
         values[b] = shared + previous_weight * q[b]
+        if not set_has(weights, s, b):
+            values[b] = as_first(weights, chosen, total / set_size(weights, s, actions))
 
 
 @interpreted_first()

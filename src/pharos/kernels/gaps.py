@@ -39,6 +39,11 @@ def empty_histogram() -> np.ndarray:
     return np.zeros(_BINS, np.int64)
 
 
+def bin_of(gap: float) -> int:
+    """The bin of a gap."""
+    return BIN_OF_ONE + (int(_LARGEST) if gap == math.inf else math.floor(min(4.0 * math.log10(gap), _LARGEST)))
+
+
 @interpreted_first()
 @kernel
 def differences(rewards, next_values, gamma):

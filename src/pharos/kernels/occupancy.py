@@ -3,13 +3,14 @@
 transitions: see kernels/outcomes.py; live (S,) bool: states in which episodes go on; now, after (S, W) float64:
 the distribution over states, W = 1, or over pairs (state, previously executed action), W = A; that of the first step
 has W = 1. policy (S, B, A) probabilities, B = 1 or, for policies that look at the previous action, A; weights: (chosen,
-previous, uniform).
+previous, uniform), with sets behind, see kernels/bellman.py.
 """
 
 import numpy as np
-from numba import njit
+from numba import njit, types
 
-from pharos.kernels.interpreted import interpreted_first
+from pharos.kernels.bellman import set_has, set_size
+from pharos.kernels.interpreted import interpreted_first, overload
 from pharos.kernels.kernel_cache import kernel
 from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 
@@ -23,14 +24,36 @@ def _mass(now, s):
     return mass
 
 
+def unrepeated(policy, weights, now, s, a):
+    """What the mass of s whose previous action is not available adds to a, as it is executed as on the first step."""
+
+
+@overload(unrepeated, jit_options={"forceinline": True})
+def _unrepeated(policy, weights, now, s, a):
+    if isinstance(weights, types.UniTuple):
+        return lambda policy, weights, now, s, a: 0.0
+
+    def in_sets(policy, weights, now, s, a):
+        has, size = set_has(weights, s, a), set_size(weights, s, now[s])
+        uniform = (1.0 - weights[3] - weights[2]) / size if has else 0.0
+        mass = 0.0 if has else -weights[1] * now[s, a]
+        for b in range(now.shape[1]):
+            if not set_has(weights, s, b):
+                p = policy[s, b if policy.shape[1] > 1 else 0, a]
+                mass += now[s, b] * ((weights[3] - weights[0]) * p + uniform)
+        return mass
+
+    return in_sets
+
+
 @njit(forceinline=True)
 def _execute(policy, weights, now, s, mass, executed):
     """executed[a] = the probability of being in s and executing a.
 
     For all actions at once: a call for each of them costs ten times the arithmetic.
     """
-    chosen_weight, previous_weight, uniform_weight = weights
-    uniform_share = uniform_weight * mass / len(executed)
+    chosen_weight, previous_weight, uniform_weight = weights[0], weights[1], weights[2]
+    uniform_share = uniform_weight * mass / set_size(weights, s, executed)
     for a in range(len(executed)):
         if policy.shape[1] == 1:
             p = mass * policy[s, 0, a]
@@ -38,9 +61,9 @@ def _execute(policy, weights, now, s, mass, executed):
             p = 0.0
             for b in range(now.shape[1]):
                 p += now[s, b] * policy[s, b, a]
-        p = chosen_weight * p + uniform_share
+        p = chosen_weight * p + (uniform_share if set_has(weights, s, a) else 0.0)
         if previous_weight > 0.0:
-            p += previous_weight * now[s, a]
+            p += previous_weight * now[s, a] + unrepeated(policy, weights, now, s, a)
         executed[a] = p
 
 

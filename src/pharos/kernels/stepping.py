@@ -12,10 +12,10 @@ W[a] + q[a, c] for features F and a diagonal.
 from typing import NamedTuple
 
 import numpy as np
-from numba import float64, njit, uint64
+from numba import float64, njit, types, uint64
 from numba.extending import overload
 
-from pharos.kernels.bellman import reward_at
+from pharos.kernels.bellman import reward_at, set_has
 from pharos.kernels.kernel_cache import kernel
 from pharos.kernels.outcomes import drawn, drawn_outcome, is_table, outcome, size_of
 
@@ -171,17 +171,39 @@ def executed_by_number(choice, previous, chance, num_actions, u):
 
 
 @njit(forceinline=True)
-def redrawn_action(choice, previous, chance, num_actions, rng):
-    """The executed action, by numbers of the stream rng (1,): a uniform action takes a second one.
+def redrawn_action(choice, previous, chance, num_actions, rng, s):
+    """The executed action in state s, by numbers of the stream rng (1,): a uniform action takes a second one.
 
-    Otherwise as `executed_by_number`.
+    Otherwise as `executed_by_number`; behind `chance` there may be sets, as in kernels/bellman.py.
     """
     u = uniform_number(rng, 0)
-    if previous < 0:
-        return choice if u < chance[3] else integer_below(rng, 0, num_actions)
+    if previous < 0 or not set_has(chance, s, previous):
+        return choice if u < chance[3] else action_of_set(chance, num_actions, rng, s)
     if u < chance[0]:
         return choice
-    return previous if u < chance[0] + chance[1] else integer_below(rng, 0, num_actions)
+    return previous if u < chance[0] + chance[1] else action_of_set(chance, num_actions, rng, s)
+
+
+def action_of_set(chance, num_actions, rng, s):
+    """A uniform one of the actions that are available in state s, by the stream rng (1,)."""
+
+
+@overload(action_of_set, jit_options={"forceinline": True})
+def _action_of_set(chance, num_actions, rng, s):
+    if isinstance(chance, types.UniTuple):
+        return lambda chance, num_actions, rng, s: integer_below(rng, 0, num_actions)
+
+    last = len(chance) - 1
+
+    def drawn_of_set(chance, num_actions, rng, s):
+        sets = chance[last]
+        left, action = integer_below(rng, 0, sets[s].sum()), 0
+        while left > 0 or not sets[s, action]:
+            left -= sets[s, action]
+            action += 1
+        return action
+
+    return drawn_of_set
 
 
 @njit(forceinline=True)
@@ -354,7 +376,8 @@ def q_learning(
 
     transitions: see kernels/outcomes.py; table, palette: rewards; starts (K,), cumulative (K,): start states and their
     cumulated probabilities;
-    chance: (chosen, previous, uniform, first_chosen); limit: steps of an episode; q, visits (R, A): values and number
+    chance: (chosen, previous, uniform, first_chosen), with sets behind where some actions are not available; limit:
+    steps of an episode; q, visits (R, A): values and number
     of updates, R = S, or S (A + 1) with rows s (A + 1) + b where the agent observes the previous action b (A: none).
     schedule: (learning rate, exponent of visits or 0, gamma, first epsilon, last epsilon, steps of exploration,
         exponential?, gamma of returns).
@@ -384,10 +407,12 @@ def q_learning(
             epsilon = first_epsilon + share * (last_epsilon - first_epsilon)
         # epsilon-greedy action
         if uniform_number(word, 0) < epsilon:
-            action = integer_below(word, 0, num_actions)
+            action = action_of_set(chance, num_actions, word, s)
         else:  # greedy, ties at random
-            best, ties, action = q[row, 0], 1, 0
-            for a in range(1, num_actions):
+            best, ties, action = -np.inf, 1, 0
+            for a in range(num_actions):
+                if not set_has(chance, s, a):
+                    continue
                 if q[row, a] > best:
                     best, ties, action = q[row, a], 1, a
                 elif q[row, a] == best:
@@ -395,7 +420,7 @@ def q_learning(
                     if uniform_number(word, 0) * ties < 1.0:
                         action = a
         # one step of the MDP
-        executed = redrawn_action(action, b if b < num_actions else -1, chance, num_actions, word)
+        executed = redrawn_action(action, b if b < num_actions else -1, chance, num_actions, word, s)
         reward = reward_at(table, palette, s, executed)
         t = _next_state(transitions, s, executed, word)
         ended = t < 0 or terminal[t]
@@ -403,9 +428,10 @@ def q_learning(
         value = 0.0
         if not ended:
             next_row = t * (num_actions + 1) + executed if observes_previous else t
-            value = q[next_row, 0]
-            for a in range(1, num_actions):
-                value = max(value, q[next_row, a])
+            value = -np.inf
+            for a in range(num_actions):
+                if set_has(chance, t, a):
+                    value = max(value, q[next_row, a])
         # the reward that the agent gets, late and noisy
         paid_reward = reward
         if len(pending) > 0:
@@ -527,7 +553,7 @@ def learn(
                     if uniform_number(word, 0) * ties < 1.0:
                         action = a
         # one step of the MDP: the outcome by its cumulated probability
-        executed = redrawn_action(action, place[1], chance, num_actions, word)
+        executed = redrawn_action(action, place[1], chance, num_actions, word, s)
         row = s * num_actions + executed
         k, last = offsets[row], offsets[row + 1] - 1
         if k < last:

@@ -8,6 +8,17 @@ from typing import TYPE_CHECKING
 from pharos.system import lazy
 
 if TYPE_CHECKING:
+    from pharos.mdp.action_sets import (
+        available_choices,
+        check_choices,
+        checked_sets,
+        drawn_actions,
+        most_actions,
+        require_all_actions,
+        stand_ins,
+        uniform_choice,
+        with_sets,
+    )
     from pharos.mdp.actions import (
         BEST,
         WORST,
@@ -16,7 +27,6 @@ if TYPE_CHECKING:
         Extreme,
         PolicyTable,
         Selection,
-        chosen_mass,
         lazy_actions,
         mass_of,
         random_actions,

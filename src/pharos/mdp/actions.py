@@ -11,7 +11,7 @@ probability of the dynamics, see table.py.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -19,7 +19,9 @@ import numpy as np
 
 from pharos.environments import declared_parameters, parameter
 from pharos.errors import ParameterError, UnknownName
+from pharos.mdp.action_sets import check_choices, uniform_choice
 from pharos.mdp.arguments import require_mdp
+from pharos.system.arrays import read_only
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -114,11 +116,12 @@ class PolicyTable:
         Rows are divided by their sums in float64: those of a float32 softmax sum to 1 within 1e-7 only, and the
         difference would add up over the steps of an episode; `operations` counts the rounding of the division.
         Raises:
-            ParameterError: the shape is wrong, or rows are not probabilities that sum to 1 within 1e-6.
+            ParameterError: the shape is wrong, or rows are not probabilities that sum to 1 within 1e-6, or have an
+                action that is not available.
         """
         num_states, num_actions = mdp.num_states, mdp.num_actions
         if policy is None:
-            return PolicyTable(num_actions, np.full((num_states, 1, num_actions), 1 / num_actions))
+            return PolicyTable(num_actions, uniform_choice(mdp)[:, None])
         table = np.asarray(policy(np.arange(num_states)) if callable(policy) else policy)
         if table.dtype.kind in "iu":
             _check_actions(mdp, table)
@@ -126,6 +129,7 @@ class PolicyTable:
                 return PolicyTable(num_actions, actions=table)
             return PolicyTable(num_actions, np.eye(num_actions)[table])
         table = _normalized(mdp, table)
+        check_choices(table, mdp.available)
         return PolicyTable(num_actions, table if table.ndim == 3 else table[:, None])
 
     @property
@@ -201,6 +205,8 @@ def _check_actions(mdp: "TabularMDP", actions: np.ndarray) -> None:
     if len(wrong):
         where = tuple(map(int, wrong[0]))
         raise ParameterError(f"the policy chooses action {actions[where]} at {where}; expected 0 to {num_actions - 1}")
+    if mdp.available is not None:
+        check_choices(np.eye(num_actions, dtype=bool)[actions], mdp.available)
 
 
 def _normalized(mdp: "TabularMDP", table: np.ndarray) -> np.ndarray:
@@ -230,12 +236,19 @@ class Chance:
 
     On the first step there is no previous action: the chosen one is executed with probability `first_chosen`, else a
     uniform one. (Only where random actions come before sticky ones does this differ from `chosen + previous`.)
+
+    Where some actions are not available, the uniform action is one of those that are; and a previous one that is not
+    counts as none: the step is as the first one.
+
+    Attributes:
+        available: (N, A) bool, the sets of the states that values and distributions are of, see `at`; None: all.
     """
 
     chosen: float = 1.0
     previous: float = 0.0
     uniform: float = 0.0
     first_chosen: float = 1.0
+    available: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @staticmethod
     def of(sticky: float = 0.0, random: float = 0.0) -> "Chance":
@@ -249,12 +262,13 @@ class Chance:
     def with_random(self, p: float) -> "Chance":
         """Random actions with probability p, before this chance."""
         _check_probability("random_actions", p)
-        return Chance((1 - p) * self.chosen, self.previous, p * self.chosen + self.uniform, (1 - p) * self.first_chosen)
+        chosen, uniform = (1 - p) * self.chosen, p * self.chosen + self.uniform
+        return replace(self, chosen=chosen, uniform=uniform, first_chosen=(1 - p) * self.first_chosen)
 
     def with_sticky(self, p: float) -> "Chance":
         """Sticky actions with probability p, before this chance."""
         _check_probability("sticky_actions", p)
-        return Chance((1 - p) * self.chosen, p * self.chosen + self.previous, self.uniform, self.first_chosen)
+        return replace(self, chosen=(1 - p) * self.chosen, previous=p * self.chosen + self.previous)
 
     # What it is -------------------------------------------------------------------------------------------------------
 
@@ -266,7 +280,7 @@ class Chance:
     @property
     def first(self) -> "Chance":
         """The chance of the first step, which has no previous action."""
-        return Chance(self.first_chosen, 0.0, self.first_uniform, self.first_chosen)
+        return replace(self, chosen=self.first_chosen, previous=0.0, uniform=self.first_uniform)
 
     @property
     def is_none(self) -> bool:
@@ -293,8 +307,26 @@ class Chance:
 
     @property
     def triple(self) -> tuple[float, float, float]:
-        """(chosen, previous, uniform), what kernels take."""
+        """(chosen, previous, uniform)."""
         return float(self.chosen), float(self.previous), float(self.uniform)
+
+    @property
+    def for_kernels(self) -> tuple[Any, ...]:
+        """The argument `weights` of kernels: `triple`, with `first_chosen` and the sets if chance depends on them."""
+        if self.available is None or self.is_none:
+            return self.triple
+        return (*self.triple, float(self.first_chosen), read_only(self.available))
+
+    @property
+    def uniform_for_kernels(self) -> "float | tuple[float, np.ndarray]":
+        """The argument `uniform` of kernels: the weight, with the sets where it depends on them."""
+        if self.available is None or not self.is_random:
+            return self.uniform
+        return float(self.uniform), read_only(self.available)
+
+    def at(self, states: States) -> "Chance":
+        """The chance in some states, of which the methods below take rows; the same where all actions are available."""
+        return self if self.available is None else replace(self, available=self.available[states])
 
     def width(self, num_actions: int) -> int:
         """W: the previous actions that values and distributions distinguish, A under sticky actions, else 1."""
@@ -314,8 +346,26 @@ class Chance:
         """
         result = self.chosen * value
         if self.uniform:
-            result = result + self.uniform * q.mean(axis=1, keepdims=True)
+            result = result + self.uniform * self.mean(q)
+        if self.available is not None and self.previous:
+            is_repeated = self.available.reshape(self.available.shape + (1,) * (q.ndim - 2))
+            as_first = self.first_chosen * value + self.first_uniform * self.mean(q)
+            return np.where(is_repeated, result + self.previous * q, as_first)
         return result + self.previous * q if self.previous else result
+
+    def mean(self, q: np.ndarray) -> np.ndarray:
+        """(N, 1, ...): the mean of q (N, A, ...) over the actions that are available."""
+        if self.available is None:
+            return q.mean(axis=1, keepdims=True)
+        shape = self.available.shape + (1,) * (q.ndim - 2)
+        total = np.where(self.available.reshape(shape), q, 0.0).sum(axis=1, keepdims=True)
+        return np.asarray(total / self.available.sum(axis=1).reshape((-1, 1) + (1,) * (q.ndim - 2)))
+
+    def shares(self, num_actions: int) -> "float | np.ndarray":
+        """The probability of each action when a uniform one is executed: 1 / A; (N, A) where sets decide it."""
+        if self.available is None:
+            return 1 / num_actions
+        return np.asarray(self.available / self.available.sum(axis=1, keepdims=True))
 
     def chosen_values(
         self, q: np.ndarray, previous: np.ndarray | None = None, mean: np.ndarray | None = None
@@ -327,26 +377,44 @@ class Chance:
             previous: (N,) previously executed actions, A where there is none; it matters under sticky actions alone.
             mean: (N, 1), the mean of q over actions, where it was added up already.
         """
-        mean = q.mean(axis=1, keepdims=True) if mean is None else mean
+        mean = self.mean(q) if mean is None or self.available is not None else mean
         later = self.chosen * q + self.uniform * mean if self.is_random else self.chosen * q
         if previous is None or not self.is_sticky:
             return later
-        is_first = (previous == q.shape[1])[:, None]
+        is_first = self._is_first(previous, q.shape[1])
         repeated = q[np.arange(len(q)), np.minimum(previous, q.shape[1] - 1)][:, None]
         later = self.chosen * q + self.previous * repeated + self.uniform * mean
         return np.where(is_first, self.first_chosen * q + self.first_uniform * mean, later)
 
-    def executed(self, mass: np.ndarray, choice: np.ndarray) -> np.ndarray:
+    def executed(self, mass: np.ndarray, policy: np.ndarray) -> np.ndarray:
         """(N, A): the mass that executes each action; the adjoint of `choice`.
 
         Args:
             mass: (N, W), of states, by the previously executed action where that matters.
-            choice: (N, A), the mass that chooses each action.
+            policy: (N, B, A) probabilities of choosing, B = W or 1.
         """
-        result = self.chosen * choice
+        if self.available is not None and self.previous:  # what cannot be repeated is as on the first step
+            can_be = np.where(self.available, mass, 0.0)
+            others = np.where(self.available, 0.0, mass)
+            uniform = self.first_uniform * others.sum(axis=1, keepdims=True) * self.shares(policy.shape[2])
+            return self._executed(can_be, policy) + self.first_chosen * chosen_mass(policy, others) + uniform
+        return self._executed(mass, policy)
+
+    def _executed(self, mass: np.ndarray, policy: np.ndarray) -> np.ndarray:
+        result = self.chosen * chosen_mass(policy, mass)
         if self.uniform:
-            result = result + self.uniform * mass.sum(axis=1, keepdims=True) / choice.shape[1]
+            uniform = self.uniform * mass.sum(axis=1, keepdims=True)
+            shares = self.shares(policy.shape[2])
+            result = result + (uniform / policy.shape[2] if self.available is None else uniform * shares)
         return result + self.previous * mass if self.previous else result
+
+    def _is_first(self, previous: np.ndarray, num_actions: int) -> np.ndarray:
+        """(N, 1) bool: whether there is no previous action (N,) that can be repeated."""
+        previous = np.asarray(previous)
+        if self.available is None:
+            return np.asarray((previous == num_actions)[:, None])
+        repeated = self.available[np.arange(len(previous)), np.minimum(previous, num_actions - 1)]
+        return np.asarray(~((previous < num_actions) & repeated)[:, None])
 
     def weights(self, policy: np.ndarray, previous: np.ndarray | None = None) -> np.ndarray:
         """(N, A): the probability that each action is executed.
@@ -356,16 +424,20 @@ class Chance:
             previous: (N,) previously executed actions, A where there is none; it matters under sticky actions alone.
         """
         num_actions = policy.shape[1]
-        later = self.chosen * policy + self.uniform / num_actions
+        if self.available is None:
+            uniform, first_uniform = self.uniform / num_actions, self.first_uniform / num_actions
+        else:
+            uniform, first_uniform = (each * self.shares(num_actions) for each in (self.uniform, self.first_uniform))
+        later = self.chosen * policy + uniform
         if previous is None or not self.is_sticky:
             return later
         later = later + self.previous * (np.asarray(previous)[:, None] == np.arange(num_actions))
-        is_first = (np.asarray(previous) == num_actions)[:, None]
-        return np.where(is_first, self.first_chosen * policy + self.first_uniform / num_actions, later)
+        is_first = self._is_first(previous, num_actions)
+        return np.where(is_first, self.first_chosen * policy + first_uniform, later)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
-        return dict(vars(self))
+        return {name: value for name, value in vars(self).items() if name != "available"}
 
 
 @dataclass(frozen=True)
@@ -457,7 +529,7 @@ class ChanceSetting:
 
 @require_mdp
 def random_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
-    """The MDP in which, with probability p, the executed action is uniform over all A actions.
+    """The MDP in which, with probability p, the executed action is uniform over all that are available.
 
     Q(s, a) = (1 - p) q(s, a) + p mean_b q(s, b), where q(s, x) = r(s, x) + gamma V(next(s, x)).
     Combined with sticky actions: this chance comes before that of `mdp`, so `random_actions(sticky_actions(mdp, p), r)`
@@ -476,7 +548,8 @@ def sticky_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
 
     V(s, b) = (1 - p) max_a q(s, a) + p q(s, b), where b is the previously executed action and q(s, x) the value of
     executing x. On the first step of an episode there is no previous action: the chosen one is executed (as in
-    Gymnasium's StickyAction). Combined with random actions: this chance comes before that of `mdp`.
+    Gymnasium's StickyAction). A previous action b that is not available counts as none: V(s, b) = max_a q(s, a).
+    Combined with random actions: this chance comes before that of `mdp`.
 
     Raises:
         ParameterError: p is not in [0, 1].

@@ -1,8 +1,9 @@
 """Bisimulation: states that no sequence of actions can tell apart, merged. Source: Givan, Dean and Greig (2003).
 
-Two states are bisimilar if they pay the same reward for every action and lead to bisimilar states. The coarsest such
-partition is found by refinement: start from terminal flag, rewards and, if wanted, observations; split classes by the
-classes that their states lead to, until nothing splits (Moore 1956; Kanellakis and Smolka 1990).
+Two states are bisimilar if they have the same actions, pay the same reward for every action and lead to bisimilar
+states. The coarsest such partition is found by refinement: start from terminal flag, rewards and, if wanted,
+observations; split classes by the classes that their states lead to, until nothing splits (Moore 1956; Kanellakis and
+Smolka 1990).
 """
 
 from dataclasses import dataclass, replace
@@ -63,6 +64,8 @@ def minimize(mdp: TabularMDP, observations: npt.ArrayLike | None = None) -> Mini
     rewards = mdp.reward_table
     entries = rewards.table if len(rewards.palette) else rewards.table + 0.0  # -0.0 and 0.0 are one reward
     classes = _numbered(entries, np.asarray(mdp.terminal).astype(np.int64))
+    if mdp.available is not None:
+        classes = _numbered(mdp.available, classes)
     if observations is not None:
         observed = np.asarray(observations)
         if observed.ndim == 0 or len(observed) != mdp.num_states:
@@ -131,6 +134,7 @@ def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -
         space=None,
         is_numbered=False,
         age=None,
+        available=None if mdp.available is None else mdp.available[representatives],
         staying=None if mdp.staying is None else _lost,
     ).with_initial(start)
 

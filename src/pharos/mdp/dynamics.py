@@ -50,7 +50,7 @@ class BellmanEquation(NamedTuple):
 
     def value(self, q: np.ndarray, states: States = slice(None)) -> np.ndarray:
         """(N, W), from the values of executing each action in some states (N, A)."""
-        return self.chance.choice(q, self.select.value(q, states))
+        return self.chance.at(states).choice(q, self.select.value(q, states))
 
 
 class PolicyStep(NamedTuple):
@@ -215,10 +215,10 @@ class Dynamics(ABC):
         if choice is None:
             assert isinstance(select, PolicyTable)
             kernel = bellman.sticky_policy_backup if chance.is_sticky else bellman.policy_backup
-            arrays += chance.triple, select.later if chance.is_sticky else select.later[:, 0]
+            arrays += chance.for_kernels, select.later if chance.is_sticky else select.later[:, 0]
         else:
             kernel = bellman.sticky_backup if chance.is_sticky else bellman.optimal_backup
-            weights = chance.triple if chance.is_sticky else chance.uniform
+            weights = chance.for_kernels if chance.is_sticky else chance.uniform_for_kernels
             arrays += weights, choice
         arrays += x_, out_, bellman.actions_of(self.num_actions, self.is_unrolled)
         whole = np.array([[0, self.num_states]])
@@ -251,7 +251,7 @@ class Dynamics(ABC):
 
         Returns the sum over live states.
         """
-        return occupancy.push(self.for_kernels, step.live, step.policy, step.chance.triple, now, after)
+        return occupancy.push(self.for_kernels, step.live, step.policy, step.chance.for_kernels, now, after)
 
     def push_forward(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
         """(S, W): the mass (S, A) of executed actions one step later, without what ends; W = A by that action, or 1.
@@ -269,12 +269,12 @@ class Dynamics(ABC):
 
         Masses below `least` may stay.
         """
-        weights = step.chance.triple
+        weights = step.chance.for_kernels
         return occupancy.count_visits(self.for_kernels, step.live, step.policy, weights, gamma, least, waiting, visits)
 
     def support(self, step: PolicyStep, reachable: np.ndarray) -> None:
         """Grow reachable (S, W), 1 where there is mass and else 0, to all that the mass may reach in some steps."""
-        occupancy.support(self.for_kernels, step.live, step.policy, step.chance.triple, reachable)
+        occupancy.support(self.for_kernels, step.live, step.policy, step.chance.for_kernels, reachable)
 
     def entries_of(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`entries` of each action in each of some states; the first is i A + a."""
@@ -378,7 +378,10 @@ class Dynamics(ABC):
             from pharos.kernels import bellman
 
             tables = (self.for_sweeps, *equation.rewards.for_kernels, equation.gamma)
-            actions, chance = bellman.actions_of(self.num_actions, self.is_unrolled), equation.chance.uniform
+            actions, chance = (
+                bellman.actions_of(self.num_actions, self.is_unrolled),
+                equation.chance.uniform_for_kernels,
+            )
             groups = (parts.order, parts.starts, parts.has_cycle)
             bellman.sweep_groups(*tables, chance, choice, x[:, 0], actions, *groups, target, settled, most, before)
             return
@@ -457,18 +460,18 @@ def swept(
         assert isinstance(select, PolicyTable)
         if chance.is_sticky:
             return bellman.sticky_policy_sweep(
-                *tables, chance.triple, select.later, x, actions, scratch, np.empty(num_actions), order, *places
+                *tables, chance.for_kernels, select.later, x, actions, scratch, np.empty(num_actions), order, *places
             )
-        return bellman.policy_sweep(*tables, chance.triple, select.later[:, 0], x[:, 0], actions, order, *places)
+        return bellman.policy_sweep(*tables, chance.for_kernels, select.later[:, 0], x[:, 0], actions, order, *places)
     if chance.is_sticky:
-        return bellman.sticky_sweep(*tables, chance.triple, choice, x, actions, scratch, order, *places)
+        return bellman.sticky_sweep(*tables, chance.for_kernels, choice, x, actions, scratch, order, *places)
     v, border = x[:, 0], rows_with_room(transitions, *places)
 
     def change_of(low: int, high: int) -> float:
         change = 0.0
         for piece, start, stop in pieces_from_the_end(transitions, low, high, border):
             largest = bellman.optimal_sweep(
-                read_only(piece), *others, chance.uniform, choice, v, actions, order, start, stop
+                read_only(piece), *others, chance.uniform_for_kernels, choice, v, actions, order, start, stop
             )
             change = float(np.maximum(change, largest))
         return change

@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 import scipy  # whose `sparse` is loaded where it is used
 
+from pharos.mdp.action_sets import stand_ins
 from pharos.mdp.tabular import TabularMDP
 
 
@@ -68,7 +69,8 @@ class ExpandedMDP:
         rewards = np.vstack([mdp.rewards, np.zeros((1, mdp.num_actions))])
         rewards[:-1][np.asarray(mdp.terminal)] = 0.0
         executed = rewards[np.minimum(self.underlying, mdp.num_states)]
-        return mdp.chance.chosen_values(executed, self.previous, mean_of_actions(executed)[:, None])
+        chance = mdp.chance.at(np.minimum(self.underlying, mdp.num_states - 1))
+        return chance.chosen_values(executed, self.previous, mean_of_actions(executed)[:, None])
 
     @cached_property
     def reversed(self) -> tuple[np.ndarray, np.ndarray]:
@@ -147,6 +149,8 @@ class ExpandedMDP:
         # Probabilities of executing each action, for each node and choice.
         node = np.flatnonzero(live[owner])
         choice, chooser = np.tile(np.eye(num_actions), (node.size, 1)), np.repeat(node, num_actions)
+        if mdp.available is not None:
+            choice = np.eye(num_actions)[stand_ins(mdp.available)[owner[node]].ravel()]
         weights = executed_actions(mdp, choice, owner[chooser], previous[chooser])
         counts = np.zeros((nodes, num_actions), np.int64)
         counts[node] = np.diff(weights.indptr).reshape(-1, num_actions)
@@ -206,7 +210,11 @@ def executed_actions(
     """
     nodes, num_actions = policy.shape
     columns = owner[:, None] * num_actions + np.arange(num_actions)
-    entries = mdp.chance.weights(policy, previous).ravel(), columns.ravel(), np.arange(nodes + 1) * num_actions
+    entries = (
+        mdp.chance.at(owner).weights(policy, previous).ravel(),
+        columns.ravel(),
+        np.arange(nodes + 1) * num_actions,
+    )
     matrix = scipy.sparse.csr_matrix(entries, shape=(nodes, mdp.num_states * num_actions))
     matrix.eliminate_zeros()
     return matrix

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pharos.errors import ParameterError
+from pharos.mdp.action_sets import filled, sets_of, stand_ins
 from pharos.mdp.arguments import as_array
 from pharos.mdp.rewards import Rewards, rounding_of_mean
 from pharos.mdp.row_sums import ROUNDED, Residual, normalized_rows, rounding_hint
@@ -18,10 +19,15 @@ AXES = ("SAS", "ASS")
 
 
 def transitions_of(
-    P: object, axes: str | None = None, ends: npt.ArrayLike = False
-) -> tuple["csr_matrix", int, np.ndarray]:
-    """((S A, S) CSR float64 with rows s A + a, A, |sum - 1| (S A,) of the rows divided by it), from any form that
-    `TabularMDP.from_matrices` takes.
+    P: object,
+    axes: str | None = None,
+    ends: npt.ArrayLike = False,
+    available: npt.ArrayLike | None = None,
+    R: object = None,
+) -> tuple["csr_matrix", int, np.ndarray, np.ndarray | None]:
+    """((S A, S) CSR float64 with rows s A + a, A, |sum - 1| (S A,) of the rows divided by it, sets (S, A) or None).
+
+    P has any form that `TabularMDP.from_matrices` takes. Rows of unavailable actions are those that they act as.
 
     Raises:
         ParameterError: the shape does not fit, or entries or their sums are no probabilities.
@@ -39,7 +45,12 @@ def transitions_of(
             raise ParameterError(
                 f"ends has shape {shares.shape}; expected True, False or probabilities ({num_states}, {num_actions})"
             )
-        ends = shares.ravel()
+        ends = shares
+    sets = _sets(matrix, (num_states, num_actions), ends, available, R)
+    if sets is not None:
+        matrix = matrix[_acting_rows(sets)]
+        ends = ends if isinstance(ends, bool | np.bool_) else filled(np.asarray(ends), sets)
+    ends = ends if isinstance(ends, bool | np.bool_) else np.asarray(ends).ravel()
 
     def refuse(row: int, total: float) -> Exception:
         s, a = divmod(row, num_actions)
@@ -49,7 +60,29 @@ def transitions_of(
     rows = np.repeat(np.arange(num_rows), np.diff(matrix.indptr))
     may_end = bool(ends) if isinstance(ends, bool | np.bool_) else np.asarray(ends)
     matrix.data, residuals = normalized_rows(matrix.data, rows, num_rows, refuse, ends=may_end)
-    return matrix, num_actions, residuals
+    return matrix, num_actions, residuals, sets
+
+
+def _sets(
+    matrix: "csr_matrix", shape: tuple[int, int], ends: npt.ArrayLike, available: npt.ArrayLike | None, R: object
+) -> np.ndarray | None:
+    """(S, A) bool, the actions that are available: as given, without those paid -inf and those whose row is empty."""
+    rewards = R if isinstance(R, np.ndarray | list | tuple) and not is_list_of_matrices(R) else np.empty(0)
+    sets = sets_of(available, as_array(rewards, "R", np.float64) if len(rewards) else np.empty(0), shape)
+    if available is not None or (isinstance(ends, bool | np.bool_) and ends):
+        return sets
+    has_row = (np.asarray(matrix.sum(axis=1)).ravel() > 0).reshape(shape)
+    if not isinstance(ends, bool | np.bool_):
+        has_row |= np.asarray(ends) > 0
+    has_row |= ~has_row.any(axis=1, keepdims=True)
+    if has_row.all():
+        return sets
+    return has_row if sets is None else sets & has_row
+
+
+def _acting_rows(sets: np.ndarray) -> np.ndarray:
+    """(S A,) the row s A + a that each row acts as."""
+    return (np.arange(len(sets))[:, None] * sets.shape[1] + stand_ins(sets)).ravel()
 
 
 def likely_reason(matrix: "csr_matrix", num_actions: int, row: int, total: float) -> str:
@@ -63,10 +96,7 @@ def likely_reason(matrix: "csr_matrix", num_actions: int, row: int, total: float
         first = row // num_actions * num_actions
         if matrix.indptr[first] == matrix.indptr[first + num_actions]:
             return ": the state has no outcomes; if it is terminal, say ends=True"
-        return (
-            ": is the action not available there? repeat the row and the reward of another one, or say ends=True if "
-            "it ends the episode"
-        )
+        return ": the action is available, but its row is empty; say ends=True if it ends the episode"
     return rounding_hint(total) or (": if the rest ends the episode, say ends=True" if total < 1 else "")
 
 
@@ -126,7 +156,12 @@ def by_rows(value: object, name: str, axes: str | None) -> "csr_matrix":
 
 
 def expected_rewards(
-    matrix: "csr_matrix", R: object, axes: str | None, num_actions: int, residuals: np.ndarray
+    matrix: "csr_matrix",
+    R: object,
+    axes: str | None,
+    num_actions: int,
+    residuals: np.ndarray,
+    sets: np.ndarray | None = None,
 ) -> tuple[Rewards | np.ndarray, Residual]:
     """((S, A) expected rewards, residual), from (S, A); from (S,), alike for every action; or from a reward for each
     transition, in any form of P, averaged over the probabilities.
@@ -147,6 +182,8 @@ def expected_rewards(
             raise ParameterError(
                 f"R has rewards for {by_transition.shape} rows and next states; expected {matrix.shape}, as P"
             )
+        if sets is not None:
+            by_transition = by_transition[_acting_rows(sets)]
         rows = np.repeat(np.arange(len(residuals)), np.diff(matrix.indptr))
         each = np.asarray(by_transition[rows, matrix.indices]).ravel()
         each[matrix.data == 0] = 0.0
@@ -161,6 +198,8 @@ def expected_rewards(
         return Rewards.from_array(means.reshape(shape), rounding), Residual.of(residuals, largest)
     if R.shape == (num_states,):
         R = np.repeat(R[:, None], num_actions, axis=1)
+    if sets is not None and R.shape == shape:
+        R = filled(R, sets)
     return R, Residual.of(residuals)
 
 

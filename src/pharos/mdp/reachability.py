@@ -50,7 +50,11 @@ def nodes_after(mdp: TabularMDP, nodes: np.ndarray, lone: np.ndarray) -> np.ndar
     if nodes.shape[1] < mdp.num_actions or mdp.chance.executes_any:
         after = _arrivals(mdp, nodes.any(axis=1) | lone)
         return after if nodes.shape[1] == mdp.num_actions else np.asarray(after.any(axis=1, keepdims=True))
-    states, actions = np.nonzero(nodes & ~np.asarray(mdp.terminal)[:, None])  # every action is a repetition
+    executed = nodes  # every action is a repetition, of one that is available
+    if mdp.available is not None:
+        chooses = (nodes & ~mdp.available).any(axis=1, keepdims=True)
+        executed = mdp.available & (nodes | chooses)
+    states, actions = np.nonzero(executed & ~np.asarray(mdp.terminal)[:, None])
     outcomes = mdp.dynamics.outcomes(states, actions)
     after = np.vstack([_arrivals(mdp, lone), np.zeros_like(nodes[:1])])
     after[outcomes.states, actions[outcomes.which]] = True
@@ -59,7 +63,13 @@ def nodes_after(mdp: TabularMDP, nodes: np.ndarray, lone: np.ndarray) -> np.ndar
 
 def _arrivals(mdp: TabularMDP, is_visited: np.ndarray) -> np.ndarray:
     """(S, A) bool: the pairs (state, executed action) one step after some states (S,) bool."""
-    return mdp.dynamics.arrivals(np.flatnonzero(is_visited & ~np.asarray(mdp.terminal)))
+    states = np.flatnonzero(is_visited & ~np.asarray(mdp.terminal))
+    if mdp.available is None:
+        return mdp.dynamics.arrivals(states)
+    which, actions = np.nonzero(mdp.available[states])
+    outcomes, after = mdp.dynamics.outcomes(states[which], actions), np.zeros((mdp.num_states + 1, mdp.num_actions))
+    after[outcomes.states, actions[outcomes.which]] = 1
+    return after[:-1] > 0
 
 
 def lone_starts(mdp: TabularMDP) -> np.ndarray:
@@ -100,6 +110,7 @@ def restricted_to(mdp: TabularMDP, states: np.ndarray) -> TabularMDP:
         folder=None,
         space=None,
         age=None,
+        available=None if mdp.available is None else mdp.available[states],
     )
 
 
@@ -140,7 +151,7 @@ class Part:
         """The states [start, stop) of an MDP. Copies their next states, renumbered."""
         dynamics, halo = mdp.dynamics.part(start, stop)
         rewards = mdp.reward_table.of(slice(start, stop))
-        return Part(start, stop, halo, dynamics, rewards, mdp.gamma, mdp.chance)
+        return Part(start, stop, halo, dynamics, rewards, mdp.gamma, mdp.chance.at(slice(start, stop)))
 
     def __len__(self) -> int:
         return self.stop - self.start

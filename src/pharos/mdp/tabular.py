@@ -12,7 +12,8 @@ import numpy.typing as npt
 from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.mdp import construction
-from pharos.mdp.actions import Chance
+from pharos.mdp.action_sets import filled, stand_ins
+from pharos.mdp.actions import Chance, States
 from pharos.mdp.arguments import (
     check_gamma,
     check_horizon,
@@ -53,6 +54,8 @@ class TabularMDP:
         is_numbered: whether states have the numbers that they were given with; not after some were merged.
         age: (S,) integers that each transition out of a state that is not terminal makes larger; None where they are
             not known. Solvers take the states in this order then, once.
+        available: (S, A) bool, the actions that exist in each state, one or more, all in terminal states; None: all
+            everywhere. Transitions and rewards of the others are those of the first available action.
         residual: what the sums of rows that were given leave open, see mdp/row_sums.py; error bounds of values count
             it.
     """
@@ -71,6 +74,7 @@ class TabularMDP:
     space: "StateSpace | None" = None
     residual: Residual = field(default_factory=Residual)
     is_numbered: bool = True
+    available: np.ndarray | None = None
 
     def __new__(cls, dynamics: object = None, *_: object, **__: object) -> "TabularMDP":
         if isinstance(dynamics, np.ndarray | list | tuple):
@@ -84,6 +88,10 @@ class TabularMDP:
     def __post_init__(self) -> None:
         check_gamma(self.gamma)
         check_horizon(self.horizon)
+        if self.available is not None and self.available.all():
+            object.__setattr__(self, "available", None)  # the class is frozen
+        if self.chance.available is not self.available:
+            object.__setattr__(self, "chance", replace(self.chance, available=self.available))
 
     # Making one -------------------------------------------------------------------------------------------------------
 
@@ -171,6 +179,15 @@ class TabularMDP:
         """Name, in words, of the nodes that values and choices belong to."""
         return "pairs (state, previously executed action)" if self.is_sticky else "states"
 
+    def acting(self, x: np.ndarray, states: States) -> np.ndarray:
+        """Values (N, A, ...) of executing actions in some states, those of unavailable actions as what they act as.
+
+        Only under sticky actions they may differ, as the action is part of what comes next.
+        """
+        if self.available is None or not self.is_sticky:
+            return x
+        return x[np.arange(len(x))[:, None], stand_ins(self.available[states])]
+
     def without_width(self, x: np.ndarray) -> np.ndarray:
         """Values (..., W) in the shape for users: without the last axis, unless actions are sticky."""
         return x if self.is_sticky else x[..., 0]
@@ -202,6 +219,8 @@ class TabularMDP:
 
     def with_rewards(self, rewards: npt.ArrayLike) -> "TabularMDP":
         """The same MDP with other rewards, (S, A); those of terminal states must be 0."""
+        if self.available is not None and np.shape(rewards) == self.available.shape:
+            rewards = filled(np.asarray(rewards, np.float64), self.available)
         table = rewards_of_shape(rewards, self.reward_table.shape)
         wrong = self.terminal[:, None] & (table.array != 0)
         if wrong.any():
@@ -262,6 +281,7 @@ class TabularMDP:
         horizon = "" if self.horizon is None else f", horizon={self.horizon}"
         states, actions = ("s" * (number != 1) for number in (self.num_states, self.num_actions))
         size = f"{self.num_states} state{states}, {self.num_actions} action{actions}"
+        size += "" if self.available is None else ", not all in each state"
         return f"TabularMDP({kind}{size}, gamma={self.gamma}{horizon}{chance})"
 
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.mdp import Rewards, TabularMDP, lacking
+from pharos.mdp import Rewards, TabularMDP, check_choices, lacking
 from pharos.observations import ObservationInContext, observe
 from pharos.policies.models import (
     DeepPolicy,
@@ -23,6 +23,7 @@ from pharos.policies.models import (
     check_observation,
     memory_error,
     no_masks_error,
+    takes_masks,
 )
 from pharos.state_space import StateSpace
 
@@ -88,6 +89,15 @@ def policy_function(policy: PolicyLike, *, masked: bool = False) -> Callable[...
     raise ParameterError(
         f"agent is {policy!r}; expected a policy table, a model of Stable-Baselines3, or a function of observations"
     )
+
+
+def masks_for(policy: PolicyLike, mdp: TabularMDP, masks: "MasksLike | None") -> "MasksLike | None":
+    """Masks under which a policy is asked: as given; else, of one trained under masks, the sets of the MDP, if any."""
+    if masks is not None or mdp.available is None:
+        return masks
+    is_model = isinstance(policy, SB3Model) and not isinstance(policy, Policy)
+    is_masked = takes_masks(policy) if is_model else getattr(policy, "masked", False)  # type: ignore[arg-type]
+    return mdp.available if is_masked else None
 
 
 # Queried policies -----------------------------------------------------------------------------------------------------
@@ -258,7 +268,8 @@ class QueriedPolicy:
             probabilities = self.query(rows)
             if max_rows is not None and len(self.rows) > max_rows:
                 return False
-            weights = mdp.chance.weights(probabilities, previous)
+            check_choices(probabilities, None if mdp.available is None else mdp.available[states], states)
+            weights = mdp.chance.at(states).weights(probabilities, previous)
             which, actions = np.nonzero(weights > 0)
             outcomes = mdp.dynamics.outcomes(states[which], actions)
             live = outcomes.states < mdp.num_states
@@ -363,14 +374,23 @@ class QueriedPolicy:
         table = replace(sub_mdp.reward_table, rounding=rounding, is_of_many=is_of_many)
         if mdp.horizon is not None:  # every step reads the rewards: no palette
             table = Rewards(np.asarray(rewards, np.float64), np.empty(0), rounding, is_of_many)
-        return replace(sub_mdp, reward_table=table, chance=mdp.chance, residual=mdp.residual.plus(sub_mdp.residual))
+        return replace(
+            sub_mdp,
+            reward_table=table,
+            chance=mdp.chance,
+            residual=mdp.residual.plus(sub_mdp.residual),
+            available=None if mdp.available is None else mdp.available[states],
+        )
 
 
 class AnyAnswers(QueriedPolicy):
     """Answers of the uniform policy, which reaches what any policy can reach."""
 
     def _query(self, rows: np.ndarray) -> np.ndarray:
-        return np.full((len(rows), self.num_actions), 1 / self.num_actions)
+        if self.mdp.available is None:
+            return np.full((len(rows), self.num_actions), 1 / self.num_actions)
+        sets = self.mdp.available[rows // self.width]
+        return np.asarray(sets / sets.sum(axis=1, keepdims=True))
 
 
 def reachable_rows(
@@ -445,7 +465,8 @@ class PolicyAnswers(QueriedPolicy):
     Args:
         policy: as `policy_function` takes it.
         deterministic: whether the most probable action is taken.
-        masks: the actions that a model trained under masks may choose, as `ActionMasks` takes them.
+        masks: the actions that a model trained under masks may choose, as `ActionMasks` takes them; None: those that
+            are available in the MDP.
     Raises:
         ParameterError: it is no policy, was trained on other observations, or masks are missing or do not fit.
     """
@@ -460,6 +481,7 @@ class PolicyAnswers(QueriedPolicy):
         masks: MasksLike | None = None,
     ):
         super().__init__(mdp, sees_previous_action=observer.previous_action)
+        masks = masks_for(policy, mdp, masks)
         self.masks = None if masks is None else ActionMasks(masks, mdp, observer)
         self.policy = policy_function(policy, masked=masks is not None)
         self.observer, self.deterministic = observer, deterministic

@@ -20,7 +20,7 @@ import numpy as np
 from pharos import solvers
 from pharos.errors import DivergenceError, ParameterError
 from pharos.kernels.stepping import execute_choices
-from pharos.mdp import PolicyTable, Rewards, Table, TabularMDP, require_mdp
+from pharos.mdp import PolicyTable, Rewards, Table, TabularMDP, drawn_actions, require_mdp
 from pharos.policies.models import SB3Model, check_observation, deep_policy
 from pharos.policies.policy import (
     AnswerOptions,
@@ -36,6 +36,7 @@ from pharos.policies.policy import (
     RecurrentPolicy,
     TableAnswers,
     TabularAgent,
+    masks_for,
 )
 from pharos.solvers import Solution
 from pharos.system.arrays import as_array
@@ -253,7 +254,8 @@ def answers_of(
     policy: PolicyLike, mdp: TabularMDP, observer: Observer, **options: Unpack[AnswerOptions]
 ) -> PolicyAnswers:
     """Answers of a policy that sees observations: of the state alone, of the last frames, or with a memory."""
-    masked = options.get("masks") is not None
+    options["masks"] = masks_for(policy, mdp, options.get("masks"))
+    masked = options["masks"] is not None
     if isinstance(policy, SB3Model) and not isinstance(policy, Policy):
         policy = deep_policy(policy, masked=masked)
     if isinstance(policy, RecurrentPolicy) and not isinstance(policy, Policy) and not masked:
@@ -659,6 +661,12 @@ def estimate(
     for step in range(steps):
         places = answers.places(rows)
         numbers = rng.random(alive.size), rng.random(alive.size), rng.integers(mdp.num_actions, size=alive.size)
+        if mdp.available is not None and not mdp.chance.is_none:
+            sets = mdp.available[states[alive]]
+            numbers = (*numbers[:2], drawn_actions(sets, rng))
+            before = previous[alive]
+            can_be = sets[np.arange(alive.size), np.minimum(before, mdp.num_actions - 1)]
+            previous[alive] = np.where(can_be, before, mdp.num_actions)
         execute_choices(
             answers.probabilities, places, numbers, chance, *rewards, states, mdp.gamma**step, alive, previous, returns
         )

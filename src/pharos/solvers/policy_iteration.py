@@ -21,7 +21,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pharos.kernels import bellman, linear_algebra
-from pharos.mdp import BellmanEquation, PolicyTable, Rewards, Selection, TabularMDP, executed_actions, nodes_of_outcomes
+from pharos.mdp import (
+    BellmanEquation,
+    PolicyTable,
+    Rewards,
+    Selection,
+    TabularMDP,
+    available_choices,
+    executed_actions,
+    nodes_of_outcomes,
+)
 from pharos.solvers.convergence import SETTLED, operations, shrinking, sweeps_left
 from pharos.system.memory import available_memory
 
@@ -318,8 +327,9 @@ class PolicyIteration:
         mdp, actions = self.mdp, np.empty(self.mdp.num_states, np.int64)
         for start in range(0, mdp.num_states, BLOCK):
             states = slice(start, min(start + BLOCK, mdp.num_states))
-            q = mdp.reward_table.rows(states) + mdp.gamma * mdp.dynamics.expected(x, states)
-            actions[states] = self.select.policy(q).table
+            q = mdp.reward_table.rows(states) + mdp.gamma * mdp.acting(mdp.dynamics.expected(x, states), states)
+            sets = None if mdp.available is None else mdp.available[states]
+            actions[states] = available_choices(self.select.policy(q).table, sets)
         return PolicyTable(mdp.num_actions, actions=actions)
 
 

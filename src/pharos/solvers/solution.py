@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.mdp import Selection, TabularMDP
+from pharos.mdp import Selection, TabularMDP, available_choices
 
 # States whose greedy actions are worked out in one go.
 _BLOCK = 1 << 20
@@ -64,13 +64,23 @@ class Solution:
 
     @property
     def q(self) -> np.ndarray:
-        """(S, A) action values, of choosing; of executing under sticky actions. Computed anew by each call."""
+        """(S, A) action values, of choosing; of executing under sticky actions. Computed anew by each call.
+
+        Of actions that are not available -inf (inf in the solution of the worst policy), which no choice takes.
+        """
         executed = self.q_of(slice(None))
-        return executed if self.mdp.is_sticky else self.mdp.chance.choice(executed, executed)
+        chosen = executed if self.mdp.is_sticky else self.mdp.chance.choice(executed, executed)
+        if self.mdp.available is None:
+            return chosen
+        return np.where(self.mdp.available, chosen, np.inf if self.kind == "worst" else -np.inf)
 
     def q_of(self, states: np.ndarray | slice) -> np.ndarray:
-        """(N, A), the values of executing each action in some states (indices or a slice)."""
+        """(N, A), the values of executing each action in some states (indices or a slice).
+
+        An action that is not available has the value of the first one that is, as which it acts.
+        """
         next_values = self.mdp.dynamics.expected(self.next_x, states).astype(np.float64, copy=False)
+        next_values = self.mdp.acting(next_values, states)
         return self.mdp.reward_table.rows(states) + self.mdp.gamma * next_values
 
     @cached_property
@@ -88,7 +98,9 @@ class Solution:
         actions = np.empty(self.mdp.num_states, np.int64)
         for start in range(0, self.mdp.num_states, _BLOCK):
             block = slice(start, min(start + _BLOCK, self.mdp.num_states))
-            actions[block] = self.select.policy(self.q_of(block)).table
+            greedy = self.select.policy(self.q_of(block)).table
+            sets = None if self.mdp.available is None else self.mdp.available[block]
+            actions[block] = available_choices(greedy, sets)
         return actions
 
     @property
@@ -111,7 +123,8 @@ class Solution:
         if not self.mdp.is_sticky:
             return float(probabilities @ self.v[starts])
         q = self.q_of(starts)
-        return float(probabilities @ self.mdp.chance.first.choice(q, self.select.first_value(q, starts))[:, 0])
+        chance = self.mdp.chance.first.at(starts)
+        return float(probabilities @ chance.choice(q, self.select.first_value(q, starts))[:, 0])
 
     def conventions(self) -> dict[str, Any]:
         """Discount, horizon, kind and error bound of the values, JSON-able."""

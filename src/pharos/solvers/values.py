@@ -22,6 +22,7 @@ from pharos.mdp import (
     mass_of,
     random_actions,
     require_mdp,
+    uniform_choice,
 )
 from pharos.solvers.convergence import imprecise
 from pharos.solvers.fixed_point import (
@@ -284,8 +285,8 @@ def evaluate_parts(
 
 @require_mdp
 def uniform_policy(mdp: TabularMDP) -> np.ndarray:
-    """(S, A) probabilities, all 1 / A."""
-    return np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions)
+    """(S, A) probabilities, all 1 / A; where some actions are not available, 1 over the number of those that are."""
+    return uniform_choice(mdp)
 
 
 def _on_its_graph(mdp: TabularMDP, select: PolicyTable, watch: Stopwatch) -> Solution:

@@ -4,6 +4,7 @@ FOLDER/manifest.json     what is there, written last
 FOLDER/NAME.npy          an array of COMMON, and those of one of the forms below
 FOLDER/observations.npy  where the source shows states: format version 2 or 3
 FOLDER/outcome_*.npy     in format version 3: outcomes, with the reward of each
+FOLDER/available.npy     in format version 5: the actions that exist in each state; other files as in version 1, 2 or 3
 """
 
 import math
@@ -22,7 +23,9 @@ OBSERVED_VERSION = 2
 """Of folders with observations."""
 PAID_VERSION = 3
 """Of folders that know the reward of each outcome, with observations or without."""
-VERSIONS = (VERSION, OBSERVED_VERSION, PAID_VERSION)
+SETS_VERSION = 5
+"""Of folders in which some actions are not available in some states. 4 is another extension of 3."""
+VERSIONS = (VERSION, OBSERVED_VERSION, PAID_VERSION, SETS_VERSION)
 
 COMMON = ("rewards", "terminal", "start_states", "start_probabilities")
 TABLE = ("next_states",)
@@ -30,6 +33,7 @@ MATRIX = ("transitions_data", "transitions_indices", "transitions_indptr")
 OUTCOMES = ("successors",)  # and, where they are: offsets; probabilities, or codes and palette
 OBSERVATIONS = "observations"
 PAID = ("outcome_offsets", "outcome_states", "outcome_probabilities", "outcome_rewards")
+AVAILABLE = "available"
 RESIDUAL = "residual"
 """Entry of the manifest: what the sums of given rows leave open, in probability and in reward; absent where nothing."""
 ROUNDING = "rounding"
@@ -86,8 +90,11 @@ def read_arrays(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> dict[
         kind = (*OUTCOMES, *offsets, *(("probabilities",) if "probabilities" in checksums else ("codes", "palette")))
     names = (*COMMON, *kind)
     version = manifest["format_version"]
-    has_shown = version == OBSERVED_VERSION or (version == PAID_VERSION and OBSERVATIONS in checksums)
-    shown, outcomes = (OBSERVATIONS,) * has_shown, PAID * (version == PAID_VERSION)
+    may_have_shown = version in (PAID_VERSION, SETS_VERSION) and OBSERVATIONS in checksums
+    shown = (OBSERVATIONS,) * (version == OBSERVED_VERSION or may_have_shown)
+    has_paid = version == PAID_VERSION or (version == SETS_VERSION and PAID[0] in checksums)
+    outcomes = PAID * has_paid
+    names = (*names, *(AVAILABLE,) * (version == SETS_VERSION))
     if set(checksums) != {*names, *shown, *outcomes}:
         raise ValueError(f"its arrays are {', '.join(checksums)}; expected {', '.join((*names, *shown, *outcomes))}")
     return {name: read_array(folder, manifest, name) for name in (*names, *outcomes)}

@@ -33,6 +33,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, PharosError
 from pharos.interaction import GymEnv
+from pharos.mdp import uniform_choice
 from pharos.policies import PolicyAnswers, PolicyLike, RecurrentPolicy, SB3Model, deep_policy
 from pharos.system.wording import in_one_line
 from pharos.training.curve import Curve, Evaluation, evaluate_agent
@@ -462,4 +463,4 @@ def not_stepped(steps: int) -> ParameterError:
 
 def uniform_policy(task: Task) -> np.ndarray:
     """(S, A) probabilities of uniform play."""
-    return np.full((task.mdp.num_states, task.mdp.num_actions), 1 / task.mdp.num_actions)
+    return uniform_choice(task.mdp)

@@ -52,7 +52,7 @@ function moved(action, [state, previous, , reward]) {
 
 function act(action) {
   const { here } = world;
-  if (!here || world.isOver || !here.actions[action]) return null;
+  if (!here || world.isOver || !here.actions[action]?.available) return null;
   let left = Math.random();
   const { outcomes } = here.actions[action];
   return moved(action, outcomes.find(([, , probability]) => (left -= probability) < 0) || outcomes[0]);

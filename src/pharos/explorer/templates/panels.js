@@ -65,6 +65,7 @@ const panels = {
     const widest = Math.max(...position.actions.map((each) => each.gap), 0), others = about.policies.filter((name) => name !== "optimal");
     const heads = ["Action", "Q*", "Gap", ...about.policies.map((name) => `${NAMES[name]}`), "Leads to"];
     const rows = position.actions.map((each, action) => {
+      if (!each.available) return null;
       const bar = h("i");
       bar.style.width = each.best || !widest ? "0" : `${Math.max(2, (54 * each.gap) / widest)}px`;
       const gap = each.best ? h("span", { class: "none" }, "best") : h("span", { class: "gap" }, bar, h("span", {}, text(each.gap, 4)));

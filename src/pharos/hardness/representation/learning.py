@@ -77,6 +77,10 @@ class Representation:
             raise ParameterError(
                 f"the representation is of {len(self.classes)} states; expected {mdp.num_states}, those of the MDP"
             )
+        if mdp.available is not None:
+            raise UndefinedMeasure(
+                f"{measure} is defined for MDPs in which every action is available everywhere: {mdp}"
+            )
         steps = next((each for each in (horizon, mdp.horizon, self.time_limit) if each is not None), None)
         if steps is None:
             raise UndefinedMeasure(f"{measure} is defined for episodes of T steps: give a horizon")

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP, executed_actions, lacking
+from pharos.mdp import TabularMDP, executed_actions, lacking, require_all_actions
 from pharos.solvers import Solution, evaluate_policy, value_iteration
 
 TOLERANCE = 1e-7
@@ -53,7 +53,7 @@ def memoryless_loss(
         optimal: the solution of `mdp`, where there is one.
         budget: seconds after which the bounds so far are returned.
     Raises:
-        ParameterError: actions are sticky.
+        ParameterError: actions are sticky, or some are not available in some states.
     Cost: up to `budget`, and one solution of the MDP and one policy beyond it.
     Source: Littman (1994), "Memoryless policies: theoretical limitations and practical results".
     """
@@ -61,6 +61,7 @@ def memoryless_loss(
         raise ParameterError(
             f"{mdp}: under sticky actions a policy without memory does not know the state; leave them out"
         )
+    require_all_actions(mdp, "memoryless_loss")
     optimal = optimal or value_iteration(mdp, TOLERANCE)
     search = _PolicySearch(mdp, np.asarray(classes), time.monotonic() + budget)
     lower, upper = search.bounds(optimal)
