@@ -390,6 +390,7 @@ def _generate(
 
 def _loaded(code: Source | bytes) -> Learn:
     if isinstance(code, Source):
+        sys.path.append(str(Path(code.file).parent))  # for imports within functions, and files of Numba's cache
         return load(code)
     import cloudpickle
 
