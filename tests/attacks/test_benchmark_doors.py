@@ -378,7 +378,7 @@ MEANS = {
     "copies of copies": lambda env: [play(env.copy().copy().copy()) for _ in range(4)],
     "copy.copy": lambda env: [play(copy.copy(env)) for _ in range(4)],
     "copy.deepcopy": lambda env: [play(copy.deepcopy(env)) for _ in range(4)],
-    "copy.replace": lambda env: [play(type(env)(env.task, env.budget, k)) for k in range(4)],
+    "copy.replace": lambda env: [play(type(env)(env._task, env.budget, k)) for k in range(4)],
     "a list": lambda env: [play(each) for each in copy.deepcopy([env] * 4)],
     "a holder": lambda env: [play(copy.deepcopy(Holder(env)).parts["env"][0]) for _ in range(4)],
     "a wrapper": lambda env: [play(copy.deepcopy(gymnasium.wrappers.OrderEnforcing(env))) for _ in range(4)],

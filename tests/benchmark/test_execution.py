@@ -444,6 +444,22 @@ def test_what_no_other_process_can_import_has_processes_too(suite, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_file_imports_files_beside_it_at_the_top_and_in_functions(suite, tmp_path):
+    for name in ("beside_at_the_top", "beside_in_a_function"):
+        (tmp_path / f"{name}.py").write_text("import numpy as np\n\ndef act(n):\n    return np.zeros(n, int)\n")
+    text = LEARN.replace("import numpy", "from beside_at_the_top import act\nimport numpy", 1)
+    lines = "    from beside_in_a_function import act as same\n    assert same(3).sum() == act(3).sum()\n    draw ="
+    text = text.replace("    draw =", lines)
+    (tmp_path / "mine.py").write_text(text)
+    path = list(sys.path)
+    assert not benchmark.run(
+        f"{tmp_path / 'mine.py'}:learn", suite, out=tmp_path / "out", seeds=[0], tasks="sea"
+    ).missing
+    assert sys.path == path
+    sys.modules.pop("beside_at_the_top")
+
+
+@pytest.mark.slow
 def test_a_run_without_an_end_is_ended_by_its_time_limit(suite, file, tmp_path):
     file.write_text(LEARN.replace("    draw =", "    while seed == 1:\n        pass\n    draw =", 1))
     with pytest.raises(AllRunsFailed) as error:

@@ -32,7 +32,7 @@ from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
 from pharos.system.sources import Source, find, is_reference, load, source_of
 from pharos.system.wording import capped, in_one_line, pluralize
-from pharos.system.workers import SERVER_LOST, Terminated, Workers, one_thread
+from pharos.system.workers import SERVER_LOST, Terminated, Workers, begin_group, end_group, one_thread
 from pharos.training import (
     Curve,
     FailedRun,
@@ -245,6 +245,7 @@ def _train_alone(
     label: str, entry: dict[str, Any], checkpoints: Path, job: Job, send: Callable[[str | OSError | None], None]
 ) -> None:
     """The body of a process: one run of an algorithm of Stable-Baselines3, as the body of `run_apart`."""
+    begin_group()
     os.dup2(2, 1)
     _seed(job.seed)
     config = RunConfig.from_dict(entry)
@@ -331,6 +332,7 @@ def _generate(
     Its standard output goes to standard error. Whatever draws from the global random numbers of Python, NumPy or
     PyTorch draws others in each run.
     """
+    begin_group()
     os.dup2(2, 1)
     process = os.getpid()
 
@@ -371,6 +373,7 @@ def _generate(
 
 def _loaded(code: Source | bytes) -> Learn:
     if isinstance(code, Source):
+        sys.path.append(str(Path(code.file).parent))  # for imports within functions, and files of Numba's cache
         return load(code)
     import cloudpickle
 
@@ -454,7 +457,7 @@ def run_apart(
     """Run each job that is not finished in a process of its own, forked from one that has loaded what runs need.
 
     So nothing of one run, neither of its modules nor of its threads, reaches another one, and a process that dies costs
-    its own run, whose run.json says why.
+    its own run, whose run.json says why. Processes that an agent leaves behind end with its run.
 
     Args:
         form: whose jobs they are; it keeps errors of runs that could not write their own.
@@ -465,6 +468,7 @@ def run_apart(
     left = deque(job for job in jobs if not is_finished(job))
     total, failed, lost = len(left), 0, 0
     running: dict[str, tuple[Job, float]] = {}  # with the time at which it is killed
+    groups: dict[str, int | None] = {}
     sent: set[str] = set()  # keys of runs that have ended, before their processes have
 
     def report_progress() -> None:
@@ -473,7 +477,9 @@ def run_apart(
         settings.tell((len(jobs) - total + ended) / len(jobs), text)
 
     report_progress()
-    with Workers(*(name for name in WARM if name in sys.modules), "pharos.benchmark.warm") as pool:
+    preload = [*(name for name in WARM if name in sys.modules), "pharos.benchmark.warm"]
+    with contextlib.ExitStack() as ends, Workers(*preload) as pool:
+        ends.callback(_end_groups, groups)
         while left or pool:
             while left and len(pool) < settings.workers:
                 job = left.popleft()
@@ -485,6 +491,7 @@ def run_apart(
                     left.appendleft(job)
                     continue
                 running[key] = job, time.monotonic() + (settings.timeout or math.inf)
+                groups[key] = pool.pid(key)
             for key, event in pool.events(POLL_SECONDS):
                 job, latest = running[key]
                 if event is None or isinstance(event, str | OSError):  # the run has ended
@@ -495,6 +502,7 @@ def run_apart(
                         form.errors[job.folder] = f"{event.strerror or event}; the same command goes on"
                     continue
                 del running[key]
+                end_group(groups.pop(key))  # processes that the agent has left behind
                 if key in sent:
                     sent.remove(key)
                     lost = 0
@@ -511,6 +519,11 @@ def run_apart(
                 if time.monotonic() > latest:
                     pool.kill(key)
             report_progress()
+
+
+def _end_groups(groups: Mapping[str, int | None]) -> None:
+    for leader in groups.values():
+        end_group(leader)
 
 
 def _server_lost(lost: int, error: Exception) -> int:

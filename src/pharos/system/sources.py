@@ -223,7 +223,13 @@ def _module_of_file(source: Source) -> ModuleType:
     if spec is None or spec.loader is None:
         raise ImportError(f"cannot read {file}")
     module = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look their module up there
-    spec.loader.exec_module(module)
+    before = list(sys.path)
+    sys.path.append(str(file.parent))  # files beside it, after all else
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        if sys.path[-1] == str(file.parent) and sys.path[:-1] == before:
+            sys.path.pop()
     _MODULES[source.file] = (source.checksum, module)
     return module
 

@@ -27,7 +27,10 @@ def in_words(name: str) -> str:
 
 def in_one_line(error: BaseException) -> str:
     """An error in one line, with its type unless it is one of pharos."""
-    text = " ".join(str(error).split())
+    try:
+        text = " ".join(str(error).split())
+    except Exception:  # of a class of the user's own
+        text = "an error that cannot be printed"
     return text if isinstance(error, PharosError) else f"{type(error).__name__}: {text}"
 
 

@@ -135,6 +135,10 @@ class Workers:
                     check_guard(code)
                 yield key, code
 
+    def pid(self, key: str) -> int | None:
+        """The number of a process that runs."""
+        return self._running[key][0].pid
+
     def kill(self, key: str) -> None:
         """Kill a process; its end is an event."""
         self._running[key][0].kill()
@@ -170,6 +174,19 @@ def _work(
     send(_Begun())  # an exit code is that of the work from here on
     function(*arguments, send)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends by itself: an exception in what is given back is printed
+
+
+def begin_group() -> None:
+    """Make this process, and those that it starts, a group of their own, which `end_group` ends."""
+    with contextlib.suppress(OSError, AttributeError):  # it leads one; Windows
+        os.setsid()
+
+
+def end_group(leader: int | None) -> None:
+    """Kill what is left of the group of a process that has ended; nothing if there is none."""
+    if leader is not None and hasattr(os, "killpg") and leader != os.getpgrp():
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(leader, signal.SIGKILL)
 
 
 def end_cleanly() -> None:
