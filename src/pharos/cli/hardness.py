@@ -285,7 +285,7 @@ def predict(
 
         plots.save(plots.predictions(prediction), plot)
     answer = {**prediction.to_dict(), "plot": plot, "compiling_seconds": compiling.seconds()}
-    return Answer(answer, lambda: _print_prediction(prediction, plot))
+    return Answer(answer, lambda: _print_prediction(target.title, prediction, plot))
 
 
 def _observation(text: str) -> tuple[str, dict[str, Any]]:
@@ -296,10 +296,10 @@ def _observation(text: str) -> tuple[str, dict[str, Any]]:
     return name, parse_parameters(options)
 
 
-def _print_prediction(prediction: "Prediction", plot: Path | None) -> None:
+def _print_prediction(title: str, prediction: "Prediction", plot: Path | None) -> None:
     facts = [*compiling_fact(), *([("plot", plot)] if plot else [])]
     print_table(
-        f"{prediction.environment}, {prediction.chance}: {prediction.states:,} states, "
+        f"{title}, {prediction.chance}: {prediction.states:,} states, "
         f"{prediction.agent.upper()} after {prediction.steps:,} steps",
         ("observation", "network", ">predicted regret", ">80 % interval", ">with a table"),
         (

@@ -409,7 +409,8 @@ def _warnings(calibration: Published, states: int, steps: int, chance: "ChanceSe
     for what, number, tested in (("states", states, calibration.states), ("steps", steps, calibration.steps)):
         low, high = int(tested.min()), int(tested.max())
         if not low <= number <= high:
-            yield f"{number:,} {what}: tested were {low:,} to {high:,}, so the interval is not calibrated here"
+            tested_ones = f"only {low:,} {what} were tested" if low == high else f"tested were {low:,} to {high:,}"
+            yield f"{number:,} {what}: {tested_ones}, so the interval is not calibrated here"
     untested = [name for name in ("sticky", "lazy", "reward_noise") if getattr(chance, name)]
     if chance.random > 0.1:
         untested.append("random above 0.1")
