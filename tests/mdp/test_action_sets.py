@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
@@ -11,6 +10,7 @@ from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
 from pharos.solvers import evaluate_policy, uniform_policy, uniform_value, worst_value
 from refusals import refusal
+from strategies import examples
 
 STATES, ACTIONS, GAMMA = 5, 3, 0.8
 CHANCE = st.sampled_from([(0.0, 0.0), (0.3, 0.0), (0.0, 0.25), (0.3, 0.25), (1.0, 0.0)])
@@ -68,8 +68,7 @@ def naive_values(world, sticky, random, choose):
     return v
 
 
-@settings(max_examples=25, deadline=None)
-@given(worlds(), CHANCE)
+@examples(25, worlds(), CHANCE)
 def test_values_are_those_of_plain_python(world, chance):
     sets, mdp = world[2], of_chance(world, *chance)
     policy = sets * np.random.default_rng(0).random(sets.shape)
@@ -99,8 +98,7 @@ def test_values_are_those_of_plain_python(world, chance):
     assert (visits * mdp.rewards).sum() == pytest.approx(value, abs=1e-6)
 
 
-@settings(max_examples=15, deadline=None)
-@given(worlds(), st.sampled_from([(0.0, 0.0), (0.0, 0.25)]))
+@examples(15, worlds(), st.sampled_from([(0.0, 0.0), (0.0, 0.25)]))
 def test_uniform_play_takes_what_is_available(world, chance):
     mdp = of_chance(world, *chance)
     expected = naive_values(world, 0.0, 1.0, lambda s, q: max(q.values()))[0, ACTIONS]
@@ -126,8 +124,7 @@ def reached(world, sticky):
     return pairs
 
 
-@settings(max_examples=20, deadline=None)
-@given(worlds(), st.sampled_from([(0.0, 0.0), (0.3, 0.0), (0.0, 0.25), (0.3, 0.25)]))
+@examples(20, worlds(), st.sampled_from([(0.0, 0.0), (0.3, 0.0), (0.0, 0.25), (0.3, 0.25)]))
 def test_gaps_and_the_value_norm_are_those_of_actions_that_exist(world, chance):
     (P, R, sets), mdp = world, of_chance(world, *chance)
     v = naive_values(world, *chance, lambda s, q: max(q.values()))
@@ -150,8 +147,7 @@ def test_gaps_and_the_value_norm_are_those_of_actions_that_exist(world, chance):
     assert hardness.environmental_value_norm(mdp) == pytest.approx(variance**0.5, abs=1e-6)
 
 
-@settings(max_examples=15, deadline=None)
-@given(worlds(), st.sampled_from([(0.0, 0.0), (0.3, 0.0)]))
+@examples(15, worlds(), st.sampled_from([(0.0, 0.0), (0.3, 0.0)]))
 def test_covering_is_of_uniform_play_over_what_is_available(world, chance):
     (P, _, sets), mdp = world, of_chance(world, *chance)
     mass, most = {(0, ACTIONS): 1.0}, {}
@@ -172,8 +168,7 @@ def test_covering_is_of_uniform_play_over_what_is_available(world, chance):
     assert result.length_bound == pytest.approx(length, rel=1e-9)
 
 
-@settings(max_examples=10, deadline=None)
-@given(worlds())
+@examples(10, worlds())
 def test_an_action_that_is_not_available_is_a_copy_of_one_that_is_to_optimal_play(world):
     P, R, sets = world
     mdp = of_chance(world, 0.0, 0.0)

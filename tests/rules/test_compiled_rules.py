@@ -145,7 +145,7 @@ def test_kernels_do_not_depend_on_rules_that_they_do_not_call():
         names = numeric_attributes(cls())[0]
         explored, played = exploration_kernels(cls, names, 1, 2), interaction_kernels(cls, names, 2)
         kernels = {**explored._asdict(), **played._asdict()}
-        assert kernels.pop("ages_of") is no_ages
+        assert kernels.pop("ages_of") is no_ages and kernels.pop("mark_available") is None
         return {name: kernel._cache.path for name, kernel in kernels.items()}
 
     def reward(self, state, action, next_state):

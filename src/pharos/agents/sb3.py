@@ -34,6 +34,7 @@ from pharos.agents.agent import (
     new_agent,
     reading_checkpoint,
 )
+from pharos.environments import Environment
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.policies import PolicyLike, deep_policy
 from pharos.system.sources import find, is_reference, load
@@ -121,16 +122,10 @@ def check_hyperparameters(
         also: names that the engine adds to those of the algorithm.
     Raises:
         UnknownName: with the nearest name that it has. ParameterError: a number out of its range, or something else for
-            one; RL Zoo's wrappers; or an algorithm that needs action masks.
+            one; or RL Zoo's wrappers.
     """
     name = _title(agent)
     parameters = inspect.signature(algorithm(agent)).parameters
-    predict = getattr(algorithm(agent), "predict", None)
-    if predict is not None and "action_masks" in inspect.signature(predict).parameters:
-        raise ParameterError(
-            f"agent {name!r}: needs action masks, which pharos does not give while it trains; train it on "
-            f"pharos.GymEnv in sb3_contrib's ActionMasker, and use pharos.evaluate_policy(mdp, model, masks=...)"
-        )
     for hyperparameter, remedy in ZOO.items():
         if hyperparameter in hyperparameters and hyperparameter not in parameters:
             raise ParameterError(f"agent {name!r}: {hyperparameter} is RL Zoo's, for wrappers; {remedy}")
@@ -143,6 +138,27 @@ def check_hyperparameters(
         expected = _expected(hyperparameter, value)
         if expected is not None:
             raise ParameterError(f"agent {name!r}: {hyperparameter} is {value!r}; expected {expected}")
+
+
+def check_masks(agent: str | Callable[..., Any], env: Environment) -> None:
+    """Refuse an algorithm that needs action masks where all actions are available, and one without where not all are.
+
+    Raises:
+        ParameterError: with what to do.
+    """
+    predict = getattr(algorithm(agent), "predict", None)
+    is_masked = predict is not None and "action_masks" in inspect.signature(predict).parameters
+    if is_masked and not env.has_sets:
+        raise ParameterError(
+            f"agent {_title(agent)!r}: needs action masks, and {env} has none: every action is available; for masks of "
+            f"your own train it on pharos.GymEnv in sb3_contrib's ActionMasker, and give masks= to "
+            f"pharos.evaluate_policy"
+        )
+    if env.has_sets and not is_masked:
+        raise ParameterError(
+            f"agent {_title(agent)!r}: takes no action masks, and some actions of {env} are not available in some "
+            f"states; take sb3_contrib:MaskablePPO, q_learning, or dqn and ppo with the engine batched"
+        )
 
 
 def _title(agent: str | Callable[..., Any]) -> str:
@@ -278,6 +294,7 @@ class DeepAgent(Agent):
 
     def learner(self, runs: Sequence[LearningRun], device: str, logs: Path | None = None) -> Learner:
         (run,) = runs
+        check_masks(run.algorithm, run.task.env)
         return _model(run, logs)
 
     def load(self, folder: Path, run: LearningRun) -> PolicyLike:
@@ -414,7 +431,7 @@ class Deep:
         self.gamma, self.steps = task.gamma, steps
         self.env = vector_environment(task, int(hyperparameters.get("n_envs", 1)), seed)
         self.model = make_model(agent, self.env, hyperparameters, seed=seed, tensorboard=tensorboard)
-        self.agent = deep_policy(self.model)
+        self.agent = deep_policy(self.model, masked=task.env.has_sets, imposed=True)
         self.finished = (0, 0.0)  # episodes, and the sum of their returns
 
     @property

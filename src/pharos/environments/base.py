@@ -440,6 +440,9 @@ class Environment:
                                     `motion=True`; with it no two states should look alike
         age(self, state) -> int     a number that every transition out of a state that is not terminal increases, such
                                     as the steps taken: values are then solved in one backward pass
+        is_available(self, state, action) -> bool    whether an action exists in a state; one or more do in each that is
+                                    not terminal. `transition`, `reward` and `probability` are never asked for others:
+                                    an action that does not exist acts as the first one that does
 
     In compiled rules `self` offers the numeric fields of the dataclass and the numeric properties of the class
     (numbers, tuples of numbers, arrays), under the same names; it has no methods. Call module-level functions instead:
@@ -459,6 +462,8 @@ class Environment:
     first_version: ClassVar[int] = 1
     residual: ClassVar[tuple[float, float]] = (0.0, 0.0)
     numbered_by: ClassVar[tuple[str, ...]] = ()
+    is_filled: ClassVar[bool] = False
+    """Whether the rules answer for actions that are not available as for the first one that is."""
 
     if TYPE_CHECKING:  # attributes, or properties
 
@@ -474,6 +479,11 @@ class Environment:
         max_episode_steps = 1000
         motion_layers = {}
         outcomes = 1
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if cls.is_available is not Environment.is_available and not cls.is_filled:
+            act_as_available(cls)
 
     def __post_init__(self) -> None:
         check_parameters(self)
@@ -521,6 +531,10 @@ class Environment:
     def is_terminal(self, state) -> bool:
         """Whether the episode has ended in `state`. The base class never ends."""
         return False
+
+    def is_available(self, state, action) -> bool:
+        """Whether `action` exists in `state`, which is not terminal. In the base class all do."""
+        return True
 
     if TYPE_CHECKING:
         reward: Callable[..., float]  # takes (state, action, next_state), or (state, action, next_state, outcome)
@@ -587,6 +601,11 @@ class Environment:
     def has_age(self) -> bool:
         """Whether the class defines `age`."""
         return type(self).age is not Environment.age
+
+    @property
+    def has_sets(self) -> bool:
+        """Whether some actions may not be available in some states: whether the class defines `is_available`."""
+        return type(self).is_available is not Environment.is_available
 
     @property
     def has_motion(self) -> bool:
@@ -666,6 +685,52 @@ class Environment:
     def __str__(self) -> str:
         fields = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
         return f"{type(self).__name__}({fields})"
+
+
+def act_as_available(cls: type[Environment]) -> None:
+    """Replace the rules of a class by those in which an action that is not available acts as the first one that is."""
+    is_available: Any = cls.is_available
+
+    def acting(self, state, action):
+        if is_available(self, state, action):
+            return action
+        for other in range(self.num_actions):
+            if is_available(self, state, other):
+                return other
+        return action
+
+    for name in ("transition", "reward", "probability"):
+        rule = getattr(cls, name)
+        rule = getattr(rule, "of_available", rule)
+        if rule is not getattr(Environment, name):
+            guarded = _guarded(name, num_arguments(rule), rule, acting)
+            guarded.of_available = rule
+            setattr(cls, name, guarded)
+
+
+def _guarded(name: str, arguments: int, rule: Any, acting: Any) -> Any:
+    """A rule that is asked for what actions act as, with the arguments that it has."""
+
+    def transition(self, state, action, out):
+        rule(self, state, acting(self, state, action), out)
+
+    def transition_of_outcome(self, state, action, outcome, out):
+        rule(self, state, acting(self, state, action), outcome, out)
+
+    def reward(self, state, action, next_state):
+        return rule(self, state, acting(self, state, action), next_state)
+
+    def reward_of_outcome(self, state, action, next_state, outcome):
+        return rule(self, state, acting(self, state, action), next_state, outcome)
+
+    def probability(self, state, action, outcome):
+        return rule(self, state, acting(self, state, action), outcome)
+
+    if name == "probability":
+        return probability
+    if name == "reward":
+        return reward_of_outcome if arguments == 5 else reward
+    return transition_of_outcome if arguments == 5 else transition
 
 
 @cache

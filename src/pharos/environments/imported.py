@@ -48,6 +48,7 @@ class ImportedWorld(Environment):
     name = "imported"
     version = 1
     numbered_by = ("state",)
+    is_filled = True
     layers = {"digit": Layer(tuple("0123456789"), (226, 228, 232), sprite=DIGITS)}
 
     def validate(self) -> None:
@@ -121,6 +122,9 @@ class ImportedWorld(Environment):
     def is_terminal(self, state):
         return self.terminal[state[0]]
 
+    def is_available(self, state, action):
+        return self.available[state[0], action]
+
     def reward(self, state, action, next_state, outcome=-1):
         if outcome < 0:
             return self.rewards[state[0], action]
@@ -170,6 +174,17 @@ class ImportedWorld(Environment):
     def rewards(self) -> np.ndarray:
         """(S, A) float64."""
         return self._with_end(np.asarray(self._arrays["rewards"], np.float64), 0.0)
+
+    @property
+    def has_sets(self) -> bool:
+        return mdp_files.AVAILABLE in self.manifest["arrays"]
+
+    @cached_property
+    def available(self) -> np.ndarray:
+        """(S, A) bool, the actions that exist in each state; (1, A), all True, where all do everywhere."""
+        if not self.has_sets:
+            return np.ones((len(self.successors), self.manifest["num_actions"]), np.bool_)
+        return self._with_end(np.asarray(self._arrays[mdp_files.AVAILABLE], np.bool_), True)
 
     @property
     def paid(self) -> np.ndarray:

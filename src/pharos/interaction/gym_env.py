@@ -85,7 +85,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
             self._shades, self._blank = observation.shades, np.zeros(observation.space.shape or (), np.uint8)
         self._has_chance, self._stays, self._lazy = simulator.has_chance, simulator.chance[0], simulator.lazy
         self._has_outcomes, self._num_outcomes = simulator.has_outcomes, int(simulator.env.outcomes)
-        self._outcome_one = simulator.rules.outcome_one
+        self._outcome_one, self._has_sets = simulator.rules.outcome_one, simulator.has_sets
         self._stream: Stream | None = None  # of random numbers, where the rules have chance
         self._is_index = simulator.context.is_plain and isinstance(observation, Index)
         self._frame_stack = FrameStack(simulator, 1) if simulator.context.has_more else None
@@ -108,6 +108,10 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
     def state(self) -> tuple[int, ...]:
         """The current state, a tuple of D integers."""
         return tuple(self._started().tolist())
+
+    def action_masks(self) -> np.ndarray:
+        """(A,) bool, the actions that are available in the current state, as sb3-contrib asks for them."""
+        return np.asarray(self.simulator.action_masks(self._started()[None])[0])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; `options={"state": ...}` says where (D integers)."""
@@ -177,6 +181,8 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._elapsed += 1
         # Infos, and delay and noise of the reward
         info: dict[str, Any] = {"state": next_state.copy(), "executed_action": executed}
+        if self._has_sets:
+            info["action_mask"] = self.action_masks().astype(np.int8)
         if self._successors is not None:
             if branch >= 0:
                 self._index = int(self._successors[self._index, executed])
@@ -223,6 +229,8 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
 
     def _info(self, state: np.ndarray) -> dict[str, Any]:
         info: dict[str, Any] = {"state": state.copy(), "executed_action": NO_ACTION}
+        if self._has_sets:
+            info["action_mask"] = self.action_masks().astype(np.int8)
         if self.simulator.state_space is not None:
             info["index"] = self._index
         if self._has_outcomes:

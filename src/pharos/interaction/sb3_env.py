@@ -84,6 +84,8 @@ class SB3VecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: object, indices: VecEnvIndices = None, **method_kwargs: object
     ) -> list[Any]:
+        if method_name == "action_masks":  # as sb3-contrib asks for them
+            return list(self.env.action_masks()[list(self._get_indices(indices))])
         raise ParameterError(
             f"{method_name!r} cannot be called: there are no single environments; use `.env`, a VectorEnv"
         )

@@ -67,6 +67,7 @@ class Simulator:
         lazy: the probability that the executed action has no effect.
         modifies_rewards: whether rewards are paid late or with noise.
         has_chance: whether another than the chosen action may be executed.
+        has_sets: whether some actions may not be available in some states.
         has_outcomes: whether the rules have chance, so that an outcome is drawn after the action.
         start_states (K, D), start_cumulative (K,): start states and the cumulative sum of their probabilities.
         ranges: (2, D) int64, lowest and highest value of each component.
@@ -92,6 +93,12 @@ class Simulator:
         self.modifies_rewards = options.chance.modifies_rewards
         self.has_chance = self.chance != (1.0, 0.0, 0.0)
         self.has_outcomes = self.env.has_chance
+        self.has_sets = self.env.has_sets
+        if self.has_sets and self.has_chance:
+            raise ParameterError(
+                f"{self.env}: some actions are not available in some states, and sticky or random actions are not "
+                f"played there; leave the chance out, or solve the MDP: pharos.sticky_actions(space.mdp(), p)"
+            )
         self.first_previous = _first_previous(options.initial_previous_action, self.env)
         states, probabilities = start_distribution(self.env)
         self.start_states = np.array(states, np.int64)
@@ -99,7 +106,13 @@ class Simulator:
         self.start_cumulative[-1] = 1.0
         components = self.env.components
         self.ranges = np.stack([components.low, components.high])
-        self.rules = rules_of(self.env).stepping
+        rules = rules_of(self.env)
+        self.rules, self._available = rules.stepping, rules.available
+
+    def action_masks(self, states: np.ndarray) -> np.ndarray:
+        """(N, A) bool, the actions that are available in states (N, D)."""
+        sets = self._available(states)
+        return np.ones((len(states), self.env.num_actions), np.bool_) if sets is None else sets
 
     def setting(self, mode: int, ranges: np.ndarray, scale: np.ndarray, starts: np.ndarray) -> Setting:
         """Arguments of the kernels of many environments; `starts` are states, or their indices in a state space."""

@@ -224,8 +224,9 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
 
     With `space` the built state space is walked as a table, and the rules are not run: `info` has "index" (N,) in place
     of "state" (N, D). It always has "executed_action" (N,), -1 after a reset; and where the rules have chance "prob"
-    (N,), the probability of the outcome that was drawn, 1 after a reset; and where rewards are paid late or with noise
-    "earned_reward" (N,), what the rules pay for the step. Arrays are fresh at every step.
+    (N,), the probability of the outcome that was drawn, 1 after a reset; and where some actions are not available in
+    some states "action_mask" (N, A) int8, those that are in the state that the step has led to; and where rewards are
+    paid late or with noise "earned_reward" (N,), what the rules pay for the step. Arrays are fresh at every step.
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
@@ -287,6 +288,10 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     def states(self) -> np.ndarray:
         """(N, D) int64, the current states."""
         return self._stepper.states(self._stepper.current).copy()
+
+    def action_masks(self) -> np.ndarray:
+        """(N, A) bool, the actions that are available in the current states."""
+        return self.simulator.action_masks(self.states)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """The picture for people of each environment, (H, W, 3) uint8, where render_mode is "rgb_array"; else None."""
@@ -367,6 +372,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             "executed_action": executed,
             "_executed_action": everywhere,
         }
+        if self.simulator.has_sets:
+            info["action_mask"], info["_action_mask"] = self.action_masks().astype(np.int8), everywhere
         if len(probabilities):
             info["prob"], info["_prob"] = probabilities, everywhere
         if self._reward_channel is not None:

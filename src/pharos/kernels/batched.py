@@ -125,6 +125,26 @@ def choose(keys, step, explores, q, actions):
                 actions[i, e] = best
 
 
+@kernel
+def choose_of_sets(keys, step, explores, q, sets, actions):
+    """`choose` among actions that are available, sets (W, E, A) bool; others have a q below all of them."""
+    for i in range(actions.shape[0]):
+        for e in range(actions.shape[1]):
+            best, left = -1, -1
+            if explores[i]:
+                left = below(philox(0, e, step, STEP, keys[i])[0], sets[i, e].sum())
+            for a in range(q.shape[2]):
+                if not sets[i, e, a]:
+                    continue
+                if explores[i]:
+                    if left == 0:
+                        best = a
+                    left -= 1
+                elif best < 0 or q[i, e, a] > q[i, e, best]:
+                    best = a
+            actions[i, e] = best
+
+
 def outcome_reward(rewards, s, a, k):
     """The reward of outcome k of (s, a), or the expected reward of (s, a) where only that is known."""
 
@@ -217,12 +237,14 @@ def act(keys, step, scores, actions, log_probabilities):
         for e in range(actions.shape[1]):
             # mass of the softmax, up to a factor; subtracting the best score avoids overflow
             best = scores[i, e].max()
-            total = 0.0
+            total, last = 0.0, 0
             for a in range(num_actions):
-                total += np.exp(np.float64(scores[i, e, a] - best))
+                mass = np.exp(np.float64(scores[i, e, a] - best))
+                total += mass
+                last = a if mass > 0.0 else last
             # the first action whose cumulative mass exceeds a uniform share of it
             u = unit(philox(0, e, step, STEP, keys[i])[0]) * total
-            cumulative, action = 0.0, num_actions - 1
+            cumulative, action = 0.0, last
             for a in range(num_actions):
                 cumulative += np.exp(np.float64(scores[i, e, a] - best))
                 if u < cumulative:

@@ -409,8 +409,10 @@ def q_learning(
         if uniform_number(word, 0) < epsilon:
             action = action_of_set(chance, num_actions, word, s)
         else:  # greedy, ties at random
-            best, ties, action = -np.inf, 1, 0
-            for a in range(num_actions):
+            best, ties, action = q[row, 0], 1, 0
+            if not set_has(chance, s, 0):
+                best = -np.inf
+            for a in range(1, num_actions):
                 if not set_has(chance, s, a):
                     continue
                 if q[row, a] > best:
@@ -428,8 +430,8 @@ def q_learning(
         value = 0.0
         if not ended:
             next_row = t * (num_actions + 1) + executed if observes_previous else t
-            value = -np.inf
-            for a in range(num_actions):
+            value = q[next_row, 0] if set_has(chance, t, 0) else -np.inf
+            for a in range(1, num_actions):
                 if set_has(chance, t, a):
                     value = max(value, q[next_row, a])
         # the reward that the agent gets, late and noisy

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         check_choices,
         checked_sets,
         drawn_actions,
+        filled,
         most_actions,
         require_all_actions,
         stand_ins,

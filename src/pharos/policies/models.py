@@ -52,18 +52,20 @@ class DeepPolicy:
     Args:
         deterministic: the most probable action of a distribution, instead of the distribution.
         masked: whether the model was trained under action masks (MaskablePPO), which come with the observations then.
+        imposed: whether masks may be those of the batched engine, of whose networks the model itself knows nothing.
     Raises:
         ParameterError: the policy has a memory, so that its probabilities do not belong to observations; it needs masks
             and there are none, or takes none; or the VecNormalize that it was trained behind is missing.
     """
 
-    def __init__(self, model: SB3Model, *, deterministic: bool = False, masked: bool = False):
+    def __init__(self, model: SB3Model, *, deterministic: bool = False, masked: bool = False, imposed: bool = False):
         if _has_memory(model):
             raise memory_error(model)
-        if masked != takes_masks(model):
+        if masked != takes_masks(model) and not (masked and imposed):
             raise no_masks_error(model) if masked else _needs_masks(model)
         check_normalizer(model)
         self.model, self.deterministic, self.masked = model, deterministic, masked
+        self._takes_masks = takes_masks(model)
 
     def action_probabilities(self, observations: Observations, masks: np.ndarray | None = None) -> np.ndarray:
         """(N, A) probabilities for a batch of observations as the environment gives them.
@@ -81,16 +83,27 @@ class DeepPolicy:
             q_net: Callable[..., torch.Tensor] | None = getattr(policy, "q_net", None)
             if q_net is not None:
                 scores = q_net(tensor).numpy()
+                scores = scores if masks is None else np.where(masks, scores, -np.inf)
                 return np.eye(scores.shape[1])[scores.argmax(axis=1)]
             distribution_of: Callable[..., CategoricalDistribution] | None = getattr(policy, "get_distribution", None)
             if distribution_of is not None:
-                options = {} if masks is None else {"action_masks": masks}
-                probabilities = distribution_of(tensor, **options).distribution.probs.numpy().astype(np.float64)
+                options = {"action_masks": masks} if masks is not None and self._takes_masks else {}
+                distribution = distribution_of(tensor, **options).distribution
+                probabilities = distribution.probs.numpy().astype(np.float64)
+                if masks is not None and not self._takes_masks:  # by the logits, as its masks are in the batched engine
+                    probabilities = restricted(distribution.logits.numpy().astype(np.float64), masks)
                 if self.deterministic:
                     return np.eye(probabilities.shape[1])[probabilities.argmax(axis=1)]
                 return probabilities
         actions, _ = self.model.predict(batch, deterministic=True)
         return np.asarray(actions)
+
+
+def restricted(logits: np.ndarray, masks: np.ndarray) -> np.ndarray:
+    """(N, A) the softmax of logits over the actions of masks (N, A) bool."""
+    logits = np.where(masks, logits, -np.inf)
+    weights = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
 class RecurrentDeepPolicy:
@@ -127,13 +140,15 @@ class RecurrentDeepPolicy:
         return distribution.distribution.probs.numpy().astype(np.float64), after
 
 
-def deep_policy(model: SB3Model, *, masked: bool = False) -> "DeepPolicy | RecurrentDeepPolicy":
+def deep_policy(model: SB3Model, *, masked: bool = False, imposed: bool = False) -> "DeepPolicy | RecurrentDeepPolicy":
     """The policy of a model of Stable-Baselines3 or sb3-contrib, with a memory or without.
 
     Args:
-        masked: as for `DeepPolicy`.
+        masked, imposed: as for `DeepPolicy`.
     """
-    return RecurrentDeepPolicy(model) if _has_memory(model) and not masked else DeepPolicy(model, masked=masked)
+    if _has_memory(model) and not masked:
+        return RecurrentDeepPolicy(model)
+    return DeepPolicy(model, masked=masked, imposed=imposed)
 
 
 def _has_memory(model: SB3Model) -> TypeGuard["RecurrentModel"]:

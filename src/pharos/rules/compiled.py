@@ -225,7 +225,7 @@ class CompiledStepping:
         kernels = interaction_kernels(_class_of(env), names, env.num_actions, int(env.outcomes))
         self.step_one, self.step_many = kernels.step_one, kernels.step_many
         self.outcome_one, self.is_terminal_one = kernels.outcome_one, kernels.is_terminal_one
-        self._step_and_draw_one = kernels.step_and_draw_one
+        self._step_and_draw_one, self._mark_available = kernels.step_and_draw_one, kernels.mark_available
         state = np.array(env.initial_states()[0][0], np.int64)
         ranges = np.stack([env.components.low, env.components.high])
         outcome = 0
@@ -235,6 +235,11 @@ class CompiledStepping:
 
     def __reduce__(self):
         return CompiledStepping, (self.env,)
+
+    def mark_available(self, states: np.ndarray, out: np.ndarray) -> None:
+        """out[n, a] = whether action a is available in states[n]."""
+        assert self._mark_available is not None
+        self._mark_available(self.parameters, states, out)
 
     def step_and_draw_one(self, *arguments: object) -> Function | None:
         """The kernel that steps and draws, compiled for these arguments; None where `draw` does not compile."""

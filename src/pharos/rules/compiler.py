@@ -51,6 +51,7 @@ def rules_of_class(cls: type[Environment]) -> tuple[str, ...]:
     optional = {
         "probability": cls.takes_outcomes(),
         "age": cls.age is not Environment.age,
+        "is_available": cls.is_available is not Environment.is_available,
         "draw_motion": cls.draw_motion is not Environment.draw_motion,
     }
     return RULES + tuple(rule for rule, is_defined in optional.items() if is_defined)

@@ -27,6 +27,7 @@ class InteractionKernels(NamedTuple):
     step_and_draw_one: Function
     step_many: Function
     is_terminal_one: Function
+    mark_available: Function | None
     draw_simple: Function
     draw_complex: Function
     draw_planes: Function
@@ -55,6 +56,7 @@ def interaction(
         step_and_draw_one=step_and_draw_one_kernel(stepped, Parameters, advances, draw_flat),
         step_many=step_many_kernel(step, Parameters, advances, drawn_outcome, A, K),
         is_terminal_one=is_terminal_one_kernel(compiler.calling("is_terminal"), rules, Parameters),
+        mark_available=mark_available_kernel(compiler, rules, Parameters) if "is_available" in rules else None,
         draw_simple=draw_simple_kernel(drawing, rules, Parameters, draw_flat),
         draw_complex=draw_complex_kernel(drawing, rules, Parameters),
         draw_planes=draw_planes_kernel(drawing, rules, Parameters),
@@ -299,6 +301,22 @@ def is_terminal_one_kernel(compiler: Compiler, rules: CompiledRules, Parameters:
         return bool(is_terminal(Parameters(*parameters), state))
 
     return is_terminal_one
+
+
+def mark_available_kernel(compiler: Compiler, rules: CompiledRules, Parameters: Constructor) -> Function:
+    """Kernel of the sets of actions of many states."""
+    is_available, is_terminal = rules["is_available"], rules["is_terminal"]
+
+    @compiler.calling("is_available", "is_terminal").kernel
+    def mark_available(parameters, states, out):
+        """out[n, a] = whether a is available in states[n]; all are in terminal states."""
+        self = Parameters(*parameters)
+        for n in range(len(states)):
+            ended = is_terminal(self, states[n])
+            for a in range(out.shape[1]):
+                out[n, a] = ended or is_available(self, states[n], a)
+
+    return mark_available
 
 
 def draw_simple_kernel(

@@ -169,6 +169,9 @@ class Stepping(Protocol):
     def is_terminal_one(self, parameters: tuple[object, ...], state: np.ndarray, /) -> bool:
         """Whether a state is terminal."""
 
+    def mark_available(self, states: np.ndarray, out: np.ndarray) -> None:
+        """out[n, a] = whether action a is available in states[n], (N, D); all are in terminal states."""
+
     def step_and_draw_one(self, *arguments: object) -> Callable[..., tuple[float, int]] | None:
         """The function that steps and draws, for these arguments after the parameters; None where there is none."""
 
@@ -240,6 +243,20 @@ class Rules:
         from pharos.rules.interpreted import InterpretedAges
 
         return InterpretedAges(self.env, self.layout)
+
+    def available(self, states: np.ndarray) -> np.ndarray | None:
+        """(N, A) bool, the actions that exist in each of the states (N, D); None where all do everywhere."""
+        if not self.env.has_sets:
+            return None
+        out = np.empty((len(states), self.env.num_actions), np.bool_)
+        is_small = out.size < compiling.SMALL // 4
+        if is_small and "stepping" not in vars(self):
+            from pharos.rules.stepping import InterpretedStepping
+
+            InterpretedStepping(self.env).mark_available(states, out)
+        else:
+            self.stepping.mark_available(np.ascontiguousarray(states, np.int64), out)
+        return out
 
     @cached_property
     def stepping(self) -> Stepping:

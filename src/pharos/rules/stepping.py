@@ -53,6 +53,11 @@ class InterpretedStepping:
         reward = float(self.env.reward_of(before, action, after, outcome))
         return reward, int(branch >= 0 and bool(self.env.is_terminal(after)))
 
+    def mark_available(self, states, out) -> None:
+        for n, state in enumerate(map(tuple, np.asarray(states).tolist())):
+            ended = bool(self.env.is_terminal(state))
+            out[n] = [ended or bool(self.env.is_available(state, action)) for action in range(out.shape[1])]
+
     def is_terminal_one(self, parameters, state) -> bool:
         return bool(self.env.is_terminal(tuple(state.tolist())))
 

@@ -30,7 +30,7 @@ from pharos.state_space.guarded_rules import SUM_TOLERANCE, InterpretedCheck
 if TYPE_CHECKING:
     from pharos.rules import Rules
 
-RULES = ("transition", "is_terminal", "reward", "draw", "probability", "age", "draw_motion")
+RULES = ("transition", "is_terminal", "reward", "draw", "probability", "age", "is_available", "draw_motion")
 
 
 @dataclass(frozen=True)
@@ -263,6 +263,8 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
             which = states[i], *divmod(branch, env.outcomes)
             _check_compiled_branch(check, which, float(probabilities[i, branch]), tuple(next_states[j].tolist()))
     _check_compiled_rewards(check, rules, states, np.concatenate([packed, keys]))
+    if env.has_sets:
+        _check_compiled_sets(check, rules, states)
     if env.layers:
         _check_compiled_drawings(check, states, notes)
     return True
@@ -282,6 +284,18 @@ def _check_compiled_branch(
             f"{check.where('transition', *branch)} leads to {check.text(successor)} compiled, to "
             f"{check.text(check.transitions[branch])} interpreted; expected the same"
         )
+
+
+def _check_compiled_sets(check: InterpretedCheck, rules: "Rules", states: list[State]) -> None:
+    """Raise a RuleError where the actions that are available in a state differ."""
+    sets = np.empty((len(states), check.env.num_actions), np.bool_)
+    rules.stepping.mark_available(np.array(states, np.int64), sets)
+    for state, compiled in zip(states, sets.tolist(), strict=True):
+        if not check.terminal[state] and tuple(compiled) != check.sets[state]:
+            raise RuleError(
+                f"{check.where('is_available', state)} says {compiled} compiled, {list(check.sets[state])} "
+                f"interpreted; expected the same"
+            )
 
 
 def _check_compiled_rewards(check: InterpretedCheck, rules: "Rules", states: list[State], every: np.ndarray) -> None:

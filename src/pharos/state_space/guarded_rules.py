@@ -61,6 +61,7 @@ class InterpretedCheck:
         self.rewards: dict[tuple[State, int, int], float] = {}
         self.probabilities: dict[tuple[State, int, int], float] = {}
         self.ages: dict[State, int] = {}
+        self.sets: dict[State, tuple[bool, ...]] = {}
         self.drawings: dict[State, np.ndarray] = {}
 
     def expand(self, state: State) -> list[State]:
@@ -69,6 +70,8 @@ class InterpretedCheck:
         if self.terminal[state]:
             return []
         successors = []
+        if self.env.has_sets:
+            self.sets[state] = self._set(state)
         for action in range(self.env.num_actions):
             for outcome, probability in enumerate(self._probabilities(state, action)):
                 if probability == 0:
@@ -94,6 +97,8 @@ class InterpretedCheck:
             raise RuleError(f"{self.where('is_terminal', state)} now says {not self.terminal[state]}; {SAME}")
         if self.terminal[state]:
             return
+        if self.env.has_sets and self._set(state) != self.sets[state]:
+            raise RuleError(f"{self.where('is_available', state)} now says other actions than before; {SAME}")
         for action in range(self.env.num_actions):
             for outcome, probability in enumerate(self._probabilities(state, action)):
                 before = self.probabilities.get((state, action, outcome), 0.0)
@@ -150,6 +155,22 @@ class InterpretedCheck:
         if answers[0] != answers[1]:
             raise RuleError(f"{where} says {answers[0]}, then {answers[1]}; {SAME}")
         return bool(answers[0])
+
+    def _set(self, state: State) -> tuple[bool, ...]:
+        """Whether each action is available in a state; RuleError unless one is."""
+        answers = []
+        for action in range(self.env.num_actions):
+            where = self.where("is_available", state, action)
+            answer = self._call(where, self.env.is_available, _ReadOnly(state), action)
+            if not isinstance(answer, bool | np.bool_):
+                raise RuleError(f"{where} says {answer!r}; expected True or False")
+            answers.append(bool(answer))
+        if not any(answers):
+            raise RuleError(
+                f"{self.where('is_available', state)} says False of every action; expected one or more in every state "
+                f"that is not terminal"
+            )
+        return tuple(answers)
 
     def _probabilities(self, state: State, action: int) -> list[float]:
         """The probabilities of the outcomes of an action, which sum to 1."""

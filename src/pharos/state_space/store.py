@@ -55,6 +55,10 @@ LONGEST = 500  # characters of what a manifest says, in a message
 _BLOCK = 1 << 16  # states whose ages are asked for at a time
 
 
+# States whose sets of actions are worked out in one go.
+ROWS_OF_SETS = 1 << 16
+
+
 class StateSpace:
     """The reachable states of an environment and their transitions, S states and A actions.
 
@@ -267,14 +271,25 @@ class StateSpace:
                 those of its range alone.
         If the class declares an age, the MDP has it, so that values are solved in one backward pass.
         Raises:
-            ParameterError: a transition leads to a state that is not older.
+            ParameterError: a transition leads to a state that is not older, or a state that is not terminal has no
+                available action.
         Cost: the rewards of all S A transitions, 20 to 50 ns each on one core; nothing is built again.
         """
-        from pharos.mdp import Residual, TabularMDP, ranged_rewards, rewards_of_space, rewards_of_staying
+        from pharos.mdp import (
+            Residual,
+            TabularMDP,
+            filled,
+            ranged_rewards,
+            rewards_of_space,
+            rewards_of_staying,
+            with_sets,
+        )
 
         by_rules = rewards is None or callable(rewards)
         staying = partial(rewards_of_staying, self, rewards) if by_rules else None
         is_ranged = by_range and rewards is None and self.environment is not None
+        if not by_rules and self.available is not None:
+            rewards = filled(np.asarray(rewards, np.float64), self.available)
         table = ranged_rewards(self) if is_ranged else rewards_of_space(self, rewards)
         mdp = TabularMDP(
             self.dynamics,
@@ -289,8 +304,23 @@ class StateSpace:
             space=self,
             residual=Residual() if self.environment is None else Residual(*self.environment.residual),
         )
+        mdp = with_sets(mdp, self.available)
         has_age = self.environment is not None and self.environment.has_age
         return mdp.with_age(self.ages) if has_age else mdp
+
+    @cached_property
+    def available(self) -> np.ndarray | None:
+        """(S, A) bool, the actions that exist in each state; None where all do everywhere.
+
+        Cost: the rule `is_available` for each state and action.
+        """
+        if self.environment is None or not self.environment.has_sets:
+            return None
+        rules, sets = rules_of(self.environment), np.empty((self.num_states, self.num_actions), np.bool_)
+        for start in range(0, self.num_states, ROWS_OF_SETS):
+            numbers = np.arange(start, min(start + ROWS_OF_SETS, self.num_states))
+            sets[numbers] = rules.available(self.states(numbers))
+        return None if sets.all() else sets
 
     def verify(self) -> None:
         """Read every file once and compare it with its checksums; StateSpaceCorrupted where one differs."""

@@ -129,7 +129,11 @@ class DQNLane(Lane[QNetworks]):
         kernels.exploring(self.keys, self.calls, self.epsilon, is_warming, self._explores)
         if not self._explores[: self.number].all():
             scores = self.scores_of(worlds.seen)
-        kernels.choose(self.keys, self.calls, self._explores, scores, self.actions)
+        if self.sets is None:
+            kernels.choose(self.keys, self.calls, self._explores, scores, self.actions)
+        else:
+            sets = self.sets.of_states(torch.from_numpy(worlds.state).to(self.device)).cpu().numpy()
+            kernels.choose_of_sets(self.keys, self.calls, self._explores, scores, sets, self.actions)
         before = worlds.state.copy()
         self.execute_actions()
         self.replay.add(self.calls, before, worlds.next_state, self.actions, worlds.reward, worlds.flags)
@@ -179,9 +183,10 @@ class DQNLane(Lane[QNetworks]):
         batch = self.replay
         for part in batch.drawn:
             part.send()
-        q_next = q_choice = self._target_scores(batch.next_states)
+        q_next = q_choice = self.masked(self._target_scores(batch.next_states), batch.next_states)
         if self.shared["double"]:
             q_choice = self.network.scores(self.values, self.observed(batch.next_states)).clone()
+            q_choice = self.masked(q_choice, batch.next_states)
         q = self.network.scores(self.values, self.observed(batch.states))
         minibatch = (batch.actions.tensor, batch.rewards.tensor, batch.discounts.tensor)
         self.arithmetic.huber(q, q_next, q_choice, minibatch, self._dq, self.loss)

@@ -26,6 +26,7 @@ from pharos.agents.batched.networks import (
 )
 from pharos.agents.batched.runs import BLOCK, BatchRun, ObservationSource, as_networks_see, is_small, resolved
 from pharos.kernels import batched as kernels
+from pharos.mdp import require_all_actions
 
 LARGEST_TABLE = 1 << 28  # bytes of observations as networks take them, on the processor
 SHARE_OF_DEVICE = 0.5  # of a GPU's free memory that a table may take
@@ -181,6 +182,47 @@ class DeviceObservationTable(ObservationTable):
         return torch.nn.functional.pad(rows, (0, self.size - rows.shape[1]))
 
 
+class ActionSets:
+    """The actions that are available in the states of the runs of a lane.
+
+    Attributes:
+        table: (N, A) bool, of the states of all MDPs, one after the other. begins: (W, 1) the row of each run's state
+        0.
+    """
+
+    def __init__(self, runs: Sequence[BatchRun], device: str):
+        tables = {id(run.mdp.terminal): run.mdp for run in runs}
+        sets = [
+            np.ones((mdp.num_states, mdp.num_actions), np.bool_) if mdp.available is None else mdp.available
+            for mdp in tables.values()
+        ]
+        begins = dict(zip(tables, np.cumsum([0, *map(len, sets)]).tolist(), strict=False))
+        self.table = torch.from_numpy(np.concatenate(sets)).to(device)
+        self.begins = torch.tensor([[begins[id(run.mdp.terminal)]] for run in runs], device=device)
+
+    @staticmethod
+    def of(runs: Sequence[BatchRun], device: str) -> "ActionSets | None":
+        """The sets of runs; None where all actions are available to all of them.
+
+        Raises:
+            ParameterError: they are not, and actions are sticky or random.
+        """
+        if all(run.mdp.available is None for run in runs):
+            return None
+        for run in runs:
+            if run.mdp.available is not None and not run.mdp.chance.is_none:
+                require_all_actions(run.mdp, "the batched engine under sticky or random actions")
+        return ActionSets(runs, device)
+
+    def of_states(self, states: torch.Tensor) -> torch.Tensor:
+        """(W, B, A) bool, of states (W, B)."""
+        return self.table[states + self.begins]
+
+
+MASKED = -1e8
+"""The score of an action that is not available: its probability is 0, and its logarithm times that, too."""
+
+
 # Lane -----------------------------------------------------------------------------------------------------------------
 
 
@@ -222,6 +264,7 @@ class Lane(Generic[Net]):
         self.actions = np.zeros((width, self.copies), np.int64)
         self.seen = (ObservationTable if device == "cpu" else DeviceObservationTable)(self.runs, device)
         self._buffers: dict[int, torch.Tensor] = {}
+        self.sets = ActionSets.of(self.runs, device)
         self.network = self.network_for(self.seen.shape)
         self._own_networks = [
             self.network if view.shape == self.seen.shape else self.network_for(view.shape) for view in self.seen.views
@@ -296,8 +339,15 @@ class Lane(Generic[Net]):
     def answer(self) -> None:
         """Write the scores of the requested states; a GPU records this."""
         self._queries.send()
-        self._scores.tensor.copy_(self.evaluate(self.observed(self._queries)))
+        self._scores.tensor.copy_(self.masked(self.evaluate(self.observed(self._queries)), self._queries))
         self._scores.fetch()
+
+    def masked(self, scores: torch.Tensor, states: PinnedBuffer) -> torch.Tensor:
+        """Scores (W, B, A) of states (W, B, *depth), in place: MASKED for actions that are not available there."""
+        if self.sets is None:
+            return scores
+        numbers = states.tensor[..., -1] if self.depth else states.tensor
+        return scores.masked_fill_(~self.sets.of_states(numbers), MASKED)
 
     def scores_of(self, states: np.ndarray) -> np.ndarray:
         """(W, E, A) scores of states (W, E, *depth), in a buffer that the next call reuses."""
@@ -384,14 +434,18 @@ class Lane(Generic[Net]):
 
 
 class RunPolicy:
-    """The current policy of one run of a lane."""
+    """The current policy of one run of a lane.
+
+    Attributes:
+        masked: whether some actions are not available in some states, so that it is asked with masks.
+    """
 
     def __init__(self, lane: Lane, i: int):
-        self.lane, self.i = lane, i
+        self.lane, self.i, self.masked = lane, i, lane.runs[i].mdp.available is not None
         self.values = {name: view[i : i + 1] for name, view in lane.values.items()}  # which change as it learns
 
-    def action_probabilities(self, observations: np.ndarray) -> np.ndarray:
-        """(M, A) float64 for observations (M, ...) as the environment gives them."""
+    def action_probabilities(self, observations: np.ndarray, masks: np.ndarray | None = None) -> np.ndarray:
+        """(M, A) float64 for observations (M, ...) as the environment gives them; masks (M, A) bool: available ones."""
         lane = self.lane
         wait(lane.device)
         answers, first = [], 0
@@ -400,7 +454,10 @@ class RunPolicy:
             rows = lane.seen.encoded(observations[first : first + size], self.i)
             block = torch.zeros((1, size, lane.seen.size), device=lane.device)
             block[0, : len(rows)] = rows  # of one of two sizes, as layers keep room for each size
-            answers.append(lane.probabilities(lane.network.scores(self.values, block)[0, : len(rows)].cpu().numpy()))
+            scores = lane.network.scores(self.values, block)[0, : len(rows)].cpu().numpy()
+            if masks is not None:
+                scores = np.where(masks[first : first + len(rows)], scores, np.float32(MASKED))
+            answers.append(lane.probabilities(scores))
             first += size
         return np.concatenate(answers)
 

@@ -182,6 +182,7 @@ class MinibatchUpdate:
             part.send()
         states, *others = self.minibatch
         scores, values = lane.network.both(lane.values, lane.observed(states))
+        scores = lane.masked(scores, states)
         parts, weights = tuple(part.tensor for part in others), tuple(part.tensor for part in lane.weights)
         lane.arithmetic.clipped_loss(scores, values, parts, weights, self._gradients, lane.loss, lane.divergence)
 
