@@ -29,6 +29,9 @@ from pharos.training.curve import Evaluation, evaluate_agent
 from pharos.training.jax_agents import compiled_curves
 from pharos.training.results import write_policy
 
+MOST_IDLE = 1000
+"""Policies in a row without a step between them, after which a generator has ended."""
+
 
 class GeneratorLearner:
     """Learner of one run: learn(env, steps, seed, **hyperparameters) yields policies; the last one counts.
@@ -56,7 +59,8 @@ class GeneratorLearner:
 
         Raises:
             ParameterError: it is no generator; or it has a second policy, or ends with another one than uniform play,
-                when no step was counted; or whatever its code raises.
+                when no step was counted; or yields MOST_IDLE policies without a step while it has some; or whatever its
+                code raises.
         """
         budget, run, waiting = self.budget, self.run, deque(points)
 
@@ -69,7 +73,7 @@ class GeneratorLearner:
                 self.ended = budget.at[number - 1] if is_passed else (budget.episodes, budget.returns)
                 at_point(point)
 
-        seed, snapshots = run.config.seed, Snapshots(run.task)
+        seed, snapshots, before, idle = run.config.seed, Snapshots(run.task), 0, 0
         try:
             policies = self.function(CountedEnv(run.task, budget, seed), budget.limit, seed, **run.hyperparameters)
             if not isinstance(policies, Iterator):
@@ -81,6 +85,14 @@ class GeneratorLearner:
                     raise not_stepped(budget.limit)
                 evaluate(budget.steps)
                 self.in_force = snapshots.taken(policy)
+                idle, before = idle + 1 if budget.steps == before else 0, budget.steps
+                if idle >= MOST_IDLE and budget.steps < budget.limit:
+                    raise ParameterError(
+                        f"learn yielded {idle:,} policies in a row without a step, after {budget.steps:,} of "
+                        f"{budget.limit:,}; expected it to step the environment, or to end"
+                    )
+                if idle >= MOST_IDLE:
+                    break
         except BudgetSpent:
             pass
         run.curve.counted_steps = budget.steps
