@@ -167,6 +167,22 @@ def test_what_is_no_agent_is_refused_in_one_line(mine):
         train(mine, GRID, steps=20, observation="one_hot", tensorboard=True, out="logged")
 
 
+def test_a_generator_without_an_end_has_ended_when_its_steps_are_spent_and_is_refused_before():
+    def endless(env, steps, seed, *, share=1.0):
+        env.reset()
+        for _ in range(int(share * steps)):
+            if any(env.step(1)[2:4]):
+                env.reset()
+        while True:
+            yield lambda seen: np.full(len(seen), 1)
+
+    options = {"steps": 40, "evaluation_interval": 20}
+    run = train(endless, GRID, hyperparameters={"share": 1}, **options)
+    assert run.result["counted_steps"] == 40 and (run.agent[:, 1] == 1).all()
+    said = refusal(ParameterError, train, endless, GRID, hyperparameters={"share": 0.5}, **options)
+    assert "policies in a row without a step, after 20 of 40" in said
+
+
 def test_an_error_in_a_function_is_that_of_its_run(mine):
     Path("broken.py").write_text("def learn(env, steps, seed):\n    env.reset()\n    yield [1, 2][seed]\n    1 / 0\n")
     task = Task.of(GRID)

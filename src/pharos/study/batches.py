@@ -85,7 +85,7 @@ def _dependencies(config: Mapping[str, Any]) -> dict[str, Any]:
 def train_batch(
     configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], checkpoints: Path, *, device: str = "cpu"
 ) -> list[str | None]:
-    """Train runs in this process with values that the study has solved already; the error of a single run is raised."""
+    """Train runs in this process, with values that the study has solved already; raise the error of a single run."""
     from pharos.training import FailedRun, PreparedRun, TaskCache, TaskValues, train_group
 
     def values(config: RunConfig) -> TaskValues | None:

@@ -61,7 +61,8 @@ class GeneratorLearner:
 
         Raises:
             ParameterError: it is no generator; or it has a second policy, or ends with another one than uniform play,
-                when no step was counted; or whatever its code raises.
+                when no step was counted; or yields very many policies without a step while it has some; or whatever its
+                code raises.
         """
         self._waiting, self._at_point = deque(points), at_point
         generate(partial(self.function, **self.run.hyperparameters), self, self.run.config.seed)
