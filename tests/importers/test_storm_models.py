@@ -275,3 +275,33 @@ def test_an_explicit_model_keeps_the_same_rule(tmp_path):
     (tmp_path / "bad.drn").write_text(text.replace("1 : 1.0", "1 : 0.2", 1))
     message = refusal(FileFormatError, importers.storm, tmp_path / "bad.drn", target="terminal", horizon=10)
     assert "the probabilities of state 0, choice 1 sum to 0.2; expected 1" in message
+
+
+CHOICES = """
+mdp
+module m
+  s : [0..4] init 0;
+  [long] s=0 -> 1:(s'=1);   [short] s=0 -> 1:(s'=2);
+  [x] s=1 -> 1:(s'=3);
+  [a] s=2 -> 1:(s'=3);  [b] s=2 -> 1:(s'=4);
+  [c] s=2 -> 0.5:(s'=3) + 0.5:(s'=4);  [d] s=2 -> 0.25:(s'=3) + 0.75:(s'=4);
+  [] s=3 -> (s'=4);  [] s=4 -> true;
+endmodule
+rewards "r"  [long] true : 1;  [short] true : 1.5;  s=3 : 1;  endrewards
+label "end" = s=4;
+"""
+
+
+@needs_storm
+def test_measures_count_the_choices_that_a_model_has(tmp_path):
+    """A model of nine commands, of which states have one to four; gaps and uniform play by hand."""
+    path = tmp_path / "choices.prism"
+    path.write_text(CHOICES)
+    mdp = importers.storm(path, reward="r", target="end", gamma=0.9)
+    assert mdp.available.sum(axis=1).tolist() == [2, 1, 4, 1, 4]
+    v3, v1, v2 = 1.0, 0.9, 0.9
+    gaps = [(1.5 + 0.9 * v2) - (1 + 0.9 * v1), 0.9 * v3, 0.9 - 0.45, 0.9 - 0.225]
+    assert pharos.hardness.sum_of_reciprocal_gaps(mdp) == pytest.approx(sum(1 / gap for gap in gaps))
+    assert pharos.hardness.sum_of_reciprocal_gaps(mdp) == pytest.approx(6.814815, abs=1e-6)
+    uniform = 0.5 * (1 + 0.9 * v1) + 0.5 * (1.5 + 0.9 * (0.9 + 0.45 + 0.225) / 4)
+    assert pharos.solvers.uniform_value(mdp).value_at_start == pytest.approx(uniform)

@@ -7,7 +7,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import MissingExtra, ParameterError
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, require_all_actions
 from pharos.observations import observe
 from pharos.state_space import StateSpace
 
@@ -52,6 +52,7 @@ def to_gymnax(
     mdp = source.mdp(gamma=1.0) if isinstance(source, StateSpace) else source
     if not isinstance(mdp, TabularMDP):
         raise ParameterError(f"to_gymnax: found {source!r}; expected a StateSpace or a TabularMDP")
+    require_all_actions(mdp, "to_gymnax")
     space = mdp.space
     env = None if space is None else space.environment
     limit = time_limit or mdp.horizon or (env.max_episode_steps if env is not None else None)

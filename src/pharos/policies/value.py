@@ -574,6 +574,7 @@ def _copies(mdp: TabularMDP, number: int) -> TabularMDP:
         folder=None,
         age=None,
         staying=None,
+        available=None if mdp.available is None else np.tile(mdp.available, (number, 1)),
     )
 
 
