@@ -100,9 +100,9 @@ def train_batch(
             case "end", place, FailedRun() as end:
                 errors[place] = end.error
             case "halve", places, reason:
-                together = HalfAsMany(reason)
+                reason_of_all = HalfAsMany(reason)
                 for place in places:
-                    errors[place] = together
+                    errors[place] = reason_of_all
 
     runs = [PreparedRun(i, RunConfig.from_dict(config), folders[i], tasks) for i, config in enumerate(configs)]
     train_group(runs, checkpoints, tell, is_single=len(runs) == 1, raises=len(runs) == 1)

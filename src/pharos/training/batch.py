@@ -84,9 +84,9 @@ def train_group(
         waiting.append(run)
     # Runs alone, programs of checkpoints, and the rest by what fits together
     programs = [[run] for run in waiting if run.is_alone]
-    together = {run.place: run for run in waiting if not run.is_alone}
-    programs += _stored_programs(runs, together, finished, checkpoints)
-    rest = list(together.values())
+    joint = {run.place: run for run in waiting if not run.is_alone}
+    programs += _stored_programs(runs, joint, finished, checkpoints)
+    rest = list(joint.values())
     programs += [[rest[i] for i in each] for each in lanes([run.key for run in rest], [lane or len(rest)] * len(rest))]
     for program in programs:
         Program(program, checkpoints, tell, raises=raises, tensorboard=tensorboard).train()

@@ -90,7 +90,7 @@ class Execution(Generic[R]):
     # What a subclass says --------------------------------------------------------------------------------------------
 
     def work(self, group: Sequence[R]) -> Work:
-        """What trains the runs."""
+        """The function that trains the runs, with its arguments."""
         raise NotImplementedError
 
     def is_over(self, run: R, *, ended: bool = False) -> bool:
