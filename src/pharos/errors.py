@@ -18,7 +18,7 @@
     ├── TimeLimit                       work on what somebody else has sent takes longer than was allowed
     ├── AllRunsFailed                   every run of a study or of a batch failed; the message says why the first did
     ├── PrecisionError                  the requested precision is finer than the error bound allows
-    ├── DivergenceError (ValueError)    the value asked for may be infinite
+    ├── DivergenceError (ValueError)    the value asked for is infinite
     ├── UndefinedMeasure                the measure does not exist for this MDP; the message says what would define it
     │   └── MeasureUnfinished           its budget ended before anything was proven
     └── MissingExtra (ImportError)      an optional dependency is needed; the message names the extra
@@ -131,7 +131,7 @@ class PrecisionError(PharosError):
 
 
 class DivergenceError(PharosError, ValueError):
-    """The value asked for may be infinite."""
+    """The value asked for is infinite, or no policy has one; the message names the cycle."""
 
 
 class UndefinedMeasure(PharosError):

@@ -342,6 +342,21 @@ def test_with_a_horizon_values_are_undiscounted_unless_told_otherwise(answer):
     assert answer("solve", "simple_grid", "--horizon", 6, "--gamma", 0.5)["value_at_start"] == 0.5**5
 
 
+def test_solving_until_the_end_and_reaching(answer):
+    lake = ("frozen_lake/4x4", "slippery=true")
+    solved = answer("solve", *lake, "--objective", "total")
+    assert solved["value_at_start"] == pytest.approx(14 / 17, abs=1e-9)
+    assert (solved["gamma"], solved["horizon"]) == (1.0, None)
+    reached = answer("solve", *lake, "--reach", "15")["reach"]
+    assert reached["maximum"]["lower"] <= 14 / 17 <= reached["maximum"]["upper"]
+    assert reached["least_cost"] == {"lower": None, "upper": None, "infinite": True}
+    assert "no horizon; found --gamma 0.9" in command_line.usage_error(
+        "solve", *lake, "--objective", "total", "--gamma", "0.9"
+    )
+    assert "unknown target" in command_line.usage_error("solve", *lake, "--reach", "somewhere")
+    assert "no upper limit" in command_line.usage_error("solve", "breakout/4x5x1", "--objective", "total")
+
+
 @pytest.mark.slow
 def test_solving_a_folder_is_solving_its_environment(answer, tmp_path):
     answer("build", "breakout", "height=7", "columns=3", "--out", tmp_path / "court")

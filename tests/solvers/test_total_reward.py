@@ -1,6 +1,7 @@
 """Total rewards against rational numbers and every policy, published values, and textbooks."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -9,9 +10,10 @@ from hypothesis import strategies as st
 import pharos
 from naive import goals as naive
 from pharos.errors import DivergenceError
-from pharos.mdp import TabularMDP
+from pharos.mdp import BEST, TabularMDP
+from pharos.solvers.goals import swept_goals
 from pharos.solvers.values import uniform_value, worst_value
-from strategies import examples, outcome_table, small_mdps
+from strategies import deterministic_mdps, examples, outcome_table, small_mdps
 
 VECTORS = [[1.0], [0.5, 0.5], [0.25, 0.75], [1e-12, 1 - 1e-12], [1 / 3, 1 / 3, 1 / 3]]
 
@@ -162,3 +164,50 @@ def test_the_slippery_lake_without_a_limit():
     mdp = pharos.build(pharos.make("frozen_lake", slippery=True)).mdp(gamma=1.0).with_horizon(None)
     solution = pharos.value_iteration(mdp)
     assert solution.value_at_start == pytest.approx(14 / 17, abs=1e-9)
+
+
+def test_whole_rewards_without_chance_are_exact():
+    mdp = pharos.build(pharos.make("taxi")).mdp(gamma=1.0)
+    solution = pharos.value_iteration(mdp)
+    assert solution.error_bound == 0.0
+    assert solution.value_at_start == pytest.approx(7.93, abs=1e-12)
+    assert (solution.v == np.round(solution.v)).all()
+    assert (solution.optimal_actions(0.0) == solution.optimal_actions(0.5)).all()  # so every tie is one
+
+
+@examples(200, deterministic_mdps())
+def test_paths_of_deterministic_mdps(mdp):
+    mdp = mdp.with_gamma(1.0)
+    check(mdp, pharos.value_iteration, 1)
+    check(mdp, worst_value, -1)
+
+
+def test_a_cycle_of_a_thousand_states_is_decided_exactly():
+    # the rewards of the cycle are decimals, so that their sum is no whole multiple of what floats of it hold
+    rng = np.random.default_rng(0)
+    rewards = np.zeros((1000, 2))
+    rewards[:, 0] = rng.integers(-100, 100, 1000) / 1000
+    rewards[-1, 0] = 0.0
+    total = sum(map(Fraction, rewards[:, 0].tolist()))
+    next_states = np.stack([(np.arange(1000) + 1) % 1000, np.full(1000, -1)], axis=1)
+    rewards[-1, 0] = -float(total)
+    mdp = TabularMDP.from_arrays(next_states, rewards, gamma=1.0)
+    left = total - Fraction(float(total))
+    if left > 0:
+        with pytest.raises(DivergenceError, match="no upper limit"):
+            pharos.value_iteration(mdp)
+    else:
+        assert np.isfinite(pharos.value_iteration(mdp).v).all()
+    rewards[-1, 0] = np.nextafter(rewards[-1, 0], -np.inf)
+    assert np.isfinite(pharos.value_iteration(mdp.with_rewards(rewards)).v).all()
+    rewards[-1, 0] += 1e-9
+    with pytest.raises(DivergenceError, match="no upper limit"):
+        pharos.value_iteration(mdp.with_rewards(rewards))
+
+
+@examples(50, mdps_with_cycles(rewards=(-1.0, -0.5, 0.25)))
+def test_sweeps_prove_the_same(mdp):
+    goals = swept_goals(mdp, BEST, 1e-6, None)
+    if goals is not None:
+        solution = pharos.value_iteration(mdp)
+        assert np.abs(goals.v - solution.v).max() <= goals.error.max() + solution.error_bound

@@ -18,13 +18,15 @@ from pharos.cli.options import (
     Chance,
     Gamma,
     Horizon,
+    Objective,
     SharedBuilding,
     Target,
     Tolerance,
     Trust,
     file_ending,
+    total_of,
 )
-from pharos.errors import FileFormatError, ParameterError, UnknownName
+from pharos.errors import DivergenceError, FileFormatError, ParameterError, UnknownName
 from pharos.solvers import Solving
 from pharos.system import compiling
 from pharos.system.wording import pluralize
@@ -41,6 +43,8 @@ def solve(
     *,
     gamma: Gamma = None,
     horizon: Horizon = None,
+    objective: Objective = None,
+    reach: str | None = None,
     chance: Chance,
     solving: Annotated[Solving, "tolerance threads dtype"],
     out: Annotated[Path | None, file_ending(".npz", ".npy")] = None,
@@ -49,12 +53,16 @@ def solve(
     """Find the optimal values and policy, with a proven error bound. With --processes the same command resumes.
 
     Args:
+        reach: Instead of values, probabilities and costs of reaching a target: terminal, or states such as 5,7.
         out: FILE.npz for the arrays v and policy, FILE.npy for the policy alone.
         values: Folder for the values, in place of memory where that has no room; a solve that was ended goes on.
     """
     ranks, processes = building.ranks, building.processes
     with termination():
         mdp = target.mdp(building, gamma=gamma, horizon=horizon, chance=chance)
+        mdp = total_of(mdp, gamma, horizon, objective)
+    if reach is not None:
+        return reaching(target, mdp, reach, solving.tolerance, chance, out)
     from pharos.solvers import uniform_value, value_iteration
     from pharos.system import storage
 
@@ -74,14 +82,17 @@ def solve(
 
         solution = solution_by(value_iteration, "optimal", "")
         report("value of the uniform policy")
-        uniform = solution_by(uniform_value, "uniform", "uniform policy, ")
+        try:
+            uniform = solution_by(uniform_value, "uniform", "uniform policy, ")
+        except DivergenceError:  # it may go on for ever where the optimal policy ends
+            uniform = None
     if solution is None:  # a rank of MPI that is not the first
         return None
     if out is not None:
         save(out, solution)
     answer = {
         "value_at_start": solution.value_at_start,
-        "uniform_value_at_start": uniform.value_at_start,
+        "uniform_value_at_start": None if uniform is None else uniform.value_at_start,
         "error_bound": solution.error_bound,
         "sweeps": solution.sweeps,
         "seconds": solution.seconds,
@@ -92,16 +103,16 @@ def solve(
         "tolerance": solving.tolerance,
         "dtype": solving.dtype,
         "processes": int(processes) if processes.isdigit() and processes != "1" else ranks,
-        "uniform_error_bound": uniform.error_bound,
-        "uniform_seconds": uniform.seconds,
+        "uniform_error_bound": None if uniform is None else uniform.error_bound,
+        "uniform_seconds": None if uniform is None else uniform.seconds,
         "num_states": mdp.num_states,
         "num_actions": mdp.num_actions,
         "file": None if out is None else str(out),
     }
     facts = [
         ("optimal value at the start", f"{solution.value_at_start:.8g}"),
-        ("uniform policy at the start", f"{uniform.value_at_start:.8g}"),
-        ("error at most", f"{max(solution.error_bound, uniform.error_bound):.2g}"),
+        ("uniform policy at the start", "infinite" if uniform is None else f"{uniform.value_at_start:.8g}"),
+        ("error at most", f"{max(each.error_bound for each in (solution, uniform) if each is not None):.2g}"),
         ("discount", describe_discount(solution.gamma, solution.horizon)),
         ("chance", chance.in_words(mdp.dynamics.has_chance)),
         ("states", f"{mdp.num_states:,} x {pluralize(mdp.num_actions, 'action')}"),
@@ -110,6 +121,62 @@ def solve(
         *([] if out is None else [("written", out)]),
     ]
     return Answer(answer, (target.title, facts))
+
+
+REACHED = {
+    "maximum": "largest probability",
+    "minimum": "least probability",
+    "least_cost": "least cost that must arrive",
+    "largest_cost": "largest cost that must arrive",
+}
+"""Names of what is known of a target -> in words."""
+
+
+def reaching(
+    target: Target, mdp: "TabularMDP", name: str, tolerance: float, chance: "ChanceSetting", out: Path | None
+) -> Answer:
+    """The answer about reaching a target: "terminal", or states with commas between them."""
+    import numpy as np
+
+    from pharos.solvers import reach
+    from pharos.system import storage
+
+    is_list = all(part.strip().isdigit() for part in name.split(","))
+    began = time.perf_counter()
+    result = reach(mdp, [int(part) for part in name.split(",")] if is_list else name, tolerance=tolerance)
+    reached: dict[str, Any] = {"target": name, "states": int(result.target.sum())}
+    facts: list[tuple[str, object]] = []
+    arrays: dict[str, Any] = {}
+    with progress_line("solving"):
+        for key, words in REACHED.items():
+            try:
+                bounds = getattr(result, key)
+            except ParameterError:  # rewards of both signs are no costs
+                reached[key] = None
+                facts.append((words, "rewards have both signs"))
+                continue
+            ends = [float(mdp.start_probabilities @ each[mdp.start_states]) for each in (bounds.lower, bounds.upper)]
+            finite = [value if math.isfinite(value) else None for value in ends]
+            reached[key] = {"lower": finite[0], "upper": finite[1], "infinite": finite[0] is None}
+            facts.append((words, "infinite" if math.isinf(ends[0]) else f"{(ends[0] + ends[1]) / 2:.8g}"))
+            arrays |= {f"{key}_lower": bounds.lower, f"{key}_upper": bounds.upper}
+    if out is not None:
+        if out.suffix.lower() == ".npy":
+            raise ParameterError(f"{out}: a target has several arrays; expected FILE.npz")
+        with storage.replacing(out, follow=True) as file:
+            np.savez_compressed(file, **arrays)
+    answer = {
+        "reach": reached,
+        "seconds": time.perf_counter() - began,
+        "compiling_seconds": compiling.seconds(),
+        **{each: getattr(chance, each) for each in ACTING},
+        "tolerance": tolerance,
+        "num_states": mdp.num_states,
+        "num_actions": mdp.num_actions,
+        "file": None if out is None else str(out),
+    }
+    facts += [("states of the target", f"{reached['states']:,} of {mdp.num_states:,}")]
+    return Answer(answer, (f"reaching {name} in {target.title}", facts))
 
 
 def save(path: Path, solution: "Solution") -> None:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.models import ParameterInfo
@@ -57,6 +57,10 @@ Seed = Annotated[int, typer.Option(min=0)]
 Seconds = Annotated[float, typer.Option(min=0)]
 Discount = Annotated[float, typer.Option(min=0, max=1)]
 Gamma = Annotated[float | None, typer.Option(min=0, max=1, help="Discount; 0.99 when not given, or 1 with a horizon.")]
+Objective = Annotated[
+    Literal["discounted", "total"] | None,
+    typer.Option(help="discounted, or total: gamma 1 and no horizon, not even a world's own. By --gamma if not given."),
+]
 Horizon = Annotated[
     int | None, typer.Option(min=1, help="Steps after which an episode ends; without end when not given.")
 ]
@@ -136,6 +140,16 @@ def parse_seeds(text: str) -> list[int]:
     if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
         raise ParameterError(f"--seeds {text!r}; expected whole numbers, each once, such as 0:64 or 0,1,5")
     return seeds
+
+
+def total_of(mdp: "TabularMDP", gamma: float | None, horizon: int | None, objective: str | None) -> "TabularMDP":
+    """The MDP, with gamma 1 and no horizon if the objective is the total reward."""
+    if objective != "total":
+        return mdp
+    if gamma not in (None, 1.0) or horizon is not None:
+        what = f"--horizon {horizon}" if horizon is not None else f"--gamma {gamma:g}"
+        raise ParameterError(f"--objective total has gamma 1 and no horizon; found {what}")
+    return mdp.with_gamma(1.0).with_horizon(None)
 
 
 def discount(gamma: float | None, horizon: int | None) -> float:

@@ -100,7 +100,7 @@ class Exploration:
         title: for people.
         progress: called with what is done next.
     Raises:
-        DivergenceError: gamma is 1, and the value may be infinite. ParameterError: what was learnt does not fit.
+        DivergenceError: gamma is 1, and the value is infinite. ParameterError: what was learnt does not fit.
     """
 
     def __init__(

@@ -298,7 +298,7 @@ def explore(  # noqa: PLR0913
         An Explorer, whose server answers until it is closed; with `out` the path of the file.
     Raises:
         ParameterError: there is no such target, the policy does not fit, the port is taken, or the space is too large
-            for a file. DivergenceError: gamma is 1, and the value may be infinite.
+            for a file. DivergenceError: gamma is 1, and the value is infinite.
     """
     agent = None if policy is None else Learnt(policy, observation=observation)
     chance = ChanceSetting(sticky, random, lazy)

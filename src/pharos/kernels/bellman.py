@@ -642,3 +642,46 @@ def sweep_groups(
             max_backups -= stop - start
             if max_backups < 0 or not has_cycle[group]:
                 break
+
+
+# Longest paths --------------------------------------------------------------------------------------------------------
+
+
+@interpreted_first()
+@kernel(makes_arrays=False)
+def lengthen_paths(next_states, rewards, ends, v, is_reached, action):
+    """Make the longest paths so far longer by single steps, in place, from the last state to the first.
+
+    v (S + 1,): what the path from each state to the end pays, where is_reached; row S is the end. rewards (S, A) and v
+    are whole numbers. action (S,): the first step of the path; -1: it stops there. Rows of ends (S,) bool do not count.
+    Returns how many it changed. Source: Bellman (1958), Ford (1956).
+    """
+    changed = 0
+    num_states, num_actions = next_states.shape
+    for s in range(num_states - 1, -1, -1):
+        if ends[s]:
+            continue
+        for a in range(num_actions):
+            t = next_states[s, a]
+            if is_reached[t] and (not is_reached[s] or rewards[s, a] + v[t] > v[s]):
+                v[s] = rewards[s, a] + v[t]
+                is_reached[s] = True
+                action[s] = a
+                changed += 1
+    return changed
+
+
+@interpreted_first()
+@kernel(makes_arrays=False)
+def cycle_of(next_states, action, mark):
+    """A state on a cycle of the steps (s, action[s]) with action[s] >= 0, or -1. mark (S,) integers is scratch."""
+    num_states = len(action)
+    mark[:] = 0
+    for start in range(num_states):
+        s = np.int64(start)
+        while s >= 0 and mark[s] == 0:
+            mark[s] = start + 1
+            s = np.int64(next_states[s, action[s]]) if action[s] >= 0 else np.int64(-1)
+        if s >= 0 and mark[s] == start + 1:
+            return s
+    return -1

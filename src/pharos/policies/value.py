@@ -18,7 +18,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 
 from pharos import solvers
-from pharos.errors import DivergenceError, ParameterError
+from pharos.errors import ParameterError
 from pharos.kernels.stepping import execute_choices
 from pharos.mdp import PolicyTable, Rewards, Table, TabularMDP, drawn_actions, require_mdp
 from pharos.policies.models import SB3Model, check_observation, deep_policy
@@ -385,7 +385,7 @@ def evaluate_policy(
         ParameterError: the policy has the wrong shape, or its rows are not probabilities; or it sees observations, and
             the MDP was not made from a state space (the observation "number" is of any table); or a model was trained
             on other observations, behind a VecNormalize that is not with it, or under masks that are not given.
-        DivergenceError: gamma is 1, there is no horizon, and the value is or may be infinite.
+        DivergenceError: gamma is 1, there is no horizon, and the policy goes on for ever where something is paid.
     Source: Puterman (1994), section 6.1.
     """
     if isinstance(policy, TabularAgent):
@@ -441,12 +441,8 @@ def _solution_of_reached(
         ParameterError: the MDP was not made from a state space of an environment, the policy is none for its
             observations, or it sees the previous action where actions are not sticky, so that values do not belong to
             states.
-        DivergenceError: gamma is 1 and there is no horizon.
+        DivergenceError: gamma is 1, there is no horizon, and the policy goes on for ever where something is paid.
     """
-    if mdp.horizon is None and mdp.gamma == 1.0:
-        raise DivergenceError(
-            f"{mdp}: gamma is 1 and there is no horizon, so the value may be infinite; give one, or gamma < 1"
-        )
     if previous_action and not mdp.is_sticky:
         raise ParameterError(
             "the policy sees the previous action, so its values belong to no state; use training.evaluate_agent"

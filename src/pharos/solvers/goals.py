@@ -35,10 +35,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pharos.errors import DivergenceError, PrecisionError
-from pharos.kernels import hitting
+from pharos.kernels import bellman, hitting
 from pharos.kernels.hitting import UNIT
 from pharos.mdp import PolicyTable, Selection, TabularMDP, end_components, executed_actions, nodes_of_outcomes
-from pharos.solvers.policy_iteration import DENSE, fills_little
+from pharos.solvers.policy_iteration import BLOCK, DENSE, fills_little
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -51,6 +51,8 @@ MOST_IMPROVEMENTS = 1000
 REFINEMENTS = 3
 # Unknowns of the largest system that is eliminated whatever it fills in.
 ELIMINATED = 20_000
+# Sweeps of paths before their steps are looked at for a cycle.
+LOOK = 8
 # More than the rounding of the computation of a bound itself.
 MARGIN = 1 + 2.0**-30
 
@@ -99,13 +101,14 @@ class Goals:
     Attributes:
         v: (N,) of the nodes of the MDP. error: (N,) each is within this of the true one.
         policy: (N,) a choice for each node, of a policy that ends almost surely where it does not stay for nothing.
-        improvements: of the policy.
+        improvements: of the policy, or sweeps. is_exact: whether values of actions, which follow from v, are exact.
     """
 
     v: np.ndarray
     error: np.ndarray
     policy: np.ndarray
     improvements: int
+    is_exact: bool = False
 
     def policy_table(self, mdp: TabularMDP) -> np.ndarray:
         """The policy as `Solution.policy` has it: (S,) actions, or (S, A + 1) if it looks at the previous action."""
@@ -124,6 +127,12 @@ def total_reward(
         DivergenceError: it is infinite, or there is no policy that has one; the message names a cycle.
         PrecisionError: floats cannot tell it, or prove no bound within the tolerance.
     """
+    if mdp.is_deterministic and not isinstance(select, PolicyTable):
+        return longest_paths(mdp, select)
+    if mdp.num_states * mdp.width > ELIMINATED and not any(mdp.residual):
+        goals = swept_goals(mdp, select, tolerance, progress)
+        if goals is not None:
+            return goals
     return Problem.of(mdp, select).solve(tolerance, progress)
 
 
@@ -263,7 +272,7 @@ class Problem:
         choices = self._without_idle(self.choices)
         sure, policy = self.proper(choices)
         if not sure[:-1].all():
-            raise self._endless(~sure[self.node_of[:-2]])
+            raise _without_end(self.mdp, ~sure[self.node_of[:-2]])
         v, error, policy, improvements = _values(choices, policy, tolerance, self._infinite, progress)
         if any(self.mdp.residual):
             error = self._within_residual(choices, v, policy)
@@ -313,24 +322,8 @@ class Problem:
 
     def _infinite(self, choices: Choices, rows: np.ndarray) -> DivergenceError:
         """The error that repeating some rows pays without limit."""
-        pairs = [divmod(int(each), self.num_choices) for each in choices.origin[rows]]
-        return DivergenceError(
-            f"{self.mdp}: the total reward has no {'lower' if self.sign < 0 else 'upper'} limit: a cycle pays again "
-            f"and again: {_pairs_in_words(self.mdp, pairs)}; give a horizon, or gamma < 1"
-        )
-
-    def _endless(self, unsure: np.ndarray) -> DivergenceError:
-        """The error that from some nodes (N,) bool no policy ends or stays for nothing."""
-        components = end_components(self.mdp)
-        labels = components.labels.ravel()
-        inside = components.pairs.reshape(len(labels), -1)
-        stuck = np.flatnonzero(unsure & (labels >= 0))
-        same = np.flatnonzero(labels == labels[stuck[0]]) if len(stuck) else np.flatnonzero(unsure)
-        pairs = [(int(n), int(a)) for n in same[: NAMED + 1] for a in np.flatnonzero(inside[n])[:1]]
-        state = int(np.flatnonzero(unsure)[0]) // self.mdp.width
-        return DivergenceError(
-            f"{self.mdp}: no policy has a finite total reward from state {state}: none ends surely, or stays where "
-            f"nothing is paid; a cycle that pays: {_pairs_in_words(self.mdp, pairs)}; give a horizon, or gamma < 1"
+        return _without_limit(
+            self.mdp, self.sign, [divmod(int(each), self.num_choices) for each in choices.origin[rows]]
         )
 
     def _unfolded(self, origin: np.ndarray) -> np.ndarray:
@@ -582,7 +575,180 @@ def _pays(choices: Choices, policy: np.ndarray, nodes: np.ndarray) -> bool:
     return bool((total[at] - slack[at] - choices.error > 0).all())
 
 
+# Longest paths --------------------------------------------------------------------------------------------------------
+
+
+# Whole numbers that 64 bits hold, and those that floats hold.
+WHOLE, EXACT = 2**62, 2**53
+
+
+def longest_paths(mdp: TabularMDP, select: Selection) -> Goals:
+    """Total rewards where every choice has one outcome: longest paths to the end, or to a cycle that pays nothing.
+
+    Rewards are whole multiples of a power of 2, so that all sums are of whole numbers, and no tie is left to rounding.
+    Paths become longer step by step; once the steps of their states form a cycle, it pays: the value is infinite.
+    """
+    sign = -1 if select.kind == "worst" else 1
+    table, terminal = np.asarray(mdp.dynamics.deterministic_table()), np.asarray(mdp.terminal)
+    rewards = mdp.reward_table
+    if len(rewards.palette):
+        floats, codes = rewards.palette, rewards.table
+    else:
+        floats, codes = np.unique(rewards.table, return_inverse=True)
+    shift = max(float(each).as_integer_ratio()[1].bit_length() - 1 for each in floats)
+    numbers = [sign * numerator * (2**shift // below) for numerator, below in map(float.as_integer_ratio, floats)]
+    fits = max(map(abs, numbers)) * (mdp.num_states + 1) < WHOLE
+    paid = np.array(numbers, np.int64 if fits else object)[codes.reshape(table.shape)]
+    free = end_components(mdp, paid == 0)
+    v = np.zeros(mdp.num_states + 1, paid.dtype)
+    is_reached = np.append(terminal | (free.labels >= 0), True)
+    action, mark = np.full(mdp.num_states, -1, np.int64), np.empty(mdp.num_states, np.int64)
+    lengthen = bellman.lengthen_paths if fits else bellman.lengthen_paths.py_func
+    sweeps = 0
+    while lengthen(table, paid, terminal, v, is_reached, action):
+        sweeps += 1
+        if sweeps & (sweeps - 1) == 0 and sweeps > LOOK:
+            state = int(bellman.cycle_of(table, action, mark))
+            if state >= 0:
+                pairs = [(state, int(action[state]))]
+                while (after := int(table[pairs[-1]])) != state:
+                    pairs.append((after, int(action[after])))
+                raise _without_limit(mdp, sign, pairs)
+    if not is_reached.all():
+        raise _without_end(mdp, ~is_reached[:-1])
+    stays = action < 0
+    action[stays] = free.pairs[stays].argmax(axis=1)
+    largest = max(int(np.abs(v).max()), 1) + max(map(abs, numbers))
+    values = sign * np.ldexp(v[:-1].astype(np.float64), -shift)
+    is_exact = largest < EXACT
+    return Goals(values, np.zeros(len(values)) if is_exact else 2 * UNIT * np.abs(values), action, sweeps, is_exact)
+
+
+# Many nodes -----------------------------------------------------------------------------------------------------------
+
+
+# Sweeps before bounds are tried first, of one attempt, and of all; the part of the tolerance by which values are moved.
+FIRST_BOUNDS, ATTEMPT, MOST_SWEEPS, PART = 32, 64, 100_000, 0.25
+
+
+def swept_goals(
+    mdp: TabularMDP, select: Selection, tolerance: float, progress: Callable[[int, float], None] | None
+) -> Goals | None:
+    """Total rewards by sweeps, where no component pays nothing and to stay in one always costs; None: elsewhere.
+
+    There T has one fixed point V. Values that a sweep lowers everywhere are no less than V, and those that it raises
+    everywhere no more, as long as each backup is rounded up, or down: it pays its rounding more, or less. So values
+    that have nearly settled are moved up and down by a part of the tolerance, and swept until they fall, and rise.
+    Source: Hartmanns and Kaminski (2020), "Optimistic value iteration".
+    """
+    components = end_components(mdp)
+    if components.total:
+        sign = -1.0 if select.kind == "worst" else 1.0
+        is_chance = isinstance(select, PolicyTable) or not mdp.chance.is_none
+        if is_chance or not (sign * mdp.rewards[components.pairs] < 0).all():
+            return None
+    from pharos.solvers.fixed_point import Backup, largest_of
+
+    backup = Backup(mdp, select)
+    x, sweeps, changes, attempt = backup.zeros(), 0, [math.inf], FIRST_BOUNDS
+    over = np.asarray(mdp.terminal)
+    while sweeps < MOST_SWEEPS:
+        changes.append(backup.sweep(x))
+        sweeps += 1
+        if progress is not None:
+            progress(sweeps, math.inf)
+        if not math.isfinite(changes[-1]):
+            return None
+        if sweeps < attempt:
+            continue
+        ratio = (changes[-1] / changes[sweeps // 2]) ** (2 / sweeps) if changes[-1] > 0 else 0.0
+        if not changes[-1] * ratio <= PART * PART * tolerance * max(1 - ratio, 1e-12):
+            attempt = sweeps + max(8, sweeps // 16)
+            continue
+        largest = largest_of(x) + tolerance
+        step = (backup.rounding(largest) + (backup.operations + 16) * UNIT * largest) * MARGIN
+        bounds = []
+        for side in (1.0, -1.0):
+            settled = _monotone(mdp, select, x, over, side, PART * tolerance, step)
+            sweeps += settled[1]
+            bounds.append(settled[0])
+        upper, lower = bounds
+        if upper is not None and lower is not None:
+            v, error = (upper + lower) / 2, float((upper - lower).max()) / 2 * MARGIN
+            if progress is not None:
+                progress(sweeps, error)
+            nodes = mdp.num_states * mdp.width
+            # where staying in a component costs, the policy that attains the bound does not
+            policy = _greedy(mdp, select, upper if select.kind == "worst" else lower)
+            return Goals(v[:-1].reshape(nodes), np.full(nodes, error), policy, sweeps)
+        changes += [changes[-1]] * (sweeps + 1 - len(changes))
+        attempt = sweeps + max(64, sweeps // 4)
+    return None
+
+
+def _monotone(
+    mdp: TabularMDP, select: Selection, x: np.ndarray, over: np.ndarray, side: float, part: float, step: float
+) -> tuple[np.ndarray | None, int]:
+    """(values moved by a part to a side, and swept until a sweep moves all of them back; sweeps); None: it does not."""
+    from dataclasses import replace
+
+    from pharos.mdp import Rewards
+    from pharos.solvers.fixed_point import Backup
+
+    table = mdp.reward_table
+    moved = (
+        Rewards(table.table, table.palette + side * step, table.rounding)
+        if len(table.palette)
+        else Rewards(table.table + side * step, table.palette, table.rounding)
+    )
+    backup = Backup(replace(mdp, reward_table=moved), select)
+    y = x + side * part
+    y[-1] = 0.0
+    y[:-1][over] = 0.0
+    for sweep in range(ATTEMPT):
+        before = y.copy()
+        backup.sweep(y)
+        y[:-1][over] = 0.0
+        if (side * (y - before) <= 0).all():
+            return y, sweep + 1
+    return None, ATTEMPT
+
+
+def _greedy(mdp: TabularMDP, select: Selection, x: np.ndarray) -> np.ndarray:
+    """(N,) the greedy actions of values, block by block."""
+    if isinstance(select, PolicyTable):
+        return np.zeros(mdp.num_states * mdp.width, np.int64)
+    actions = np.empty(mdp.num_states, np.int64)
+    for start in range(0, mdp.num_states, BLOCK):
+        states = slice(start, min(start + BLOCK, mdp.num_states))
+        actions[states] = select.policy(mdp.reward_table.rows(states) + mdp.dynamics.expected(x, states)).table
+    return np.repeat(actions, mdp.width)
+
+
 # Words ----------------------------------------------------------------------------------------------------------------
+
+
+def _without_limit(mdp: TabularMDP, sign: float, pairs: list[tuple[int, int]]) -> DivergenceError:
+    """The error that repeating some pairs (node, choice) pays without limit."""
+    return DivergenceError(
+        f"{mdp}: the total reward has no {'lower' if sign < 0 else 'upper'} limit: a cycle pays again and again: "
+        f"{_pairs_in_words(mdp, pairs)}; give a horizon, or gamma < 1"
+    )
+
+
+def _without_end(mdp: TabularMDP, unsure: np.ndarray) -> DivergenceError:
+    """The error that from some nodes (N,) bool no policy surely ends or stays for nothing."""
+    components = end_components(mdp)
+    labels = components.labels.ravel()
+    inside = components.pairs.reshape(len(labels), -1)
+    stuck = np.flatnonzero(unsure & (labels >= 0))
+    same = np.flatnonzero(labels == labels[stuck[0]]) if len(stuck) else np.flatnonzero(unsure)
+    pairs = [(int(n), int(a)) for n in same[: NAMED + 1] for a in np.flatnonzero(inside[n])[:1]]
+    return DivergenceError(
+        f"{mdp}: no policy has a finite total reward from state {int(np.argmax(unsure)) // mdp.width}: none ends "
+        f"surely, or stays where nothing is paid; a cycle that pays: {_pairs_in_words(mdp, pairs)}; give a horizon, or "
+        "gamma < 1"
+    )
 
 
 def _pairs_in_words(mdp: TabularMDP, pairs: list[tuple[int, int]]) -> str:

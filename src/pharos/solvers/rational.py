@@ -34,6 +34,8 @@ def rational_values(
     count, entries_left = choices.num_nodes, MOST_ENTRIES
     matrix = choices.matrix
     rows: list[Row] = []
+    if matrix.nnz > MOST_ENTRIES:
+        raise _too_many(count)
     for i in range(matrix.shape[0]):
         places = range(matrix.indptr[i], matrix.indptr[i + 1])
         row = {int(matrix.indices[k]): Fraction(float(matrix.data[k])) for k in places}
@@ -44,11 +46,7 @@ def rational_values(
         v, entries = eliminated([rows[i] for i in policy], count, entries_left)
         entries_left -= entries
         if entries_left < 0:
-            raise PrecisionError(
-                f"64-bit floats cannot tell the total reward of {count} nodes within the tolerance, or whether it is "
-                "finite, and they are too many for rational numbers; raise the tolerance, lower gamma, or give a "
-                "horizon"
-            )
+            raise _too_many(count)
         if v is None:
             raise infinite(choices, policy[_stuck(choices, policy)])
         v.append(Fraction(0))
@@ -63,6 +61,13 @@ def rational_values(
         if not is_better:
             values = np.array([float(each) for each in v[:-1]])
             return values, 2.0**-52 * np.abs(values) + 2.0**-1074, policy, improvements
+
+
+def _too_many(count: int) -> PrecisionError:
+    return PrecisionError(
+        f"64-bit floats cannot tell the total reward of {count} nodes within the tolerance, or whether it is finite, "
+        "and they are too many for rational numbers; raise the tolerance, lower gamma, or give a horizon"
+    )
 
 
 def eliminated(rows: list[Row], count: int, most: int) -> tuple[list[Fraction] | None, int]:

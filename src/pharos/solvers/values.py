@@ -144,7 +144,8 @@ def _until_the_end(mdp: TabularMDP, select: Selection, solving: Solving, watch: 
     x = backup.zeros()
     x[:-1] = goals.v.reshape(mdp.num_states, mdp.width)
     largest = float(np.abs(goals.v).max(initial=0.0))
-    bound = (float(goals.error.max(initial=0.0)) + backup.rounding(largest)) * MARGIN
+    rounding = 0.0 if goals.is_exact and not backup.is_single else backup.rounding(largest)
+    bound = (float(goals.error.max(initial=0.0)) + rounding) * MARGIN
     if not bound <= solving.tolerance and not any(mdp.residual):
         raise imprecise(mdp, bound, solving.tolerance, backup.is_single)
     if solving.values is not None:
