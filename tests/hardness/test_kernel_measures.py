@@ -465,7 +465,8 @@ def test_a_report_has_them_where_there_is_a_representation_and_keeps_them(grid):
 
 @pytest.mark.long
 def test_the_command_line_has_them(grid):
-    target = ["hardness", "simple_grid", "height=3", "width=4", "--measures", ",".join(MEASURES)]
+    measured = ["--measures", ",".join(MEASURES), "--budget", "inf"]  # however busy the machine is
+    target = ["hardness", "simple_grid", "height=3", "width=4", *measured]
     answer = json.loads(run(*target, "--observation", "simple_image", "--network", "cnn16", "--json").stdout)
     assert 0 < answer["measures"]["kernel_regret"]["value"] < 1
     assert answer["conventions"]["representation"]["network"] == "cnn16"

@@ -323,7 +323,7 @@ def test_a_horizon_must_be_a_number_of_steps():
 
 
 def run(*words):
-    return command_line.run("hardness", *words, env={"COLUMNS": "160"})
+    return command_line.run("hardness", *words, "--budget", "inf", env={"COLUMNS": "160"})
 
 
 def test_the_command_answers_with_the_keys_of_its_contract():

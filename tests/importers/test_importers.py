@@ -213,7 +213,9 @@ def test_an_imported_file_and_folder_are_targets(tmp_path):
     done = run("import", "bridge", CORRIDOR, "--horizon", 100, "--out", tmp_path / "kc", "--json")
     assert json.loads(done.stdout)["num_states"] == 168
     for target in ([CORRIDOR, "--horizon", 100], [tmp_path / "kc"]):
-        answer = json.loads(run("hardness", *target, "--measures", "effective_horizon,covering", "--json").stdout)
+        answer = json.loads(
+            run("hardness", *target, "--measures", "effective_horizon,covering", "--budget", "inf", "--json").stdout
+        )
         assert answer["measures"]["effective_horizon"]["value"] == 16.0
         assert answer["measures"]["covering"]["omega_max"] == pytest.approx(3.62514e-7, rel=1e-5)
         assert answer["conventions"]["gamma"] == 1.0
