@@ -460,15 +460,6 @@ def test_a_file_imports_files_beside_it_at_the_top_and_in_functions(suite, tmp_p
 
 
 @pytest.mark.slow
-def test_a_run_without_an_end_is_ended_by_its_time_limit(suite, file, tmp_path):
-    file.write_text(LEARN.replace("    draw =", "    while seed == 1:\n        pass\n    draw =", 1))
-    with pytest.raises(AllRunsFailed) as error:
-        benchmark.run(f"{file}:learn", suite, out=tmp_path / "out", seeds=range(2), tasks="sea", timeout=20.0)
-    (message,) = error.value.outcome.missing.values()
-    assert "seed 1: took longer than 20 s" in message and "--timeout" in message
-
-
-@pytest.mark.slow
 def test_a_run_that_has_ended_may_leave_threads_behind(suite, file, tmp_path, monkeypatch):
     monkeypatch.setattr("pharos.benchmark.agents.LINGER_SECONDS", 0.5)
     text = "    import threading\n    threading.Thread(target=threading.Event().wait).start()\n    draw ="

@@ -438,7 +438,7 @@ def failure(label: str, job: Job, end: BaseException | str, file: str | None = N
 
 
 def line_in(error: BaseException, file: str | None) -> str:
-    """The last line of a file in the traceback of an error, as " (mine.py, line 12)"; empty if there is none."""
+    """The last line of a file in the traceback of an error, such as " (FILE, line 12)"; empty if there is none."""
     frames = [each for each in traceback.extract_tb(error.__traceback__) if file and each.filename == file]
     return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
