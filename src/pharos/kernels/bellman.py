@@ -178,15 +178,15 @@ def _set_size(weights, s, actions):
     return counted
 
 
-def as_first(weights, chosen, mean):
+def as_first(weights, choice_value, mean):
     """The value of a step as the first one, from that of the choice and the mean over available actions."""
 
 
 @overload(as_first, jit_options={"forceinline": True})
-def _as_first(weights, chosen, mean):
+def _as_first(weights, choice_value, mean):
     if isinstance(weights, types.UniTuple):
-        return lambda weights, chosen, mean: chosen
-    return lambda weights, chosen, mean: weights[3] * chosen + (1.0 - weights[3]) * mean
+        return lambda weights, choice_value, mean: choice_value
+    return lambda weights, choice_value, mean: weights[3] * choice_value + (1.0 - weights[3]) * mean
 
 
 def weight_of(uniform):
@@ -399,18 +399,18 @@ def _sticky_policy_values(transitions, table, palette, gamma, weights, policy, v
     for a in range(len(actions)):
         q[a] = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
     # the mean under the policy, once where it does not depend on the previous action b
-    shared, chosen, total = 0.0, 0.0, 0.0
+    shared, choice_value, total = 0.0, 0.0, 0.0
     for b in range(len(actions)):
         if b == 0 or looks_back:
-            shared, chosen, total = 0.0, 0.0, 0.0
+            shared, choice_value, total = 0.0, 0.0, 0.0
             for a in range(len(actions)):
                 has = set_has(weights, s, a)
                 shared += (chosen_weight * policy[s, b, a] + (uniform_share if has else 0.0)) * q[a]
-                chosen += policy[s, b, a] * q[a]
+                choice_value += policy[s, b, a] * q[a]
                 total += q[a] if has else 0.0
         values[b] = shared + previous_weight * q[b]
         if not set_has(weights, s, b):
-            values[b] = as_first(weights, chosen, total / set_size(weights, s, actions))
+            values[b] = as_first(weights, choice_value, total / set_size(weights, s, actions))
 
 
 @interpreted_first()

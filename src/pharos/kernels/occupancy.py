@@ -24,12 +24,12 @@ def _mass(now, s):
     return mass
 
 
-def unrepeated(policy, weights, now, s, a):
-    """What the mass of s whose previous action is not available adds to a, as it is executed as on the first step."""
+def mass_as_first(policy, weights, now, s, a):
+    """The mass by which a step after an action that is not available, as the first one, executes a more in s."""
 
 
-@overload(unrepeated, jit_options={"forceinline": True})
-def _unrepeated(policy, weights, now, s, a):
+@overload(mass_as_first, jit_options={"forceinline": True})
+def _mass_as_first(policy, weights, now, s, a):
     if isinstance(weights, types.UniTuple):
         return lambda policy, weights, now, s, a: 0.0
 
@@ -63,7 +63,7 @@ def _execute(policy, weights, now, s, mass, executed):
                 p += now[s, b] * policy[s, b, a]
         p = chosen_weight * p + (uniform_share if set_has(weights, s, a) else 0.0)
         if previous_weight > 0.0:
-            p += previous_weight * now[s, a] + unrepeated(policy, weights, now, s, a)
+            p += previous_weight * now[s, a] + mass_as_first(policy, weights, now, s, a)
         executed[a] = p
 
 

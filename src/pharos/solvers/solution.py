@@ -69,10 +69,10 @@ class Solution:
         Of actions that are not available -inf (inf in the solution of the worst policy), which no choice takes.
         """
         executed = self.q_of(slice(None))
-        chosen = executed if self.mdp.is_sticky else self.mdp.chance.choice(executed, executed)
+        values = executed if self.mdp.is_sticky else self.mdp.chance.choice(executed, executed)
         if self.mdp.available is None:
-            return chosen
-        return np.where(self.mdp.available, chosen, np.inf if self.kind == "worst" else -np.inf)
+            return values
+        return np.where(self.mdp.available, values, np.inf if self.kind == "worst" else -np.inf)
 
     def q_of(self, states: np.ndarray | slice) -> np.ndarray:
         """(N, A), the values of executing each action in some states (indices or a slice).
