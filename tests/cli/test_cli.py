@@ -354,7 +354,9 @@ def test_solving_until_the_end_and_reaching(answer):
         "solve", *lake, "--objective", "total", "--gamma", "0.9"
     )
     assert "unknown target" in command_line.usage_error("solve", *lake, "--reach", "somewhere")
-    assert "no upper limit" in command_line.usage_error("solve", "breakout/4x5x1", "--objective", "total")
+    assert "no upper limit" in command_line.usage_error(
+        "solve", "breakout", "height=7", "columns=3", "--objective", "total"
+    )
 
 
 @pytest.mark.slow

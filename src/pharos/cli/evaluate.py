@@ -144,7 +144,7 @@ def reaching(
     is_list = all(part.strip().isdigit() for part in name.split(","))
     began = time.perf_counter()
     result = reach(mdp, [int(part) for part in name.split(",")] if is_list else name, tolerance=tolerance)
-    reached: dict[str, Any] = {"target": name, "states": int(result.target.sum())}
+    numbers: dict[str, Any] = {"target": name, "states": int(result.target.sum())}
     facts: list[tuple[str, object]] = []
     arrays: dict[str, Any] = {}
     with progress_line("solving"):
@@ -152,12 +152,12 @@ def reaching(
             try:
                 bounds = getattr(result, key)
             except ParameterError:  # rewards of both signs are no costs
-                reached[key] = None
+                numbers[key] = None
                 facts.append((words, "rewards have both signs"))
                 continue
             ends = [float(mdp.start_probabilities @ each[mdp.start_states]) for each in (bounds.lower, bounds.upper)]
             finite = [value if math.isfinite(value) else None for value in ends]
-            reached[key] = {"lower": finite[0], "upper": finite[1], "infinite": finite[0] is None}
+            numbers[key] = {"lower": finite[0], "upper": finite[1], "infinite": finite[0] is None}
             facts.append((words, "infinite" if math.isinf(ends[0]) else f"{(ends[0] + ends[1]) / 2:.8g}"))
             arrays |= {f"{key}_lower": bounds.lower, f"{key}_upper": bounds.upper}
     if out is not None:
@@ -166,7 +166,7 @@ def reaching(
         with storage.replacing(out, follow=True) as file:
             np.savez_compressed(file, **arrays)
     answer = {
-        "reach": reached,
+        "reach": numbers,
         "seconds": time.perf_counter() - began,
         "compiling_seconds": compiling.seconds(),
         **{each: getattr(chance, each) for each in ACTING},
@@ -175,7 +175,7 @@ def reaching(
         "num_actions": mdp.num_actions,
         "file": None if out is None else str(out),
     }
-    facts += [("states of the target", f"{reached['states']:,} of {mdp.num_states:,}")]
+    facts += [("states of the target", f"{numbers['states']:,} of {mdp.num_states:,}")]
     return Answer(answer, (f"reaching {name} in {target.title}", facts))
 
 

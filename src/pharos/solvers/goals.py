@@ -133,10 +133,10 @@ def total_reward(
         goals = swept_goals(mdp, select, tolerance, progress)
         if goals is not None:
             return goals
-    return Problem.of(mdp, select).solve(tolerance, progress)
+    return GoalProblem.of(mdp, select).solve(tolerance, progress)
 
 
-class Problem:
+class GoalProblem:
     """Nodes of an MDP, their choices, and the same after components that pay nothing are collapsed.
 
     Attributes:
@@ -159,7 +159,7 @@ class Problem:
         self.matrix, self.inside = matrix, inside
 
     @staticmethod
-    def of(mdp: TabularMDP, select: Selection, arrived: np.ndarray | None = None) -> "Problem":
+    def of(mdp: TabularMDP, select: Selection, arrived: np.ndarray | None = None) -> "GoalProblem":
         """
         arrived: (S + 1,) bool, the terminal states, and last the end, in which play has arrived. The other ones, and to
             stay for ever where nothing is paid, then have no value. None: everything counts as arrived.
@@ -179,14 +179,14 @@ class Problem:
             table, per_node = np.tile(np.eye(num_actions), (nodes, 1)), num_actions
         live = ~np.repeat(np.asarray(mdp.terminal), width)
         outcomes = nodes_of_outcomes(mdp.dynamics.matrix(~np.asarray(mdp.terminal)), num_actions, width)
-        paid = mdp.rewards.ravel()
+        each_reward = mdp.rewards.ravel()
         if is_policy or not mdp.chance.is_none:
             each = np.repeat(np.arange(nodes), per_node)
             weights = executed_actions(mdp, table, owner[each], previous[each])
             matrix = (weights @ outcomes).tocsr()
-            rewards, size = weights @ paid, weights @ np.abs(paid)
+            rewards, size = weights @ each_reward, weights @ np.abs(each_reward)
         else:
-            matrix, rewards, size = outcomes, paid, np.abs(paid)
+            matrix, rewards, size = outcomes, each_reward, np.abs(each_reward)
         # what leads to a terminal state, or to the end, is over: column N, or N + 1 if it has not arrived
         column = np.full(matrix.shape[1], nodes)
         column[:nodes][live] = np.flatnonzero(live)
@@ -235,7 +235,7 @@ class Problem:
         choices = _sorted_choices(
             joined, own, sign * rewards[keep], keep, 0 if arrived is not None else total, error, terms
         )
-        return Problem(mdp, sign, per_node, choices, node_of, matrix, inside)
+        return GoalProblem(mdp, sign, per_node, choices, node_of, matrix, inside)
 
     # Solving ----------------------------------------------------------------------------------------------------------
 
@@ -402,7 +402,7 @@ def recurrent_classes(matrix: "csr_matrix", live: np.ndarray) -> tuple[np.ndarra
 
 
 def _proper(matrix: "csr_matrix", rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((M + 1,) bool, (M,) rows), see `Problem.proper`."""
+    """((M + 1,) bool, (M,) rows), see `GoalProblem.proper`."""
     size = matrix.shape[1]
     goal, sure, scratch = (np.zeros(size, np.bool_) for _ in range(3))
     goal[-1] = True
@@ -598,14 +598,14 @@ def longest_paths(mdp: TabularMDP, select: Selection) -> Goals:
     shift = max(float(each).as_integer_ratio()[1].bit_length() - 1 for each in floats)
     numbers = [sign * numerator * (2**shift // below) for numerator, below in map(float.as_integer_ratio, floats)]
     fits = max(map(abs, numbers)) * (mdp.num_states + 1) < WHOLE
-    paid = np.array(numbers, np.int64 if fits else object)[codes.reshape(table.shape)]
-    free = end_components(mdp, paid == 0)
-    v = np.zeros(mdp.num_states + 1, paid.dtype)
+    whole = np.array(numbers, np.int64 if fits else object)[codes.reshape(table.shape)]
+    free = end_components(mdp, whole == 0)
+    v = np.zeros(mdp.num_states + 1, whole.dtype)
     is_reached = np.append(terminal | (free.labels >= 0), True)
     action, mark = np.full(mdp.num_states, -1, np.int64), np.empty(mdp.num_states, np.int64)
     lengthen = bellman.lengthen_paths if fits else bellman.lengthen_paths.py_func
     sweeps = 0
-    while lengthen(table, paid, terminal, v, is_reached, action):
+    while lengthen(table, whole, terminal, v, is_reached, action):
         sweeps += 1
         if sweeps & (sweeps - 1) == 0 and sweeps > LOOK:
             state = int(bellman.cycle_of(table, action, mark))

@@ -16,7 +16,7 @@ from pharos.errors import ParameterError, UnknownName
 from pharos.kernels import hitting
 from pharos.kernels.hitting import UNIT
 from pharos.mdp import BEST, WORST, Rewards, Selection, TabularMDP, end_components, require_mdp
-from pharos.solvers.goals import Problem, total_reward
+from pharos.solvers.goals import GoalProblem, total_reward
 
 if TYPE_CHECKING:
     from pharos.solvers.goals import Choices
@@ -76,7 +76,7 @@ class Reachability:
         Raises:
             ParameterError: costs are needed, as rewards have both signs.
         """
-        problem = Problem.of(self._stopping(-self._costs()), BEST, self._arrived)
+        problem = GoalProblem.of(self._stopping(-self._costs()), BEST, self._arrived)
         surely = problem.proper(problem.choices)[0]
         v, error = problem.solve_in(surely, self.tolerance)
         return self._of_states(np.where(np.isfinite(v), v, -np.inf), error, -self._costs(), BEST, -1.0)
@@ -89,7 +89,7 @@ class Reachability:
             ParameterError: costs are needed, as rewards have both signs.
         """
         mdp = self._stopping(self._costs())
-        problem = Problem.of(mdp, BEST, self._arrived)
+        problem = GoalProblem.of(mdp, BEST, self._arrived)
         components = end_components(mdp).labels.ravel() >= 0
         missed = np.zeros(problem.choices.num_nodes + 1, np.bool_)
         missed[problem.node_of[:-2][components]] = True
