@@ -21,7 +21,7 @@ from pharos.benchmark import BenchmarkTask, BudgetSpent, Ladder, Protocol, Suite
 from pharos.benchmark.suite import EARLIER, digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
 from pharos.system.sources import find, load
-from pharos.training.budget import generated_curve
+from pharos.training import generated_curve, write_curve
 
 PROTOCOL = Protocol(steps=300, evaluations=3, seeds=2)
 SEA = {"size": 4, "mapping_seed": 1}
@@ -315,7 +315,8 @@ def test_a_file_runs_in_processes_to_the_same_bytes(suite, file, tmp_path):
 
 
 @pytest.mark.long
-def test_a_full_disk_is_said_by_the_runs_of_a_generator(suite, tmp_path):
+def test_a_full_disk_is_said_by_the_runs_of_a_generator(suite, tmp_path, monkeypatch):
+    monkeypatch.setattr("pharos.benchmark.agents.write_curve", write_curve)  # is set back: this process loads it too
     full = "raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), '/results/curve.csv')"
     text = f"import errno, os\nfrom pharos.benchmark import agents\n\ndef write(*_):\n    {full}\n\n"
     text += "agents.write_curve = write\n"
