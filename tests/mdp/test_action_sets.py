@@ -259,3 +259,28 @@ def test_measures_that_are_not_of_sets_say_so():
     report = hardness.report(mdp, "tight_effective_horizon,sum_of_reciprocal_gaps", horizon=3)
     assert "every action is available everywhere" in report["tight_effective_horizon"].undefined
     assert report["sum_of_reciprocal_gaps"].value == 0.0 or report["sum_of_reciprocal_gaps"].exact
+
+
+@examples(40, worlds(), st.sampled_from([0.0, 0.25, 1.0]))
+def test_total_rewards_choose_what_is_available(world, random):
+    """Worlds that end by each action with probability 0.1: the total is that of a long horizon."""
+    P, R, sets = world
+    mdp = TabularMDP.from_matrices(0.9 * P, np.where(sets, -np.abs(R), -np.inf), gamma=1.0, axes="SAS", ends=True)
+    mdp = pharos.random_actions(mdp, random) if random else mdp
+    for solve in (pharos.value_iteration, worst_value, uniform_value):
+        total, long = solve(mdp), solve(mdp.with_horizon(600))
+        assert np.abs(total.v - long.v).max() <= total.error_bound + long.error_bound + 1e-9
+    policy = pharos.value_iteration(mdp).policy
+    assert sets[np.arange(STATES), policy].all()
+    lake = pharos.reach(mdp, [STATES - 1])
+    costs = np.where(np.arange(STATES)[:, None] == STATES - 1, 0.0, np.abs(np.where(sets, R, 0.0)))
+    other = pharos.reach(mdp, [STATES - 1], costs=np.where(sets, costs, 99.0))
+    assert (lake.minimum.lower <= lake.maximum.upper).all()
+    assert np.array_equal(lake.least_cost.lower, other.least_cost.lower)
+
+
+def test_total_rewards_of_sticky_actions_with_sets_are_refused():
+    sets = np.array([[True, False], [True, True]])
+    mdp = TabularMDP.from_arrays([[1, -1], [-1, 0]], -np.ones((2, 2)), gamma=1.0, available=sets)
+    with pytest.raises(ParameterError, match="sticky actions, which gamma 1 without a horizon needs: in 1 of 2 states"):
+        pharos.value_iteration(pharos.sticky_actions(mdp, 0.3))

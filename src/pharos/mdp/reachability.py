@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pharos.kernels import end_components as kernels
+from pharos.mdp.action_sets import require_all_actions
 from pharos.mdp.actions import Chance, PolicyTable, Selection
 from pharos.mdp.dynamics import Dynamics
 from pharos.mdp.rewards import Rewards
@@ -209,9 +210,13 @@ def end_components(mdp: TabularMDP, pairs: np.ndarray | None = None) -> EndCompo
     Args:
         pairs: (S, A) bool, under sticky actions also (S, A, A) with the previously executed action second: the choices
             that may be made; None: all.
+    Raises:
+        ParameterError: actions are sticky, and not all are available in each state.
     Cost: a few reads of all transitions, of which only those of nodes in question are looked at again; A + 33 bytes a
         node. Source: de Alfaro (1997), section 3.3.
     """
+    if mdp.is_sticky:
+        require_all_actions(mdp, "the end components of sticky actions, which gamma 1 without a horizon needs")
     width, num_actions = mdp.width, mdp.num_actions
     num_nodes, dtype = mdp.num_states * width, np.int32 if mdp.num_states * width < 2**31 else np.int64
     live = ~np.asarray(mdp.terminal)

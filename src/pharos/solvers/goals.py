@@ -29,7 +29,7 @@ properties in Markov decision processes".
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -37,7 +37,15 @@ import numpy as np
 from pharos.errors import DivergenceError, PrecisionError
 from pharos.kernels import bellman, hitting
 from pharos.kernels.hitting import UNIT
-from pharos.mdp import PolicyTable, Selection, TabularMDP, end_components, executed_actions, nodes_of_outcomes
+from pharos.mdp import (
+    PolicyTable,
+    Selection,
+    TabularMDP,
+    end_components,
+    executed_actions,
+    nodes_of_outcomes,
+    stand_ins,
+)
 from pharos.solvers.policy_iteration import BLOCK, DENSE, fills_little
 
 if TYPE_CHECKING:
@@ -124,9 +132,19 @@ def total_reward(
     """The expected sum of rewards until the end of the best, the worst or a given policy.
 
     Raises:
+        ParameterError: actions are sticky, and not all are available in each state.
         DivergenceError: it is infinite, or there is no policy that has one; the message names a cycle.
         PrecisionError: floats cannot tell it, or prove no bound within the tolerance.
     """
+    goals = _goals(mdp, select, tolerance, progress)
+    if mdp.available is None or isinstance(select, PolicyTable):
+        return goals
+    return replace(goals, policy=stand_ins(mdp.available)[np.arange(mdp.num_states), goals.policy])
+
+
+def _goals(
+    mdp: TabularMDP, select: Selection, tolerance: float, progress: Callable[[int, float], None] | None
+) -> Goals:
     if mdp.is_deterministic and not isinstance(select, PolicyTable):
         return longest_paths(mdp, select)
     if mdp.num_states * mdp.width > ELIMINATED and not any(mdp.residual):
@@ -690,8 +708,6 @@ def _monotone(
     mdp: TabularMDP, select: Selection, x: np.ndarray, over: np.ndarray, side: float, part: float, step: float
 ) -> tuple[np.ndarray | None, int]:
     """(values moved by a part to a side, and swept until a sweep moves all of them back; sweeps); None: it does not."""
-    from dataclasses import replace
-
     from pharos.mdp import Rewards
     from pharos.solvers.fixed_point import Backup
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from pharos.errors import ParameterError, UnknownName
 from pharos.kernels import hitting
 from pharos.kernels.hitting import UNIT
-from pharos.mdp import BEST, WORST, Rewards, Selection, TabularMDP, end_components, require_mdp
+from pharos.mdp import BEST, WORST, Rewards, Selection, TabularMDP, end_components, filled, require_mdp
 from pharos.solvers.goals import GoalProblem, total_reward
 
 if TYPE_CHECKING:
@@ -191,6 +191,7 @@ def reach(
         costs = np.asarray(costs, np.float64)
         if costs.shape != mdp.rewards.shape or not (np.isfinite(costs) & (costs >= 0)).all():
             raise ParameterError(f"costs have shape {costs.shape}; expected {mdp.rewards.shape} finite numbers >= 0")
+        costs = costs if mdp.available is None else filled(costs, mdp.available)
     return Reachability(replace(mdp, gamma=1.0, horizon=None), mask, with_end, costs, tolerance)
 
 
