@@ -67,6 +67,24 @@ def test_large_systems_are_solved_inexactly_and_agree_with_sweeps():
     assert solution.error_bound <= 1e-6 and solution.sweeps < swept.sweeps
 
 
+@pytest.mark.parametrize("size", [300, 5000])  # by direct solves, and by Krylov steps
+def test_progress_is_told_while_equations_are_solved_so_that_a_budget_can_end_them(size):
+    mdp, sweeps = random_actions(ring(size, 0.5), 0.5).with_gamma(0.999999), []
+    value_iteration(mdp, 1e-3, progress=lambda sweep, _: sweeps.append(sweep))
+    assert sweeps == sorted(sweeps) and len(sweeps) > len(set(sweeps))
+
+    class Spent(Exception):
+        pass
+
+    def end_within(sweep, _):
+        if sweeps.append(sweep) or len(sweeps) > len(set(sweeps)):
+            raise Spent
+
+    sweeps.clear()
+    with pytest.raises(Spent):
+        value_iteration(mdp, 1e-3, progress=end_within)
+
+
 def test_what_is_tried_depends_on_the_operator_and_its_size():
     chain, walk = ring(100, 0.5), random_actions(ring(100, 0.5), 0.5)
     large = random_actions(ring(5000, 0.5), 0.5)

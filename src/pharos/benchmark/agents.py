@@ -43,7 +43,7 @@ from pharos.training import (
     Shapes,
     Task,
     TaskCache,
-    check_agent,
+    check_agent_files,
     clear_run,
     compiled_curves,
     evaluate_agent,
@@ -145,7 +145,7 @@ class Form:
         if record.get("status") != "finished":
             error = record.get("error") or self.errors.get(job.folder)
             raise PharosError(error or "its process ended without a result; the same command goes on")
-        check_agent(job.folder)
+        check_agent_files(job.folder)
         rows = {row["step"]: row for row in read_rows(job.folder)}
         points = [protocol.evaluation_interval * (i + 1) for i in range(protocol.evaluations)]
         exact = all(rows[point]["exact"] for point in points)

@@ -17,7 +17,7 @@ from pharos.environments import class_called
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, ResultCorrupted
 from pharos.system import records, storage
 from pharos.system.sealed import check_values, write_sealed
-from pharos.training import RunConfig, check_agent, read_record, read_rows, run_id
+from pharos.training import RunConfig, check_agent_files, read_record, read_rows, run_id
 
 POLICY = "policy"
 """The array of a tabular agent; a network has arrays by the names of its parameters."""
@@ -118,7 +118,7 @@ class Entry:
             raise FileFormatError(
                 f"{run}: the run is {record.get('status')}; the same command that began it finishes it"
             )
-        check_agent(run)
+        check_agent_files(run)
         config = RunConfig.from_dict(record["config"])
         if config.environment == "imported":
             raise ParameterError(

@@ -25,7 +25,7 @@ from pharos.benchmark.scores import check_suite
 from pharos.benchmark.suite import Suite, load_suite
 from pharos.errors import FileFormatError, ParameterError
 from pharos.system.sealed import SUFFIX, read_sealed, write_sealed
-from pharos.training import Snapshots, Task, check_agent, load_agent
+from pharos.training import Snapshots, Task, check_agent_files, load_agent
 
 ProgressCallback = Callable[[int, int, str], None]
 """Called with how many are done, how many there are, and the next one."""
@@ -192,7 +192,7 @@ def final_policy(run: Path, task: Task, *, trust: bool = False) -> np.ndarray | 
     """
     table: Any
     if (run / "run.json").exists():
-        check_agent(run)
+        check_agent_files(run)
     if (run / "policy.npy").exists():
         table = stored_table(run)
     elif (run / "agent").is_dir():

@@ -85,6 +85,11 @@ class Convergence:
         factor = (self.bound / self._bounds[count // 2]) ** (2 / count)
         return not factor < 1 or math.log(self.bound / self.tolerance) > _ENDLESS * -math.log(factor)
 
+    def tick(self) -> None:
+        """Say between sweeps that work goes on."""
+        if self.progress is not None:
+            self.progress(self.sweeps, self.bound)
+
     def check(self, is_moving: bool, patience: float) -> None:
         """PrecisionError unless sweeps move values by more than rounding does, and have gained within `patience`."""
         if not math.isfinite(self.bound):

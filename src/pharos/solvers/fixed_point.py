@@ -178,7 +178,7 @@ def fixed_point(
     if backup.is_single:
         return _in_single(backup, convergence, x)
     rho, largest = backup.factor, largest_of(x)
-    components, better = ComponentSolver(mdp, select), PolicyIteration(mdp, select)
+    components, better = ComponentSolver(mdp, select), PolicyIteration(mdp, select, convergence.tick)
     while True:
         change = backup.sweep(x)
         largest += change  # at most that: the entries are read where it matters, which costs a third of a sweep

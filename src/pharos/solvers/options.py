@@ -24,7 +24,7 @@ class Solving:
         horizon: number of steps to go, instead of the MDP's own; backward induction then, without keeping the steps.
         keep_all: with a horizon, keep the values of every step as `all_steps`, (T + 1, S), under sticky actions (T + 1,
             S, A): row t has t steps to go.
-        progress: called after each sweep with its number and the bound so far.
+        progress: called after each sweep with its number and the bound so far, and as often while equations are solved.
         values: a file (.npy) that holds the values while they are computed, in place of memory, and afterwards; what
             it holds already is where the sweeps begin, so that a solve that was killed goes on. Large ones that memory
             has room for are swept there, and copied to the file every ten minutes and in the end, whatever ends it.

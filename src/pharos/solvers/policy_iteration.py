@@ -176,10 +176,14 @@ SPARSE = 50_000.0
 
 
 class PolicyIteration:
-    """Policy iteration between sweeps: decides when an attempt pays, by counting operations, and improves values."""
+    """Policy iteration between sweeps: decides when an attempt pays, by counting operations, and improves values.
 
-    def __init__(self, mdp: TabularMDP, select: Selection):
-        self.mdp, self.select = mdp, select
+    Attributes:
+        tick: called between the parts of an attempt, as often as after a few sweeps; it may raise.
+    """
+
+    def __init__(self, mdp: TabularMDP, select: Selection, tick: Callable[[], object] = bool):
+        self.mdp, self.select, self.tick = mdp, select, tick
         self.equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, select)
         self.nodes = mdp.num_states * mdp.width
         self._change, self._sweeps, self._rate = math.inf, 0, 1.0
@@ -240,6 +244,7 @@ class PolicyIteration:
     def _improve_exactly(self, x: np.ndarray) -> None:
         policy = self._greedy(x)
         for _ in range(MOST_IMPROVEMENTS):
+            self.tick()
             before = x.copy()
             self._evaluate(x, policy)
             if not np.isfinite(x).all():
@@ -311,6 +316,7 @@ class PolicyIteration:
         image = swept[:-1].reshape(self.nodes)  # a view; the row of the end stays 0
 
         def times(y: np.ndarray) -> np.ndarray:
+            self.tick()
             image[:] = y
             mdp.dynamics.sweep(silent, swept)
             linear_algebra.subtract_from(y, image)
@@ -335,7 +341,8 @@ class PolicyIteration:
 
 def without_rewards(rewards: Rewards) -> Rewards:
     """Rewards of 0, stored like `rewards`."""
-    return Rewards(np.zeros_like(rewards.table), np.zeros_like(rewards.palette))
+    zeros = np.zeros_like(rewards.table), np.zeros_like(rewards.palette)
+    return Rewards(*zeros, is_of_many=rewards.is_of_many)
 
 
 def chain(mdp: TabularMDP, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

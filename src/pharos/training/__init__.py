@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
     from pharos.training.results import (
         TrainingResult,
-        check_agent,
+        check_agent_files,
         clear_run,
         digest_of_curve,
         load_agent,

@@ -224,7 +224,7 @@ def _check_digest(path: Path, columns: Mapping[str, np.ndarray]) -> None:
             raise ResultCorrupted(f"{path}: does not match its checksum in {RECORD}; {AGAIN}")
 
 
-def check_agent(folder: Path) -> None:
+def check_agent_files(folder: Path) -> None:
     """Check the files of the trained agent against the checksums in run.json.
 
     Raises:
@@ -479,7 +479,7 @@ def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task,
         raise FileFormatError(
             f"{folder}: the run is {record.get('status')}; the same command that began it finishes it"
         )
-    check_agent(folder)
+    check_agent_files(folder)
     try:
         config = RunConfig.from_dict(record["config"])
         task = config.task(trust=trust)
