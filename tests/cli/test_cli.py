@@ -438,7 +438,7 @@ def test_render_draws_in_the_terminal(pharos):
         (["render", "breakout", "--out", "nowhere/a.png"], "there is no folder"),
         (["render", "breakout", "--state", "1,2"], "expected 21"),
         (["solve", "breakout", "--gamma", "1.5"], "--gamma"),
-        (["solve", "simple_grid", "--gamma", "1"], "give a horizon"),
+        (["solve", "simple_grid", "--objective", "total", "--gamma", "0.9"], "no horizon; found --gamma 0.9"),
         (["solve", "nofolder/"], "no such folder"),
         (["solve", "simple_grid", "--tolerance", "0"], "expected a positive number"),
         (["solve", "simple_grid", "--out", "values.txt"], "ends in .npz or .npy"),

@@ -12,6 +12,7 @@ import math
 import numpy as np
 from numba import prange
 
+from pharos.kernels.interpreted import interpreted_first
 from pharos.kernels.kernel_cache import kernel
 
 
@@ -49,6 +50,7 @@ def values(next_states, rewards, tie, best, worst, explored, best_now, worst_now
         variance[s] = spread
 
 
+@interpreted_first()
 @kernel(parallel=True)
 def lookahead(next_states, rewards, gamma, after, now):
     """now (S,) = max over a of r(s, a) + gamma after(next state)."""
@@ -60,6 +62,7 @@ def lookahead(next_states, rewards, gamma, after, now):
         now[s] = high
 
 
+@interpreted_first()
 @kernel(parallel=True)
 def largest(next_states, after, now):
     """now (S,) = max over a of after(next state), at least 0."""

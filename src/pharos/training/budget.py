@@ -296,7 +296,7 @@ def _check_again(table: np.ndarray, again: np.ndarray) -> None:
         )
 
 
-class Recorder(Protocol):
+class PolicySink(Protocol):
     """An environment with a budget, and what becomes of the policies that are learnt on it."""
 
     env: CountedEnv
@@ -422,7 +422,7 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
     return recorder.curve()
 
 
-def generate(learn: Callable[..., Any], recorder: Recorder, seed: int) -> None:
+def generate(learn: Callable[..., Any], recorder: PolicySink, seed: int) -> None:
     """Train with a generator, and record its policies until it, or its budget, has ended; raises as `generated_curve`.
 
     After a refused step one more policy counts. A generator that yields IGNORED policies in a row without a step is
