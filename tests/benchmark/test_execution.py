@@ -631,3 +631,19 @@ def test_the_ppo_of_the_page_learns_with_four_environments_that_share_the_budget
         _, curve = curve_of(load(find(f"{example}:learn")), task, steps=steps)
         assert curve.counted_steps == steps and len(curve.rows) == 4
         assert steps < 9000 or curve.rows[-1]["normalized_regret"] < 0.2
+
+
+def test_a_class_with_act_observe_and_policy_is_run_in_processes_of_its_own(suite, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    methods = "def __init__(self, **given): self.num_actions = given['action_space'].n"
+    for signature, body in (
+        ("act(self, observations)", "[self.num_actions - 1] * len(observations)"),
+        ("observe(self, *step)", "None"),
+        ("policy(self, observations)", "[0] * len(observations)"),
+    ):
+        methods += f"\n    def {signature}: return {body}"
+    Path("stepped.py").write_text(f"class Right:\n    {methods}\n")
+    outcome = benchmark.run("stepped.py:Right", suite, out="results", seeds=[0])
+    assert not outcome.missing
+    for curves in outcome.results.curves.values():
+        assert np.ptp(curves) == 0  # one policy, at all evaluations

@@ -275,3 +275,55 @@ def test_a_function_of_jax_learns_with_all_seeds_as_one_program(mine, tmp_path):
     alone = train(learn, GRID, seed=1, **options)
     assert str(alone.curve) == str(ends[1].curve)
     assert "expected a divisor" in refusal(ParameterError, train, learn, GRID, steps=40, evaluation_interval=15)
+
+
+class Stepped:
+    """Q-learning on one-hot observations, as a class whose steps pharos takes."""
+
+    def __init__(self, observation_space, action_space, num_envs, seed, rate=0.5):
+        assert num_envs == 1
+        self.q, self.rng = np.zeros((observation_space.shape[0], action_space.n)), np.random.default_rng(seed)
+        self.rate = rate
+
+    def act(self, observations):
+        return self.rng.integers(self.q.shape[1], size=len(observations))
+
+    def observe(self, observations, actions, rewards, next_observations, terminated, truncated):
+        (x,), (action,), (after,) = observations, actions, next_observations
+        best = 0.9 * (not terminated[0]) * (after @ self.q).max()
+        self.q[:, action] += self.rate * x * (rewards[0] + best - x @ self.q[:, action])
+
+    def policy(self, observations):
+        return (observations @ self.q).argmax(axis=1)
+
+
+def as_function(env, steps, seed, *, rate=0.5):
+    agent = Stepped(env.observation_space, env.action_space, 1, seed, rate)
+    x, _ = env.reset(seed=seed)
+    for step in range(steps):
+        action = agent.act(x[None])
+        after, reward, terminated, truncated, _ = env.step(int(action[0]))
+        agent.observe(x[None], action, [reward], after[None], [terminated], [truncated])
+        x = env.reset()[0] if terminated or truncated else after
+        if step % 50 == 49:
+            yield agent.policy
+
+
+def test_a_class_with_act_observe_and_policy_learns_as_its_loop_written_out_does(tmp_path):
+    options = {"observation": "one_hot", "random": 0.2, "steps": 400, "evaluation_interval": 50, "seed": 3}
+    for rate in (0.5, 0.1):
+        curves = [
+            train(agent, GRID, **options, hyperparameters={"rate": rate}).curve for agent in (Stepped, as_function)
+        ]
+        assert repr(curves[0]) == repr(curves[1]) and len({row["value"] for row in curves[0]}) > 2
+    with pytest.raises(UnknownName, match=r"hyperparameter of .*Stepped.*'rat'.*did you mean 'rate'"):
+        train(Stepped, GRID, **options, hyperparameters={"rat": 0.1})
+
+
+def test_actions_of_a_wrong_shape_are_one_line(tmp_path):
+    class Scalar(Stepped):
+        def act(self, observations):
+            return 0
+
+    with pytest.raises(ParameterError, match=r"act\(observations\) gave an array of shape \(\); expected \(1,\)"):
+        train(Scalar, GRID, observation="one_hot", steps=100)

@@ -1,20 +1,24 @@
 """Agents of the user's own, `module:Name` or `file.py:Name`: what the name stands for says how they are trained.
 
     class        an algorithm with Stable-Baselines3's interface
-    generator    learn(env, steps, seed), which yields policies as it learns
+    generator    learn(env, steps, seed), which yields policies as it learns; or a class with act, observe and policy,
+                 whose steps are taken for it (`generator_of`)
     jax          learn(env, params, steps, key) -> (apply, snapshots), which is compiled
 
-What stands behind a `*` in the parameters of a function are its hyperparameters: learn(env, steps, seed, *, rate=0.1).
+What stands behind a `*` in the parameters of a function are its hyperparameters: learn(env, steps, seed, *, rate=0.1);
+of a class with act, observe and policy it is what its constructor takes beside MADE_WITH.
 A name is recognised here for all, `train`, `tune`, studies and the benchmark; a further form is a line of `form_of`.
 """
 
 import contextlib
 import inspect
 import json
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from pharos.agents.agent import POLICY, Learner, LearningRun, read_policy_table
 from pharos.agents.sb3 import DeepAgent, is_known
@@ -23,6 +27,8 @@ from pharos.policies import PolicyLike
 from pharos.system.sources import Source, announce, announced, find, load
 
 CLASS, GENERATOR, COMPILED = "class", "generator", "jax"
+STEPPED = ("act", "observe", "policy")
+MADE_WITH = ("observation_space", "action_space", "num_envs", "seed")
 FUNCTIONS = "a function learn(env, steps, seed), or learn(env, params, steps, key) of JAX"
 
 FunctionLearner = Callable[[Sequence[LearningRun], Callable[..., Any]], Any]
@@ -41,7 +47,7 @@ def form_of(name: str, code: object) -> str:
         ParameterError: it is no agent.
     """
     if isinstance(code, type):
-        return CLASS
+        return GENERATOR if all(callable(getattr(code, each, None)) for each in STEPPED) else CLASS
     if code is None:
         where, _, attribute = name.rpartition(":")
         raise ParameterError(f"agent {name!r}: {where} has no {attribute!r}; expected the name of a class or function")
@@ -57,6 +63,42 @@ def form_of(name: str, code: object) -> str:
     except (TypeError, ValueError) as error:
         raise ParameterError(f"agent {name!r}: {error}; expected {FUNCTIONS}") from None
     return GENERATOR
+
+
+def generator_of(code: Callable[..., Any]) -> Callable[..., Iterator[PolicyLike]]:
+    """An agent of the form GENERATOR as a function learn(env, steps, seed, **hyperparameters).
+
+    A class is made with MADE_WITH, num_envs = 1. Each step asks `act(observations)`, arrays (1, ...), for (1,) actions,
+    and ends with `observe(observations, actions, rewards, next_observations, terminated, truncated)`; next_observations
+    are those before a reset. At each evaluation `policy(observations)`, of any number of them, is what it has learnt.
+    """
+    if not isinstance(code, type):
+        return code
+
+    def learn(env: Any, steps: int, seed: int, **hyperparameters: Any) -> Iterator[PolicyLike]:
+        agent = code(
+            observation_space=env.observation_space,
+            action_space=env.action_space,
+            num_envs=1,
+            seed=seed,
+            **hyperparameters,
+        )
+        observation, _ = env.reset(seed=seed)
+        for step in range(1, steps + 1):
+            actions = np.asarray(agent.act(observation[None]))
+            if actions.shape != (1,):
+                raise ParameterError(
+                    f"act(observations) gave an array of shape {actions.shape}; expected (1,), an action for each of "
+                    f"{len(observation[None])} observations"
+                )
+            after, reward, terminated, truncated, _ = env.step(actions[0])
+            ends = np.array([terminated]), np.array([truncated])
+            agent.observe(observation[None], actions, np.array([reward]), after[None], *ends)
+            observation = env.reset()[0] if terminated or truncated else after
+            if step % env.budget.interval == 0 or step == steps:
+                yield agent.policy
+
+    return learn
 
 
 def agent_source(
@@ -97,7 +139,7 @@ class OwnAgent(DeepAgent):
         source = agent_source(self.name)
         assert source is not None
         code = load(source)
-        if isinstance(code, type):
+        if form_of(self.name, code) == CLASS:
             return super().library_default(name)
         parameter = inspect.signature(code).parameters.get(name)
         return None if parameter is None or parameter.default is parameter.empty else parameter.default
@@ -138,7 +180,10 @@ def _check_keywords(name: str, code: Any, hyperparameters: Mapping[str, Any]) ->
     parameters = inspect.signature(code).parameters.values()
     if any(each.kind is each.VAR_KEYWORD for each in parameters):
         return
-    keywords = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
+    is_class = isinstance(code, type)
+    keywords = [
+        each.name for each in parameters if each.kind is each.KEYWORD_ONLY or (is_class and each.name not in MADE_WITH)
+    ]
     unknown = [each for each in hyperparameters if each not in keywords]
     if unknown and not keywords:
         raise ParameterError(

@@ -27,7 +27,17 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from pharos.agents import COMPILED, POLICY, agent_called, agents, check_hyperparameters, form_of, is_known
+from pharos.agents import (
+    CLASS,
+    COMPILED,
+    POLICY,
+    agent_called,
+    agents,
+    check_hyperparameters,
+    form_of,
+    generator_of,
+    is_known,
+)
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
 from pharos.system.sources import Source, find, is_reference, load, source_of
@@ -174,7 +184,7 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
     if is_reference(agent) and not is_known(agent):
         source = find(agent)
         code = load(source)
-        if not isinstance(code, type):
+        if form_of(agent, code) != CLASS:
             return _function(code, source, setting)
         check_hyperparameters(code, setting)
         return TrainedForm(agent, "class", setting, source, sha256(source.file))
@@ -275,6 +285,8 @@ def _write_failure(config: RunConfig, job: Job, message: str) -> None:
 def _function(code: Callable[..., Any], source: Source | None, setting: Mapping[str, Any]) -> Form:
     name = source.name if source is not None else getattr(code, "__qualname__", repr(code))
     form = form_of(name, code)
+    if form == CLASS:
+        raise ParameterError(f"agent {name!r} is a class itself; expected its name, such as mine.py:{code.__name__}")
     if setting:
         raise ParameterError(
             f"agent {name!r} is a function, which has its hyperparameters in its code; found {', '.join(setting)}"
@@ -356,7 +368,7 @@ def _generate(
     result: Curve | BaseException
     file = code.file if isinstance(code, Source) else None
     try:
-        learn = _loaded(code)
+        learn = generator_of(_loaded(code))
         file = file or getattr(getattr(learn, "__code__", None), "co_filename", None)
         _seed(job.seed)
         task = job.task.training_task(protocol)

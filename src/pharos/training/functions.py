@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import COMPILED, GENERATOR, register_form
+from pharos.agents import COMPILED, GENERATOR, generator_of, register_form
 from pharos.errors import ParameterError
 from pharos.policies import PolicyLike
 from pharos.training.budget import (
@@ -65,7 +65,7 @@ class GeneratorLearner:
                 code raises.
         """
         self._waiting, self._at_point = deque(points), at_point
-        generate(partial(self.function, **self.run.hyperparameters), self, self.run.config.seed)
+        generate(partial(generator_of(self.function), **self.run.hyperparameters), self, self.run.config.seed)
         self.run.curve.counted_steps = self.budget.steps
         self._evaluate(math.inf)
         first, last = (self.run.curve.rows[place]["normalized_regret"] for place in (0, -1))
