@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, SupportsIndex, TypeGu
 import numpy as np
 
 from pharos.errors import ParameterError, RuleError
+from pharos.system.wording import capped
 
 # Parameters -----------------------------------------------------------------------------------------------------------
 #
@@ -634,7 +635,7 @@ class Environment:
             for index, values in _flattened(declared):
                 if not isinstance(values, range) or values.step != 1 or not values:
                     raise ParameterError(
-                        f"{self}: variable {variable!r} is declared as {values!r}; "
+                        f"{self}: variable {variable!r} is declared as {capped(declared)}; "
                         f"expected a non-empty range with step 1, or a nested sequence of such ranges"
                     )
                 if values.start < -(2**63) or values.stop > 2**63 or values.stop - values.start >= 2**63:

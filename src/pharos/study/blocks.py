@@ -32,7 +32,7 @@ try:
         field_validator,
     )
 except ImportError as error:
-    raise MissingExtra("a study", str(error.name), "study") from error
+    raise MissingExtra("a study", str(error.name).replace("yaml", "pyyaml"), "study") from error
 
 # Limit that reports a mistake in a number of seeds at once
 MOST_RUNS = 1_000_000
