@@ -184,6 +184,7 @@ def test_tables_and_drn_have_the_choices_that_there_are(tmp_path):
     assert "some actions are not available" in refusal(ParameterError, exporters.bridge, tree(), tmp_path / "t.npz")
 
 
+@pytest.mark.long
 def test_q_learning_and_the_batched_engine_learn_within_the_sets(tmp_path):
     world = importers.environment(tree())
     for agent, options in (("q_learning", {}), ("dqn", {"engine": "batched"}), ("ppo", {"engine": "batched"})):

@@ -168,6 +168,7 @@ def test_covering_is_of_uniform_play_over_what_is_available(world, chance):
     assert result.length_bound == pytest.approx(length, rel=1e-9)
 
 
+@pytest.mark.long
 @examples(10, worlds())
 def test_an_action_that_is_not_available_is_a_copy_of_one_that_is_to_optimal_play(world):
     P, R, sets = world

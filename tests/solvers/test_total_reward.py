@@ -66,6 +66,7 @@ def test_rewards_of_one_sign(mdp):
     check(mdp, worst_value, -1)
 
 
+@pytest.mark.long
 @examples(200, small_mdps(max_states=3))
 def test_every_kind_of_mdp_and_chance(mdp):
     mdp = mdp.with_gamma(1.0)
@@ -205,6 +206,7 @@ def test_a_cycle_of_a_thousand_states_is_decided_exactly():
         pharos.value_iteration(mdp.with_rewards(rewards))
 
 
+@pytest.mark.long
 @examples(50, mdps_with_cycles(rewards=(-1.0, -0.5, 0.25)))
 def test_sweeps_prove_the_same(mdp):
     goals = swept_goals(mdp, BEST, 1e-6, None)

@@ -242,7 +242,7 @@ def learn(env, steps, seed):
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_processes_that_are_killed_are_begun_again_and_only_a_run_that_always_dies_has_failed(mine):
     Path("killed.py").write_text(KILLED)
     task = Task.of(GRID, observation="one_hot")
