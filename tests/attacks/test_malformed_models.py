@@ -33,13 +33,19 @@ def probabilities(rng):
     return weights / weights.sum(axis=2, keepdims=True)
 
 
-def optimal(P, R, ends):
+def optimal(P, R, ends, has_sets=False):
     """Optimal values in fractions, of rows divided by what they and their ends sum to; None if they are no MDP.
 
     The rule in plain Python: a row may differ from 1 by a millionth, and may lack more where `ends` says that rows end.
+    has_sets: whether an empty row that does not end is an action that is not available.
     """
     rows = [[[Fraction(p) for p in row] if np.isfinite(row).all() else None for row in rows] for rows in P.tolist()]
-    for row in (row for each in rows for row in each):
+    available = [list(range(ACTIONS)) for _ in range(STATES)]
+    if has_sets and not ends:
+        available = [[a for a in range(ACTIONS) if rows[s][a] is None or any(rows[s][a])] for s in range(STATES)]
+        if not all(available):
+            return None
+    for row in (rows[s][a] for s in range(STATES) for a in available[s]):
         if row is None or min(row) < 0 or sum(row) > 1 + Fraction(1, 10**6) + Fraction(1, 10**12):
             return None
         if sum(row) < 1 - Fraction(1, 10**6) - Fraction(1, 10**12):
@@ -47,7 +53,7 @@ def optimal(P, R, ends):
                 return None
             continue
         row[:] = [p / sum(row) for p in row]
-    policy = [0] * STATES
+    policy = [actions[0] for actions in available]
     while True:
         system = [
             [Fraction(s == t) - Fraction(GAMMA) * rows[s][policy[s]][t] for t in range(STATES)]
@@ -62,7 +68,7 @@ def optimal(P, R, ends):
             ]
             for s in range(STATES)
         ]
-        better = [max(range(ACTIONS), key=row.__getitem__) for row in q]
+        better = [max(actions, key=row.__getitem__) for actions, row in zip(available, q, strict=True)]
         if all(q[s][better[s]] == q[s][policy[s]] for s in range(STATES)):
             return v
         policy = better
@@ -109,7 +115,7 @@ def test_matrices(kind, count):
             s, a = rng.integers(STATES), rng.integers(ACTIONS)
             P[s, a, rng.choice(np.flatnonzero(P[s, a] > 0)) if (P[s, a] > 0).any() else 0] *= rng.choice(WRONG)
         mdp, _ = tried(lambda P=P, R=R, ends=ends: made(kind, P, R, ends))
-        truth = optimal(P, R, ends)
+        truth = optimal(P, R, ends, has_sets=kind not in ("outcomes", "table"))
         assert (mdp is None) == (truth is None), (P, ends)
         if mdp is not None:
             solution = pharos.value_iteration(mdp)

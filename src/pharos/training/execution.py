@@ -119,6 +119,8 @@ class Execution(Generic[R]):
                 self._await()
         if self.checkpoints is not None and self.checkpoints.is_dir():
             for folder in (*self.checkpoints.iterdir(), self.checkpoints):
+                if folder != self.checkpoints and not (folder / "batch.json").exists():
+                    shutil.rmtree(folder, ignore_errors=True)  # a process was killed while it removed this
                 with contextlib.suppress(OSError):  # it is not empty
                     folder.rmdir()
 
