@@ -81,7 +81,7 @@ def test_loops_of_the_pages_run(tmp_path, monkeypatch):
     for page in (PAGE, agents):
         space = {}
         exec(re.search(r"## A loop of your own\n.*?```python\n(.*?)```", page, re.DOTALL)[1], space)
-    assert benchmark.read_results("results/mine").curves["deep_sea-8"].shape == (2, 15)
+    assert benchmark.read_results("results/my-loop").curves["deep_sea-8"].shape == (2, 15)
     assert Path("runs/mine/run.json").exists() and space["row"]["step"] == 3000
 
 
