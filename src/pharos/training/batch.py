@@ -103,6 +103,12 @@ def _refuse(run: PreparedRun, error: Exception, tell: Tell, raises: bool) -> Non
     tell(("end", run.place, FailedRun(run.config.to_dict(), run.folder, error)))
 
 
+def remove_batch(folder: Path) -> None:
+    """Remove the checkpoint of a program, and last what says which runs these are: a kill leaves what can be told."""
+    clear_run(folder)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
 def _stored_programs(
     runs: Sequence[PreparedRun], waiting: dict[int | None, PreparedRun], finished: set[str], checkpoints: Path | None
 ) -> Iterator[list[PreparedRun]]:
@@ -115,7 +121,7 @@ def _stored_programs(
             continue
         if not any(config.id in by_id for config in configs):
             if finished.issuperset(config.id for config in configs):  # it was killed before it removed this
-                shutil.rmtree(folder, ignore_errors=True)
+                remove_batch(folder)
             continue
         if any(config.id not in by_id and _is_foreign(config, runs) for config in configs):
             continue
@@ -253,8 +259,7 @@ class Program:
 
     def _remove_checkpoint(self) -> None:
         if self.holds and self._folder is not None:
-            clear_run(self._folder)  # and last what says which runs these are
-            shutil.rmtree(self._folder, ignore_errors=True)
+            remove_batch(self._folder)
 
     # Learning --------------------------------------------------------------------------------------------------------
 

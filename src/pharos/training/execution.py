@@ -7,7 +7,6 @@ run does not depend on who else is in its group, so nothing does on how groups a
 
 import contextlib
 import itertools
-import shutil
 import signal
 import time
 import warnings
@@ -22,7 +21,7 @@ from pharos.errors import ParameterError, PharosError
 from pharos.system.storage import read_json
 from pharos.system.wording import in_one_line, pluralize
 from pharos.system.workers import Workers, one_thread
-from pharos.training.batch import CallbackError, train_group
+from pharos.training.batch import CallbackError, remove_batch, train_group
 from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
 from pharos.training.results import TrainingResult
 from pharos.training.schedule import halves, plan
@@ -83,6 +82,7 @@ class Execution(Generic[R]):
         self.running: dict[str, tuple[list[R], float]] = {}
         self.pool, self.num_workers, self.timeout, self.attempts = pool, workers, timeout, attempts
         self.checkpoints = checkpoints
+        self._ids = {run.id for _, group in self.waiting for run in group}
         self.kills: dict[int, int] = defaultdict(int)  # by the identity of the run
         self._keys = map(str, itertools.count())
         self._reasons: set[str] = set()
@@ -118,9 +118,10 @@ class Execution(Generic[R]):
                 self.look()
                 self._await()
         if self.checkpoints is not None and self.checkpoints.is_dir():
+            for folder, ids in stored_batches(self.checkpoints).items():
+                if ids <= self._ids:  # a process was killed before it had removed this
+                    remove_batch(folder)
             for folder in (*self.checkpoints.iterdir(), self.checkpoints):
-                if folder != self.checkpoints and not (folder / "batch.json").exists():
-                    shutil.rmtree(folder, ignore_errors=True)  # a process was killed while it removed this
                 with contextlib.suppress(OSError):  # it is not empty
                     folder.rmdir()
 
@@ -149,7 +150,7 @@ class Execution(Generic[R]):
         ids = {run.id for run in runs}
         for folder, others in stored_batches(self.checkpoints).items():
             if ids & others:
-                shutil.rmtree(folder, ignore_errors=True)
+                remove_batch(folder)
 
     def _start(self) -> None:
         for _ in range(len(self.waiting)):
