@@ -20,7 +20,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from pharos.errors import ParameterError, PharosError
 from pharos.system.storage import read_json
 from pharos.system.wording import in_one_line, pluralize
-from pharos.system.workers import Workers, one_thread
+from pharos.system.workers import SERVER_LOST, Workers, one_thread
 from pharos.training.batch import CallbackError, remove_batch, train_group
 from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
 from pharos.training.results import TrainingResult
@@ -33,10 +33,8 @@ BUSY_SECONDS = 0.5
 WAITING_SECONDS = 1.0
 EXIT_BUSY = 75
 """Exit code of a process whose runs another process trains."""
-# How often in a row the process that forks workers is begun again, and the exit code that multiprocessing gives a
-# worker whose server is gone
+# How often in a row the process that forks workers is begun again
 LOST_SERVERS = 10
-SERVER_LOST = 255
 
 
 class Named(Protocol):
