@@ -115,7 +115,9 @@ class Simulator:
     def setting(self, mode: int, ranges: np.ndarray, scale: np.ndarray, starts: np.ndarray) -> Setting:
         """Arguments of the kernels of many environments; `starts` are states, or their indices in a state space."""
         limit = self.limit if self.limit is not None else 1 << 62
-        return Setting(ranges, scale, self._weights_of_kernels, limit, mode, self.first_previous, starts, self.start_cumulative)
+        return Setting(
+            ranges, scale, self._weights_of_kernels, limit, mode, self.first_previous, starts, self.start_cumulative
+        )
 
     def drawn_start(self, rng: "np.random.Generator | Stream") -> int:
         """Index of a drawn start state; draws a random number only if there are several."""

@@ -132,14 +132,14 @@ def total_reward(
     """The expected sum of rewards until the end of the best, the worst or a given policy.
 
     Raises:
-        ParameterError: actions are sticky, and not all are available in each state.
         DivergenceError: it is infinite, or there is no policy that has one; the message names a cycle.
         PrecisionError: floats cannot tell it, or prove no bound within the tolerance.
     """
     goals = _goals(mdp, select, tolerance, progress)
     if mdp.available is None or isinstance(select, PolicyTable):
         return goals
-    return replace(goals, policy=stand_ins(mdp.available)[np.arange(mdp.num_states), goals.policy])
+    states = np.repeat(np.arange(mdp.num_states), mdp.width)
+    return replace(goals, policy=stand_ins(mdp.available)[states, goals.policy])
 
 
 def _goals(
@@ -194,7 +194,10 @@ class GoalProblem:
             table = np.broadcast_to(select.later, (num_states, width, num_actions)).reshape(nodes, num_actions)
             per_node = 1
         else:
-            table, per_node = np.tile(np.eye(num_actions), (nodes, 1)), num_actions
+            acts = (
+                np.tile(np.arange(num_actions), (num_states, 1)) if mdp.available is None else stand_ins(mdp.available)
+            )
+            table, per_node = np.eye(num_actions)[np.repeat(acts, width, axis=0).ravel()], num_actions
         live = ~np.repeat(np.asarray(mdp.terminal), width)
         outcomes = nodes_of_outcomes(mdp.dynamics.matrix(~np.asarray(mdp.terminal)), num_actions, width)
         each_reward = mdp.rewards.ravel()
