@@ -64,9 +64,7 @@ class SpaceStates:
         return self.space.states(np.asarray(states, np.int64))
 
     def column(self, variable: int, block: slice) -> np.ndarray:
-        layout = self.space.layout
-        words = self.space.packed_states[block, int(layout.word[variable])]
-        return ((words >> layout.shift[variable]) & layout.mask[variable]).astype(np.int64) + self.low[variable]
+        return self.space.column(variable, block)
 
     def matching(self, fixed: Mapping[int, int], block: slice) -> np.ndarray:
         layout, packed = self.space.layout, self.space.packed_states

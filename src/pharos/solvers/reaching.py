@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pharos.errors import ParameterError, UnknownName
+from pharos.errors import ParameterError
 from pharos.kernels import hitting
 from pharos.kernels.hitting import UNIT
-from pharos.mdp import BEST, WORST, Rewards, Selection, TabularMDP, end_components, filled, require_mdp
+from pharos.mdp import BEST, WORST, Rewards, Selection, TabularMDP, end_components, filled, names_of, require_mdp
 from pharos.solvers.goals import GoalProblem, total_reward
 
 if TYPE_CHECKING:
@@ -171,7 +171,9 @@ def reach(
     Discount and horizon of the MDP do not count: play goes on until it arrives, or for ever.
 
     Args:
-        target: (S,) bool; or indices of states; or "terminal", every terminal state and the end of an episode.
+        target: (S,) bool; or indices of states; or "terminal", every terminal state and the end of an episode; or a
+            label or an expression over the variables of states, such as "x=3 & !done", see `Names.states_where`. What
+            there is to name, `names_of(mdp)` says.
         costs: (S, A) numbers >= 0 of executed actions. None: the rewards if none is negative, or those negated if none
             is positive.
         tolerance: the largest error of a probability and of a finite cost.
@@ -180,12 +182,12 @@ def reach(
         `upper`. Costs are those *that must arrive*, as `Rmin=? [F target]` and `Rmax=? [F target]` of PRISM and Storm:
         infinite where they cannot, or need not.
     Raises:
-        ParameterError: the target names no state, or costs are negative. UnknownName: the target is no name.
+        ParameterError: the target names no state, label or expression, or costs are negative.
         PrecisionError: floats, and rational numbers within their limits, do not reach the tolerance.
     Cost: as of total rewards, see `value_iteration`.
     Source: Baier and Katoen (2008), chapter 10; Haddad and Monmege (2018).
     """
-    with_end = isinstance(target, str)
+    with_end = isinstance(target, str) and target == TERMINAL
     mask = _mask(mdp, target)
     if costs is not None:
         costs = np.asarray(costs, np.float64)
@@ -197,16 +199,16 @@ def reach(
 
 def _mask(mdp: TabularMDP, target: ArrayLike | str) -> np.ndarray:
     if isinstance(target, str):
-        if target != TERMINAL:
-            raise UnknownName("target", target, [TERMINAL])
-        return np.array(mdp.terminal)
+        if target == TERMINAL:
+            return np.array(mdp.terminal)
+        return names_of(mdp).states_where(target, mdp.num_states)
     array = np.asarray(target)
     if array.dtype == np.bool_ and array.shape == (mdp.num_states,):
         return array
     if array.dtype.kind not in "iu" or array.ndim > 1 or ((array < 0) | (array >= mdp.num_states)).any():
         raise ParameterError(
             f"target is {array.dtype} of shape {array.shape}; expected ({mdp.num_states},) bool, indices of states "
-            f"from 0 to {mdp.num_states - 1}, or {TERMINAL!r}"
+            f"from 0 to {mdp.num_states - 1}, {TERMINAL!r}, a label or an expression"
         )
     mask = np.zeros(mdp.num_states, np.bool_)
     mask[array] = True
