@@ -15,8 +15,19 @@ from numpy.typing import ArrayLike
 from pharos.errors import ParameterError
 from pharos.kernels import hitting
 from pharos.kernels.hitting import UNIT
-from pharos.mdp import BEST, WORST, Rewards, Selection, TabularMDP, end_components, filled, names_of, require_mdp
-from pharos.solvers.goals import GoalProblem, total_reward
+from pharos.mdp import (
+    BEST,
+    WORST,
+    Rewards,
+    Selection,
+    TabularMDP,
+    end_components,
+    filled,
+    names_of,
+    require_mdp,
+    stand_ins,
+)
+from pharos.solvers.goals import GoalProblem, table_of_choices, total_reward
 
 if TYPE_CHECKING:
     from pharos.solvers.goals import Choices
@@ -31,10 +42,13 @@ class Bounds:
 
     Attributes:
         lower, upper: (S,) float64, proven; both infinite if the number is.
+        policy: (S,) actions that attain it, or (S, A + 1) under sticky actions, by the previous action; meaningless
+            where the number is infinite.
     """
 
     lower: np.ndarray
     upper: np.ndarray
+    policy: np.ndarray
 
     def __repr__(self) -> str:
         return f"Bounds(lower={self.lower}, upper={self.upper})"
@@ -78,8 +92,8 @@ class Reachability:
         """
         problem = GoalProblem.of(self._stopping(-self._costs()), BEST, self._arrived)
         surely = problem.proper(problem.choices)[0]
-        v, error = problem.solve_in(surely, self.tolerance)
-        return self._of_states(np.where(np.isfinite(v), v, -np.inf), error, -self._costs(), BEST, -1.0)
+        v, error, policy = problem.solve_in(surely, self.tolerance)
+        return self._of_states(np.where(np.isfinite(v), v, -np.inf), error, policy, -self._costs(), BEST, -1.0)
 
     @cached_property
     def largest_cost(self) -> Bounds:
@@ -94,8 +108,13 @@ class Reachability:
         missed = np.zeros(problem.choices.num_nodes + 1, np.bool_)
         missed[problem.node_of[:-2][components]] = True
         missed[-2] = True  # the trap
-        v, error = problem.solve_in(~_may_reach(problem.choices, missed), self.tolerance)
-        return self._of_states(v, error, self._costs(), BEST, 1.0)
+        v, error, policy = problem.solve_in(~_may_reach(problem.choices, missed), self.tolerance)
+        return self._of_states(v, error, policy, self._costs(), BEST, 1.0)
+
+    @property
+    def stopped(self) -> TabularMDP:
+        """The MDP that ends in the target."""
+        return self._stopping(self.mdp.rewards)
 
     # How ------------------------------------------------------------------------------------------------------------
 
@@ -124,16 +143,16 @@ class Reachability:
         mdp = self._stopping(entering)
         goals = total_reward(mdp, select, self.tolerance)
         error = goals.error + (mdp.dynamics.operations + 8) * UNIT
-        result = self._of_states(goals.v, error, mdp.rewards, select, 1.0)
+        result = self._of_states(goals.v, error, goals.policy, mdp.rewards, select, 1.0)
         for bound in (result.lower, result.upper):
             np.clip(bound, 0.0, 1.0, out=bound)
             bound[self.target] = 1.0
         return result
 
     def _of_states(
-        self, v: np.ndarray, error: np.ndarray, rewards: np.ndarray, select: Selection, sign: float
+        self, v: np.ndarray, error: np.ndarray, policy: np.ndarray, rewards: np.ndarray, select: Selection, sign: float
     ) -> Bounds:
-        """Bounds of the states, from values (N,) of the nodes and the error of each; sign -1 negates them."""
+        """Bounds of the states, from values (N,), errors and choices of the nodes; sign -1 negates them."""
         mdp = self._stopping(rewards)
         bounds = []
         for x in (v - error, v + error):
@@ -146,7 +165,9 @@ class Reachability:
             bounds.append(sign * np.where(np.asarray(mdp.terminal) & np.isfinite(x), 0.0, x))
         lower, upper = bounds if sign > 0 else bounds[::-1]
         room = 8 * UNIT * np.where(np.isfinite(lower), np.abs(lower), 0.0)
-        return Bounds(lower - room, upper + room)
+        if mdp.available is not None:
+            policy = stand_ins(mdp.available)[np.arange(mdp.num_states).repeat(mdp.width), policy]
+        return Bounds(lower - room, upper + room, table_of_choices(mdp, policy))
 
 
 def _may_reach(choices: "Choices", goal: np.ndarray) -> np.ndarray:
