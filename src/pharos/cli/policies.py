@@ -17,8 +17,8 @@ class PolicyRows:
     """The first rows of a policy, in the order in which the policy gets to the states.
 
     Attributes:
-        rows: of each `state` its number, `variables`, `labels`, `previous` action under sticky actions, `action` and its
-            `name`.
+        rows: of each `state` its number, `variables`, `labels`, `previous` action under sticky actions, `action` and
+            its `name`.
         left_out: states, under sticky actions pairs of a state and the previous action, beyond the first rows.
         title: of which policy they are.
     """
