@@ -118,9 +118,9 @@ class Exploration:
         self.mdp = mdp = mdp.with_horizon(None)
         self.env, self.space, self.learnt, self.chance = env, space, learnt, chance
         self.title = title or (env.name if env is not None else "MDP")
-        self.labels = names_of(mdp)
+        self.names = names_of(mdp)
         self.actions = (
-            env.actions if env is not None else self.labels.actions or tuple(map(str, range(mdp.num_actions)))
+            env.actions if env is not None else self.names.actions or tuple(map(str, range(mdp.num_actions)))
         )
         self.states: States = _states_of(mdp, space)
         progress("optimal values")
@@ -214,7 +214,7 @@ class Exploration:
             "terminal": is_over,
             "layer": int(self.layers.of(here)[0]),
             "start": float(self.mdp.start_probabilities[self.mdp.start_states == state].sum()),
-            "labels": self.labels.labels_of(state),
+            "labels": self.names.labels_of(state),
             **self.pictures.of(self._rules_state(state)),
             "v": dict.fromkeys(self.solutions, 0.0),
             "actions": [],
@@ -233,7 +233,7 @@ class Exploration:
                 {
                     "q": best - gap,
                     "gap": gap,
-                    "name": self.labels.action(state, action) if self.labels.choices is not None else None,
+                    "name": self.names.action(state, action) if self.names.choices is not None else None,
                     "available": bool(sets[action]),
                     "best": gap <= self.tie_tolerance and bool(sets[action]),
                     "policies": {name: number(chances[name][action]) for name in self.solutions},

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pharos.errors import ParameterError
+from pharos.errors import ParameterError, UnknownName
 from pharos.system.wording import capped
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Names:
         ! binds weaker than comparisons: !x=3 is !(x=3).
 
         Raises:
-            ParameterError: it is none, or names something else; the message lists what there is.
+            ParameterError: it is none. UnknownName: it names something else; the message lists what there is.
         """
         if expression in self.labels:
             return np.array(self.labels[expression], np.bool_)
@@ -362,4 +362,4 @@ class Parser:
         return ParameterError(f"expression {capped(self.text, 120)!r}: found {what}; expected {expected}")
 
     def _unknown(self, kind: str, word: str) -> ParameterError:
-        return ParameterError(f"unknown {kind} {capped(word, 60)!r}; there are {self.names.in_words}")
+        return UnknownName(kind, capped(word, 60), (), f"there are {self.names.in_words}")

@@ -203,7 +203,8 @@ def reach(
         `upper`. Costs are those *that must arrive*, as `Rmin=? [F target]` and `Rmax=? [F target]` of PRISM and Storm:
         infinite where they cannot, or need not.
     Raises:
-        ParameterError: the target names no state, label or expression, or costs are negative.
+        ParameterError: the target is no states and no expression, or costs are negative. UnknownName: it names a label
+            or a variable that is not there.
         PrecisionError: floats, and rational numbers within their limits, do not reach the tolerance.
     Cost: as of total rewards, see `value_iteration`.
     Source: Baier and Katoen (2008), chapter 10; Haddad and Monmege (2018).
