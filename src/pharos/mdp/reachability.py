@@ -111,6 +111,7 @@ def restricted_to(mdp: TabularMDP, states: np.ndarray) -> TabularMDP:
         space=None,
         age=None,
         available=None if mdp.available is None else mdp.available[states],
+        names=None if mdp.names is None else mdp.names.of(states),
     )
 
 
