@@ -207,7 +207,7 @@ def collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any],
     notes: dict[str, dict[str, str]] = {}
     seeds, steps = tuple(dict.fromkeys(job.seed for job in jobs)), 0
     for job in jobs:
-        task, which = job.task.name, f"{job.task.name}, seed {job.seed}"
+        task, which = job.task.name, job.id
         try:
             curve, is_exact = form.curve(job, suite.protocol)
         except PharosError as error:
