@@ -280,6 +280,8 @@ def _answer(answers: PolicyAnswers, policy: PolicyLike, observations: Any, count
     except Exception as error:
         kind = f"{getattr(observations, 'shape', '')} {getattr(observations, 'dtype', '')}".strip()
         hint = "" if not hasattr(policy, "state_dict") else "; of a network: lambda seen: " + NETWORK_POLICY
+        if hasattr(getattr(policy, "__self__", policy), "predict"):
+            hint = "; of Stable-Baselines3: the model itself"
         raise ParameterError(
             f"the policy raised {in_one_line(error)}, asked about {count} observations, an array {kind}; expected a "
             f"function of such arrays that returns ({count}, A) probabilities or ({count},) actions{hint}"
