@@ -115,6 +115,22 @@ class Job:
 
 
 @dataclass(frozen=True)
+class RunResult:
+    """What counts of a finished run.
+
+    Attributes:
+        curve: (evaluations,) normalised regret. exact: whether all of it is.
+        steps: of the environment, as it counted them, else those of the protocol.
+        notes: sentences on what looks like a mistake, by kind.
+    """
+
+    curve: np.ndarray
+    exact: bool
+    steps: int
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Form:
     """An agent and the way to train it; base class of the forms.
 
@@ -142,18 +158,8 @@ class Form:
         """Train all runs. Each leaves a finished run.json and a curve in its folder, or a run.json with its error."""
         raise NotImplementedError
 
-    def steps_used(self, job: Job, protocol: Protocol) -> int:
-        """Environment steps of a finished run: as the environment counted them, else those of the protocol."""
-        counted = read_record(job.folder)["result"].get("counted_steps")
-        return protocol.steps if counted is None else int(counted)
-
-    def notes(self, job: Job) -> dict[str, str]:
-        """Sentences on what looks like a mistake in a finished run, by kind."""
-        notes = read_record(job.folder).get("notes")
-        return {str(kind): str(text) for kind, text in notes.items()} if isinstance(notes, Mapping) else {}
-
-    def curve(self, job: Job, protocol: Protocol) -> tuple[np.ndarray, bool]:
-        """(evaluations,) normalised regret, and whether all of it is exact.
+    def result(self, job: Job, protocol: Protocol) -> RunResult:
+        """The result of a finished run.
 
         Raises:
             PharosError: the run has not finished; why not. ResultCorrupted: a file of it was changed since.
@@ -164,9 +170,14 @@ class Form:
             raise PharosError(error or "its process ended without a result; the same command goes on")
         check_agent_files(job.folder)
         rows = {row["step"]: row for row in read_rows(job.folder)}
-        points = [protocol.evaluation_interval * (i + 1) for i in range(protocol.evaluations)]
-        exact = all(rows[point]["exact"] for point in points)
-        return np.array([rows[point]["normalized_regret"] for point in points]), exact
+        rows_at = [rows[protocol.evaluation_interval * (i + 1)] for i in range(protocol.evaluations)]
+        counted, notes = record["result"].get("counted_steps"), record.get("notes")
+        return RunResult(
+            np.array([row["normalized_regret"] for row in rows_at]),
+            all(row["exact"] for row in rows_at),
+            protocol.steps if counted is None else int(counted),
+            {str(kind): str(text) for kind, text in notes.items()} if isinstance(notes, Mapping) else {},
+        )
 
 
 def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: Mapping[str, Any] | None = None) -> Form:
@@ -585,16 +596,10 @@ class ExactForm(Form):
     def train(self, jobs: Sequence[Job], protocol: Protocol, settings: RunSettings) -> None:
         """Do nothing: there is nothing to learn."""
 
-    def steps_used(self, job: Job, protocol: Protocol) -> int:
-        return 0
-
-    def notes(self, job: Job) -> dict[str, str]:
-        return {}
-
-    def curve(self, job: Job, protocol: Protocol) -> tuple[np.ndarray, bool]:
+    def result(self, job: Job, protocol: Protocol) -> RunResult:
         if job.task.name not in self.regrets:
             self.regrets[job.task.name] = self._regret(job.task.training_task(protocol))
-        return np.full(protocol.evaluations, self.regrets[job.task.name]), True
+        return RunResult(np.full(protocol.evaluations, self.regrets[job.task.name]), True, 0)
 
     def _regret(self, task: Task) -> float:
         if self.label == "oracle":
