@@ -1,6 +1,5 @@
 """Long-run averages against rational numbers and every policy, published values, theorems and textbooks."""
 
-
 import numpy as np
 import pytest
 from hypothesis import strategies as st

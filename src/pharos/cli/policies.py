@@ -126,7 +126,8 @@ def _visited(mdp: "TabularMDP", policy: "np.ndarray") -> "np.ndarray":
 
 def with_policy(answer: Answer, rows: PolicyRows) -> Answer:
     """The answer with a policy below its table, and in its JSON object."""
-    title, facts = answer.text  # type: ignore[misc]
+    text: Any = answer.text
+    title, facts = text
 
     def say() -> None:
         print_facts(title, facts)

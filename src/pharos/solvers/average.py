@@ -57,8 +57,8 @@ FIRST_SWEEPS, MOST_SWEEPS, DAMPING = 32, 100_000, 0.5
 HOMING = 32
 # Improvements of a policy, at most.
 MOST_IMPROVEMENTS = 200
-POLICIES = {"optimal": BEST, "worst": WORST}
-"""Names of the policies that are found -> selections."""
+POLICIES = ("optimal", "worst")
+"""Names of the policies that are found."""
 
 
 class Interval(NamedTuple):
@@ -136,7 +136,7 @@ def average_reward(
     Returns:
         An `AverageReward` with `gain`, `gain_at_start`, `policy` and `bias`.
     Raises:
-        ParameterError: the policy has the wrong shape; or actions are sticky, and not all are available in each state.
+        ParameterError: the policy has the wrong shape.
         UnknownName: no such policy. PrecisionError: floats, within limits of time, prove no bound within the tolerance.
     Cost: nodes and outcomes are written out, 12 bytes an outcome; sweeps, and linear equations of some policies of each
         end component; of components of more than 20,000 nodes where elimination fills little in, else sweeps alone.
@@ -164,7 +164,7 @@ def _selection(mdp: TabularMDP, policy: TablePolicy | str | None) -> Selection:
             return PolicyTable.of(mdp)
         if policy is not None and policy not in POLICIES:
             raise UnknownName("policy", policy, [*POLICIES, "uniform"])
-        return POLICIES[policy or "optimal"]
+        return WORST if policy == "worst" else BEST
     return PolicyTable.of(mdp, policy.policy_table() if isinstance(policy, TableAgent) else policy)
 
 
