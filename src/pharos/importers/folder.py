@@ -248,7 +248,8 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
         return make("imported", folder=os.fspath(mdp.folder))
     place = storage.cache_directory() / "imported"
     parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
-    contents: list[Any] = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon, str(mdp.chance), sorted(parts.items())]
+    shape = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon]
+    contents: list[Any] = [*shape, str(mdp.chance), sorted(parts.items())]
     names, name_arrays = _names_of(mdp)
     if mdp.names is not None:
         digests = [storage.digest_of_bytes(np.ascontiguousarray(each).data) for each in name_arrays.values()]
