@@ -166,7 +166,7 @@ def _read_names(folder: Path, manifest: Mapping[str, Any]) -> Names | None:
     stored, actions = mdp_files.read_names(folder, manifest), manifest.get("actions")
     if stored is None:
         return None if actions is None else Names(actions=tuple(actions))
-    values = stored.get(mdp_files.VARIABLES)
+    values = stored[mdp_files.VARIABLES] if stored["variables"] else np.empty((0, 0))
     return Names(
         labels={name: stored[mdp_files.LABELS][:, i] for i, name in enumerate(stored["labels"])},
         variables={
@@ -248,7 +248,14 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
         return make("imported", folder=os.fspath(mdp.folder))
     place = storage.cache_directory() / "imported"
     parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
-    contents = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon, str(mdp.chance), sorted(parts.items())]
+    contents: list[Any] = [
+        mdp.num_states,
+        mdp.num_actions,
+        mdp.gamma,
+        mdp.horizon,
+        str(mdp.chance),
+        sorted(parts.items()),
+    ]
     names, name_arrays = _names_of(mdp)
     if mdp.names is not None:
         digests = [storage.digest_of_bytes(np.ascontiguousarray(each).data) for each in name_arrays.values()]
