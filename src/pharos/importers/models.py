@@ -28,6 +28,8 @@ TARGET = "target"
 """Label under which the states of an expression or of a property are kept."""
 MAXIMUM, MINIMUM, LEAST_COST, LARGEST_COST = "maximum", "minimum", "least_cost", "largest_cost"
 """Answers of `pharos.reach`, by which properties are answered."""
+STEPS = "the number of steps"
+"""Stands for a reward structure, in properties Tmin and Tmax."""
 LARGEST_TOTAL, LEAST_TOTAL = "largest_total", "least_total"
 """Answers of properties R [C]: the optimal and the worst value at gamma 1 without a horizon."""
 
@@ -87,7 +89,7 @@ def storm(
             structure, reaching one pays 1, so that the optimal value at gamma 1 is the maximal probability of reaching
             it.
         property: instead of these two, a property in PRISM's language, or the name of one in a JANI file:
-            P, Pmax or Pmin=? [F target] or [avoid U target], R{"reward"}, Rmax or Rmin=? [F target] or [C]. Its target
+            P, Pmax or Pmin=? [F target] or [avoid U target], R{"reward"}, Rmax or Rmin=? [F target] or [C]; Tmax or Tmin=? [F target], of steps. Its target
             ends the episode, as do, of U, the states from which it cannot be reached any more.
         gamma, horizon: of the MDP.
     Raises:
@@ -147,7 +149,7 @@ def storm_import(
     query, ended = built.query, np.zeros(model.nr_states, np.bool_)
     if query is not None:
         reward = query.reward
-        if reward == "" or (reward is not None and reward not in names):
+        if reward == "" or (reward not in (None, STEPS, *names)):
             if reward or len(names) != 1:
                 raise UnknownName(f"reward structure of {path}", reward, names)
             reward = names[0]
@@ -156,7 +158,7 @@ def storm_import(
         ended[list(model.labeling.get_states(target))] = True
     elif reward is None and len(names) == 1:
         reward = names[0]
-    if reward is not None and reward not in names:
+    if reward not in (None, STEPS, *names):
         raise UnknownName(f"reward structure of {path}", reward, names)
     if reward is None and target is None and property is None:
         raise ParameterError(
@@ -164,7 +166,8 @@ def storm_import(
             f"target: a label ({', '.join(labels)}) or an expression; or a property"
         )
     goal = ended if query is None else query.goal
-    outcomes = _outcomes(model, ended, goal, None if reward is None else model.reward_models[reward])
+    paying = Steps() if reward == STEPS else None if reward is None else model.reward_models[reward]
+    outcomes = _outcomes(model, ended, goal, paying)
     actions = (len(outcomes.offsets) - 1) // model.nr_states
 
     def refuse(row: int, total: float) -> FileFormatError:
@@ -309,12 +312,23 @@ NOT_ONE = re.compile("do not s[uo]me? to one")
 """In the refusal of Storm's checks, which compare sums with 1 as exact fractions; "some" for synchronised commands."""
 
 
+class Steps:
+    """The reward structure that pays 1 with every choice, of properties Tmin and Tmax: expected numbers of steps."""
+
+    has_state_rewards = has_transition_rewards = False
+    has_state_action_rewards = True
+
+    @staticmethod
+    def get_state_action_reward(_: int) -> float:
+        return 1.0
+
+
 class Query(NamedTuple):
     """States of a target or a property, and what it asks.
 
     Attributes:
         text: the property. goal, failed: (S,) bool, where it has come true, and where it cannot any more.
-        reward: name of its reward structure, "" for the only one; None: probabilities.
+        reward: name of its reward structure, "" for the only one, STEPS for steps; None: probabilities.
         answer, of_starts: as of `Question`. is_total: whether rewards are added up for ever.
     """
 
@@ -383,12 +397,12 @@ def _program(path: Path, constants: str) -> tuple[Any, dict[str, Any]]:
     return stormpy.instantiate_constants(program, constants)[0] if constants else program, properties
 
 
-OPTIMUM = re.compile(r"^\s*(?:filter\(\w+,\s*)?[PR](?:\{[^}]*\})?(?:max|min)")
+OPTIMUM = re.compile(r"^\s*(?:filter\(\w+,\s*)?[PRT](?:\{[^}]*\})?(?:max|min)")
 REWARD_LAST = re.compile(r"\bR(max|min)\s*(\{[^}]*\})")
 """PRISM's Rmax{"steps"}, which Storm writes R{"steps"}max."""
 DENIED = re.compile(r"!\s*(\w+\s*(?:<=|>=|!=|=|<|>)\s*-?\w+)")
 """!x=3, which is !(x=3) in PRISM, and refused by Storm."""
-FORMS = 'P, Pmax or Pmin=? [F target] or [a U b]; R, Rmax or Rmin=? [F target] or [C], of a reward structure R{"name"}'
+FORMS = 'P, Pmax or Pmin=? [F target] or [a U b]; R, Rmax or Rmin=? [F target] or [C], of a reward structure R{"name"}; Tmax or Tmin=? [F target]'
 
 
 def _formula(path: Path, program: Any, properties: dict[str, Any], text: str) -> Any:
@@ -459,7 +473,9 @@ def _query_of(model: Any, prop: Any) -> Query:
         mask[list(stormpy.model_checking(model, condition).get_truth_values_vector())] = True
         return mask
 
-    kind = {"ProbabilityOperatorFormula": "P", "RewardOperatorFormula": "R"}.get(type(formula).__name__)
+    kind = {"ProbabilityOperatorFormula": "P", "RewardOperatorFormula": "R", "TimeOperatorFormula": "T"}.get(
+        type(formula).__name__
+    )
     if kind is None or formula.has_bound:
         raise refused()
     path, nothing = formula.subformula, np.zeros(states, np.bool_)
@@ -468,6 +484,8 @@ def _query_of(model: Any, prop: Any) -> Query:
     of_starts = {"maximum": "max", "minimum": "min"}.get(match[1] if match else "", "mean")
     query = Query(text, nothing, nothing, None, MINIMUM if is_least else MAXIMUM, of_starts)
     shape = type(path).__name__
+    if kind == "T":
+        query = query._replace(reward=STEPS, answer=LEAST_COST if is_least else LARGEST_COST)
     if kind == "R":
         named = re.match(r'R\{"([^"]*)"\}', text)  # its `reward_name` fails if there is none
         query = query._replace(reward=named[1] if named else "", answer=LEAST_COST if is_least else LARGEST_COST)
