@@ -89,8 +89,8 @@ def storm(
             structure, reaching one pays 1, so that the optimal value at gamma 1 is the maximal probability of reaching
             it.
         property: instead of these two, a property in PRISM's language, or the name of one in a JANI file:
-            P, Pmax or Pmin=? [F target] or [avoid U target], R{"reward"}, Rmax or Rmin=? [F target] or [C]; Tmax or Tmin=? [F target], of steps. Its target
-            ends the episode, as do, of U, the states from which it cannot be reached any more.
+            P, Pmax or Pmin=? [F target] or [a U target]; R{"reward"}, Rmax or Rmin=? [F target] or [C]; Tmax or
+            Tmin=? [F target], of steps. Its target ends the episode, and of U the states in which `a` does not hold.
         gamma, horizon: of the MDP.
     Raises:
         MissingExtra: stormpy is not installed.
@@ -402,7 +402,10 @@ REWARD_LAST = re.compile(r"\bR(max|min)\s*(\{[^}]*\})")
 """PRISM's Rmax{"steps"}, which Storm writes R{"steps"}max."""
 DENIED = re.compile(r"!\s*(\w+\s*(?:<=|>=|!=|=|<|>)\s*-?\w+)")
 """!x=3, which is !(x=3) in PRISM, and refused by Storm."""
-FORMS = 'P, Pmax or Pmin=? [F target] or [a U b]; R, Rmax or Rmin=? [F target] or [C], of a reward structure R{"name"}; Tmax or Tmin=? [F target]'
+FORMS = (
+    'P, Pmax or Pmin=? [F target] or [a U b]; R, Rmax or Rmin=? [F target] or [C], of a reward structure R{"name"}; '
+    "Tmax or Tmin=? [F target]"
+)
 
 
 def _formula(path: Path, program: Any, properties: dict[str, Any], text: str) -> Any:
