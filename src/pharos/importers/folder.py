@@ -166,7 +166,7 @@ def _read_names(folder: Path, manifest: Mapping[str, Any]) -> Names | None:
     stored, actions = mdp_files.read_names(folder, manifest), manifest.get("actions")
     if stored is None:
         return None if actions is None else Names(actions=tuple(actions))
-    values: Any = stored.get(mdp_files.VARIABLES)
+    values = stored[mdp_files.VARIABLES] if stored["variables"] else np.empty((0, 0))
     return Names(
         labels={name: stored[mdp_files.LABELS][:, i] for i, name in enumerate(stored["labels"])},
         variables={
