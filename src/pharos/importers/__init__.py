@@ -13,6 +13,7 @@ from pharos.importers.gymnasium import (
     minigrid_grids,
     minigrid_recording,
 )
+from pharos.importers.stepping import stepping
 
 __all__ = [
     "bridge",
@@ -25,6 +26,7 @@ __all__ = [
     "minigrid",
     "minigrid_grids",
     "save",
+    "stepping",
     "storm",
     "storm_recording",
 ]

@@ -42,15 +42,14 @@ class Arrival(NamedTuple):
 
 
 class Steppable(Protocol):
-    """A source of states.
-
-    Attributes:
-        name: for messages.
-        num_actions: the same in all states.
-    """
+    """A source of states, with the same number of actions in each; its `name` is for messages."""
 
     name: str
-    num_actions: int
+
+    @property
+    def num_actions(self) -> int:
+        """Number of actions."""
+        ...
 
     def starts(self) -> list[Arrival]:
         """The states in which episodes start, with their probabilities."""
@@ -98,7 +97,7 @@ class ExpansionsHere:
 
 
 @dataclass
-class Exploration:
+class SteppedStates:
     """States and transitions so far: those of the states below `num_expanded`, in the order of their discovery.
 
     Attributes:
@@ -166,7 +165,7 @@ class Exploration:
 
 
 @dataclass
-class Search:
+class BreadthFirst:
     """One enumeration, which can be stopped and goes on from what it has.
 
     Args:
@@ -175,21 +174,21 @@ class Search:
         max_states: more are an error.
         too_large: text for that error, with what the user can do.
         report: called now and then with (exploration, seconds, whether it is finished).
-        on_state: called with each new (number, saved state).
+        on_state: called with (depth, saved state) of each new one.
         checkpoint: called after each expanded state.
     """
 
     source: Steppable
     horizon: int | None = None
     max_states: int = 100_000
-    too_large: Callable[[Exploration], str] = lambda _: ""
-    report: Callable[[Exploration, float, bool], None] = lambda *_: None
+    too_large: Callable[[SteppedStates], str] = lambda _: ""
+    report: Callable[[SteppedStates, float, bool], None] = lambda *_: None
     on_state: Callable[[int, Any], None] = lambda *_: None
-    checkpoint: Callable[[Exploration], None] = lambda _: None
+    checkpoint: Callable[[SteppedStates], None] = lambda _: None
 
-    def begin(self) -> tuple[Exploration, dict[int, Any]]:
+    def begin(self) -> tuple[SteppedStates, dict[int, Any]]:
         """(an exploration with the start states, the saved state of each)."""
-        exploration, frontier = Exploration(self.source.num_actions), dict[int, Any]()
+        exploration, frontier = SteppedStates(self.source.num_actions), dict[int, Any]()
         totals: dict[int, Fraction | float] = {}
         for arrival in self.source.starts():
             if arrival.key is None:
@@ -199,7 +198,7 @@ class Search:
         exploration.starts = {number: float(p) for number, p in totals.items()}
         return exploration, frontier
 
-    def run(self, exploration: Exploration, frontier: dict[int, Any], pool: Expansions) -> None:
+    def run(self, exploration: SteppedStates, frontier: dict[int, Any], pool: Expansions) -> None:
         """Expand all states, in their order.
 
         Args:
@@ -221,7 +220,7 @@ class Search:
         self.report(exploration, time.monotonic() - since, True)
 
     def _add(
-        self, exploration: Exploration, frontier: dict[int, Any], state: int, rows: Iterable[Sequence[Arrival]]
+        self, exploration: SteppedStates, frontier: dict[int, Any], state: int, rows: Iterable[Sequence[Arrival]]
     ) -> None:
         """Add the outcomes of a state, and the states that they lead to."""
         is_last = self.horizon is not None and exploration.depths[state] + 1 >= self.horizon
@@ -237,7 +236,7 @@ class Search:
             exploration.add_row(shares)
 
     def _number(
-        self, exploration: Exploration, frontier: dict[int, Any], arrival: Arrival, parent: int, action: int
+        self, exploration: SteppedStates, frontier: dict[int, Any], arrival: Arrival, parent: int, action: int
     ) -> int:
         """Number of the state that was arrived in, which may be new."""
         assert arrival.key is not None
@@ -247,12 +246,12 @@ class Search:
                 raise StateSpaceTooLarge(self.too_large(exploration))
             number = exploration.add_state(arrival, parent, action)
             frontier[number] = arrival.saved
-            self.on_state(number, arrival.saved)
+            self.on_state(exploration.depths[number], arrival.saved)
         return number
 
 
 def mdp_of(
-    exploration: Exploration, *, gamma: float, horizon: int | None
+    exploration: SteppedStates, *, gamma: float, horizon: int | None
 ) -> tuple[TabularMDP, ImportedOutcomes | None]:
     """The MDP of a finished exploration; and its outcomes, None where no action pays different rewards."""
     outcomes, actions = exploration.outcomes(), exploration.num_actions
