@@ -230,7 +230,7 @@ class RandomNumber:
         return self._unit.below(tuple(array.ravel().tolist()), self._scale, self._offset).reshape(array.shape)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **_: Any) -> Any:
-        """What NumPy's functions give of the number: comparisons, whole parts, sums and products."""
+        """Answers to NumPy's functions: comparisons, whole parts, sums and products."""
         names = UFUNCS.get(ufunc.__name__) if method == "__call__" else None
         if names is None:
             raise self._refusal()

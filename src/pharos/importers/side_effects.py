@@ -49,7 +49,7 @@ class _Sink(io.TextIOBase):
 
 
 class SideEffects:
-    """What an environment did to the process, while it was watched.
+    """Effects of an environment on the process, while it was watched.
 
     Attributes:
         lines: one for each kind of effect, for people.

@@ -38,10 +38,10 @@ from pharos.system.wording import capped, pluralize
 
 MOST_STATES = 100_000
 CHECKED_COPIES = 50
-CHECKED_PAIRS = 1_000
-PAIRS_OF_A_KEY = 2
-WALKS, WALK_STEPS = 4, 20
-"""Walks from each pair of states with the same key, as long as nothing is drawn."""
+CHECKED_PAIRS = 200
+"""Pairs of different states with one key that are compared: the first 100, and then each tenth."""
+WALK_STEPS = 20
+"""Steps of a walk from each such pair, as long as nothing is drawn."""
 REPEATED = 100
 """Each so many states, and the first 20, are expanded twice."""
 MOST_NAMED = 1_024
@@ -58,7 +58,7 @@ Payment: TypeAlias = Callable[[Any], float] | Sequence[float]
 
 @dataclass(frozen=True, kw_only=True)
 class SteppingOptions:
-    """What of an environment becomes the MDP.
+    """Options that decide which MDP an environment becomes.
 
     Attributes:
         seed: of the reset; None: all starts that a reset can draw.
@@ -80,7 +80,7 @@ class SteppingOptions:
 
 
 class StepRecording(NamedTuple):
-    """What `stepping` saw beside the MDP; `arguments()` are those of `importers.save`.
+    """Observations, names and notes beside the MDP of `stepping`; `arguments()` are those of `importers.save`.
 
     Attributes:
         observations: what the environment shows of each state: images (S, H, W, 3) uint8, or vectors (S, N) as
@@ -135,8 +135,8 @@ def stepping(  # noqa: PLR0913  (options of one import)
         factory: makes the environment; called several times, it must make the same one. Wrappers count: what the
             wrapped environment does is imported. Time limits, recorders and checkers around it are left out.
         seed: of the reset, whose own chance then is not enumerated: one start. None: all starts that it can draw.
-        key: (environment) -> what is equal for equal states. It is checked on up to CHECKED_PAIRS pairs of different
-            states with equal keys.
+        key: (environment) -> what is equal for equal states. Pairs of different states with equal keys are
+            compared: each action, and a walk.
         ignore: names of fields that are no part of the state, such as counters of steps; checked in the same way.
             Truncations by the environment itself then do not end an episode; without, they do.
         reward: (reward) -> number, or weights of a vector of rewards.
@@ -268,13 +268,12 @@ class SteppedEnvironment:
         self.name = getattr(factory, "__name__", type(factory).__name__)
         self._sent: set[bytes] = set()
         self._first: dict[bytes, tuple[bytes, bytes]] = {}
-        self._pairs_of: Counter[bytes] = Counter()
-        self._num_expanded = self._num_pairs = self._num_copies = 0
+        self._num_expanded = self._num_twins = self._num_pairs = self._num_copies = 0
         with self.effects.watched():
             self._env, self.time_limit = self.made()
             self.name = _name_of(self._env)
             self.actions, self.action_names = _actions_of(self._env, options.actions, self.name)
-            self.observer = Observer(getattr(self._env, "observation_space", None), self.name)
+            self.observer = SpaceRecorder(getattr(self._env, "observation_space", None), self.name)
             self._prepare()
 
     @property
@@ -382,7 +381,7 @@ class SteppedEnvironment:
         return number
 
     def _calling(self, what: str, function: Callable[[], Any]) -> Any:
-        """What a function of the environment returns; its errors become one line that names the line of its code."""
+        """Answer of a function of the environment; its errors become one line that names the line of its code."""
         try:
             answer = function()
             self.draws.check()
@@ -501,7 +500,7 @@ class SteppedEnvironment:
         self._num_copies += 1
         if self._num_copies <= CHECKED_COPIES or self._num_copies % REPEATED == 0:
             self._check_copy(env, saved)
-        if (self.options.key is not None or self.options.ignore) and len(self._first) < CHECKED_PAIRS:
+        if (self.options.key is not None or self.options.ignore) and len(self._first) < 10 * CHECKED_PAIRS:
             self._first[key] = saved, self.snapshots.digest(env, complete=True)
         shown = self.observer.shown(observation)
         return Arrival(self.draws.probability, payment, key, saved, shown, self.draws.script)
@@ -517,13 +516,15 @@ class SteppedEnvironment:
 
     def _check_pair(self, env: Stepped, key: bytes) -> None:
         """RuleError if a state does not behave as the first one with the same key."""
-        if key not in self._first or self._num_pairs >= CHECKED_PAIRS or self._pairs_of[key] >= PAIRS_OF_A_KEY:
+        if key not in self._first or self._num_pairs >= CHECKED_PAIRS:
             return
         saved, digest = self._first[key]
         if self.snapshots.digest(env, complete=True) == digest:
             return
+        self._num_twins += 1
+        if self._num_twins > CHECKED_PAIRS // 2 and self._num_twins % 10:
+            return
         self._num_pairs += 1
-        self._pairs_of[key] += 1
         draws, self.draws = self.draws, DrawTree(self.options.max_outcomes)
         try:
             self._compare_behaviour(saved, self.snapshots.save(env))
@@ -538,8 +539,7 @@ class SteppedEnvironment:
                 if one != other:
                     raise self._refused_merge(f"action {number}", _difference(one, other))
             rng = python_random.Random(self._num_pairs)
-            for _ in range(WALKS):
-                self._compare_walk(first, second, [rng.randrange(self.num_actions) for _ in range(WALK_STEPS)])
+            self._compare_walk(first, second, [rng.randrange(self.num_actions) for _ in range(WALK_STEPS)])
 
     def _compare_walk(self, first: bytes, second: bytes, actions: Sequence[int]) -> None:
         """RuleError if the same actions lead elsewhere; up to the first draw, as draws may be made in any order."""
@@ -578,7 +578,7 @@ def _signature(arrival: Arrival) -> tuple:
 
 
 def _difference(one: Counter, other: Counter) -> str:
-    """How two distributions over (key, reward) differ, in a few words."""
+    """Words on two distributions over (key, reward) that differ."""
     rewards = [sorted({payment for _, payment in each}) for each in (one, other)]
     if rewards[0] != rewards[1]:
         first, second = (", ".join(f"{payment:g}" for payment in each[:3]) for each in rewards)
@@ -659,7 +659,7 @@ def _action_names(env: Stepped, actions: tuple[Any, ...]) -> tuple[str, ...] | N
     return tuple(names) if is_fitting else None
 
 
-class Observer:
+class SpaceRecorder:
     """Observations of an environment as images or vectors.
 
     Attributes:
