@@ -94,17 +94,9 @@ def rows_of(mdp, outcomes):
     """(offsets of the rows, next states, probabilities, rewards) of an MDP; -1 is the end."""
     if outcomes is not None:
         return outcomes
-    matrix = mdp.dynamics.matrix().tocsr()
-    offsets, states, p, rewards = [0], [], [], []
-    for row, reward in enumerate(mdp.rewards.ravel()):
-        entries = slice(matrix.indptr[row], matrix.indptr[row + 1])
-        shares = dict(zip(matrix.indices[entries].tolist(), matrix.data[entries].tolist(), strict=True))
-        shares |= {-1: 1 - sum(shares.values())} if sum(shares.values()) < 1 - 1e-9 else {}
-        states += shares
-        p += shares.values()
-        rewards += [reward] * len(shares)
-        offsets.append(len(states))
-    return np.array(offsets), np.array(states), np.array(p), np.array(rewards)
+    matrix = mdp.dynamics.matrix().tocsr()  # its last column is the end
+    states = np.where(matrix.indices == mdp.num_states, -1, matrix.indices)
+    return matrix.indptr, states, matrix.data, np.repeat(mdp.rewards.ravel(), np.diff(matrix.indptr))
 
 
 def differing_rows(name, **options):
