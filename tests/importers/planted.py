@@ -2,7 +2,9 @@
 that other processes can import them."""
 
 import itertools
+import os
 import random
+import signal
 import sys
 import threading
 import time
@@ -323,3 +325,16 @@ def slips():
 
 def sticky():
     return gymnasium.wrappers.StickyAction(Walk(), 0.25)
+
+
+class KillsItself(Slips):
+    """Ends its process at once in the third cell, while the file of `armed` is there."""
+
+    def __init__(self, armed=""):
+        super().__init__()
+        self.armed = armed
+
+    def step(self, action):
+        if self.cell == 3 and os.path.exists(self.armed):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(action)

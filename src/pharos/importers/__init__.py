@@ -14,7 +14,9 @@ from pharos.importers.gymnasium import (
     minigrid_recording,
 )
 from pharos.importers.models import Question, storm, storm_import, storm_recording
-from pharos.importers.stepping import stepping
+from pharos.importers.search import SteppedStates
+from pharos.importers.step_target import StepTarget
+from pharos.importers.stepping import StepRecording, stepping
 
 __all__ = [
     "Question",

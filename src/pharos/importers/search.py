@@ -19,6 +19,7 @@ from pharos.importers.folder import ImportedOutcomes
 from pharos.mdp import Residual, Rewards, TabularMDP, lacking, normalized_rows, rounding_of_mean
 
 END = -1
+REPORT_SECONDS = 0.1
 
 
 class Arrival(NamedTuple):
@@ -77,6 +78,10 @@ class Expansions(Protocol):
         """The outcomes of the first state that was submitted and not fetched so far."""
         ...
 
+    def close(self) -> None:
+        """End what works for it."""
+        ...
+
 
 class ExpansionsHere:
     """States that are expanded in this process, one after the other."""
@@ -95,6 +100,9 @@ class ExpansionsHere:
         """The outcomes of the state."""
         return self._source.expand(self._saved)
 
+    def close(self) -> None:
+        """Nothing works elsewhere."""
+
 
 @dataclass
 class SteppedStates:
@@ -106,6 +114,7 @@ class SteppedStates:
         starts: state -> probability.
         offsets, next_states, probabilities, rewards: outcomes of each state and action, row s A + a.
         layers: number of states at each depth.
+        num_resumed: states that were expanded by another process, which was interrupted.
     """
 
     num_actions: int
@@ -121,6 +130,7 @@ class SteppedStates:
     probabilities: array = field(default_factory=lambda: array("d"))
     rewards: array = field(default_factory=lambda: array("d"))
     layers: list[int] = field(default_factory=list)
+    num_resumed: int = 0
     numbers: dict[bytes, int] = field(default_factory=dict)
 
     @property
@@ -206,6 +216,7 @@ class BreadthFirst:
         Raises:
             StateSpaceTooLarge: there are more than `max_states`.
         """
+        exploration.num_resumed = exploration.num_expanded
         submitted, since, shown = exploration.num_expanded, time.monotonic(), 0.0
         while (state := exploration.num_expanded) < exploration.num_states:
             while submitted < exploration.num_states and submitted - state < pool.room:
@@ -214,7 +225,7 @@ class BreadthFirst:
             self._add(exploration, frontier, state, pool.fetch())
             self.checkpoint(exploration)
             seconds = time.monotonic() - since
-            if seconds - shown > 0.1:
+            if seconds - shown > REPORT_SECONDS:
                 self.report(exploration, seconds, False)
                 shown = seconds
         self.report(exploration, time.monotonic() - since, True)

@@ -128,13 +128,14 @@ class EnvironmentSnapshots:
     Attributes:
         is_strict: whether a generator of NumPy or Python that is met is an error: it was made after the first copy, and
             its draws are not seen.
+        is_closed: whether other processes restore the snapshots, so that no object outside may be new.
         constants: (position among `chain_of`, field) -> the bytes of a table that all copies share.
     """
 
     def __init__(self, branches: DrawTree, ignore: frozenset[str] = frozenset()):
         self.numpy, self.python = BranchingGenerator(branches), BranchingPythonGenerator(branches)
         self.ignore = ignore
-        self.is_strict = False
+        self.is_strict = self.is_closed = False
         self.constants: dict[tuple[int, str], bytes] = {}
         self._outside: list[Any] = []
         self._places: dict[tuple[int, str], int] = {}
@@ -211,6 +212,10 @@ class EnvironmentSnapshots:
         return "python" if isinstance(value, python_random.Random | BranchingPythonGenerator) else "numpy"
 
     def _add_outside(self, value: Any) -> int:
+        if self.is_closed:
+            raise RuleError(
+                f"made a {type(value).__name__} in a step, which other processes do not have; try one worker"
+            )
         self._numbers[id(value)] = len(self._outside)
         self._outside.append(value)
         _tame(value, self.numpy)
@@ -288,6 +293,11 @@ class EnvironmentSnapshots:
                     continue
                 feeder.feed(value)
         return hasher.digest()
+
+    def outside_digest(self) -> bytes:
+        """Digest of the objects outside: two processes with the same can restore each other's snapshots."""
+        names = [(type(each).__qualname__, getattr(each, "__qualname__", "")) for each in self._outside]
+        return digest_of([*names, *(data for data in self.constants.values())])
 
     def adopt(self, env: Stepped) -> str | None:
         """Take the tables of another environment for those that are shared; the name of one that differs, if any."""

@@ -32,9 +32,12 @@ from pharos.importers.search import (
 )
 from pharos.importers.side_effects import SideEffects
 from pharos.importers.snapshots import EnvironmentSnapshots, bare, chain_of, digest_of, integers_of
+from pharos.importers.step_checkpoint import StepCheckpoint
+from pharos.importers.step_workers import ExpansionsElsewhere
 from pharos.importers.wrappers import Stepped, as_integer, reset
 from pharos.mdp import TabularMDP, whole_number
 from pharos.system.wording import capped, pluralize
+from pharos.system.workers import usable_workers
 
 MOST_STATES = 100_000
 CHECKED_COPIES = 50
@@ -122,6 +125,7 @@ def stepping(  # noqa: PLR0913  (options of one import)
     horizon: int | None = None,
     max_states: int = MOST_STATES,
     max_outcomes: int = MOST_OUTCOMES,
+    workers: int = 1,
     check: bool = True,
     progress: Callable[[SteppedStates, float, bool], None] | None = None,
 ) -> tuple[TabularMDP, StepRecording]:
@@ -144,6 +148,7 @@ def stepping(  # noqa: PLR0913  (options of one import)
         gamma: discount; None: 1 with a horizon, else 0.99.
         horizon: steps of an episode; states that are first met after so many are not made. None: all states.
         max_states, max_outcomes: of the MDP, and of one step; more are an error.
+        workers: processes that share the work, with the same result; the factory must be one that they can import.
         check: whether a new environment is played with its own generators and compared with the MDP.
         progress: called now and then with (states so far, seconds, whether it is finished).
     Returns:
@@ -163,7 +168,7 @@ def stepping(  # noqa: PLR0913  (options of one import)
         actions=None if actions is None else tuple(actions),
         max_outcomes=whole_number(max_outcomes, "max_outcomes", "a number of at least 1"),
     )
-    run = SteppingRun(factory, options, horizon=horizon, max_states=max_states, check=check)
+    run = SteppingRun(factory, options, horizon=horizon, max_states=max_states, check=check, workers=workers)
     return run.finish(gamma, progress)
 
 
@@ -174,7 +179,7 @@ class SteppingRun:
     Args:
         factory, options: of `stepping`. horizon, max_states, check: as there.
         checkpoint: keeps what is finished in a folder; None: nothing is kept.
-        pool: makes what expands states; None: this process does.
+        workers: processes that expand states; 1: this one does.
     """
 
     factory: Factory
@@ -182,12 +187,13 @@ class SteppingRun:
     horizon: int | None = None
     max_states: int = MOST_STATES
     check: bool = True
-    checkpoint: Any = None
-    pool: Callable[["SteppedEnvironment"], Any] | None = None
+    checkpoint: StepCheckpoint | None = None
+    workers: int = 1
 
     def __post_init__(self) -> None:
         if self.horizon is not None:
             self.horizon = whole_number(self.horizon, "horizon", "a number of steps of at least 1")
+        self.workers = usable_workers(self.workers)
         self.max_states = whole_number(self.max_states, "max_states", "a number of at least 1")
 
     def finish(
@@ -228,11 +234,12 @@ class SteppingRun:
         if self.checkpoint is not None:
             search.checkpoint = self.checkpoint.save
         states, frontier = (self.checkpoint.resume if self.checkpoint else BreadthFirst.begin)(search)
-        pool: Expansions = ExpansionsHere(source) if self.pool is None else self.pool(source)
+        pool: Expansions
+        pool = ExpansionsHere(source) if self.workers == 1 else ExpansionsElsewhere(source, self.workers)
         try:
             search.run(states, frontier, pool)
         finally:
-            getattr(pool, "close", lambda: None)()
+            pool.close()
             if self.checkpoint is not None:
                 self.checkpoint.write(states)
         source.check_constants()
@@ -315,12 +322,17 @@ class SteppedEnvironment:
             self.draws.replay(script)
             env = self.snapshots.restore(self._blank if saved is None else saved)
             if saved is None:
-                observation, payment, ended = self._reset(env), 0.0, False
+                is_seeded, payment, ended = self.options.seed is not None, 0.0, False
+                observation = self._observation if is_seeded else self._reset(env)
             else:
                 observation, payment, ended = self._step(env, self.actions[action])
             key = None if ended else self.key_of(env)
             self._sent.update(() if key is None else [key])
             return self._arrival(env, key, observation, payment)
+
+    def skip(self, keys: Sequence[bytes]) -> None:
+        """Hand over no saved states of these keys, which others have."""
+        self._sent.update(keys)
 
     def check_constants(self) -> None:
         """Raise ConstantChanged if a table that copies share was changed."""
@@ -539,7 +551,8 @@ class SteppedEnvironment:
                 if one != other:
                     raise self._refused_merge(f"action {number}", _difference(one, other))
             rng = python_random.Random(self._num_pairs)
-            self._compare_walk(first, second, [rng.randrange(self.num_actions) for _ in range(WALK_STEPS)])
+            for _ in range(8 if self._num_pairs <= 5 else 1):
+                self._compare_walk(first, second, [rng.randrange(self.num_actions) for _ in range(WALK_STEPS)])
 
     def _compare_walk(self, first: bytes, second: bytes, actions: Sequence[int]) -> None:
         """RuleError if the same actions lead elsewhere; up to the first draw, as draws may be made in any order."""
@@ -837,9 +850,13 @@ class FreshPlay:
                 return
         raise RuleError(
             f"{self.source.name}: played with its own generators, action {action} in state {state} had an outcome that "
-            f"stepping did not find (reward {payment:g}): its chance comes from elsewhere (time, files, threads, C++), "
-            f"or a copy shares what a step changes"
+            f"stepping did not find (reward {payment:g}): {self._reason()}"
         )
+
+    def _reason(self) -> str:
+        if self.source.options.key is not None or self.source.options.ignore:
+            return "the key, or what is ignored, leaves out something that matters"
+        return "its chance comes from elsewhere (time, files, threads, C++), or a copy shares what a step changes"
 
     def _check_frequencies(self) -> None:
         for row, counts in self.samples.items():
