@@ -1,6 +1,7 @@
 """pharos import env: targets, folders, imports that go on after they were killed, and processes that share the work."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -192,3 +193,21 @@ def test_environments_that_packages_announce(tmp_path, monkeypatch):
     finally:
         gymnasium.registry.pop("Announced/Lake-v0", None)
     assert mdp.num_states == 28
+
+
+@pytest.mark.slow
+def test_the_page_runs_as_printed(tmp_path, monkeypatch, capsys):
+    page = (HERE.parents[2] / "docs" / "your-own-environment.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```(\w*)\n(.*?)```", page, re.DOTALL)
+    shop, python = (text for kind, text in blocks if kind == "python")
+    commands, printed, array_text = (text for kind, text in blocks if kind != "python")
+    (tmp_path / "shop.py").write_text(shop)
+    monkeypatch.chdir(tmp_path)
+    for command, count in zip(commands.splitlines(), (4, 4), strict=True):
+        words = [sys.executable, "-m", *command.split()]
+        lines = subprocess.run(words, check=True, capture_output=True, text=True).stdout.splitlines()[:count]
+        expected, printed = printed.splitlines()[:count], "\n".join(printed.splitlines()[count:])
+        assert [" ".join(line.split()) for line in lines] == [" ".join(line.split()) for line in expected]
+    capsys.readouterr()
+    exec(shop + python, {})
+    assert capsys.readouterr().out == array_text

@@ -5,6 +5,7 @@ import warnings
 from fractions import Fraction
 from functools import partial
 
+import fake_game
 import gymnasium
 import numpy as np
 import planted
@@ -324,3 +325,24 @@ def test_what_an_environment_prints_is_one_line_each():
     text = "\n".join(recording.notes)
     assert "lines, the first: hello from the factory" in text
     assert "it warned: old style" in text
+
+
+# Games ----------------------------------------------------------------------------------------------------------------
+
+
+def against(policies=None, player=None):
+    return importers.OnePlayer(fake_game.Stones(), player, policies)
+
+
+def test_a_game_of_two_is_an_mdp_of_one():
+    """Of four stones the first takes one. Three are left: a uniform opponent takes one or two, and the rest is won."""
+    mdp, recording = importers.stepping(against, gamma=1.0)
+    assert value_iteration(mdp).value_at_start == 1.0
+    assert recording.observations.argmax(axis=1).tolist() == [4, 2, 1]
+    second, _ = importers.stepping(partial(against, player="second"), gamma=1.0)
+    assert sorted(second.start_probabilities) == [0.5, 0.5]
+    clumsy, _ = importers.stepping(partial(against, {"second": fake_game.clumsy}), gamma=1.0)
+    assert clumsy.dynamics.is_deterministic
+    assert value_iteration(clumsy).value_at_start == 1.0
+    with pytest.raises(ParameterError, match="'third': is no player; expected one of first, second"):
+        against(player="third")

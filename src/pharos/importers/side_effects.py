@@ -8,6 +8,7 @@ import contextlib
 import io
 import os
 import random as python_random
+import re
 import sys
 import threading
 import warnings
@@ -30,6 +31,7 @@ CLOCKS = frozenset(
 """Names of functions in C whose answers change from call to call."""
 HEADLESS = {"SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy", "PYGAME_HIDE_SUPPORT_PROMPT": "1"}
 LONGEST_LINE = 120
+COLORS = re.compile("\x1b\\[[0-9;]*m")
 
 
 class _Sink(io.TextIOBase):
@@ -44,7 +46,7 @@ class _Sink(io.TextIOBase):
     def write(self, text: str) -> int:
         self.count += text.count("\n")
         if not self.first:
-            self.first = capped(text.strip(), LONGEST_LINE)
+            self.first = capped(" ".join(COLORS.sub("", text).split()), LONGEST_LINE)
         return len(text)
 
 
@@ -90,7 +92,7 @@ class SideEffects:
             yield
 
     def _on_warning(self, message: Warning | str, *_: Any, **__: Any) -> None:
-        text = capped(str(message), LONGEST_LINE)
+        text = capped(COLORS.sub("", str(message)), LONGEST_LINE)
         if text in self._warnings or len(self._warnings) < 100:
             self._warnings[text] = self._warnings.get(text, 0) + 1
 
