@@ -14,8 +14,13 @@ from pharos.importers.gymnasium import (
     minigrid_recording,
 )
 from pharos.importers.models import Question, storm, storm_import, storm_recording
+from pharos.importers.one_player import OnePlayer
+from pharos.importers.search import SteppedStates
+from pharos.importers.step_target import StepTarget
+from pharos.importers.stepping import StepRecording, stepping
 
 __all__ = [
+    "OnePlayer",
     "Question",
     "bridge",
     "bridge_screens",
@@ -27,6 +32,7 @@ __all__ = [
     "minigrid",
     "minigrid_grids",
     "save",
+    "stepping",
     "storm",
     "storm_import",
     "storm_recording",

@@ -44,6 +44,8 @@ class ImportedOutcomes(NamedTuple):
 IMAGE, GRID, VECTOR = "image", "grid", "vector"
 OBSERVED = {IMAGE: 4, GRID: 4, VECTOR: 2}
 """Kinds of observations that a source may show -> dimensions of their array."""
+BUILDING = ".building"
+"""Folder within the one of an MDP, for what is finished while it is made."""
 FOREIGN = ": is not empty and holds no imported MDP; choose another folder"
 
 
@@ -179,9 +181,15 @@ def _read_names(folder: Path, manifest: Mapping[str, Any]) -> Names | None:
     )
 
 
+def check_room(folder: str | os.PathLike) -> None:
+    """Raise ParameterError if a folder holds something else than an imported MDP, or the beginning of one."""
+    if _is_foreign(Path(folder)):
+        raise ParameterError(f"{folder}{FOREIGN}")
+
+
 def _is_foreign(folder: Path) -> bool:
     names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    others = {name for name in names - {storage.LOCK, storage.CLAIM} if not storage.is_temporary(name)}
+    others = {name for name in names - {storage.LOCK, storage.CLAIM, BUILDING} if not storage.is_temporary(name)}
     return bool(others) and not is_folder(folder)
 
 
