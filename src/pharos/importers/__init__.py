@@ -1,8 +1,10 @@
-"""MDPs from elsewhere, and folders that keep them: files of BRIDGE, tables of Gymnasium, matrices, MiniGrid, Storm.
+"""MDPs from elsewhere, and folders that keep them: files of BRIDGE, tables of Gymnasium, matrices, MiniGrid, Storm,
+games of Atari and Procgen.
 
 Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """
 
+from pharos.importers.consoles import Recording, atari, building_folder, procgen, save_recording
 from pharos.importers.files import bridge, bridge_screens, has_screens, how_to_import, storm, storm_recording
 from pharos.importers.folder import environment, is_folder, load, save
 from pharos.importers.gymnasium import (
@@ -15,6 +17,8 @@ from pharos.importers.gymnasium import (
 )
 
 __all__ = [
+    "Recording",
+    "atari",
     "bridge",
     "bridge_screens",
     "environment",
@@ -24,6 +28,7 @@ __all__ = [
     "matrices",
     "minigrid",
     "minigrid_grids",
+    "procgen",
     "save",
     "storm",
     "storm_recording",
