@@ -5,7 +5,7 @@ Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """
 
 from pharos.importers.consoles import Recording, atari, building_folder, procgen, save_recording
-from pharos.importers.files import bridge, bridge_screens, has_screens, how_to_import, storm, storm_recording
+from pharos.importers.files import bridge, bridge_screens, has_screens, how_to_import
 from pharos.importers.folder import environment, is_folder, load, save
 from pharos.importers.gymnasium import (
     gymnasium,
@@ -15,8 +15,10 @@ from pharos.importers.gymnasium import (
     minigrid_grids,
     minigrid_recording,
 )
+from pharos.importers.models import Question, storm, storm_import, storm_recording
 
 __all__ = [
+    "Question",
     "Recording",
     "atari",
     "bridge",
@@ -31,5 +33,6 @@ __all__ = [
     "procgen",
     "save",
     "storm",
+    "storm_import",
     "storm_recording",
 ]
