@@ -6,6 +6,7 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -252,9 +253,51 @@ def test_a_folder_with_something_else_is_refused_before_the_game_is_played(tmp_p
 # Procgen --------------------------------------------------------------------------------------------------------------
 
 
+class StoredMaze:
+    """The published table of a maze, with the interface of Procgen."""
+
+    def __init__(self, **options):
+        assert options["env_name"] == "maze" and options["start_level"] == 0 and options["num_levels"] == 1
+        with np.load(BRIDGE / "maze_easy_l0_30_fs1.npz") as file:
+            self.table, self.rewards = file["transitions"], file["rewards"]
+        self.state, self.paid = 0, 0.0
+
+    def callmethod(self, name, *values):
+        if name == "get_state":
+            return [self.state.to_bytes(4, "little")]
+        self.state = int.from_bytes(values[0][0], "little")
+        return None
+
+    def act(self, actions):
+        action = int(actions[0])
+        self.paid, self.state = self.rewards[self.state, action], int(self.table[self.state, action])
+
+    def observe(self):
+        picture = np.full((1, 2, 2, 3), max(self.state, 0) % 256, np.uint8)
+        picture[..., 0] = max(self.state, 0) // 256
+        return [self.paid], {"rgb": picture}, [self.state < 0]
+
+
+def test_a_stored_maze_played_as_procgen_is_gives_its_table_again(monkeypatch):
+    monkeypatch.setitem(sys.modules, "procgen", SimpleNamespace(ProcgenGym3Env=StoredMaze))
+    mdp, recording = importers.procgen("maze", level=0, mode="easy", horizon=30)
+    published = importers.bridge(BRIDGE / "maze_easy_l0_30_fs1.npz")
+    ours, theirs = (canonical(table_of(each), each.rewards) for each in (mdp, published))
+    assert len(ours[0]) == 243 and ours[:2] == theirs[:2]
+    assert recording.num_raw_states == recording.observations.num_distinct == 243
+    skipped, _ = importers.procgen("maze", horizon=3, frame_skip=2, raw=True)
+    for action in range(9):  # held for two steps, or until the end
+        state, total = 0, 0.0
+        for _ in range(2):
+            if state >= 0:
+                total += published.rewards[state, action]
+                state = table_of(published)[state, action]
+        assert skipped.rewards[0, action] == total and (table_of(skipped)[0, action] < 0) == (state < 0)
+
+
 @pytest.mark.long
 def test_a_maze_is_the_published_table_of_bridge():
-    """Where Procgen is installed; else the table that it makes is among the data of other tests."""
+    """If Procgen is installed; see the stored maze otherwise."""
     pytest.importorskip("procgen")
     mdp, recording = importers.procgen("maze", level=0, mode="easy", horizon=30)
     published = importers.bridge(BRIDGE / "maze_easy_l0_30_fs1.npz")

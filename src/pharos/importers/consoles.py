@@ -5,6 +5,8 @@ Naddaf, Veness and Bowling (2013), "The Arcade Learning Environment"; Cobbe, Hes
 "Leveraging Procedural Generation to Benchmark Reinforcement Learning".
 """
 
+import contextlib
+import io
 import os
 import shutil
 import warnings
@@ -359,7 +361,7 @@ PROCGEN_PARTS = "procgen-mirror==0.10.7 gym==0.26.2 gym-notices gym3==0.3.3 imag
 
 
 def _procgen() -> Any:
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):  # of the old gym
         warnings.simplefilter("ignore")
         try:
             import procgen as package

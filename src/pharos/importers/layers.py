@@ -78,7 +78,8 @@ class ConsoleLayers(NamedTuple):
 class ConsoleStep(NamedTuple):
     """One action of one state, as a process sends it.
 
-    key is empty if the episode ends. saved (deflated) and screen come with the first of equal keys.
+    key is empty if the episode ends. saved (deflated) and screen come with the first of equal keys, but not in the last
+    layer.
     """
 
     reward: float
@@ -104,10 +105,13 @@ class Player:
             state = self.game.load(inflated(packed, self.first))
             for action in range(len(self.game.actions)):
                 reward, ends = self.game.step(state, action)
-                if is_last:
-                    steps.append(ConsoleStep(reward if ends else reward + self.game.last_reward(), b""))
+                if ends:
+                    steps.append(ConsoleStep(reward, b""))
+                elif is_last:
+                    key = key_of(self.game.save())
+                    steps.append(ConsoleStep(reward + self.game.last_reward(), key))
                 else:
-                    steps.append(ConsoleStep(reward, b"") if ends else self._step(reward))
+                    steps.append(self._step(reward))
         return steps
 
     def _step(self, reward: float) -> ConsoleStep:
@@ -170,8 +174,11 @@ class LayerSearch:
     frontier: list[bytes] = field(default_factory=list)
 
     def add(self, step: ConsoleStep) -> int:
-        """Number of the state that a step leads to; it joins the next layer if it is new."""
-        if not step.key:
+        """Number of the state that a step leads to; it joins the next layer if it is new.
+
+        A step of the last layer, which has no screen, ends the episode in a new state.
+        """
+        if not step.key or (step.screen is None and step.key not in self.keys):
             return END
         number = self.keys.setdefault(step.key, len(self.keys))
         if number == len(self.screen_numbers):
