@@ -198,7 +198,7 @@ def _recorded(
         mdp, screens = merged.mdp, screens.with_index(screens.index[merged.representatives])
     package = f"{identity['package']} {identity['version']}"
     source = f"{package}: {identity['game']}, {', '.join(words)}, horizon {horizon}"
-    return mdp, Recording(screens, make().actions, source, number, tuple(layers.sizes), layers.num_steps)
+    return mdp, Recording(screens, layers.actions, source, number, tuple(layers.sizes), layers.num_steps)
 
 
 def _package(*names: str) -> dict[str, str]:
@@ -273,8 +273,8 @@ class AtariGame:
         self.ale.setFloat("repeat_action_probability", 0.0)
         self.ale.setInt("frame_skip", 1)
         self.ale.loadROM(_rom_path(self.name))
-        self._legal = self.ale.getLegalActionSet() if self.all_actions else self.ale.getMinimalActionSet()
-        self.actions: tuple[str, ...] = tuple(action.name.lower() for action in self._legal)
+        self.legal = self.ale.getLegalActionSet() if self.all_actions else self.ale.getMinimalActionSet()
+        self.actions: tuple[str, ...] = tuple(action.name.lower() for action in self.legal)
 
     def start(self) -> bytes:
         """Reset the game, and let `noops` frames pass."""
@@ -294,7 +294,7 @@ class AtariGame:
     def step(self, state: Any, action: int) -> tuple[float, bool]:
         """Hold an action for all frames of a step, also after a lost life, as BRIDGE does."""
         self.ale.restoreSystemState(state)
-        return self._play(self._legal[action])
+        return self._play(self.legal[action])
 
     def _play(self, action: Any) -> tuple[float, bool]:
         ale, reward, ends = self.ale, 0, False
@@ -316,7 +316,7 @@ class AtariGame:
         """Rewards of `settle` steps without an action."""
         total = 0.0
         for _ in range(self.settle):
-            reward, ends = self._play(self._legal[0])
+            reward, ends = self._play(self.legal[0])
             total += reward
             if ends:
                 break

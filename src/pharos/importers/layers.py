@@ -66,6 +66,7 @@ class ConsoleLayers(NamedTuple):
         screens: (S, H, W, 3).
         sizes: number of states of each depth.
         num_steps: steps of the game that were played now.
+        actions: their names.
     """
 
     next_states: np.ndarray
@@ -73,6 +74,7 @@ class ConsoleLayers(NamedTuple):
     screens: DistinctRows
     sizes: list[int]
     num_steps: int
+    actions: tuple[str, ...]
 
 
 class ConsoleStep(NamedTuple):
@@ -261,10 +263,10 @@ def _explored(
                 search.shown.append(search.collector.num_distinct)
                 if store is not None:
                     store.append(search)
-    return _layers(search, horizon, steps)
+    return _layers(search, horizon, steps, player.game.actions)
 
 
-def _layers(search: LayerSearch, horizon: int, steps: int) -> ConsoleLayers:
+def _layers(search: LayerSearch, horizon: int, steps: int, actions: tuple[str, ...]) -> ConsoleLayers:
     sizes = [size for size in search.sizes[:horizon] if size]
     count = sum(sizes)
     table = np.concatenate(search.rows[: len(sizes)])
@@ -272,7 +274,7 @@ def _layers(search: LayerSearch, horizon: int, steps: int) -> ConsoleLayers:
     screens = search.collector.rows(np.array(search.screen_numbers[:count], np.int64))
     if count < len(search.screen_numbers):  # layers of a longer horizon
         screens = distinct_rows.shortened(screens, search.shown[len(sizes) - 1])
-    return ConsoleLayers(np.where(table >= count, END, table), rewards, screens, sizes, steps)
+    return ConsoleLayers(np.where(table >= count, END, table), rewards, screens, sizes, steps, actions)
 
 
 def _too_large(name: str, search: LayerSearch, most: int, done: int, states: int) -> StateSpaceTooLarge:
