@@ -213,14 +213,16 @@ def explored(
         StateSpaceTooLarge: more than max_states. ParameterError: the folder holds another game. FolderLocked: another
             process imports there.
     """
+    player = Player(make)
     with contextlib.ExitStack() as held:
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
             held.enter_context(storage.lock(folder, FolderLocked, "importing"))
-        return _explored(make, identity, horizon, max_states, folder, workers, settles, progress)
+        return _explored(player, make, identity, horizon, max_states, folder, workers, settles, progress)
 
 
 def _explored(
+    player: Player,
     make: Callable[[], Console],
     identity: Mapping[str, Any],
     horizon: int,
@@ -230,7 +232,6 @@ def _explored(
     settles: bool,
     progress: Callable[[str], object] | None,
 ) -> ConsoleLayers:
-    player = Player(make)
     name = str(identity["game"])
     search = LayerSearch(player.first, RowCollector((*player.game.screen().shape,), np.uint8))
     store = None if folder is None else KeptLayers(folder, {**identity, "start": key_of(player.first).hex()})

@@ -5,6 +5,7 @@ as its bytewise exclusive or with the first one: screens of one game differ in a
 The chunk is then deflated (zlib, RFC 1950).
 """
 
+import math
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pharos.errors import FileFormatError
 from pharos.system import storage
 
 CHUNK_BYTES = 1 << 20
@@ -31,6 +33,9 @@ class DistinctRows:
         shape: (N, *shape of a row). dtype: of the entries.
         num_distinct: D.
         rows_in_chunk: distinct rows of a chunk; the last one may have fewer.
+        name: of their file, for messages.
+    Raises:
+        FileFormatError: a chunk that is looked at is damaged.
     """
 
     def __init__(
@@ -41,8 +46,9 @@ class DistinctRows:
         num_distinct: int,
         rows_in_chunk: int,
         chunk: Callable[[int], bytes],
+        name: str = "rows",
     ):
-        self.index, self.dtype = index, np.dtype(dtype)
+        self.name, self.index, self.dtype = name, index, np.dtype(dtype)
         self.shape = (len(index), *row_shape)
         self.num_distinct, self.rows_in_chunk = num_distinct, rows_in_chunk
         self.chunk = chunk
@@ -86,14 +92,18 @@ class DistinctRows:
 
     def with_index(self, index: np.ndarray) -> "DistinctRows":
         """Rows of the same distinct ones, by another index."""
-        return DistinctRows(index, self.shape[1:], self.dtype, self.num_distinct, self.rows_in_chunk, self.chunk)
+        sizes = self.num_distinct, self.rows_in_chunk
+        return DistinctRows(index, self.shape[1:], self.dtype, *sizes, self.chunk, self.name)
 
     def _rows(self, chunk: int) -> np.ndarray:
         if chunk in self._cache:
             self._cache.move_to_end(chunk)
             return self._cache[chunk]
         count = min(self.rows_in_chunk, self.num_distinct - chunk * self.rows_in_chunk)
-        rows = unpacked(self.chunk(chunk), (count, *self.shape[1:]), self.dtype)
+        try:
+            rows = unpacked(self.chunk(chunk), (count, *self.shape[1:]), self.dtype)
+        except ValueError as error:
+            raise error if isinstance(error, FileFormatError) else FileFormatError(f"{self.name}: {error}") from None
         self._cache[chunk] = rows
         while len(self._cache) > 1 and sum(each.nbytes for each in self._cache.values()) > CACHED_BYTES:
             self._cache.popitem(last=False)
@@ -109,7 +119,7 @@ class RowCollector:
 
     def __init__(self, shape: Sequence[int], dtype: npt.DTypeLike):
         self.shape, self.dtype = tuple(shape), np.dtype(dtype).newbyteorder("<")
-        size = int(np.prod(self.shape, dtype=np.int64)) * self.dtype.itemsize
+        size = math.prod(self.shape) * self.dtype.itemsize
         self.rows_in_chunk = max(1, CHUNK_BYTES // max(1, size))
         self.chunks: list[bytes] = []
         self.pending: list[np.ndarray] = []
@@ -210,14 +220,14 @@ def unpacked(chunk: bytes, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
     Raises:
         ValueError: it does not hold exactly these.
     """
-    size = int(np.prod(tuple(shape), dtype=np.int64)) * dtype.itemsize
+    size = math.prod(shape) * dtype.itemsize
     machine = zlib.decompressobj()
     try:
         data = machine.decompress(chunk, size + 1)
     except zlib.error as error:
-        raise ValueError(str(error)) from None
+        raise ValueError(f"a chunk of rows cannot be read: {error}") from None
     if len(data) != size or not machine.eof:
-        raise ValueError(f"a chunk has {len(data)} bytes or more; expected {size}")
+        raise ValueError(f"a chunk of rows has {len(data)} bytes or more; expected {size}")
     flat = np.frombuffer(bytearray(data), np.uint8).reshape(shape[0], -1)
     flat[1:] ^= flat[0]
     return flat.view(dtype).reshape(tuple(shape))

@@ -50,6 +50,8 @@ ROUNDING = "rounding"
 NAMES = "names"
 """Entry of the manifest: names of labels, variables and choices, and the checksums of their arrays."""
 LABELS, VARIABLES, CHOICES = "label_states", "variable_values", "choice_names"
+MOST_INFLATED = 1100
+"""Bytes that a byte of a deflated chunk stands for, at most: 1,032 (RFC 1951)."""
 AGAIN = "import it again"
 
 
@@ -152,16 +154,25 @@ def read_rows(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> np.ndar
             raise ValueError(f"{ROWS} is {capped(entry)}")
         if not len(lengths) == len(checksums) == -(-count // in_chunk):
             raise ValueError(f"there are {len(lengths)} chunks of {in_chunk} rows; expected {count} rows")
+        largest = MOST_INFLATED * (lengths[0] + 1)
+        if math.prod(shape) * dtype.itemsize * min(count, in_chunk) > largest:
+            raise ValueError(f"a row of shape {capped(shape)} is larger than its chunk can hold")
         if index.ndim != 1 or index.dtype.kind not in "iu" or not len(index) or index.min() < 0 or index.max() >= count:
             raise ValueError(f"{INDEX} has shape {index.shape}; expected one row from 0 to {count - 1} a state")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise FileFormatError(f"{folder}: its observations are damaged: {reason}; {AGAIN}") from None
+    try:
+        storage.check_regular(path)
+        if path.stat().st_size != sum(lengths):
+            raise FileFormatError(f"{path} was changed after it was written; {AGAIN}")
+    except OSError as error:
+        wrong = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+        raise FileFormatError(f"{path}: {wrong}; {AGAIN}") from None
     ends = np.cumsum(lengths, dtype=np.int64).tolist()
 
     def chunk(number: int) -> bytes:
         try:
-            storage.check_regular(path)
             with open(path, "rb") as file:
                 file.seek(ends[number] - lengths[number])
                 data = file.read(lengths[number])
@@ -172,7 +183,7 @@ def read_rows(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> np.ndar
             raise FileFormatError(f"{path} was changed after it was written; {AGAIN}")
         return data
 
-    return DistinctRows(index, shape, dtype, count, in_chunk, chunk)
+    return DistinctRows(index, shape, dtype, count, in_chunk, chunk, str(path))
 
 
 def residual_of(manifest: Mapping[str, Any]) -> tuple[float, float]:
