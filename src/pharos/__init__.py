@@ -2,7 +2,8 @@
 
 In the order of the data flow: an Environment (`make`) is enumerated into a StateSpace (`build`, `load`), which is a
 TabularMDP with its rewards (`StateSpace.mdp`), to which chance can be added (`sticky_actions`, `random_actions`,
-`lazy_actions`), which is solved (`value_iteration`, `evaluate_policy`, `reach`) and measured (`hardness`).
+`lazy_actions`), which is solved (`value_iteration`, `evaluate_policy`, `reach`, `average_reward`) and measured
+(`hardness`).
 
 Interaction goes another way from the same Environment:
 `gymnasium.make("pharos/Breakout-v0", observation="simple_image")`.
@@ -89,7 +90,7 @@ if TYPE_CHECKING:
     from pharos.observations import observe
     from pharos.policies import evaluate_policy
     from pharos.prediction import predict
-    from pharos.solvers import Solution, reach, value_iteration
+    from pharos.solvers import Solution, average_reward, reach, value_iteration
     from pharos.state_space import StateSpace, load
     from pharos.state_space.build import build
     from pharos.state_space.conformance import check_environment
@@ -111,6 +112,7 @@ __all__ = [
     "TabularMDP",
     "__version__",
     "agents",
+    "average_reward",
     "benchmark",
     "bisimulation",
     "build",

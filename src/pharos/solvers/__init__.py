@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from pharos.system import lazy
 
 if TYPE_CHECKING:
+    from pharos.solvers.average import AverageReward, average_reward
     from pharos.solvers.options import Solving, SolvingOptions
     from pharos.solvers.policy_iteration import chain
     from pharos.solvers.reaching import Bounds, Reachability, reach
@@ -20,10 +21,12 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "AverageReward",
     "Bounds",
     "Reachability",
     "Solution",
     "Solving",
+    "average_reward",
     "evaluate_policy",
     "reach",
     "uniform_value",

@@ -120,10 +120,15 @@ class Goals:
 
     def policy_table(self, mdp: TabularMDP) -> np.ndarray:
         """The policy as `Solution.policy` has it: (S,) actions, or (S, A + 1) if it looks at the previous action."""
-        by_node = self.policy.reshape(mdp.num_states, mdp.width)
-        if (by_node == by_node[:, :1]).all():
-            return by_node[:, 0].copy()
-        return np.concatenate([by_node, by_node[:, :1]], axis=1)
+        return table_of_choices(mdp, self.policy)
+
+
+def table_of_choices(mdp: TabularMDP, policy: np.ndarray) -> np.ndarray:
+    """Choices (N,) of the nodes as (S,) actions, or (S, A + 1) if they look at the previous action."""
+    by_node = policy.reshape(mdp.num_states, mdp.width)
+    if (by_node == by_node[:, :1]).all():
+        return by_node[:, 0].copy()
+    return np.concatenate([by_node, by_node[:, :1]], axis=1)
 
 
 def total_reward(
@@ -132,14 +137,14 @@ def total_reward(
     """The expected sum of rewards until the end of the best, the worst or a given policy.
 
     Raises:
-        ParameterError: actions are sticky, and not all are available in each state.
         DivergenceError: it is infinite, or there is no policy that has one; the message names a cycle.
         PrecisionError: floats cannot tell it, or prove no bound within the tolerance.
     """
     goals = _goals(mdp, select, tolerance, progress)
     if mdp.available is None or isinstance(select, PolicyTable):
         return goals
-    return replace(goals, policy=stand_ins(mdp.available)[np.arange(mdp.num_states), goals.policy])
+    states = np.repeat(np.arange(mdp.num_states), mdp.width)
+    return replace(goals, policy=stand_ins(mdp.available)[states, goals.policy])
 
 
 def _goals(
@@ -154,6 +159,68 @@ def _goals(
     return GoalProblem.of(mdp, select).solve(tolerance, progress)
 
 
+class WrittenOut(NamedTuple):
+    """Nodes of an MDP and the outcomes of their choices.
+
+    Attributes:
+        mdp: its nodes are states, under sticky actions pairs (state, previously executed action); N in all.
+        sign: -1 if rewards are to be minimised, else 1. per_node: C, choices of a node: A, or 1 under a policy.
+        matrix: (N C, N + 2) CSR, column N: it is over; column N + 1: it is over without having arrived.
+        rewards: (N C,) means. size: (N C,) means of their absolute values. error: bound on the error of each.
+        live: (N,) bool, nodes of states that are not terminal. arrived: as `GoalProblem.of` takes it.
+    """
+
+    mdp: TabularMDP
+    sign: float
+    per_node: int
+    matrix: "csr_matrix"
+    rewards: np.ndarray
+    size: np.ndarray
+    error: float
+    live: np.ndarray
+    arrived: np.ndarray | None
+
+    @staticmethod
+    def of(mdp: TabularMDP, select: Selection, arrived: np.ndarray | None = None) -> "WrittenOut":
+        """The nodes of an MDP under a selection of actions."""
+        from scipy import sparse
+
+        is_policy = isinstance(select, PolicyTable)
+        num_states, num_actions, width = mdp.num_states, mdp.num_actions, mdp.width
+        nodes = num_states * width
+        owner = np.repeat(np.arange(num_states), width)
+        previous = np.tile(np.arange(width), num_states)
+        if isinstance(select, PolicyTable):
+            table = np.broadcast_to(select.later, (num_states, width, num_actions)).reshape(nodes, num_actions)
+            per_node = 1
+        else:
+            acts = (
+                np.tile(np.arange(num_actions), (num_states, 1)) if mdp.available is None else stand_ins(mdp.available)
+            )
+            table, per_node = np.eye(num_actions)[np.repeat(acts, width, axis=0).ravel()], num_actions
+        live = ~np.repeat(np.asarray(mdp.terminal), width)
+        outcomes = nodes_of_outcomes(mdp.dynamics.matrix(~np.asarray(mdp.terminal)), num_actions, width)
+        each_reward = mdp.rewards.ravel()
+        error = mdp.reward_table.rounding
+        if is_policy or not mdp.chance.is_none:
+            each = np.repeat(np.arange(nodes), per_node)
+            weights = executed_actions(mdp, table, owner[each], previous[each])
+            matrix = (weights @ outcomes).tocsr()
+            rewards, size = weights @ each_reward, weights @ np.abs(each_reward)
+            error += (num_actions + 8) * UNIT * float(size.max(initial=0.0))
+        else:
+            matrix, rewards, size = outcomes, each_reward, np.abs(each_reward)
+        # what leads to a terminal state, or to the end, is over: column N, or N + 1 if it has not arrived
+        column = np.full(matrix.shape[1], nodes)
+        column[:nodes][live] = np.flatnonzero(live)
+        if arrived is not None:
+            column[~np.repeat(arrived, width)[: len(column)] & (column == nodes)] = nodes + 1
+        matrix = sparse.csr_matrix((matrix.data, column[matrix.indices], matrix.indptr), (matrix.shape[0], nodes + 2))
+        matrix.sum_duplicates()
+        sign = -1.0 if select.kind == "worst" else 1.0
+        return WrittenOut(mdp, sign, per_node, matrix, rewards, size, error, live, arrived)
+
+
 class GoalProblem:
     """Nodes of an MDP, their choices, and the same after components that pay nothing are collapsed.
 
@@ -161,6 +228,7 @@ class GoalProblem:
         choices: of the collapsed nodes. node_of: (N,) the collapsed node of each node; M: it is over.
         matrix: (N C, N + 1) the outcomes of all C choices of the nodes; column N: it is over.
         inside: (N C,) bool, the choices that stay in a collapsed component.
+        staying: (N,) the choices of nodes that stay there for ever; None: any.
     """
 
     def __init__(
@@ -172,9 +240,10 @@ class GoalProblem:
         node_of: np.ndarray,
         matrix: "csr_matrix",
         inside: np.ndarray,
+        staying: np.ndarray | None = None,
     ):
         self.mdp, self.sign, self.num_choices, self.choices, self.node_of = mdp, sign, num_choices, choices, node_of
-        self.matrix, self.inside = matrix, inside
+        self.matrix, self.inside, self.staying = matrix, inside, staying
 
     @staticmethod
     def of(mdp: TabularMDP, select: Selection, arrived: np.ndarray | None = None) -> "GoalProblem":
@@ -182,39 +251,10 @@ class GoalProblem:
         arrived: (S + 1,) bool, the terminal states, and last the end, in which play has arrived. The other ones, and to
             stay for ever where nothing is paid, then have no value. None: everything counts as arrived.
         """
-        from scipy import sparse
-
-        sign = -1.0 if select.kind == "worst" else 1.0
-        is_policy = isinstance(select, PolicyTable)
-        num_states, num_actions, width = mdp.num_states, mdp.num_actions, mdp.width
-        nodes = num_states * width
-        owner = np.repeat(np.arange(num_states), width)
-        previous = np.tile(np.arange(width), num_states)
+        nodes = WrittenOut.of(mdp, select, arrived)
+        size = nodes.size
         if isinstance(select, PolicyTable):
-            table = np.broadcast_to(select.later, (num_states, width, num_actions)).reshape(nodes, num_actions)
-            per_node = 1
-        else:
-            table, per_node = np.tile(np.eye(num_actions), (nodes, 1)), num_actions
-        live = ~np.repeat(np.asarray(mdp.terminal), width)
-        outcomes = nodes_of_outcomes(mdp.dynamics.matrix(~np.asarray(mdp.terminal)), num_actions, width)
-        each_reward = mdp.rewards.ravel()
-        if is_policy or not mdp.chance.is_none:
-            each = np.repeat(np.arange(nodes), per_node)
-            weights = executed_actions(mdp, table, owner[each], previous[each])
-            matrix = (weights @ outcomes).tocsr()
-            rewards, size = weights @ each_reward, weights @ np.abs(each_reward)
-        else:
-            matrix, rewards, size = outcomes, each_reward, np.abs(each_reward)
-        # what leads to a terminal state, or to the end, is over: column N, or N + 1 if it has not arrived
-        column = np.full(matrix.shape[1], nodes)
-        column[:nodes][live] = np.flatnonzero(live)
-        if arrived is not None:
-            column[~np.repeat(arrived, width)[: len(column)] & (column == nodes)] = nodes + 1
-        matrix = sparse.csr_matrix((matrix.data, column[matrix.indices], matrix.indptr), (matrix.shape[0], nodes + 2))
-        matrix.sum_duplicates()
-        row_node = np.repeat(np.arange(nodes), per_node)
-        if isinstance(select, PolicyTable):
-            component, inside = recurrent_classes(matrix, live)
+            component, inside = recurrent_classes(nodes.matrix, nodes.live)
             pays = inside & (size > 0)
             if pays.any():
                 same = np.flatnonzero(component == component[np.argmax(pays)])
@@ -223,21 +263,46 @@ class GoalProblem:
                     f"{_states_in_words(mdp, same)}, which pay; give a horizon, or gamma < 1"
                 )
         else:
-            shape = (num_states, width, num_actions) if mdp.is_sticky else (num_states, num_actions)
+            shape = (mdp.num_states, mdp.width, mdp.num_actions) if mdp.is_sticky else (mdp.num_states, mdp.num_actions)
             free = end_components(mdp, (size == 0).reshape(shape))
             component, inside = free.labels.ravel(), free.pairs.ravel()
+        total = int(component.max(initial=-1)) + 1
+        stops = np.zeros(0 if arrived is not None else total)
+        return GoalProblem.collapsed(nodes, component, inside, stops, nodes.rewards, nodes.error)
+
+    @staticmethod
+    def collapsed(
+        nodes: "WrittenOut",
+        component: np.ndarray,
+        inside: np.ndarray,
+        stops: np.ndarray,
+        rewards: np.ndarray,
+        error: float,
+        staying: np.ndarray | None = None,
+    ) -> "GoalProblem":
+        """
+        component: (N,) the component of each node, from 0 on, each of which becomes one node; -1: none.
+        inside: (N C,) bool, the choices that stay in a component.
+        stops: what staying in the first components pays for ever, to be maximised.
+        rewards: (N C,) of the choices. error: bound on the error of each.
+        staying: (N,) the choices of nodes of components that stay; None: any that is inside.
+        """
+        from scipy import sparse
+
+        mdp, matrix, live, count_of_nodes = nodes.mdp, nodes.matrix, nodes.live, len(nodes.live)
         # one node for each component, then those in none, a trap without choices, and the end
         is_collapsed = component >= 0
         total = int(component.max(initial=-1)) + 1
         alone = np.flatnonzero(live & ~is_collapsed)
         trap = total + len(alone)
-        count = trap + (arrived is not None)
-        node_of = np.full(nodes + 2, count)
+        count = trap + (nodes.arrived is not None)
+        node_of = np.full(count_of_nodes + 2, count)
         node_of[:-2][is_collapsed] = component[is_collapsed]
         node_of[alone] = total + np.arange(len(alone))
         node_of[-1] = trap
-        if arrived is not None:
-            node_of[:-2][np.repeat(~arrived[:-1], width) & ~live] = trap
+        if nodes.arrived is not None:
+            node_of[:-2][np.repeat(~nodes.arrived[:-1], mdp.width) & ~live] = trap
+        row_node = np.repeat(np.arange(count_of_nodes), nodes.per_node)
         keep = np.flatnonzero(live[row_node] & ~inside)
         part = matrix[keep]
         own = node_of[row_node[keep]]
@@ -246,21 +311,17 @@ class GoalProblem:
         joined = sparse.csr_matrix((data, after, part.indptr), shape=(len(keep), count + 1))
         joined.sum_duplicates()
         joined.eliminate_zeros()
-        error = mdp.reward_table.rounding
-        if is_policy or not mdp.chance.is_none:
-            error += (num_actions + 8) * UNIT * float(size.max(initial=0.0))
-        terms = int(np.diff(joined.indptr).max(initial=0)) + num_actions + mdp.dynamics.operations
-        choices = _sorted_choices(
-            joined, own, sign * rewards[keep], keep, 0 if arrived is not None else total, error, terms
-        )
-        return GoalProblem(mdp, sign, per_node, choices, node_of, matrix, inside)
+        terms = int(np.diff(joined.indptr).max(initial=0)) + mdp.num_actions + mdp.dynamics.operations
+        choices = _sorted_choices(joined, own, nodes.sign * rewards[keep], keep, stops, error, terms)
+        return GoalProblem(mdp, nodes.sign, nodes.per_node, choices, node_of, matrix, inside, staying)
 
     # Solving ----------------------------------------------------------------------------------------------------------
 
     def solve_in(
         self, inside: np.ndarray, tolerance: float, progress: Callable[[int, float], None] | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """((N,) values, (N,) error of each) where `inside` (M + 1,) bool holds, at the end 0, else infinite.
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """((N,) values, (N,) error of each, (N,) choices) where `inside` (M + 1,) bool holds, at the end 0, else
+        infinite.
 
         From the nodes inside, the end among them, some policy surely ends without leaving them; choices that may leave
         them are left out.
@@ -281,9 +342,11 @@ class GoalProblem:
             origin=choices.origin[rows],
         )
         v, error = np.full(len(inside), np.inf), np.zeros(len(inside))
-        values, errors, _, _ = _values(part, self.proper(part)[1], tolerance, self._infinite, progress)
+        values, errors, policy, _ = _values(part, self.proper(part)[1], tolerance, self._infinite, progress)
         v[nodes], error[nodes] = np.append(self.sign * values, 0.0), np.append(errors, 0.0)
-        return v[self.node_of[:-2]], error[self.node_of[:-2]]
+        origin = np.full(len(inside) - 1, -1)
+        origin[nodes[:-1]] = part.origin[policy]
+        return v[self.node_of[:-2]], error[self.node_of[:-2]], self._unfolded(origin)
 
     def solve(self, tolerance: float, progress: Callable[[int, float], None] | None = None) -> Goals:
         """Policy iteration, then bounds; in rational numbers where floats cannot tell, or are too short."""
@@ -298,7 +361,7 @@ class GoalProblem:
         return Goals(
             self.sign * np.append(v, 0.0)[nodes],
             np.append(error, 0.0)[nodes],
-            self._unfolded(choices.origin[policy]),
+            self.unfolded(choices.origin[policy]),
             improvements,
         )
 
@@ -344,7 +407,7 @@ class GoalProblem:
             self.mdp, self.sign, [divmod(int(each), self.num_choices) for each in choices.origin[rows]]
         )
 
-    def _unfolded(self, origin: np.ndarray) -> np.ndarray:
+    def unfolded(self, origin: np.ndarray) -> np.ndarray:
         """(N,) choices of the nodes, from those of the collapsed nodes (M,); -1 is to stop."""
         nodes = len(self.node_of) - 2
         policy = np.zeros(nodes, np.int64)
@@ -369,8 +432,8 @@ class GoalProblem:
         hitting.almost_surely(first, node, rows, goal, sure, scratch, row)
         towards = np.flatnonzero(~goal)
         policy[towards] = rows_in[row[towards]] % self.num_choices
-        staying = collapsed[stops[collapsed]]
-        policy[staying] = rows_in[rows[staying]] % self.num_choices
+        stays = collapsed[stops[collapsed]]
+        policy[stays] = rows_in[rows[stays]] % self.num_choices if self.staying is None else self.staying[stays]
         return policy
 
 
@@ -379,19 +442,20 @@ def _sorted_choices(
     owner: np.ndarray,
     rewards: np.ndarray,
     origin: np.ndarray,
-    stops: int,
+    stops: np.ndarray,
     error: float,
     terms: int,
 ) -> Choices:
-    """Choices by node, with one more row that stops for each of the first `stops` nodes."""
+    """Choices by node, with one more row that stops for each of the first nodes, and is paid what `stops` says."""
     from scipy import sparse
 
     count = matrix.shape[1] - 1
-    if stops:
-        entries = (np.ones(stops), (np.arange(stops), np.full(stops, count)))
-        matrix = sparse.vstack([matrix, sparse.csr_matrix(entries, shape=(stops, count + 1))], format="csr")
-        owner, rewards = np.append(owner, np.arange(stops)), np.append(rewards, np.zeros(stops))
-        origin = np.append(origin, np.full(stops, -1))
+    if len(stops):
+        first = np.arange(len(stops))
+        entries = (np.ones(len(stops)), (first, np.full(len(stops), count)))
+        matrix = sparse.vstack([matrix, sparse.csr_matrix(entries, shape=(len(stops), count + 1))], format="csr")
+        owner, rewards = np.append(owner, first), np.append(rewards, stops)
+        origin = np.append(origin, np.full(len(stops), -1))
     order = np.argsort(owner, kind="stable")
     if (order[1:] < order[:-1]).any():
         matrix, owner, rewards, origin = matrix[order], owner[order], rewards[order], origin[order]
@@ -529,7 +593,7 @@ def _iterated(
         slack += choices.error
         own = np.abs(total[policy]) + slack[policy]
         gain = total - slack
-        better = _best_rows(choices, gain)
+        better = best_rows(choices, gain)
         if bonus is None and (gain[better] > 2 * own).any():
             changed = np.where(gain[better] > 2 * own, better, policy)
             if not _proper(choices.matrix[changed], np.arange(len(nodes) + 1))[0].all():
@@ -552,7 +616,7 @@ def _iterated(
             progress(improvements, float(w.max(initial=0.0)))
         if (above <= 0).all() and (below >= 0).all():
             return v[:-1], w[:-1] * MARGIN, policy, improvements
-        better = _best_rows(choices, above)
+        better = best_rows(choices, above)
         changed = np.where(above[better] > 0, better, policy)
         is_stuck = (
             np.array_equal(changed, policy) or not _proper(choices.matrix[changed], np.arange(len(nodes) + 1))[0].all()
@@ -563,7 +627,7 @@ def _iterated(
     raise Undecided(policy)
 
 
-def _best_rows(choices: Choices, gain: np.ndarray) -> np.ndarray:
+def best_rows(choices: Choices, gain: np.ndarray) -> np.ndarray:
     """(M,) the row of each node whose gain (R,) is largest, the first among equals."""
     largest = np.maximum.reduceat(gain, choices.rows[:-1])
     at = np.flatnonzero(gain == largest[choices.owner])

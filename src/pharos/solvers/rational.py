@@ -1,4 +1,4 @@
-"""Total rewards in rational numbers, where floats cannot tell a value from an infinite one.
+"""Total and average rewards in rational numbers, where floats are too short to tell or to hold a value.
 
 The numbers are those of the floats, rows divided by their exact sums. Policy iteration keeps an action unless another
 one is better, and begins with a policy that ends almost surely. So a policy that does not, later on, stays in a
@@ -32,15 +32,10 @@ def rational_values(
         DivergenceError: from `infinite`. PrecisionError: the nodes are too many.
     """
     count, entries_left = choices.num_nodes, MOST_ENTRIES
-    matrix = choices.matrix
-    rows: list[Row] = []
-    if matrix.nnz > MOST_ENTRIES:
+    written = fractions_of(choices)
+    if written is None:
         raise _too_many(count)
-    for i in range(matrix.shape[0]):
-        places = range(matrix.indptr[i], matrix.indptr[i + 1])
-        row = {int(matrix.indices[k]): Fraction(float(matrix.data[k])) for k in places}
-        total = sum(row.values())
-        rows.append((Fraction(float(choices.rewards[i])) / total, {m: p / total for m, p in row.items()}))
+    rows = [_divided(*row) for row in written]
     policy, improvements = policy.copy(), 0
     while True:
         v, entries = eliminated([rows[i] for i in policy], count, entries_left)
@@ -61,6 +56,61 @@ def rational_values(
         if not is_better:
             values = np.array([float(each) for each in v[:-1]])
             return values, 2.0**-52 * np.abs(values) + 2.0**-1074, policy, improvements
+
+
+def fractions_of(choices: "Choices") -> list[Row] | None:
+    """The rows as rational numbers, those of floats; None if they are too many."""
+    matrix = choices.matrix
+    if matrix.nnz > MOST_ENTRIES:
+        return None
+    rows = []
+    for i in range(matrix.shape[0]):
+        places = range(matrix.indptr[i], matrix.indptr[i + 1])
+        row = {int(matrix.indices[k]): Fraction(float(matrix.data[k])) for k in places}
+        rows.append((Fraction(float(choices.rewards[i])), row))
+    return rows
+
+
+def _divided(reward: Fraction, after: dict[int, Fraction]) -> Row:
+    """A row divided by its sum: what stays, which a row leaves out, is repeated until it leaves."""
+    total = sum(after.values())
+    return reward / total, {m: p / total for m, p in after.items()}
+
+
+def exact_sums(after: list[dict[int, Fraction]], b: list[Fraction]) -> list[Fraction] | None:
+    """x = b + P x of n nodes, of rows without what stays, each left almost surely; None if it fills in too much."""
+    rows = [_divided(*each) for each in zip(b, after, strict=True)]
+    return eliminated(rows, len(b), MOST_ENTRIES)[0]
+
+
+def best_mean(
+    choices: "Choices", rows: list[Row], policy: np.ndarray, class_of: np.ndarray
+) -> tuple[Fraction, np.ndarray] | None:
+    """(The mean reward of a policy (M,), a better policy or the same one); None if it fills in too much.
+
+    Args:
+        class_of: (M,) 0 in the only recurrent class of the policy, else -1.
+    """
+    count, home = choices.num_nodes, int(np.argmax(class_of == 0))
+    nodes = [n for n in range(count) if n != home]
+    number = {n: i for i, n in enumerate(nodes)} | {home: count - 1}
+    afters = [{number[m]: p for m, p in rows[policy[n]][1].items()} for n in nodes]
+    sums = [exact_sums(afters, b) for b in ([rows[policy[n]][0] for n in nodes], [Fraction(1)] * len(nodes))]
+    if sums[0] is None or sums[1] is None:
+        return None
+    totals, times = ([*each, Fraction(0)] for each in sums if each is not None)
+    reward, after = rows[policy[home]]
+    earned, steps = (sum((p * each[number[m]] for m, p in after.items()), Fraction(0)) for each in (totals, times))
+    gain = (reward + earned) / (1 + steps)
+    h = [totals[number[n]] - gain * times[number[n]] for n in range(count)]
+    better = policy.copy()
+    for n in range(count):
+        most = gain
+        for i in range(choices.rows[n], choices.rows[n + 1]):
+            change = rows[i][0] + sum((p * (h[m] - h[n]) for m, p in rows[i][1].items()), Fraction(0))
+            if change > most:
+                most, better[n] = change, i
+    return gain, better
 
 
 def _too_many(count: int) -> PrecisionError:
