@@ -363,3 +363,15 @@ class CountsInTheClass(Walk):
         type(self).count += 1
         cell, reward, *rest = super().step(action)
         return cell, reward + self.count % 3, *rest
+
+
+class Heavy(Walk):
+    """Some hundred states of 40 kB each."""
+
+    def reset(self, *, seed=None, options=None):
+        self.pad = np.zeros(5_000)
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        self.pad = self.pad + 2 * action + 1
+        return 0, 1.0, self.pad[0] > 150, False, {}
