@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, progress_line, termination, written
+from pharos.cli.answers import Answer, complain, progress_line, termination, written
 from pharos.cli.command import Commands
 from pharos.cli.options import Count, Discount, Gamma, Target, Tolerance, check_format
 from pharos.errors import DivergenceError, ParameterError, PharosError, UnknownName
@@ -23,7 +23,7 @@ from pharos.system.wording import capped, pluralize
 if TYPE_CHECKING:
     import numpy as np
 
-    from pharos.importers import Question, Recording
+    from pharos.importers import Question, Recording, SteppedStates
     from pharos.mdp import TabularMDP
 
 app = Commands(help="Bring an MDP from elsewhere into a folder.", no_args_is_help=True)
@@ -100,6 +100,67 @@ def gymnasium(
     limit, outcomes = env.spec.max_episode_steps if env.spec else None, importers.gymnasium_outcomes(env)
     importers.save(mdp, out, source=f"Gymnasium: {words}", time_limit=limit, outcomes=outcomes)
     return _answer(words, mdp, out)
+
+
+@app.command("env")
+def env(
+    target: str,
+    *,
+    out: Out,
+    option: Mapping[str, Any],
+    seed: int | None = None,
+    key: Annotated[str | None, "CODE"] = None,
+    ignore: str = "",
+    reward: Annotated[str | None, "CODE"] = None,
+    weights: str = "",
+    gamma: Gamma = None,
+    horizon: Episode = None,
+    max_states: Count = 100_000,
+    max_outcomes: Count = 3_000,
+    workers: Count = 1,
+    check: bool = True,
+) -> Answer:
+    """Import any environment of Gymnasium by stepping it from every state; the same command resumes.
+
+    Args:
+        target: gymnasium:ID, module:factory or file.py:factory; wrappers count.
+        option: Of the environment or the factory, such as is_slippery=false.
+        seed: Of one reset; else all starts are imported.
+        key: module:function or file.py:function (environment) -> equal for equal states; pairs are checked.
+        ignore: FIELD,FIELD: no part of the state, such as counters of steps.
+        reward: module:function or file.py:function (reward) -> number.
+        weights: 1,0.5 of a vector of rewards.
+        max_states: More are an error.
+        max_outcomes: Of the draws of one step.
+        workers: Processes that share the work.
+        check: Play the environment and compare.
+    """
+    from pharos import importers
+
+    source = importers.StepTarget(target, option, key=key, reward=reward, weights=weights)
+    with progress_line(f"stepping {target}") as show:
+        mdp, recording = source.import_into(
+            out,
+            seed=seed,
+            ignore=tuple(name for name in ignore.split(",") if name),
+            gamma=gamma,
+            horizon=horizon,
+            max_states=max_states,
+            max_outcomes=max_outcomes,
+            workers=workers,
+            check=check,
+            progress=lambda states, seconds, _: show(_stepping_text(states, seconds)),
+        )
+    for note in recording.notes:
+        complain(note)
+    answer = _answer(source.words, mdp, out)
+    return answer._replace(json={**answer.json, "notes": list(recording.notes)})
+
+
+def _stepping_text(states: "SteppedStates", seconds: float) -> str:
+    left = states.num_states - states.num_expanded
+    rate = (states.num_expanded - states.num_resumed) / max(seconds, 1e-9)
+    return f"{states.num_states:,} states, {left:,} to expand, step {states.depths[-1]}, {rate:,.0f} states/s"
 
 
 Noops = Annotated[int, typer.Option(min=0)]

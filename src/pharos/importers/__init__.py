@@ -16,8 +16,13 @@ from pharos.importers.gymnasium import (
     minigrid_recording,
 )
 from pharos.importers.models import Question, storm, storm_import, storm_recording
+from pharos.importers.one_player import OnePlayer
+from pharos.importers.search import SteppedStates
+from pharos.importers.step_target import StepTarget
+from pharos.importers.stepping import StepRecording, stepping
 
 __all__ = [
+    "OnePlayer",
     "Question",
     "Recording",
     "atari",
@@ -32,6 +37,7 @@ __all__ = [
     "minigrid_grids",
     "procgen",
     "save",
+    "stepping",
     "storm",
     "storm_import",
     "storm_recording",

@@ -47,6 +47,8 @@ BUILDING = ".building"
 """Folder, within that of an MDP, of what an import that is not finished has so far."""
 OBSERVED = {IMAGE: 4, GRID: 4, VECTOR: 2}
 """Kinds of observations that a source may show -> dimensions of their array."""
+BUILDING = ".building"
+"""Folder within the one of an MDP, for what is finished while it is made."""
 FOREIGN = ": is not empty and holds no imported MDP; choose another folder"
 
 
@@ -179,7 +181,7 @@ def _read_names(folder: Path, manifest: Mapping[str, Any]) -> Names | None:
     stored, actions = mdp_files.read_names(folder, manifest), manifest.get("actions")
     if stored is None:
         return None if actions is None else Names(actions=tuple(actions))
-    values = stored.get(mdp_files.VARIABLES)
+    values = stored[mdp_files.VARIABLES] if stored["variables"] else np.empty((0, 0))
     return Names(
         labels={name: stored[mdp_files.LABELS][:, i] for i, name in enumerate(stored["labels"])},
         variables={
@@ -190,6 +192,12 @@ def _read_names(folder: Path, manifest: Mapping[str, Any]) -> Names | None:
         choices=stored.get(mdp_files.CHOICES),
         choice_names=tuple(stored["choices"]),
     )
+
+
+def check_room(folder: str | os.PathLike) -> None:
+    """Raise ParameterError if a folder holds something else than an imported MDP, or the beginning of one."""
+    if _is_foreign(Path(folder)):
+        raise ParameterError(f"{folder}{FOREIGN}")
 
 
 def _is_foreign(folder: Path) -> bool:
@@ -260,7 +268,8 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
         return make("imported", folder=os.fspath(mdp.folder))
     place = storage.cache_directory() / "imported"
     parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
-    contents = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon, str(mdp.chance), sorted(parts.items())]
+    shape = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon]
+    contents: list[Any] = [*shape, str(mdp.chance), sorted(parts.items())]
     names, name_arrays = _names_of(mdp)
     if mdp.names is not None:
         digests = [storage.digest_of_bytes(np.ascontiguousarray(each).data) for each in name_arrays.values()]

@@ -319,7 +319,7 @@ def _start(env: object, inner: object, states: int, is_stepped: bool) -> np.ndar
     starts = np.flatnonzero(counts)
     if start is None and len(starts) == 1 and counts.sum() == count:
         return np.eye(states)[starts[0]]
-    if start is not None and (not len(starts) or (not counts[start == 0].any() and not _is_unlikely(counts, start))):
+    if start is not None and (not len(starts) or (not counts[start == 0].any() and not is_unlikely(counts, start))):
         return start
     listed = ", ".join([*map(str, starts[:5]), *(["..."] if len(starts) > 5 else [])]) or "no state's number"
     says = "it has no initial_state_distrib" if start is None else f"its {name} says otherwise"
@@ -340,7 +340,7 @@ def _distribution(env: object, name: str, value: object, states: int) -> np.ndar
     return start
 
 
-def _is_unlikely(counts: np.ndarray, probabilities: np.ndarray, comparisons: int = 1) -> bool:
+def is_unlikely(counts: np.ndarray, probabilities: np.ndarray, comparisons: int = 1) -> bool:
     """Whether such counts are less likely than LEAST_PROBABILITY, of several comparisons together."""
     return _probability_of(counts, probabilities) < LEAST_PROBABILITY / comparisons
 
@@ -430,7 +430,7 @@ def _compare_frequencies(env: object, inner: object, table: list, samples: dict[
         named.setdefault(shares, (state, action))
     tests += [(*named[shares], shares, sampled) for shares, sampled in groups.items()]
     for state, action, shares, sampled in tests:
-        if _is_unlikely(sampled, np.array(shares), len(tests)):
+        if is_unlikely(sampled, np.array(shares), len(tests)):
             chance = _probability_of(sampled, np.array(shares))
             raise FileFormatError(
                 f"{name_of(env)}: in state {state}, action {action} (and those with the same probabilities) had its "
