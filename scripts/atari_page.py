@@ -22,7 +22,7 @@ GAMES = {  # horizon, and other options of the import
     "pong": (20, {}),
     "breakout": (14, {}),
     "boxing": (3, {}),
-    "seaquest": (10, {}),
+    "seaquest": (7, {}),
     "tennis": (3, {}),
     "space_invaders": (5, {"noops": 120}),
 }
@@ -67,15 +67,18 @@ def row(game: str) -> str:
 
 
 def main() -> None:
-    names = sys.argv[1:] or list(GAMES)
-    text = PAGE.read_text()
-    before, _, rest = text.partition(HEAD)
+    for name in sys.argv[1:] or GAMES:
+        line = row(name)
+        print(line, flush=True)
+        put(name, line)
+
+
+def put(name: str, line: str) -> None:
+    """Write the row of a game into the page."""
+    before, _, rest = PAGE.read_text().partition(HEAD)
     lines, _, after = rest.partition("\n\n")
-    rows = {match[1]: match[0] for match in re.finditer(r"^\| `(\w+)`.*$", lines, re.MULTILINE)}
-    for name in names:
-        rows[name] = row(name)
-        print(rows[name], flush=True)
-    ordered = "\n".join(rows[name] for name in GAMES if name in rows)
+    rows = {match[1]: match[0] for match in re.finditer(r"^\| `(\w+)`.*$", lines, re.MULTILINE)} | {name: line}
+    ordered = "\n".join(rows[game] for game in GAMES if game in rows)
     PAGE.write_text(f"{before}{HEAD}\n{'|---' * HEAD.count(' | ')}|---|\n{ordered}\n\n{after}")
 
 
