@@ -24,6 +24,7 @@ CONFIDENCE = 0.95
 TIE_TOLERANCE = 1e-9  # of the spread: what differs by less is rounding, and has one rank
 ZERO_VARIANCE = 1e-30  # equal numbers whose mean is rounded vary by less
 RESAMPLED = 1 << 22  # numbers that one batch of resamples may hold
+PERMUTED = 250  # permutations at a time
 GRID = 256  # points of a segment between two levels, between which `fieller_interval` looks for a root
 
 Strata = Sequence[np.ndarray]

@@ -78,6 +78,33 @@ def test_episodes_are_as_likely_as_the_mdp_says(slippery, chance):
         assert within(executed_after[previous, chosen], likely)
 
 
+def test_what_is_executed_is_in_the_sets_and_as_likely_as_it_should_be():
+    sets = np.array([[1, 1, 0], [0, 1, 1], [1, 1, 1]], np.bool_)
+    free = TabularMDP.from_arrays([[1, 2, 0], [2, 0, 1], [0, 1, 2]], np.zeros((3, 3)), gamma=0.9)
+    some = TabularMDP.from_arrays(free.next_states, np.zeros((3, 3)), gamma=0.9, available=sets)
+    both = [random_actions(sticky_actions(mdp, 0.3), 0.2) for mdp in (some, free)]
+    runs = [run for mdp in both for run in runs_on(mdp, 20)]
+    keys = np.array([run.key for run in runs], np.uint64)
+    worlds, alone = BatchedEpisodes(runs, keys, 4, 1, lanes.ActionSets.of(runs, "cpu")), BatchedEpisodes(runs, keys, 4)
+    rng, counts = np.random.default_rng(2), {}
+    for step in range(300):
+        state, previous = worlds.state.copy(), worlds.previous.copy()
+        chosen = (rng.random((20, 4, 3)) * sets[state[:20]]).argmax(axis=2)
+        worlds.step(step, np.concatenate([chosen, chosen]), counts=True)
+        alone.step(step, np.concatenate([chosen, chosen]), counts=True)
+        # runs without sets are what they are without a neighbour that has some
+        assert (worlds.state[20:] == alone.state[20:]).all() and (worlds.previous[20:] == alone.previous[20:]).all()
+        goes_on = worlds.flags[:20] & kernels.DONE == 0
+        each = zip(state[:20][goes_on], chosen[goes_on], previous[:20][goes_on], strict=True)
+        for key, executed in zip(each, worlds.previous[:20][goes_on], strict=True):
+            counts.setdefault(key, np.zeros(3))[executed] += 1
+    for (s, a, b), seen in counts.items():
+        uniform = sets[s] / sets[s].sum()
+        choice = 0.8 * np.eye(3)[a] + 0.2 * uniform
+        sticks = b >= 0 and sets[s, b]
+        assert within(seen, 0.7 * choice + 0.3 * np.eye(3)[b] if sticks else choice)
+
+
 def test_lazy_actions_stay_as_often_as_they_should_and_pay_what_staying_pays(slippery):
     mdp, successors, probabilities, rewards = slippery
     staying = 100.0 + np.arange(10.0).reshape(5, 2)

@@ -461,6 +461,20 @@ def test_a_file_imports_files_beside_it_at_the_top_and_in_functions(suite, tmp_p
 
 
 @pytest.mark.slow
+def test_keywords_of_a_function_are_its_hyperparameters(suite, file, tmp_path):
+    file.write_text(LEARN.replace("seed):", "seed, *, best=0):").replace("wins.argmax()", "best"))
+    words = "benchmark", "run", "--agent", f"{file}:learn", "--tasks", "sea", "--seeds", "1", "--out", tmp_path / "out"
+    write_suite(suite, tmp_path / "small.yaml")
+    answer(*words, "--suite", tmp_path / "small.yaml", "--set", "best=1")
+    assert (np.load(tmp_path / "out/runs/sea/seed-0/policy.npy").argmax(axis=1) == 1).all()
+    assert json.loads((tmp_path / "out/agent.json").read_text())["hyperparameters"] == {"best": 1}
+    with pytest.raises(ParameterError, match="holds runs with another hyperparameters"):
+        benchmark.run(f"{file}:learn", suite, out=tmp_path / "out")
+    with pytest.raises(UnknownName, match="did you mean 'best'"):
+        benchmark.run(f"{file}:learn", suite, out=tmp_path / "out", hyperparameters={"bset": 1})
+
+
+@pytest.mark.slow
 def test_a_run_that_has_ended_may_leave_threads_behind(suite, file, tmp_path, monkeypatch):
     monkeypatch.setattr("pharos.benchmark.agents.LINGER_SECONDS", 0.5)
     text = "    import threading\n    threading.Thread(target=threading.Event().wait).start()\n    draw ="

@@ -1,5 +1,6 @@
 """Agents in JAX on tasks of the benchmark: which snapshot counts, and that its value is exact. Skipped without JAX."""
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -135,18 +136,19 @@ def test_snapshots_without_a_common_axis_are_refused(jax):
 def test_a_suite_is_run_and_goes_on(jax, tmp_path):
     protocol = Protocol(steps=300, evaluations=3, seeds=2)
     suite = _suite(protocol)
-    calls = []
+    calls = tmp_path / "calls"
 
     def learn(env, params, steps, key):
-        calls.append(steps)
+        with calls.open("a") as file:
+            print(steps, file=file)
         return learner(jax, 3)(env, params, steps, key)
 
     found = benchmark.run(learn, suite, out=tmp_path / "mine", seeds=range(2))
-    assert calls == [300] and found.results.record["form"] == "jax" and not found.missing
-    assert found.results.curves["grid"].shape == (2, 3)
+    assert calls.read_text() == "300\n" and found.results.record["form"] == "jax" and not found.missing
+    assert found.results.curves["grid-4"].shape == (2, 3)
     again = benchmark.run(learn, suite, out=tmp_path / "mine", seeds=range(2))
-    assert calls == [300]
-    np.testing.assert_array_equal(again.results.curves["grid"], found.results.curves["grid"])
+    assert calls.read_text() == "300\n"
+    np.testing.assert_array_equal(again.results.curves["grid-4"], found.results.curves["grid-4"])
 
     def broken(env, params, steps, key):
         raise ValueError("no gradient")
@@ -155,7 +157,31 @@ def test_a_suite_is_run_and_goes_on(jax, tmp_path):
         benchmark.run(broken, suite, out=tmp_path / "broken", seeds=range(2))
 
 
-def _suite(protocol):
-    task = BenchmarkTask("grid", "simple_grid", {"height": 4, "width": 4}, "one_hot")
-    suite = Suite("one", protocol, (frozen(task, protocol),), (), "", {})
+@pytest.mark.slow
+def test_a_program_has_a_process_of_its_own_with_a_limit_and_its_crash_costs_its_own_task(jax, tmp_path):
+    helper = jax.jit(lambda key: jax.random.uniform(key, (3, 4)))  # sent by value with the function
+
+    def learn(env, params, steps, key, *, fault=""):
+        (tmp_path / str(os.getpid())).touch()
+        if fault == "crash" and len(params.observations) == 17:  # 16 states, and the end
+            os._exit(9)
+        while fault == "loop":
+            pass
+        return lambda logits, seen: jax.nn.softmax(jax.numpy.broadcast_to(logits, (len(seen), 4))), helper(key)
+
+    suite = _suite(Protocol(steps=300, evaluations=3, seeds=2), 4, 5)
+    end = benchmark.run(learn, suite, out=tmp_path / "crash", seeds=range(2), hyperparameters={"fault": "crash"})
+    said = end.missing
+    assert list(said) == ["grid-4, seed 0", "grid-4, seed 1"] and "exit code 9" in said["grid-4, seed 1"]
+    assert list(end.results.curves) == ["grid-5"]
+    assert len(list(tmp_path.glob("[0-9]*"))) == 2 and not (tmp_path / str(os.getpid())).exists()
+    options = {"timeout": 0.5, "hyperparameters": {"fault": "loop"}, "tasks": "grid-4"}
+    with pytest.raises(AllRunsFailed, match=r"took longer than 0\.5 s"):
+        benchmark.run(learn, suite, out=tmp_path / "loop", seeds=[0], **options)
+
+
+def _suite(protocol, *sizes):
+    options = {f"grid-{size}": {"height": size, "width": size} for size in sizes or [4]}
+    tasks = [BenchmarkTask(name, "simple_grid", sides, "one_hot") for name, sides in options.items()]
+    suite = Suite("one", protocol, tuple(frozen(task, protocol) for task in tasks), (), "", {})
     return replace(suite, digest=digest_of_suite(suite))

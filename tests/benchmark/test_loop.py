@@ -13,7 +13,7 @@ from pharos import benchmark
 from pharos.benchmark import BenchmarkTask, BudgetSpent, Protocol, Suite, write_suite
 from pharos.benchmark.suite import digest_of_suite, frozen
 from pharos.errors import ParameterError, UnknownName
-from pharos.training import RegretCurve, read_record, read_rows
+from pharos.training import RegretCurve, evaluate_agent, read_record, read_rows
 
 PROTOCOL = Protocol(steps=300, evaluations=3, seeds=2)
 TASKS = (
@@ -143,6 +143,40 @@ def test_a_folder_has_one_setting(suite, tmp_path):
             continue
         with pytest.raises(ParameterError, match=error):
             env.close()
+
+
+@pytest.mark.long
+def test_a_loop_of_stable_baselines3_takes_the_environment_and_its_model_is_a_policy(suite, tmp_path):
+    """PPO on the environment itself, and on copies with a callback that records; the budget ends its own loop."""
+    sb3 = pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    options = {"n_steps": 30, "batch_size": 30, "seed": 0, "device": "cpu"}
+    with benchmark.task("lake", suite=suite, seed=0, out=tmp_path / "out") as env:
+        model = sb3.PPO("MlpPolicy", env, **options)
+        model.learn(120)
+        env.record(model)
+        with pytest.raises(ParameterError, match="of Stable-Baselines3: the model itself"):
+            env.record(model.policy)
+        model.learn(180, reset_num_timesteps=False)
+        env.record(model)
+    assert env.budget.steps == 300 and not env.notes()
+    value = evaluate_agent(model, env._task).value
+    assert env.curve().rows[-1]["value"] == pytest.approx(value, abs=1e-6)
+
+    class Recording(BaseCallback):
+        def _on_rollout_end(self):
+            env.record(self.model)
+
+        def _on_step(self):
+            return True
+
+    with benchmark.task("lake", suite=suite, seed=1, out=tmp_path / "out") as env:
+        copies = DummyVecEnv([env.copy] * 3)
+        sb3.PPO("MlpPolicy", copies, **options).learn(10**6, callback=Recording())
+    assert env.budget.steps == 300 and env.budget.episodes > 0 and not env.notes()
+    assert benchmark.read_results(tmp_path / "out").curves["lake"].shape == (2, 3)
 
 
 # Any target -----------------------------------------------------------------------------------------------------------

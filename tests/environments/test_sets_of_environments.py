@@ -135,10 +135,59 @@ def test_an_action_that_is_not_available_acts_as_the_first_one_that_is():
     assert env.step(0)[4]["state"].tolist() == [1]  # open, which is not there: left
 
 
-def test_chance_that_steps_do_not_play_is_refused():
-    said = refusal(ParameterError, GymEnv, Corridor(), sticky=0.2)
-    assert "sticky or random actions are not played there" in said
-    assert pharos.value_iteration(pharos.sticky_actions(pharos.build(Corridor()).mdp(), 0.2)).v.shape == (7, 3)
+CHANCES = {"sticky": {"sticky": 0.3}, "random": {"random": 0.4}, "both": {"sticky": 0.3, "random": 0.4}}
+
+
+def likely(sets, chosen, previous, *, sticky=0.0, random=0.0):
+    """(A,) how likely each action is executed: random actions replace the choice, which then may stick."""
+    uniform = sets / sets.sum()
+    result = (1 - random) * np.eye(len(sets))[chosen] + random * uniform
+    if previous >= 0 and sets[previous]:
+        result = (1 - sticky) * result + sticky * np.eye(len(sets))[previous]
+    return result
+
+
+@pytest.mark.parametrize("chance", CHANCES)
+@pytest.mark.parametrize("tabulated", [False, True])
+def test_steps_execute_what_is_available_as_often_as_they_should(chance, tabulated):
+    world, n, counts = Corridor(), 4000, {}
+    space = pharos.build(world) if tabulated else None
+    env = VectorEnv(world, n, autoreset_mode="NextStep", space=space, time_limit=6, **CHANCES[chance])
+    env.reset(seed=3)
+    rng, sets = np.random.default_rng(0), expected_sets(world.length)
+    for _ in range(14):
+        x, previous, ended = env.states[:, 0], env._previous.copy(), env._ended.copy()
+        chosen = (rng.random((n, 3)) * sets[x]).argmax(axis=1)
+        executed = env.step(chosen)[4]["executed_action"]
+        assert (executed[ended] == -1).all() and sets[x, executed][~ended].all()
+        for key in zip(x[~ended], chosen[~ended], previous[~ended], executed[~ended], strict=True):
+            counts.setdefault(key[:3], np.zeros(3))[key[3]] += 1
+    assert len(counts) > 15
+    for (x, chosen, previous), seen in counts.items():
+        p = likely(sets[x], chosen, previous, **CHANCES[chance])
+        assert (np.abs(seen - seen.sum() * p) <= 5 * np.sqrt(seen.sum() * p * (1 - p)) + 1e-9).all()
+
+
+@pytest.mark.parametrize("chance", CHANCES)
+def test_one_environment_and_many_draw_the_same_within_the_sets(chance):
+    one = GymEnv(Slippery(), **CHANCES[chance])
+    many = VectorEnv(Slippery(), 1, autoreset_mode="Disabled", **CHANCES[chance])
+    rng = np.random.default_rng(1)
+    info, _ = one.reset(seed=5)[1], many.reset(seed=[5])
+    for _ in range(20):
+        action = int(rng.choice(np.flatnonzero(info["action_mask"])))
+        *_, done, cut, info = one.step(action)
+        others = many.step(np.array([action]))[4]
+        assert info["executed_action"] == others["executed_action"][0]
+        assert info["state"].tolist() == others["state"][0].tolist()
+        if done or cut:
+            return
+
+
+def test_a_choice_that_is_not_available_acts_as_the_first_one_that_is_before_chance():
+    env = GymEnv(Corridor(), sticky=0.01)
+    env.reset(seed=0)
+    assert env.step(0)[4]["executed_action"] == 1  # open, which is not there
 
 
 def test_a_state_without_actions_is_refused():
@@ -185,11 +234,12 @@ def test_tables_and_drn_have_the_choices_that_there_are(tmp_path):
 
 
 @pytest.mark.long
-def test_q_learning_and_the_batched_engine_learn_within_the_sets(tmp_path):
+@pytest.mark.parametrize("chance", ["none", *CHANCES])
+def test_q_learning_and_the_batched_engine_learn_within_the_sets(chance, tmp_path):
     world = importers.environment(tree())
     for agent, options in (("q_learning", {}), ("dqn", {"engine": "batched"}), ("ppo", {"engine": "batched"})):
         out = tmp_path / agent
-        result = pharos.train(agent, world, steps=2048, out=out, **options)
+        result = pharos.train(agent, world, steps=2048, out=out, **options, **CHANCES.get(chance, {}))
         values = [row["value"] for row in result.curve]
         assert np.isfinite(values).all()
         loaded, policy = training.load_agent(out)

@@ -19,7 +19,7 @@ try:
 except ImportError:
     models = None
 
-storm = importlib.import_module("pharos.importers.files")
+storm = importlib.import_module("pharos.importers.models")
 needs_storm = pytest.mark.skipif(models is None, reason="stormpy is not installed")
 
 
@@ -46,6 +46,29 @@ class Rows:
         return [*self.first[1:], len(self.rows)][state]
 
 
+class Valuations:
+    """Values of variables as stormpy shows them; `late` has none in state 0."""
+
+    def __init__(self, columns):
+        self.columns = columns
+
+    def get_all_variables(self):
+        kinds = {name: isinstance(column[0], bool) for name, column in self.columns.items()}
+        return [
+            SimpleNamespace(name=name, index=-i, has_boolean_type=lambda b=b: b, has_integer_type=lambda b=b: not b)
+            for i, (name, b) in enumerate([*kinds.items(), ("late", False)])
+        ]
+
+    def entity_has_variable(self, state, variable):
+        return variable.name != "late" or state > 0
+
+    def get_value(self, state, variable):
+        return self.columns[variable.name][state]
+
+    def get_int64_values(self, variable):
+        return self.columns[variable.name]
+
+
 def bet(rewards):
     """A model as stormpy gives it. State 0 bets, once carefully and once boldly, state 1 has won, state 2 lost and only
     waits for one of the others."""
@@ -59,6 +82,10 @@ def bet(rewards):
     )
     labels = {"won": [1], "init": [0]}
     return SimpleNamespace(
+        has_state_valuations=lambda: True,
+        state_valuations=Valuations({"money": [1, 2, 0], "open": [True, False, True], "_loc_m": [0, 0, 0]}),
+        has_choice_labeling=lambda: True,
+        choice_labeling=SimpleNamespace(get_labels_of_choice=[{"careful"}, {"bold"}, set(), {"wait"}].__getitem__),
         nr_states=3,
         initial_states=[0],
         labeling=SimpleNamespace(get_labels=lambda: set(labels), get_states=labels.__getitem__),
@@ -68,7 +95,31 @@ def bet(rewards):
 
 
 def built(monkeypatch, rewards=()):
-    monkeypatch.setattr(storm, "_model", lambda *_: (bet(rewards), ""))
+    monkeypatch.setattr(storm, "_model", lambda *_: storm.Built(bet(rewards), "", None))
+
+
+def test_labels_variables_and_names_of_choices_are_kept(monkeypatch, tmp_path):
+    built(monkeypatch)
+    done = run("import", "prism", "bet.nm", "--target", "won", "--out", tmp_path / "bet")
+    assert (done.exit_code, done.stderr) == (0, "")
+    mdp = importers.load(tmp_path / "bet")
+    names = mdp.names
+    assert {name: mask.tolist() for name, mask in names.labels.items()} == {
+        "init": [True, False, False],
+        "won": [False, True, False],
+    }
+    # in the order of Storm's numbers; without what has no value in some state, and places of which there is one
+    assert {name: column.tolist() for name, column in names.variables.items()} == {
+        "open": [True, False, True],
+        "money": [1, 2, 0],
+    }
+    assert (names.state(0), names.labels_of(1)) == ("open=true money=1", ["won"])
+    assert [names.action(s, a) for s, a in ((0, 0), (0, 1), (1, 0), (2, 0))] == ["careful", "bold", "0", "wait"]
+    for target, states in (("won", [1]), ("money>=1 & !won", [0]), ('!"won" & open', [0, 2])):
+        assert np.flatnonzero(pharos.reach(mdp, target).target).tolist() == states
+    answer = json.loads(run("solve", tmp_path / "bet", "--gamma", "0.5", "--print-policy", "--json").stdout)
+    row = {"state": 0, "variables": {"open": True, "money": 1}, "labels": ["init"], "action": 1, "name": "bold"}
+    assert (answer["policy_rows"], answer["policy_left_out"]) == ([row], 0)  # which never gets to state 2
 
 
 def law(outcomes, row):
@@ -106,7 +157,7 @@ def test_reaching_a_target_pays_one_when_it_is_reached(monkeypatch):
 def test_where_no_transition_pays_otherwise_the_mdp_says_it_all(monkeypatch):
     model = bet(["money"])
     model.reward_models["money"].has_transition_rewards = False
-    monkeypatch.setattr(storm, "_model", lambda *_: (model, ""))
+    monkeypatch.setattr(storm, "_model", lambda *_: storm.Built(model, "", None))
     mdp, outcomes = importers.storm_recording("bet.nm", target="won", reward="money")
     assert outcomes is None
     assert mdp.rewards.tolist() == [[-1.0, -0.5], [0.0, 0.0], [-2.0, -2.0]]

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 import pharos
 from pharos import hardness
-from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP
+from pharos.errors import DivergenceError, ParameterError
+from pharos.mdp import TabularMDP, end_components
 from pharos.solvers import evaluate_policy, uniform_policy, uniform_value, worst_value
 from refusals import refusal
 from strategies import examples
@@ -280,8 +280,59 @@ def test_total_rewards_choose_what_is_available(world, random):
     assert np.array_equal(lake.least_cost.lower, other.least_cost.lower)
 
 
-def test_total_rewards_of_sticky_actions_with_sets_are_refused():
-    sets = np.array([[True, False], [True, True]])
-    mdp = TabularMDP.from_arrays([[1, -1], [-1, 0]], -np.ones((2, 2)), gamma=1.0, available=sets)
-    with pytest.raises(ParameterError, match="sticky actions, which gamma 1 without a horizon needs: in 1 of 2 states"):
-        pharos.value_iteration(pharos.sticky_actions(mdp, 0.3))
+# Until the end --------------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def worlds_that_may_end(draw):
+    """As `worlds`, with rewards of which many are 0, and rows that may end."""
+    P, _, sets = draw(worlds())
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    P[rng.random((STATES, ACTIONS)) < 0.3] *= 0.5
+    return P, rng.choice([-1.0, -0.5, 0.0, 0.0, 0.0, 0.25], size=(STATES, ACTIONS)), sets
+
+
+def written_out(world, sticky, random):
+    """The MDP without chance of acting whose states are the nodes (s, b)."""
+    P, R, sets = world
+    nodes = STATES * ACTIONS
+    matrix, rewards = np.zeros((nodes, ACTIONS, nodes)), np.full((nodes, ACTIONS), -np.inf)
+    for s, b in np.ndindex(STATES, ACTIONS):
+        for c in available(sets, s):
+            rewards[s * ACTIONS + b, c] = 0.0
+            for a, p in executed(sets, s, b, c, sticky, random).items():
+                rewards[s * ACTIONS + b, c] += p * R[s, a]
+                matrix[s * ACTIONS + b, c, a:nodes:ACTIONS] += p * P[s, a]
+    return TabularMDP.from_matrices(matrix, rewards, gamma=1.0, axes="SAS", ends=True)
+
+
+def outcome_of(solve, mdp):
+    try:
+        return solve(mdp)
+    except DivergenceError:
+        return None
+
+
+@pytest.mark.long
+@examples(150, worlds_that_may_end(), st.sampled_from([(0.25, 0.0), (0.25, 0.5), (1.0, 0.0), (0.0, 0.5)]))
+def test_total_rewards_under_chance_are_those_of_the_nodes_written_out(world, chance):
+    P, R, sets = world
+    mdp = TabularMDP.from_matrices(P, np.where(sets, R, -np.inf), gamma=1.0, axes="SAS", ends=True)
+    mdp = pharos.sticky_actions(mdp, chance[0]) if chance[0] else mdp
+    mdp = pharos.random_actions(mdp, chance[1]) if chance[1] else mdp
+    nodes = written_out(world, *chance)
+    parts, expected = end_components(mdp), end_components(nodes)
+    if mdp.is_sticky:
+        labels, others = parts.labels.ravel(), expected.labels
+        assert ((labels < 0) == (others < 0)).all()
+        assert ((labels[:, None] == labels) == (others[:, None] == others)).all()
+    for solve in (pharos.value_iteration, worst_value, uniform_value):
+        if solve is uniform_value and (mdp.is_sticky or mdp.is_random):
+            continue  # uniform play replaces what sticks, too
+        solution, truth = outcome_of(solve, mdp), outcome_of(solve, nodes)
+        assert (solution is None) == (truth is None)
+        if truth is not None:
+            v = solution.v if mdp.is_sticky else np.repeat(solution.v, ACTIONS)
+            error = solution.error_bound + truth.error_bound + 1e-12
+            np.testing.assert_allclose(np.ravel(v), truth.v, rtol=0, atol=error)
+            assert sets[np.arange(STATES), solution.policy.T].all()

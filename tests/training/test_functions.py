@@ -7,6 +7,7 @@ import pytest
 
 from batched_runs import Killed
 from command_line import answer, usage_error
+from command_line import run as command
 from pharos import study
 from pharos.errors import ParameterError, UnknownName, UntrustedCode
 from pharos.system import sources
@@ -102,6 +103,31 @@ def test_a_run_has_the_curve_that_the_same_function_has_in_the_benchmark(mine, t
 
 def pharos_json(result):
     return {name: None if value != value else value for name, value in result.items()}
+
+
+def test_what_looks_like_a_mistake_is_a_note_of_the_run_and_of_the_summary(mine):
+    def careless(env, steps, seed):
+        env.reset()
+        for _ in range(steps // 3):
+            env.step(1)  # and no reset
+        yield lambda seen: np.zeros(len(seen), int)
+
+    run = train(careless, GRID, steps=300, evaluation_interval=100, out="run")
+    assert list(run.notes) == ["steps after an end", "few steps"]
+    assert (
+        read_record("run")["notes"]
+        == run.notes
+        == train(careless, GRID, steps=300, evaluation_interval=100, out="run").notes
+    )
+    file = Path("mine.py")
+    file.write_text(file.read_text().replace("if step % 50 == 49:", "if False:"))
+    said = answer("train", GRID, "--agent", mine, "--steps", "300", "--observation", "one_hot")
+    assert (
+        said["notes"] == {"no policy": said["notes"]["no policy"]} and "yielded no policy" in said["notes"]["no policy"]
+    )
+    words = ("train", GRID, "--agent", mine, "--steps", "300", "--observation", "one_hot", "--seeds", "0:2")
+    assert list(answer(*words)["notes"]["no policy"]) == ["seed 0", "seed 1"]
+    assert "seed 0 and 1 more: yielded no policy" in " ".join(command(*words).stdout.split())
 
 
 def test_it_learns_and_is_loaded_again_where_it_is_trusted(mine):
@@ -249,7 +275,7 @@ def test_processes_that_are_killed_are_begun_again_and_only_a_run_that_always_di
     configs = [RunConfig.of_task(task, "killed.py:learn", steps=20, seed=seed) for seed in range(3)]
     dead, *others = train_configs(configs, [Path(f"{seed}") for seed in range(3)], workers=2)
     assert isinstance(dead, FailedRun)
-    assert dead.error == "its process ended by signal 9, 3 times; was there memory enough?" == read_record("0")["error"]
+    assert dead.error == "its process ended by SIGKILL, 3 times; was there memory enough?" == read_record("0")["error"]
     assert [end.result["counted_steps"] for end in others] == [20, 20]
 
 

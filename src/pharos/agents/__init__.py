@@ -22,7 +22,17 @@ from pharos.agents.idealised import (
     Idealised,
     curve_points,
 )
-from pharos.agents.own import CLASS, COMPILED, GENERATOR, agent_name, agent_source, form_of, generator_of, register_form
+from pharos.agents.own import (
+    CLASS,
+    COMPILED,
+    GENERATOR,
+    agent_name,
+    agent_source,
+    check_keywords,
+    form_of,
+    generator_of,
+    register_form,
+)
 from pharos.agents.q_learning import QLearning
 from pharos.agents.registry import agent_called, primary_predictors
 from pharos.agents.sb3 import (

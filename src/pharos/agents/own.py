@@ -148,7 +148,7 @@ class OwnAgent(DeepAgent):
         form = form_of(self.name, run.algorithm)
         if form == CLASS:
             return super().prepare(run, device, is_single=is_single)
-        _check_keywords(self.name, run.algorithm, run.hyperparameters)
+        check_keywords(self.name, run.algorithm, run.hyperparameters)
         if form == GENERATOR or is_single:
             return None
         return form, json.dumps({**run.config.to_dict(), "seed": None}, sort_keys=True)
@@ -175,7 +175,7 @@ class OwnAgent(DeepAgent):
         return read_policy_table(folder)
 
 
-def _check_keywords(name: str, code: Any, hyperparameters: Mapping[str, Any]) -> None:
+def check_keywords(name: str, code: Any, hyperparameters: Mapping[str, Any]) -> None:
     """Raise UnknownName or ParameterError for hyperparameters that are no keywords of the function."""
     parameters = inspect.signature(code).parameters.values()
     if any(each.kind is each.VAR_KEYWORD for each in parameters):

@@ -12,16 +12,15 @@
 import contextlib
 import hashlib
 import inspect
-import math
 import os
 import random
-import signal
 import sys
 import time
 import traceback
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -34,6 +33,7 @@ from pharos.agents import (
     agent_called,
     agents,
     check_hyperparameters,
+    check_keywords,
     form_of,
     generator_of,
     is_known,
@@ -41,10 +41,11 @@ from pharos.agents import (
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
 from pharos.system.sources import Source, find, is_reference, load, source_of
-from pharos.system.wording import capped, in_one_line, pluralize
-from pharos.system.workers import SERVER_LOST, Terminated, Workers, begin_group, end_group, one_thread
+from pharos.system.wording import capped, in_one_line
+from pharos.system.workers import Terminated, Workers
 from pharos.training import (
     Curve,
+    Execution,
     FailedRun,
     Learn,
     LearnCompiled,
@@ -53,6 +54,7 @@ from pharos.training import (
     Shapes,
     Task,
     TaskCache,
+    Work,
     check_agent_files,
     clear_run,
     compiled_curves,
@@ -72,13 +74,13 @@ from pharos.training import (
 EXACT = ("oracle", "random")
 WARM = ("torch", "stable_baselines3")
 """Libraries that take long to load: the process that runs are forked from has them if the agent has."""
-POLL_SECONDS = 1.0
 LINGER_SECONDS = 10.0  # that a process may take to end when its run has
-LOST_SERVERS = 3  # in a row
 LONGEST = 500  # letters of an agent's error
 
 Tell = Callable[[float, str], None]
 """tell(share of the steps that are done, text)."""
+Send = Callable[[tuple[Path, str | OSError | None]], None]
+"""send((folder of a run that has ended, None, an error message, or the OSError of writing))."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,27 @@ class Job:
     task: BenchmarkTask
     seed: int
     folder: Path
+
+    @property
+    def id(self) -> str:
+        """Its task and seed, in words."""
+        return f"{self.task.name}, seed {self.seed}"
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What counts of a finished run.
+
+    Attributes:
+        curve: (evaluations,) normalised regret. exact: whether all of it is.
+        steps: of the environment, as it counted them, else those of the protocol.
+        notes: sentences on what looks like a mistake, by kind.
+    """
+
+    curve: np.ndarray
+    exact: bool
+    steps: int
+    notes: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -135,18 +158,8 @@ class Form:
         """Train all runs. Each leaves a finished run.json and a curve in its folder, or a run.json with its error."""
         raise NotImplementedError
 
-    def steps_used(self, job: Job, protocol: Protocol) -> int:
-        """Environment steps of a finished run: as the environment counted them, else those of the protocol."""
-        counted = read_record(job.folder)["result"].get("counted_steps")
-        return protocol.steps if counted is None else int(counted)
-
-    def notes(self, job: Job) -> dict[str, str]:
-        """Sentences on what looks like a mistake in a finished run, by kind."""
-        notes = read_record(job.folder).get("notes")
-        return {str(kind): str(text) for kind, text in notes.items()} if isinstance(notes, Mapping) else {}
-
-    def curve(self, job: Job, protocol: Protocol) -> tuple[np.ndarray, bool]:
-        """(evaluations,) normalised regret, and whether all of it is exact.
+    def result(self, job: Job, protocol: Protocol) -> RunResult:
+        """The result of a finished run.
 
         Raises:
             PharosError: the run has not finished; why not. ResultCorrupted: a file of it was changed since.
@@ -157,9 +170,14 @@ class Form:
             raise PharosError(error or "its process ended without a result; the same command goes on")
         check_agent_files(job.folder)
         rows = {row["step"]: row for row in read_rows(job.folder)}
-        points = [protocol.evaluation_interval * (i + 1) for i in range(protocol.evaluations)]
-        exact = all(rows[point]["exact"] for point in points)
-        return np.array([rows[point]["normalized_regret"] for point in points]), exact
+        rows_at = [rows[protocol.evaluation_interval * (i + 1)] for i in range(protocol.evaluations)]
+        counted, notes = record["result"].get("counted_steps"), record.get("notes")
+        return RunResult(
+            np.array([row["normalized_regret"] for row in rows_at]),
+            all(row["exact"] for row in rows_at),
+            protocol.steps if counted is None else int(counted),
+            {str(kind): str(text) for kind, text in notes.items()} if isinstance(notes, Mapping) else {},
+        )
 
 
 def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: Mapping[str, Any] | None = None) -> Form:
@@ -222,7 +240,7 @@ class TrainedForm(Form):
 
         if alone := [job for job, apart in zip(jobs, is_apart, strict=True) if apart]:
             arguments = {job.folder: (self.label, configs[job.folder].to_dict(), settings.checkpoints) for job in alone}
-            run_apart(self, alone, _train_alone, arguments, fail, settings)
+            Apart(self, [[job] for job in alone], _train_alone, arguments, fail, settings).execute()
 
     def _train_batched(self, jobs: Sequence[Job], configs: Sequence[RunConfig], settings: RunSettings) -> None:
         """Train runs of the batched engine and tables, by lanes; they are of pharos' own code."""
@@ -251,26 +269,24 @@ class TrainedForm(Form):
         )
 
 
-def _train_alone(
-    label: str, entry: dict[str, Any], checkpoints: Path, job: Job, send: Callable[[str | OSError | None], None]
-) -> None:
-    """The body of a process: one run of an algorithm of Stable-Baselines3, as the body of `run_apart`."""
-    begin_group()
+def _train_alone(label: str, entry: dict[str, Any], checkpoints: Path, jobs: Sequence[Job], send: Send) -> None:
+    """The body of a process: one run of an algorithm of Stable-Baselines3."""
     os.dup2(2, 1)
+    (job,) = jobs
     _seed(job.seed)
     config = RunConfig.from_dict(entry)
     try:
         tasks = TaskCache(trust=True)  # the user has named the code
         (end,) = train_configs([config], [job.folder], checkpoints=checkpoints, tasks=tasks)
-        send(end.error if isinstance(end, FailedRun) else None)
+        send((job.folder, end.error if isinstance(end, FailedRun) else None))
     except Terminated:
         raise
     except OSError as error:
-        send(error)
+        send((job.folder, error))
     except BaseException as error:
         message = failure(label, job, error, config.sources["agent"].file if "agent" in config.sources else None)
         _write_failure(config, job, message)
-        send(message)
+        send((job.folder, message))
 
 
 def _write_failure(config: RunConfig, job: Job, message: str) -> None:
@@ -279,7 +295,7 @@ def _write_failure(config: RunConfig, job: Job, message: str) -> None:
     write_record(job.folder, record)
 
 
-# Generators -----------------------------------------------------------------------------------------------------------
+# Functions ------------------------------------------------------------------------------------------------------------
 
 
 def _function(code: Callable[..., Any], source: Source | None, setting: Mapping[str, Any]) -> Form:
@@ -287,13 +303,9 @@ def _function(code: Callable[..., Any], source: Source | None, setting: Mapping[
     form = form_of(name, code)
     if form == CLASS:
         raise ParameterError(f"agent {name!r} is a class itself; expected its name, such as mine.py:{code.__name__}")
-    if setting:
-        raise ParameterError(
-            f"agent {name!r} is a function, which has its hyperparameters in its code; found {', '.join(setting)}"
-        )
+    check_keywords(name, code, setting)
     checksum = sha256(source.file) if source is not None else _text_checksum(code)
-    kind = CompiledForm if form == COMPILED else GeneratedForm
-    return kind(name, form, source=source, checksum=checksum, learn=code)
+    return FunctionForm(name, form, setting, source, checksum, learn=code)
 
 
 def _text_checksum(code: Callable[..., Any]) -> str:
@@ -303,27 +315,35 @@ def _text_checksum(code: Callable[..., Any]) -> str:
 
 
 @dataclass(frozen=True)
-class GeneratedForm(Form):
-    """A generator; each run has a process of its own with one thread.
+class FunctionForm(Form):
+    """A function. Each run of a generator has a process of its own with one thread.
+
+    A function of JAX is one program for all seeds of a task, which runs again if the result of a seed is missing. Each
+    program has a process of its own, one after another: it uses all processors, or most of a GPU's memory.
 
     Attributes:
-        learn: the function.
+        learn: the function; sent by value if it has no source.
     """
 
-    learn: Learn | None = None
+    learn: Learn | LearnCompiled | None = None
 
     def train(self, jobs: Sequence[Job], protocol: Protocol, settings: RunSettings) -> None:
         code = self.source or _by_value(self.learn, self.label)
+        groups, body = [[job] for job in jobs], _generate
+        if self.kind == COMPILED:
+            programs: dict[str, list[Job]] = defaultdict(list)
+            for job in jobs:
+                programs[job.task.name].append(job)
+            groups, body, settings = list(programs.values()), _compile, replace(settings, workers=1)
 
         def fail(job: Job, reason: str) -> None:
             record_run(self.label, job, protocol, reason)
 
-        with one_thread():
-            arguments = dict.fromkeys((job.folder for job in jobs), (code, self.label, protocol))
-            run_apart(self, jobs, _generate, arguments, fail, settings)
+        arguments = dict.fromkeys((job.folder for job in jobs), (code, self.label, protocol, self.hyperparameters))
+        Apart(self, groups, body, arguments, fail, settings).execute()
 
 
-def _by_value(learn: Learn | None, label: str) -> bytes:
+def _by_value(learn: Learn | LearnCompiled | None, label: str) -> bytes:
     """A function that no other process can import, of a notebook or within another one, with what it needs."""
     import cloudpickle  # which Gymnasium needs; this process sends it to its own processes
 
@@ -337,24 +357,25 @@ def _by_value(learn: Learn | None, label: str) -> bytes:
 
 
 def _generate(
-    code: Source | bytes, label: str, protocol: Protocol, job: Job, send: Callable[[str | OSError | None], None]
+    code: Source | bytes,
+    label: str,
+    protocol: Protocol,
+    hyperparameters: Mapping[str, Any],
+    jobs: Sequence[Job],
+    send: Send,
 ) -> None:
-    """The body of a process: one run. It writes the run's folder, and sends None or an error message.
+    """The body of a process: one run of a generator.
 
     Its standard output goes to standard error. Whatever draws from the global random numbers of Python, NumPy or
     PyTorch draws others in each run.
     """
-    begin_group()
     os.dup2(2, 1)
-    process = os.getpid()
+    (job,), process = jobs, os.getpid()
 
     def end(result: Curve | BaseException, notes: Mapping[str, str], file: str | None = None) -> None:
         if os.getpid() != process:  # a fork that the agent has made, and that has come back
             os._exit(1)
-        try:
-            send(record_run(label, job, protocol, result, notes, file))
-        except OSError as error:
-            send(error)
+        _send_end(send, label, job, protocol, result, notes, file)
 
     def give_up() -> NoReturn:
         """End an agent that goes on and on after its budget, with the policies that it has."""
@@ -372,9 +393,9 @@ def _generate(
         file = file or getattr(getattr(learn, "__code__", None), "co_filename", None)
         _seed(job.seed)
         task = job.task.training_task(protocol)
-        recorder = PolicyRecorder(task, steps=protocol.steps, evaluations=protocol.evaluations, seed=job.seed)
+        recorder = PolicyRecorder(task, steps=protocol.steps, interval=protocol.evaluation_interval, seed=job.seed)
         recorder.budget.give_up = give_up
-        generate(learn, recorder, job.seed)
+        generate(partial(learn, **hyperparameters), recorder, job.seed)
         result, notes = recorder.curve(), recorder.notes()
     except Terminated:
         raise
@@ -383,7 +404,39 @@ def _generate(
     end(result, notes, file)
 
 
-def _loaded(code: Source | bytes) -> Learn:
+def _compile(
+    code: Source | bytes,
+    label: str,
+    protocol: Protocol,
+    hyperparameters: Mapping[str, Any],
+    jobs: Sequence[Job],
+    send: Send,
+) -> None:
+    """The body of a process: all seeds of a task with a function of JAX."""
+    os.dup2(2, 1)
+    file = code.file if isinstance(code, Source) else None
+    ends: Sequence[Curve | BaseException]
+    try:
+        learn, task = partial(_loaded(code), **hyperparameters), jobs[0].task.training_task(protocol)
+        seeds = [job.seed for job in jobs]
+        ends = compiled_curves(learn, task, steps=protocol.steps, evaluations=protocol.evaluations, seeds=seeds)
+    except Terminated:
+        raise
+    except BaseException as error:
+        ends = [error] * len(jobs)
+    for job, end in zip(jobs, ends, strict=True):
+        _send_end(send, label, job, protocol, end, {}, file)
+
+
+def _send_end(send: Send, label: str, job: Job, *ended: Any) -> None:
+    """Write the folder of a run as `record_run`, and send what became of it."""
+    try:
+        send((job.folder, record_run(label, job, *ended)))
+    except OSError as error:
+        send((job.folder, error))
+
+
+def _loaded(code: Source | bytes) -> Any:
     if isinstance(code, Source):
         sys.path.append(str(Path(code.file).parent))  # for imports within functions, and files of Numba's cache
         return load(code)
@@ -446,7 +499,7 @@ def failure(label: str, job: Job, end: BaseException | str, file: str | None = N
     """The message of a run that has failed: its agent, task and seed, the error, and the line of the agent's file."""
     text, place = (end, "") if isinstance(end, str) else (in_one_line(end), line_in(end, file))
     printable = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in capped(text, LONGEST))
-    return f"{label} on {job.task.name}, seed {job.seed}: {printable.rstrip(': ')}{place}"
+    return f"{label} on {job.id}: {printable.rstrip(': ')}{place}"
 
 
 def line_in(error: BaseException, file: str | None) -> str:
@@ -458,140 +511,77 @@ def line_in(error: BaseException, file: str | None) -> str:
 # Processes ------------------------------------------------------------------------------------------------------------
 
 
-def run_apart(
-    form: Form,
-    jobs: Sequence[Job],
-    body: Callable[..., None],
-    arguments: Mapping[Path, Sequence[Any]],
-    fail: Callable[[Job, str], object],
-    settings: RunSettings,
-) -> None:
-    """Run each job that is not finished in a process of its own, forked from one that has loaded what runs need.
+class Apart(Execution[Job]):
+    """Execution of runs that are not finished: each group in a process of its own, forked from one that has loaded
+    what runs need.
 
     So nothing of one run, neither of its modules nor of its threads, reaches another one, and a process that dies costs
-    its own run, whose run.json says why. Processes that an agent leaves behind end with its run.
+    its own runs, whose run.json says why. Processes that an agent leaves behind end with its run.
 
     Args:
         form: whose jobs they are; it keeps errors of runs that could not write their own.
-        body: function(*arguments[job.folder], job, send), which writes the folder of a run and sends None, an error
-            message, or the OSError of writing.
+        groups: of jobs; those of a group that are finished run again if one is not.
+        body: function(*arguments[folder of the first job], jobs, send), which writes the folders of all runs and sends
+            for each (its folder, None, an error message, or the OSError of writing).
         fail: fail(job, reason) writes the folder of a run whose process could not.
     """
-    left = deque(job for job in jobs if not is_finished(job))
-    total, failed, lost = len(left), 0, 0
-    running: dict[str, tuple[Job, float]] = {}  # with the time at which it is killed
-    groups: dict[str, int | None] = {}
-    sent: set[str] = set()  # keys of runs that have ended, before their processes have
 
-    def report_progress() -> None:
-        ended = total - len(left) - len(running) + len(sent)
-        text = f"{len(jobs) - total + ended - failed} of {len(jobs)} runs{f', {failed} failed' * (failed > 0)}"
-        settings.tell((len(jobs) - total + ended) / len(jobs), text)
+    is_divisible = False
 
-    report_progress()
-    preload = [*(name for name in WARM if name in sys.modules), "pharos.benchmark.warm"]
-    with contextlib.ExitStack() as ends, Workers(*preload) as pool:
-        ends.callback(_end_groups, groups)
-        while left or pool:
-            while left and len(pool) < settings.workers:
-                job = left.popleft()
-                key = str(job.folder)
-                try:
-                    pool.start(key, body, (*arguments[job.folder], job))
-                except (EOFError, ConnectionError) as error:  # the process that forks is gone; another one begins
-                    lost = _server_lost(lost, error)
-                    left.appendleft(job)
-                    continue
-                running[key] = job, time.monotonic() + (settings.timeout or math.inf)
-                groups[key] = pool.pid(key)
-            for key, event in pool.events(POLL_SECONDS):
-                job, latest = running[key]
-                if event is None or isinstance(event, str | OSError):  # the run has ended
-                    sent.add(key)
-                    running[key] = job, time.monotonic() + LINGER_SECONDS
-                    failed += event is not None
-                    if isinstance(event, OSError):
-                        form.errors[job.folder] = f"{event.strerror or event}; the same command goes on"
-                    continue
-                del running[key]
-                end_group(groups.pop(key))  # processes that the agent has left behind
-                if key in sent:
-                    sent.remove(key)
-                    lost = 0
-                elif event == SERVER_LOST and lost < LOST_SERVERS:
-                    lost += 1
-                    left.append(job)
-                else:
-                    failed += 1
-                    try:
-                        fail(job, _how_it_ended(event, latest, settings.timeout))
-                    except OSError as error:
-                        form.errors[job.folder] = f"{error.strerror or error}; the same command goes on"
-            for key, (_, latest) in running.items():
-                if time.monotonic() > latest:
-                    pool.kill(key)
-            report_progress()
+    def __init__(
+        self,
+        form: Form,
+        groups: Sequence[Sequence[Job]],
+        body: Callable[..., None],
+        arguments: Mapping[Path, Sequence[Any]],
+        fail: Callable[[Job, str], object],
+        settings: RunSettings,
+    ):
+        self.form, self.body, self.arguments, self.on_failure, self.tell = form, body, arguments, fail, settings.tell
+        self.total = sum(len(group) for group in groups)
+        groups = [group for group in groups if not all(map(is_finished, group))]
+        self.left = sum(len(group) for group in groups)
+        self.failed: dict[Path, bool] = {}  # of runs that have ended
+        self.sent: dict[str, float] = {}  # when the runs of a process have ended
+        preload = [*(name for name in WARM if name in sys.modules), "pharos.benchmark.warm"]
+        pool = Workers(*preload, groups=True)
+        super().__init__(groups, pool, workers=settings.workers, checkpoints=None, timeout=settings.timeout, attempts=1)
 
+    def execute(self) -> None:
+        super().execute()
+        self.look()
 
-def _end_groups(groups: Mapping[str, int | None]) -> None:
-    for leader in groups.values():
-        end_group(leader)
+    def work(self, group: Sequence[Job]) -> Work:
+        return self.body, (*self.arguments[group[0].folder], group), ()
 
+    def is_over(self, run: Job, *, ended: bool = False) -> bool:
+        return run.folder in self.failed
 
-def _server_lost(lost: int, error: Exception) -> int:
-    if lost >= LOST_SERVERS:
-        raise PharosError(
-            f"the process that starts runs died {pluralize(lost + 1, 'time')} in a row ({in_one_line(error)}); was "
-            f"there memory enough?"
-        ) from error
-    return lost + 1
+    def receive(self, key: str, message: tuple[Any, ...]) -> None:
+        folder, error = message
+        self.failed[folder] = error is not None
+        self.sent[key] = time.monotonic()
+        if isinstance(error, OSError):
+            self.form.errors[folder] = f"{error.strerror or error}; the same command goes on"
 
+    def fail(self, run: Job, reason: str) -> None:
+        self.failed[run.folder] = True
+        try:
+            self.on_failure(run, reason)
+        except OSError as error:
+            self.form.errors[run.folder] = f"{error.strerror or error}; the same command goes on"
 
-def _how_it_ended(code: int, latest: float, timeout: float | None) -> str:
-    if code == -signal.SIGKILL and time.monotonic() > latest:
-        return f"took longer than {timeout:g} s; it was ended: raise --timeout, or look for a loop without an end"
-    name = signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
-    advice = "; was there memory enough?" if code == -signal.SIGKILL else "; look at what it wrote to standard error"
-    return f"its process ended {f'by {name}' if code < 0 else f'with exit code {code}'}{advice}"
+    def look(self) -> None:
+        """Report, and kill processes whose runs have ended and which do not end themselves."""
+        failed, done = sum(self.failed.values()), self.total - self.left + len(self.failed)
+        self.tell(done / self.total, f"{done - failed} of {self.total} runs{f', {failed} failed' * (failed > 0)}")
+        for key in self.running.keys() & self.sent.keys():
+            if time.monotonic() - self.sent[key] > LINGER_SECONDS and self.pool is not None:
+                self.pool.kill(key)
 
 
 def is_finished(job: Job) -> bool:
     return (job.folder / "run.json").exists() and read_record(job.folder).get("status") == "finished"
-
-
-# JAX ------------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class CompiledForm(Form):
-    """A function of JAX: one program for all seeds of a task; it runs again if the result of a seed is missing.
-
-    Attributes:
-        learn: the function.
-    """
-
-    learn: LearnCompiled | None = None
-
-    def train(self, jobs: Sequence[Job], protocol: Protocol, settings: RunSettings) -> None:
-        assert self.learn is not None
-        groups: dict[str, list[Job]] = defaultdict(list)
-        for job in jobs:
-            groups[job.task.name].append(job)
-        for number, group in enumerate(groups.values()):
-            settings.tell(number / len(groups), f"{number} of {len(groups)} tasks")
-            if all(is_finished(job) for job in group):
-                continue
-            task, seeds = group[0].task.training_task(protocol), [job.seed for job in group]
-            ends: Sequence[Curve | Exception]
-            try:
-                ends = compiled_curves(
-                    self.learn, task, steps=protocol.steps, evaluations=protocol.evaluations, seeds=seeds
-                )
-            except Exception as error:
-                ends = [error] * len(group)
-            for job, end in zip(group, ends, strict=True):
-                record_run(self.label, job, protocol, end)
-        settings.tell(1.0, f"{len(groups)} of {len(groups)} tasks")
 
 
 # Exact ----------------------------------------------------------------------------------------------------------------
@@ -606,16 +596,10 @@ class ExactForm(Form):
     def train(self, jobs: Sequence[Job], protocol: Protocol, settings: RunSettings) -> None:
         """Do nothing: there is nothing to learn."""
 
-    def steps_used(self, job: Job, protocol: Protocol) -> int:
-        return 0
-
-    def notes(self, job: Job) -> dict[str, str]:
-        return {}
-
-    def curve(self, job: Job, protocol: Protocol) -> tuple[np.ndarray, bool]:
+    def result(self, job: Job, protocol: Protocol) -> RunResult:
         if job.task.name not in self.regrets:
             self.regrets[job.task.name] = self._regret(job.task.training_task(protocol))
-        return np.full(protocol.evaluations, self.regrets[job.task.name]), True
+        return RunResult(np.full(protocol.evaluations, self.regrets[job.task.name]), True, 0)
 
     def _regret(self, task: Task) -> float:
         if self.label == "oracle":

@@ -255,8 +255,8 @@ def learning_panel(steps: int, lines: Sequence[Sequence[ConfidenceInterval]], ti
 
 
 def regret_axis(left: float, right: float, top: float, bottom: float) -> list[Element]:
-    """Lines of the oracle (below), of half and of random play (above), with their names."""
-    heights = {"oracle": bottom, "0.5": (top + bottom) / 2, "random": top}
+    """Lines of the optimal policy (below), of half and of random play (above), with their names."""
+    heights = {"optimal": bottom, "0.5": (top + bottom) / 2, "random": top}
     shapes = [line(left, y, right, y, "grid" if name == "0.5" else "edge") for name, y in heights.items()]
     return shapes + [label(left - 5, y + 4, name, "end", "faint") for name, y in heights.items()]
 

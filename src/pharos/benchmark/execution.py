@@ -207,17 +207,17 @@ def collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any],
     notes: dict[str, dict[str, str]] = {}
     seeds, steps = tuple(dict.fromkeys(job.seed for job in jobs)), 0
     for job in jobs:
-        task, which = job.task.name, f"{job.task.name}, seed {job.seed}"
+        task, which = job.task.name, job.id
         try:
-            curve, is_exact = form.curve(job, suite.protocol)
+            result = form.result(job, suite.protocol)
         except PharosError as error:
             missing[which] = in_one_line(error)
             continue
-        steps += form.steps_used(job, suite.protocol)
-        for kind, text in form.notes(job).items():
+        steps += result.steps
+        for kind, text in result.notes.items():
             notes.setdefault(kind, {})[which] = text
-        curves.setdefault(task, []).append(curve)
-        exact[task] = exact.get(task, True) and is_exact
+        curves.setdefault(task, []).append(result.curve)
+        exact[task] = exact.get(task, True) and result.exact
     whole = {task: np.stack(each) for task, each in curves.items() if len(each) == len(seeds)}
     if (text := equal_seeds(whole)) and form.learns:
         notes["equal seeds"] = {f"{len(whole)} tasks": text}

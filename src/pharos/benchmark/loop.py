@@ -65,7 +65,7 @@ class TaskEnv(CountedEnv):
     ):
         protocol = suite.protocol
         self._recorder = PolicyRecorder(
-            task.check(protocol), steps=protocol.steps, evaluations=protocol.evaluations, seed=seed
+            task.check(protocol), steps=protocol.steps, interval=protocol.evaluation_interval, seed=seed
         )
         super().__init__(self._recorder.task, self._recorder.budget, seed)
         self.task, self.suite, self.folder = task, suite, folder

@@ -108,7 +108,7 @@ def _lead(contents: Contents) -> list[Element]:
     core += "".join(f"; {each.name} {each.score.core.value:.2f}" for each in contents.beside if each.score.has_core)
     rest = {"Final score": own.final, "interquartile mean": own.iqm}
     parts = [*(f"{name} {number(interval)}" for name, interval in rest.items()), unclipped_regret(contents)]
-    scale = "A score is 1 for the oracle and 0 for random play. Intervals are of 95 %, over seeds."
+    scale = "A score is 1 for the optimal policy and 0 for random play. Intervals are of 95 %, over seeds."
     scores = f"{f'{core}. ' if own.axes else ''}{', '.join(filter(None, parts))}."
     lines.append(element("p", f"{scores if own.has_core else 'The core was not run.'} {scale}"))
     if own.preliminary:

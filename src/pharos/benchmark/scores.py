@@ -143,7 +143,7 @@ class BenchmarkScore:
 
 
 def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
-    """Return the scores of an agent's results on a suite; oracle scores 1 and uniform play 0.
+    """Return the scores of an agent's results on a suite; the optimal policy scores 1 and uniform play 0.
 
     Raises:
         ParameterError: the results are those of another suite.

@@ -324,6 +324,12 @@ def compiling_fact() -> list[tuple[str, str]]:
     return [("compiling", f"{seconds:.1f} s{suffix}")] if seconds >= NOTABLE_SECONDS else []
 
 
+def note_facts(notes: Mapping[str, Mapping[str, str]]) -> list[tuple[str, str]]:
+    """A fact for each kind of note, kind -> run -> sentence, with its first run and how many more have one."""
+    firsts = [(*next(iter(runs.items())), len(runs) - 1) for runs in notes.values()]
+    return [("note", f"{run}{f' and {more:,} more' * (more > 0)}: {text}") for run, text, more in firsts]
+
+
 def peak_memory_bytes() -> int:
     """Peak memory of this process so far, in bytes."""
     import resource

@@ -14,6 +14,7 @@ from pharos.cli.answers import (
     complain,
     console,
     counted_bar,
+    note_facts,
     print_facts,
     print_table,
     progress_bar,
@@ -141,10 +142,7 @@ def run(
     if outcome.scores.has_core:
         facts += [("score of the core", f"{outcome.score}{', preliminary' if outcome.scores.preliminary else ''}")]
     facts += [(f"frontier of {axis}", f"{each.frontier} {each.unit}") for axis, each in outcome.axes.items()]
-    for runs in outcome.notes.values():
-        which, text = next(iter(runs.items()))
-        facts.append(("note", f"{which}{f' and {len(runs) - 1:,} more' * (len(runs) > 1)}: {text}"))
-    facts.append(("results", out))
+    facts += [*note_facts(outcome.notes), ("results", out)]
     answer = {
         "agent": results.agent,
         "suite": results.suite,

@@ -16,6 +16,7 @@ from pharos.cli.answers import Answer, compiling_fact, describe_discount, progre
 from pharos.cli.options import (
     Building,
     Chance,
+    Count,
     Gamma,
     Horizon,
     Objective,
@@ -26,6 +27,7 @@ from pharos.cli.options import (
     file_ending,
     total_of,
 )
+from pharos.cli.policies import readable_policy, with_policy
 from pharos.errors import DivergenceError, FileFormatError, ParameterError, PrecisionError, UnknownName
 from pharos.solvers import Solving
 from pharos.system import compiling
@@ -49,22 +51,28 @@ def solve(
     solving: Annotated[Solving, "tolerance threads dtype"],
     out: Annotated[Path | None, file_ending(".npz", ".npy")] = None,
     values: Path | None = None,
+    print_policy: bool = False,
+    policy_rows: Count = 100,
 ) -> Answer | None:
     """Find the optimal values and policy, with a proven error bound. With --processes the same command resumes.
 
     Args:
-        reach: Instead of values, probabilities and costs of reaching a target: terminal, or states such as 5,7.
+        reach: Instead of values, probabilities and costs of reaching terminal, a label, an expression such as
+            'x=3 & !done', or states such as 5,7.
         out: FILE.npz for the arrays v and policy, FILE.npy for the policy alone.
         values: Folder for the values, in place of memory where that has no room; a solve that was ended goes on.
+        print_policy: Print the action of each state that the policy gets to; with --reach of the least cost, or where
+            the target may be missed, of the largest probability.
+        policy_rows: States of the policy that are printed, at most.
     """
     ranks, processes = building.ranks, building.processes
     with termination():
         mdp = target.mdp(building, gamma=gamma, horizon=horizon, chance=chance)
         mdp = total_of(mdp, gamma, horizon, objective)
     if reach is not None:
-        return reaching(target, mdp, reach, solving.tolerance, chance, out)
+        return reaching(target, mdp, reach, solving.tolerance, chance, out, policy_rows if print_policy else 0)
     if objective == "average":
-        return averaging(target, mdp, solving.tolerance, chance, out)
+        return averaging(target, mdp, solving.tolerance, chance, out, policy_rows if print_policy else 0)
     from pharos.solvers import uniform_value, value_iteration
     from pharos.system import storage
 
@@ -122,7 +130,8 @@ def solve(
         *compiling_fact(),
         *([] if out is None else [("written", out)]),
     ]
-    return Answer(answer, (target.title, facts))
+    result = Answer(answer, (target.title, facts))
+    return with_policy(result, readable_policy(mdp, solution.policy, policy_rows)) if print_policy else result
 
 
 REACHED = {
@@ -135,9 +144,15 @@ REACHED = {
 
 
 def reaching(
-    target: Target, mdp: "TabularMDP", name: str, tolerance: float, chance: "ChanceSetting", out: Path | None
+    target: Target,
+    mdp: "TabularMDP",
+    name: str,
+    tolerance: float,
+    chance: "ChanceSetting",
+    out: Path | None,
+    policy_rows: int = 0,
 ) -> Answer:
-    """The answer about reaching a target: "terminal", or states with commas between them."""
+    """The answer about reaching a target: a name or an expression, or states with commas between them."""
     import numpy as np
 
     from pharos.solvers import reach
@@ -161,7 +176,7 @@ def reaching(
             finite = [value if math.isfinite(value) else None for value in ends]
             numbers[key] = {"lower": finite[0], "upper": finite[1], "infinite": finite[0] is None}
             facts.append((words, "infinite" if math.isinf(ends[0]) else f"{(ends[0] + ends[1]) / 2:.8g}"))
-            arrays |= {f"{key}_lower": bounds.lower, f"{key}_upper": bounds.upper}
+            arrays |= {f"{key}_lower": bounds.lower, f"{key}_upper": bounds.upper, f"{key}_policy": bounds.policy}
     if out is not None:
         if out.suffix.lower() == ".npy":
             raise ParameterError(f"{out}: a target has several arrays; expected FILE.npz")
@@ -178,10 +193,23 @@ def reaching(
         "file": None if out is None else str(out),
     }
     facts += [("states of the target", f"{numbers['states']:,} of {mdp.num_states:,}")]
-    return Answer(answer, (f"reaching {name} in {target.title}", facts))
+    reply = Answer(answer, (f"reaching {name} in {target.title}", facts))
+    if not policy_rows:
+        return reply
+    cost = numbers["least_cost"]
+    best = "maximum" if cost is None or cost["infinite"] else "least_cost"
+    rows = readable_policy(result.stopped, arrays[f"{best}_policy"], policy_rows, f"policy of the {REACHED[best]}")
+    return with_policy(reply, rows)
 
 
-def averaging(target: Target, mdp: "TabularMDP", tolerance: float, chance: "ChanceSetting", out: Path | None) -> Answer:
+def averaging(
+    target: Target,
+    mdp: "TabularMDP",
+    tolerance: float,
+    chance: "ChanceSetting",
+    out: Path | None,
+    policy_rows: int,
+) -> Answer:
     """The answer about the average reward of a step in the long run."""
     import numpy as np
 
@@ -228,7 +256,8 @@ def averaging(target: Target, mdp: "TabularMDP", tolerance: float, chance: "Chan
         *compiling_fact(),
         *([] if out is None else [("written", out)]),
     ]
-    return Answer(answer, (f"long run of {target.title}", facts))
+    result = Answer(answer, (f"long run of {target.title}", facts))
+    return with_policy(result, readable_policy(mdp, best.policy, policy_rows)) if policy_rows else result
 
 
 def save(path: Path, solution: "Solution") -> None:

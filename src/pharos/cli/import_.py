@@ -4,20 +4,26 @@ pharos export: MDPs for other programs.
 """
 
 import json
-from collections.abc import Mapping
+import math
+import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pharos.cli.answers import Answer, written
 from pharos.cli.command import Commands
-from pharos.cli.options import Count, Discount, Gamma, Target, check_format
-from pharos.errors import ParameterError, UnknownName
+from pharos.cli.options import Count, Discount, Gamma, Target, Tolerance, check_format
+from pharos.errors import DivergenceError, ParameterError, PharosError, UnknownName
 from pharos.mdp import ChanceSetting
-from pharos.system.wording import pluralize
+from pharos.system.wording import capped, pluralize
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from pharos.importers import Question
     from pharos.mdp import TabularMDP
 
 app = Commands(help="Bring an MDP from elsewhere into a folder.", no_args_is_help=True)
@@ -103,29 +109,81 @@ def prism(
     out: Out,
     constants: str = "",
     reward: str | None = None,
-    target: str | None = None,
+    target: Annotated[str | None, "LABEL|EXPRESSION"] = None,
+    property: str | None = None,
     gamma: Discount = 1.0,
     horizon: Episode = None,
+    tolerance: Tolerance = 1e-6,
 ) -> Answer:
-    """Import a model in PRISM's language, in JANI or in Storm's DRN.
+    """Import a model in PRISM's language, in JANI or in Storm's DRN; with a property, answer it.
 
     Args:
         file: A model: .prism, .nm, .pm, .jani or .drn; built by Storm.
         constants: Undefined ones, such as N=3,K=2.
         reward: Reward structure; the only one when not given, without --target.
-        target: Label that ends the episode; pays 1 where there is no --reward.
+        target: Label or expression that ends the episode; pays 1 where there is no --reward.
+        property: Such as 'Pmax=? [F "goal" & !x=3]' or 'Rmin{"steps"}=? [F "goal"]', or its name in a JANI file.
         gamma: Discount of the MDP.
+        tolerance: Largest error of the answer to a property.
     """
     from pharos import importers
 
-    mdp, outcomes = importers.storm_recording(
-        file, constants=constants, reward=reward, target=target, gamma=gamma, horizon=horizon
+    mdp, outcomes, question = importers.storm_import(
+        file, constants=constants, reward=reward, target=target, property=property, gamma=gamma, horizon=horizon
     )
-    importers.save(mdp, out, source=f"Storm: {file.name} {constants}".rstrip(), outcomes=outcomes)
-    return _answer(file.name, mdp, out)
+    words = " ".join(filter(None, (file.name, constants, property)))
+    importers.save(mdp, out, source=f"Storm: {words}", outcomes=outcomes)
+    if question is None:
+        return _answer(file.name, mdp, out)
+    return _answer(file.name, mdp, out, *_answered(capped(property, 60), mdp, question, tolerance, out))
 
 
-def _answer(name: str, mdp: "TabularMDP", out: Path) -> Answer:
+def _answered(
+    name: str, mdp: "TabularMDP", question: "Question", tolerance: float, out: Path
+) -> tuple[dict[str, Any], list[tuple[str, object]]]:
+    """The proven interval of the number that a property asks for: as JSON, and as lines of a table."""
+    from pharos.solvers import reach, value_iteration, worst_value
+
+    entry: dict[str, Any] = {"text": question.text, "reach": question.reach, "answer": question.answer}
+    command = f"pharos solve {out}" + ("" if question.reach is None else f" --reach {shlex.quote(question.reach)}")
+    facts: list[tuple[str, object]] = []
+    try:
+        if question.reach is not None:
+            bounds = getattr(reach(mdp, question.reach, tolerance=tolerance), question.answer)
+            ends = bounds.lower, bounds.upper
+        else:
+            total = mdp.with_gamma(1.0).with_horizon(None)
+            solution = (worst_value if question.answer == "least_total" else value_iteration)(total, tolerance)
+            ends = solution.v - solution.error_bound, solution.v + solution.error_bound
+        lower, upper = (_at_start(mdp, each, question.of_starts) for each in ends)
+        is_infinite = math.isinf(lower)
+        entry |= {"lower": None if is_infinite else lower, "upper": None if is_infinite else upper}
+        entry |= {"infinite": is_infinite, "reason": None}
+        number = "infinite" if is_infinite else f"{(lower + upper) / 2:.10g}, within {(upper - lower) / 2:.2g}"
+        facts.append((name, number))
+        values = ends[0][mdp.starts]
+        if len(values) > 1 and math.isfinite(values.max()):
+            span = f"{values.min():.8g} to {values.max():.8g}"
+            facts.append(("start states", f"{len(values):,}, from {span}; the {question.of_starts} is said"))
+    except PharosError as error:
+        entry |= {"lower": None, "upper": None, "infinite": isinstance(error, DivergenceError), "reason": str(error)}
+        facts.append((name, f"not answered: {error}"))
+    return {"property": entry}, [*facts, ("more", command)]
+
+
+def _at_start(mdp: "TabularMDP", values: "np.ndarray", of_starts: str) -> float:
+    if of_starts == "mean":
+        return float(mdp.start_probabilities @ values[mdp.start_states])
+    return float(getattr(values[mdp.starts], of_starts)())
+
+
+def _answer(
+    name: str,
+    mdp: "TabularMDP",
+    out: Path,
+    more: Mapping[str, Any] = MappingProxyType({}),
+    facts: Sequence[tuple[str, object]] = (),
+) -> Answer:
     answer = {
         "num_states": mdp.num_states,
         "num_actions": mdp.num_actions,
@@ -133,9 +191,10 @@ def _answer(name: str, mdp: "TabularMDP", out: Path) -> Answer:
         "horizon": mdp.horizon,
         "gamma": mdp.gamma,
         "folder": out,
+        **more,
     }
     size = f"{mdp.num_states:,} x {pluralize(mdp.num_actions, 'action')}"
-    return Answer(answer, (name, [("states", size), ("horizon", mdp.horizon), ("folder", out)]))
+    return Answer(answer, (name, [("states", size), ("horizon", mdp.horizon), ("folder", out), *facts]))
 
 
 # Export ---------------------------------------------------------------------------------------------------------------

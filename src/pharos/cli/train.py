@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, compiling_fact, complain, progress_bar
+from pharos.cli.answers import Answer, compiling_fact, complain, note_facts, progress_bar
 from pharos.cli.options import Count, Discount, Seed, Target, parse_seeds, parse_value
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.system import compiling
@@ -92,8 +92,10 @@ def train(
         "compiling_seconds": compiling.seconds(),
         "folder": out,
         "plot": picture,
+        "notes": result.notes,
     }
     facts = _facts(result, training.steps, training.chance.in_words(env.has_chance))
+    facts += [("note", text) for text in result.notes.values()]
     if out is not None:
         facts += [("results", out), *([("plot", picture)] if picture else [])]
     return Answer(answer, (f"{title}, {result.config['observation']}", facts))
@@ -119,6 +121,12 @@ def _train_many(title: str, *, seeds: list[int], steps: int, out: Path | None, *
     runs = [{"seed": seed, **run.result, "folder": run.folder} for seed, run in results.items()]
     answer = {"runs": runs, "failed": failed, "quartiles": spread, "seconds": seconds, "folder": out}
     facts = _facts_of_many(results, spread, steps, seconds)
+    notes: dict[str, dict[str, str]] = {}
+    for number, run in results.items():
+        for kind, text in run.notes.items():
+            notes.setdefault(kind, {})[f"seed {number}"] = text
+    answer["notes"] = notes
+    facts += note_facts(notes)
     if out is not None:
         facts.append(("results", f"{out}/seed-{seeds[0]} and so on"))
 

@@ -27,6 +27,7 @@ from pharos.explorer.states import (
     OPTIMAL,
     UNIFORM,
     Learnt,
+    NamedStates,
     NumberedStates,
     SpaceStates,
     StateLayers,
@@ -34,7 +35,7 @@ from pharos.explorer.states import (
     probabilities,
 )
 from pharos.hardness import discounted_visits, occupancy
-from pharos.mdp import TabularMDP, uniform_choice
+from pharos.mdp import TabularMDP, names_of, uniform_choice
 from pharos.observations import num_values
 from pharos.policies import state_losses
 from pharos.solvers import Solution, uniform_value, value_iteration
@@ -117,8 +118,9 @@ class Exploration:
         self.mdp = mdp = mdp.with_horizon(None)
         self.env, self.space, self.learnt, self.chance = env, space, learnt, chance
         self.title = title or (env.name if env is not None else "MDP")
-        self.actions = env.actions if env is not None else tuple(map(str, range(mdp.num_actions)))
-        self.states: States = NumberedStates(mdp.num_states) if space is None else SpaceStates(space)
+        self.names = names_of(mdp)
+        self.actions = env.actions if env is not None else self.names.actions or tuple(map(str, range(mdp.num_actions)))
+        self.states: States = _states_of(mdp, space)
         progress("optimal values")
         self.solutions: dict[str, Solution] = {OPTIMAL: value_iteration(mdp)}
         if learnt is not None:
@@ -128,7 +130,7 @@ class Exploration:
         self.solutions[UNIFORM] = uniform_value(mdp)
         self.tie_tolerance = max(1e-9, ERRORS_PER_TIE * self.solutions[OPTIMAL].error_bound)
         starts = mdp.starts
-        self.pictures = Pictures(env, self._variables_of(int(starts[0])) if env is not None else None)
+        self.pictures = Pictures(env, self._rules_state(int(starts[0])) if env is not None else None)
 
     @property
     def policies(self) -> list[str]:
@@ -190,11 +192,12 @@ class Exploration:
             state: its number.
             previous: the action executed before, under sticky actions; None: there was none.
         Returns:
-            state, previous, values (of its variables), terminal, layer, start (probability that an episode starts
-            there), v (policy -> value), the drawing as `Pictures.of` has it, and for each action: `q` and `gap`, of
-            choosing it; `available`, whether it is; `best`, whether the gap is a tie; of each policy, `policies` (how
-            often it chooses it) and `q_of` (the value of choosing it, and following the policy afterwards); `reward`,
-            expected; `outcomes`: a list of state (None for the end), previous action, probability, reward.
+            state, previous, values (of its variables), labels, terminal, layer, start (probability that an episode
+            starts there), v (policy -> value), the drawing as `Pictures.of` has it, and for each action: `name`, where
+            actions have other names in other states, else None; `q` and `gap`, of choosing it; `available`, whether it
+            is; `best`, whether the gap is a tie; of each policy, `policies` (how often it chooses it) and `q_of` (the
+            value of choosing it, and following the policy afterwards); `reward`, expected; `outcomes`: a list of state
+            (None for the end), previous action, probability, reward.
         Raises:
             ParameterError: there is no such state or action.
         """
@@ -209,7 +212,8 @@ class Exploration:
             "terminal": is_over,
             "layer": int(self.layers.of(here)[0]),
             "start": float(self.mdp.start_probabilities[self.mdp.start_states == state].sum()),
-            **self.pictures.of(variables),
+            "labels": self.names.labels_of(state),
+            **self.pictures.of(self._rules_state(state)),
             "v": dict.fromkeys(self.solutions, 0.0),
             "actions": [],
         }
@@ -227,6 +231,7 @@ class Exploration:
                 {
                     "q": best - gap,
                     "gap": gap,
+                    "name": self.names.action(state, action) if self.names.choices is not None else None,
                     "available": bool(sets[action]),
                     "best": gap <= self.tie_tolerance and bool(sets[action]),
                     "policies": {name: number(chances[name][action]) for name in self.solutions},
@@ -259,12 +264,12 @@ class Exploration:
         """
         env, mdp = self.env, self.mdp
         if env is not None and env.has_chance and not mdp.laziness:
-            before, listed = self._variables_of(state), []
+            before, listed = self._rules_state(state), []
             for outcome in range(env.outcomes):
                 if (probability := float(env.probability(before, action, outcome))) > 0:
                     next_state = env.next_state(before, action, outcome)
                     reward = float(env.reward_of(before, action, next_state, outcome))
-                    after = self.states.number(next_state) if next_state[0] < mdp.num_states or self.space else None
+                    after = self._number_of(next_state)
                     listed.append((after, probability, reward))
             return listed
         mean = float(mdp.reward_table.rows(np.array([state]))[0, action])
@@ -277,6 +282,16 @@ class Exploration:
 
     def _variables_of(self, state: int) -> tuple[int, ...]:
         return tuple(self.states.values(np.array([state]))[0].tolist())
+
+    def _rules_state(self, state: int) -> State:
+        """A state as the rules of the environment take it."""
+        return self._variables_of(state) if self.space is not None else (state,)
+
+    def _number_of(self, state: State) -> int | None:
+        """The number of a state of the environment; None: the end."""
+        if self.space is not None:
+            return self.states.number(state)
+        return int(state[0]) if state[0] < self.mdp.num_states else None
 
     def _checked(self, state: int, previous: int | None) -> tuple[int, int | None]:
         if not 0 <= state < self.mdp.num_states:
@@ -433,6 +448,14 @@ def number(value: float | np.floating) -> float | None:
 
 
 LONGEST = 720  # pixels of the longer side of a drawing, where cells are not the smallest for it
+
+
+def _states_of(mdp: TabularMDP, space: StateSpace | None) -> States:
+    if space is not None:
+        return SpaceStates(space)
+    if mdp.names is not None and mdp.names.variables:
+        return NamedStates(mdp.names.variables)
+    return NumberedStates(mdp.num_states)
 
 
 class Pictures:

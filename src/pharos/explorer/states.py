@@ -64,9 +64,7 @@ class SpaceStates:
         return self.space.states(np.asarray(states, np.int64))
 
     def column(self, variable: int, block: slice) -> np.ndarray:
-        layout = self.space.layout
-        words = self.space.packed_states[block, int(layout.word[variable])]
-        return ((words >> layout.shift[variable]) & layout.mask[variable]).astype(np.int64) + self.low[variable]
+        return self.space.column(variable, block)
 
     def matching(self, fixed: Mapping[int, int], block: slice) -> np.ndarray:
         layout, packed = self.space.layout, self.space.packed_states
@@ -109,6 +107,33 @@ class NumberedStates:
         if len(values) != 1 or not 0 <= values[0] < self.num_states:
             raise ParameterError(f"state {tuple(values)} does not exist; expected a number below {self.num_states}")
         return int(values[0])
+
+
+class NamedStates:
+    """States with the variables that an MDP names, such as those of an imported model."""
+
+    def __init__(self, variables: Mapping[str, np.ndarray]):
+        self.names = tuple(variables)
+        self._columns = np.stack([np.asarray(column, np.int64) for column in variables.values()], axis=1)
+        self.num_states = len(self._columns)
+        self.low = self._columns.min(axis=0)
+        self.size = self._columns.max(axis=0) - self.low + 1
+
+    def values(self, states: np.ndarray) -> np.ndarray:
+        return self._columns[states]
+
+    def column(self, variable: int, block: slice) -> np.ndarray:
+        return self._columns[block, variable]
+
+    def matching(self, fixed: Mapping[int, int], block: slice) -> np.ndarray:
+        part = self._columns[block]
+        return np.all([part[:, variable] == value for variable, value in fixed.items()] or [np.ones(len(part))], axis=0)
+
+    def number(self, values: Sequence[int]) -> int:
+        same = np.flatnonzero((self._columns == np.asarray(values)).all(axis=1)) if len(values) == len(self.low) else []
+        if not len(same):
+            raise ParameterError(f"no state has the values {tuple(values)} of {', '.join(self.names)}")
+        return int(same[0])
 
 
 @dataclass(frozen=True)

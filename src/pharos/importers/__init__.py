@@ -3,7 +3,7 @@
 Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """
 
-from pharos.importers.files import bridge, bridge_screens, has_screens, how_to_import, storm, storm_recording
+from pharos.importers.files import bridge, bridge_screens, has_screens, how_to_import
 from pharos.importers.folder import environment, is_folder, load, save
 from pharos.importers.gymnasium import (
     gymnasium,
@@ -13,8 +13,10 @@ from pharos.importers.gymnasium import (
     minigrid_grids,
     minigrid_recording,
 )
+from pharos.importers.models import Question, storm, storm_import, storm_recording
 
 __all__ = [
+    "Question",
     "bridge",
     "bridge_screens",
     "environment",
@@ -26,5 +28,6 @@ __all__ = [
     "minigrid_grids",
     "save",
     "storm",
+    "storm_import",
     "storm_recording",
 ]

@@ -11,7 +11,7 @@ import numpy as np
 
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, FolderLocked, ParameterError
-from pharos.mdp import OutcomeTable, Residual, TabularMDP, checked_sets, lacking, whole_number, with_sets
+from pharos.mdp import Names, OutcomeTable, Residual, TabularMDP, checked_sets, lacking, whole_number, with_sets
 from pharos.system import mdp_files, storage
 from pharos.system.mdp_files import (
     AGAIN,
@@ -64,7 +64,8 @@ def save(
         folder: made where it is not there; an MDP that lies there is replaced, file by file and the manifest last.
             Where another process writes it at the moment, that one is waited for, with a warning.
         source: where the MDP comes from, for people.
-        actions: names of the actions; None: their numbers.
+        actions: names of the actions; None: those of `mdp.names`, else their numbers. Labels, variables and names of
+            choices of `mdp.names` are kept as well.
         time_limit: steps after which training cuts an episode off where the MDP has no horizon; None: 1,000.
         observations: what the source shows of each state, which agents may see as the observation "recorded".
         observed: what they are: "image", (S, H, W, 3) uint8; "grid", (S, columns, rows, C) uint8 codes of things;
@@ -75,6 +76,8 @@ def save(
         ParameterError: the folder holds something else, or the MDP has sticky, random or lazy actions (add them after
             loading); or names, limit, observations or outcomes do not fit it.
     """
+    if actions is None and mdp.names is not None:
+        actions = mdp.names.actions
     description = _description(mdp, actions, time_limit, observations, observed)
     outcome_arrays = {} if outcomes is None else _checked_outcomes(mdp, outcomes)
     folder = Path(folder)
@@ -92,11 +95,10 @@ def save(
             raise ParameterError(f"{folder}{FOREIGN}")
         if not is_folder(folder):  # a mark, so that a killed import is repeated there
             storage.replace_json(folder / MANIFEST, {"format": FORMAT, "format_version": "unfinished"})
-        checksums = {}
-        for name, array in arrays.items():
-            path = folder / f"{name}.npy"
-            storage.replace_array(path, array)
-            checksums[name] = storage.digest_of_file(path)
+        checksums = _written(folder, arrays)
+        names, name_arrays = _names_of(mdp)
+        if names:
+            description[mdp_files.NAMES] = {**names, "arrays": _written(folder, name_arrays)}
         manifest = {
             "format": FORMAT,
             "format_version": version,
@@ -113,6 +115,68 @@ def save(
         storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
         (folder / storage.LOCK).unlink()  # whoever waits for it replaces what is whole
     return folder
+
+
+def _written(folder: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """Write arrays into a folder; the checksum of each file."""
+    checksums = {}
+    for name, array in arrays.items():
+        path = folder / f"{name}.npy"
+        storage.replace_array(path, array)
+        checksums[name] = storage.digest_of_file(path)
+    return checksums
+
+
+def _names_of(mdp: TabularMDP) -> tuple[dict[str, list[str]], dict[str, np.ndarray]]:
+    """(lists of names, arrays) of the labels, variables and choices of an MDP; empty if it has none."""
+    names = mdp.names
+    if names is None or not (names.labels or names.variables or names.choice_names):
+        return {}, {}
+    columns = {name: np.asarray(column) for name, column in names.variables.items()}
+    arrays = {}
+    if names.labels:
+        arrays[mdp_files.LABELS] = np.stack([np.asarray(mask, np.bool_) for mask in names.labels.values()], axis=1)
+    if columns:
+        arrays[mdp_files.VARIABLES] = _narrow(
+            np.stack([column.astype(np.int64) for column in columns.values()], axis=1)
+        )
+    if names.choices is not None and names.choice_names:
+        arrays[mdp_files.CHOICES] = _narrow(np.asarray(names.choices))
+    lists = {
+        "labels": list(names.labels),
+        "variables": list(columns),
+        "booleans": [name for name, column in columns.items() if column.dtype == np.bool_],
+        "choices": list(names.choice_names),
+    }
+    return lists, arrays
+
+
+def _narrow(numbers: np.ndarray) -> np.ndarray:
+    """Integers in the narrowest signed type that holds them."""
+    least, most = int(numbers.min(initial=0)), int(numbers.max(initial=0))
+    return numbers.astype(next(t for t in (np.int8, np.int16, np.int32, np.int64) if _holds(t, least, most)))
+
+
+def _holds(dtype: type, least: int, most: int) -> bool:
+    return bool(np.iinfo(dtype).min <= least and most <= np.iinfo(dtype).max)
+
+
+def _read_names(folder: Path, manifest: Mapping[str, Any]) -> Names | None:
+    """The names that a folder holds; None: neither labels, variables nor names of actions."""
+    stored, actions = mdp_files.read_names(folder, manifest), manifest.get("actions")
+    if stored is None:
+        return None if actions is None else Names(actions=tuple(actions))
+    values = stored.get(mdp_files.VARIABLES)
+    return Names(
+        labels={name: stored[mdp_files.LABELS][:, i] for i, name in enumerate(stored["labels"])},
+        variables={
+            name: values[:, i].astype(np.bool_) if name in stored["booleans"] else values[:, i].astype(np.int64)
+            for i, name in enumerate(stored["variables"])
+        },
+        actions=None if actions is None else tuple(actions),
+        choices=stored.get(mdp_files.CHOICES),
+        choice_names=tuple(stored["choices"]),
+    )
 
 
 def _is_foreign(folder: Path) -> bool:
@@ -185,6 +249,10 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
     place = storage.cache_directory() / "imported"
     parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
     contents = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon, str(mdp.chance), sorted(parts.items())]
+    names, name_arrays = _names_of(mdp)
+    if mdp.names is not None:
+        digests = [storage.digest_of_bytes(np.ascontiguousarray(each).data) for each in name_arrays.values()]
+        contents += [names, digests, mdp.names.actions]
     contents += [*mdp.residual] if any(mdp.residual) else []
     contents += [mdp_files.ROUNDING, mdp.reward_table.rounding] if mdp.reward_table.rounding else []
     folder = place / storage.digest_of_json(contents)
@@ -221,12 +289,13 @@ def load(folder: str | os.PathLike) -> TabularMDP:
         mdp = _mdp(manifest, mdp_files.read_arrays(folder, manifest))
         residual = mdp.residual.plus(Residual(*mdp_files.residual_of(manifest)))
         rewards = replace(mdp.reward_table, rounding=mdp_files.rounding_of(manifest))
+        names = _read_names(folder, manifest)
     except FileFormatError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, MemoryError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise FileFormatError(f"{folder}: the imported MDP is damaged: {reason}; {AGAIN}") from None
-    return replace(mdp, folder=folder, residual=residual, reward_table=rewards)
+    return replace(mdp, folder=folder, residual=residual, reward_table=rewards, names=names)
 
 
 def _mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> TabularMDP:

@@ -152,8 +152,10 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         if state is None or self._terminated:
             return self._step_after_the_end()
         # Executed action: sticky and random actions
-        if self._has_chance and (u := (self._stream or self.np_random).random()) >= self._stays:
-            executed = self.simulator.executed(executed, self._previous, u)
+        if self._has_chance:
+            u, mask = (self._stream or self.np_random).random(), self.action_masks() if self._has_sets else None
+            if u >= self._stays or mask is not None:
+                executed = self.simulator.executed(executed, self._previous, u, mask)
         # Outcome of the executed action; a negative branch is a lazy step
         branch, probability = executed, 1.0
         if self._lazy and (self._stream or self.np_random).random() < self._lazy:

@@ -90,15 +90,13 @@ class Simulator:
         self.chance, self.first_chosen = chance.triple, float(chance.first_chosen)
         self.lazy = float(options.chance.lazy)
         self._weights = (*self.chance, self.first_chosen, self.lazy)
+        self._weights_of_kernels = self._weights
         self.modifies_rewards = options.chance.modifies_rewards
         self.has_chance = self.chance != (1.0, 0.0, 0.0)
         self.has_outcomes = self.env.has_chance
         self.has_sets = self.env.has_sets
-        if self.has_sets and self.has_chance:
-            raise ParameterError(
-                f"{self.env}: some actions are not available in some states, and sticky or random actions are not "
-                f"played there; leave the chance out, or solve the MDP: pharos.sticky_actions(space.mdp(), p)"
-            )
+        if self.has_sets and self.has_chance:  # see `executed_in_sets`
+            self._weights_of_kernels = (1.0, 0.0, 0.0, 1.0, self.lazy)
         self.first_previous = _first_previous(options.initial_previous_action, self.env)
         states, probabilities = start_distribution(self.env)
         self.start_states = np.array(states, np.int64)
@@ -117,7 +115,9 @@ class Simulator:
     def setting(self, mode: int, ranges: np.ndarray, scale: np.ndarray, starts: np.ndarray) -> Setting:
         """Arguments of the kernels of many environments; `starts` are states, or their indices in a state space."""
         limit = self.limit if self.limit is not None else 1 << 62
-        return Setting(ranges, scale, self._weights, limit, mode, self.first_previous, starts, self.start_cumulative)
+        return Setting(
+            ranges, scale, self._weights_of_kernels, limit, mode, self.first_previous, starts, self.start_cumulative
+        )
 
     def drawn_start(self, rng: "np.random.Generator | Stream") -> int:
         """Index of a drawn start state; draws a random number only if there are several."""
@@ -125,9 +125,22 @@ class Simulator:
             return 0
         return int(np.searchsorted(self.start_cumulative, rng.random(), side="right"))
 
-    def executed(self, action: int, previous: int, u: float) -> int:
-        """The executed action, by one uniform number u in [0, 1): `action`, then `previous`, then a uniform one."""
-        return stepping.executed_by_number.py_func(action, previous, self._weights, self.env.num_actions, u)
+    def executed(self, action: int, previous: int, u: float, mask: np.ndarray | None = None) -> int:
+        """The executed action, by one uniform number u in [0, 1): `action`, then `previous`, then a uniform one.
+
+        mask (A,) bool: the available actions; None: all are.
+        """
+        if mask is None:
+            return stepping.executed_by_number.py_func(action, previous, self._weights, self.env.num_actions, u)
+        return stepping.executed_of_set.py_func(action, previous, self._weights, mask, u)
+
+    def executed_in_sets(
+        self, rng: np.ndarray, actions: np.ndarray, previous: np.ndarray, ended: np.ndarray, sets: np.ndarray
+    ) -> np.ndarray:
+        """(N,) executed actions of environments in states with sets (N, A) bool, whose kernels then draw none."""
+        executed = np.empty_like(actions)
+        stepping.execute_in_sets(rng, actions, previous, ended, self._weights, sets, executed)
+        return executed
 
     def checked_state(self, state: object) -> np.ndarray:
         """(D,) int64 from a user's state; ParameterError unless every component is in its range."""

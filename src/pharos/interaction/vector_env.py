@@ -335,6 +335,9 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
                 f"{self.environment}: episodes of environments {np.flatnonzero(self._ended)[:8].tolist()} have ended; "
                 f"call reset(options={{'reset_mask': terminated | truncated}}), or choose another autoreset_mode"
             )
+        if self.simulator.has_sets and self.simulator.has_chance:
+            masks = self.action_masks()
+            actions = self.simulator.executed_in_sets(self._rng, actions, self._previous, self._ended, masks)
         n = self.num_envs
         rewards, executed, probabilities = np.empty(n), np.empty(n, np.int64), np.empty(self._num_drawn)
         terminated, truncated = np.empty(n, np.bool_), np.empty(n, np.bool_)

@@ -24,7 +24,13 @@ from numba.extending import overload
 from pharos.kernels.bellman import reward_at
 from pharos.kernels.kernel_cache import kernel
 from pharos.kernels.outcomes import drawn_outcome, outcome, size_of
-from pharos.kernels.stepping import delayed_reward, executed_by_number, normal_by_numbers, start_by_number
+from pharos.kernels.stepping import (
+    delayed_reward,
+    executed_by_number,
+    executed_of_set,
+    normal_by_numbers,
+    start_by_number,
+)
 
 # Random numbers -------------------------------------------------------------------------------------------------------
 
@@ -162,6 +168,21 @@ def start(keys, runs, starts, cumulative, state):
     for i in runs:
         for e in range(state.shape[1]):
             state[i, e] = starts[start_by_number(cumulative, unit(philox(1, e, 0, STEP, keys[i])[3]))]
+
+
+@kernel
+def execute_in_sets(keys, step, chances, sets, previous, actions, executed):
+    """executed (W, E): what is executed of chosen actions, in states with the sets (W, E, A) bool.
+
+    Draws what `advance` would draw. chances (W, 4): as in `stepping.Setting`; previous (W, E): -1 where there is none.
+    """
+    for i in range(actions.shape[0]):
+        chance = (chances[i, 0], chances[i, 1], chances[i, 2], chances[i, 3])
+        for e in range(actions.shape[1]):
+            executed[i, e] = actions[i, e]
+            if chance[0] < 1.0 or chance[3] < 1.0:
+                u = unit(philox(0, e, step, STEP, keys[i])[1])
+                executed[i, e] = executed_of_set(actions[i, e], previous[i, e], chance, sets[i, e], u)
 
 
 @kernel

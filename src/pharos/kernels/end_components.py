@@ -2,8 +2,9 @@
 
 Common arguments: transitions: see kernels/outcomes.py. Node n = s W + b is the state s after the executed action b; W =
 A under sticky actions, else 1. A choice a of a node executes a, its b or any action, as the weights (chosen, previous,
-uniform) have it, and an executed action e leads from s to nodes t W + e, or t where W is 1. allowed (N, A) bool: the
-choices that count; count (N,) integers: how many a node has.
+uniform) have it, and an executed action e leads from s to nodes t W + e, or t where W is 1. With first_chosen and the
+sets of available actions behind the weights, a b that is not available counts as none, and a uniform action is one that
+is. allowed (N, A) bool: the choices that count; count (N,) integers: how many a node has.
 
 Strongly connected components are found along allowed choices. A choice that may lead out of the component of its node,
 or to the end, is no choice of an end component: it is removed, and the rest is looked at again, until nothing changes.
@@ -12,19 +13,42 @@ each node: Pearce (2016), "A space-efficient algorithm for finding strongly conn
 """
 
 import numpy as np
+from numba import types
 
-from pharos.kernels.interpreted import interpreted_first
+from pharos.kernels.bellman import set_has
+from pharos.kernels.interpreted import interpreted_first, overload
 from pharos.kernels.kernel_cache import kernel
 from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 
 
+def weights_after(weights, s, b):
+    """(chosen, previous, uniform) weights of a step in state s after the executed action b."""
+
+
+@overload(weights_after, jit_options={"forceinline": True})
+def _weights_after(weights, s, b):
+    if isinstance(weights, types.UniTuple):
+        return lambda weights, s, b: weights
+
+    def as_sets_have_it(weights, s, b):
+        if set_has(weights, s, b):
+            return weights[0], weights[1], weights[2]
+        return weights[3], 0.0, 1.0 - weights[3]
+
+    return as_sets_have_it
+
+
 @kernel
-def may_execute(weights, allowed, count, width, n, e):
-    """Whether an allowed choice of node n may execute e."""
-    chosen_weight, previous_weight, uniform_weight = weights
+def may_execute(weights, allowed, count, n, s, b, e):
+    """Whether an allowed choice of node n = s W + b may execute e."""
     if count[n] == 0:
         return False
-    return uniform_weight > 0.0 or (chosen_weight > 0.0 and allowed[n, e]) or (previous_weight > 0.0 and n % width == e)
+    chosen_weight, previous_weight, uniform_weight = weights_after(weights, s, b)
+    return (
+        (uniform_weight > 0.0 and set_has(weights, s, e))
+        or (chosen_weight > 0.0 and allowed[n, e])
+        or (previous_weight > 0.0 and b == e)
+    )
 
 
 @interpreted_first()
@@ -60,7 +84,7 @@ def number_components(transitions, weights, allowed, count, component, path, wai
             # look on at its transitions; a smaller number than its own shows a way back to an earlier node
             e, k = np.int64(action[depth]), np.int64(branch[depth])
             while e < num_actions and next_node == n:
-                if not may_execute(weights, allowed, count, width, n, e):
+                if not may_execute(weights, allowed, count, n, s, n - s * width, e):
                     e, k = e + 1, np.int64(0)
                     continue
                 while k < len(outcomes_of(transitions, s, e)):
@@ -105,7 +129,6 @@ def remove_leaving(transitions, weights, component, allowed, count, leaves):
 
     leaves (A,) bool is scratch. One pass, from the last node to the first.
     """
-    chosen_weight, previous_weight, uniform_weight = weights
     num_states, num_actions = size_of(transitions)
     width = len(component) // num_states
     removed = 0
@@ -113,10 +136,11 @@ def remove_leaving(transitions, weights, component, allowed, count, leaves):
         if count[n] == 0:
             continue
         s, b = n // width, n % width
+        chosen_weight, previous_weight, uniform_weight = weights_after(weights, s, b)
         leaves_by_any = False
         for e in range(num_actions):
             leaves[e] = False
-            if may_execute(weights, allowed, count, width, n, e):
+            if may_execute(weights, allowed, count, n, s, b, e):
                 for k in outcomes_of(transitions, s, e):
                     t, _ = outcome(transitions, s, e, k)
                     m = np.int64(t) * width + (e if width > 1 else 0)

@@ -171,6 +171,49 @@ def executed_by_number(choice, previous, chance, num_actions, u):
 
 
 @njit(forceinline=True)
+def executed_of_set(choice, previous, chance, is_available, u):
+    """`executed_by_number` in a state with some actions only, is_available (A,) bool.
+
+    A choice that does not exist acts as the first action that does; a previous action that does not counts as none.
+    """
+    number, first = 0, -1
+    for a in range(len(is_available)):
+        if is_available[a]:
+            number += 1
+            first = a if first < 0 else first
+    action = choice if is_available[choice] else first
+    if previous < 0 or not is_available[previous]:
+        if u < chance[3]:
+            return action
+        share = (u - chance[3]) / (1.0 - chance[3])
+    else:
+        if u < chance[0]:
+            return action
+        if u < chance[0] + chance[1]:
+            return previous
+        share = (u - chance[0] - chance[1]) / chance[2]
+    left = min(int(share * number), number - 1)
+    for a in range(len(is_available)):
+        if is_available[a]:
+            if left == 0:
+                return a
+            left -= 1
+    return action
+
+
+@kernel
+def execute_in_sets(rng, choices, previous, ended, chance, sets, executed):
+    """executed[i] = the executed action of stream i, for choices (N,) in states with the sets (N, A) bool.
+
+    Nothing is drawn for an episode that has ended: its step only starts another.
+    """
+    for i in range(len(choices)):
+        executed[i] = choices[i]
+        if not ended[i]:
+            executed[i] = executed_of_set(choices[i], previous[i], chance, sets[i], uniform_number(rng, i))
+
+
+@njit(forceinline=True)
 def redrawn_action(choice, previous, chance, num_actions, rng, s):
     """The executed action in state s, by numbers of the stream rng (1,): a uniform action takes a second one.
 

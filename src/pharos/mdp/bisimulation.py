@@ -135,6 +135,7 @@ def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -
         is_numbered=False,
         age=None,
         available=None if mdp.available is None else mdp.available[representatives],
+        names=None,
         staying=None if mdp.staying is None else _lost,
     ).with_initial(start)
 

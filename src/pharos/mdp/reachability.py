@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pharos.kernels import end_components as kernels
-from pharos.mdp.action_sets import require_all_actions
 from pharos.mdp.actions import Chance, PolicyTable, Selection
 from pharos.mdp.dynamics import Dynamics
 from pharos.mdp.rewards import Rewards
@@ -112,6 +111,7 @@ def restricted_to(mdp: TabularMDP, states: np.ndarray) -> TabularMDP:
         space=None,
         age=None,
         available=None if mdp.available is None else mdp.available[states],
+        names=None if mdp.names is None else mdp.names.of(states),
     )
 
 
@@ -210,21 +210,21 @@ def end_components(mdp: TabularMDP, pairs: np.ndarray | None = None) -> EndCompo
     Args:
         pairs: (S, A) bool, under sticky actions also (S, A, A) with the previously executed action second: the choices
             that may be made; None: all.
-    Raises:
-        ParameterError: actions are sticky, and not all are available in each state.
     Cost: a few reads of all transitions, of which only those of nodes in question are looked at again; A + 33 bytes a
         node. Source: de Alfaro (1997), section 3.3.
     """
-    if mdp.is_sticky:
-        require_all_actions(mdp, "the end components of sticky actions, which gamma 1 without a horizon needs")
     width, num_actions = mdp.width, mdp.num_actions
     num_nodes, dtype = mdp.num_states * width, np.int32 if mdp.num_states * width < 2**31 else np.int64
     live = ~np.asarray(mdp.terminal)
     allowed = np.repeat(np.broadcast_to(live[:, None], (mdp.num_states, num_actions)), width, axis=0)
     if pairs is not None:
         allowed &= np.repeat(pairs, width, axis=0) if pairs.ndim == 2 else pairs.reshape(num_nodes, num_actions)
+    weights: tuple = mdp.chance.triple
+    if mdp.is_sticky and mdp.available is not None:  # else one that is not available is as the first one that is
+        weights = mdp.chance.for_kernels
+        allowed &= np.repeat(mdp.available, width, axis=0)
     count = np.count_nonzero(allowed, axis=1).astype(np.int32)
-    transitions, weights = mdp.dynamics.for_kernels, mdp.chance.triple
+    transitions = mdp.dynamics.for_kernels
     component, path, waiting = (np.empty(num_nodes, dtype) for _ in range(3))
     leaves, removed = np.empty(num_actions, np.bool_), 1
     while removed:

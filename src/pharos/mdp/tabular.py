@@ -1,9 +1,10 @@
 """TabularMDP: next states, rewards, discount, start distribution, and chance that stays implicit."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,7 @@ from pharos.mdp.arguments import (
     start_of,
 )
 from pharos.mdp.dynamics import Dynamics, TopologicalOrder
+from pharos.mdp.names import Names, names_from
 from pharos.mdp.rewards import Rewards, rewards_of_shape
 from pharos.mdp.row_sums import Residual
 from pharos.mdp.table import (
@@ -56,6 +58,7 @@ class TabularMDP:
             not known. Solvers take the states in this order then, once.
         available: (S, A) bool, the actions that exist in each state, one or more, all in terminal states; None: all
             everywhere. Transitions and rewards of the others are those of the first available action.
+        names: of states and actions: labels, variables, names of actions; None: those of the space, if there is one.
         residual: what the sums of rows that were given leave open, see mdp/row_sums.py; error bounds of values count
             it.
     """
@@ -75,6 +78,7 @@ class TabularMDP:
     residual: Residual = field(default_factory=Residual)
     is_numbered: bool = True
     available: np.ndarray | None = None
+    names: Names | None = None
 
     def __new__(cls, dynamics: object = None, *_: object, **__: object) -> "TabularMDP":
         if isinstance(dynamics, np.ndarray | list | tuple):
@@ -243,6 +247,24 @@ class TabularMDP:
         """The same MDP with another start: a state, a sequence of states, or (S,) probabilities."""
         states, probabilities = start_of(initial, self.num_states)
         return replace(self, start_states=states, start_probabilities=probabilities)
+
+    def with_names(
+        self,
+        *,
+        labels: Mapping[str, npt.ArrayLike] = MappingProxyType({}),
+        variables: Mapping[str, npt.ArrayLike] = MappingProxyType({}),
+        actions: Sequence[str] | None = None,
+    ) -> "TabularMDP":
+        """The same MDP whose states and actions have names, which `reach`, `solve --print-policy` and pages use.
+
+        Args:
+            labels: name -> (S,) bool, or indices of states.
+            variables: name -> (S,) integers or bool.
+            actions: (A,) names; None: numbers.
+        Raises:
+            ParameterError: they do not fit the MDP.
+        """
+        return replace(self, names=names_from(labels, variables, actions, self.reward_table.shape))
 
     def with_age(self, age: npt.ArrayLike) -> "TabularMDP":
         """The same MDP with an age (S,) of each state: an integer that every transition makes larger.

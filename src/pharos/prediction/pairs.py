@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pharos.statistics import TIE_TOLERANCE
+from pharos.statistics import PERMUTED, TIE_TOLERANCE
 
-BLOCK = 250  # permutations at a time
 CLEAR = 0.05  # difference of an outcome between two observations of one MDP that counts
 
 
@@ -116,8 +115,8 @@ class Pairs:
         row_at[mdps, columns] = np.arange(len(x))
         rng = np.random.default_rng(seed)
         agreements = np.full(permutations, np.nan)
-        for start in range(0, permutations, BLOCK):
-            size = min(BLOCK, permutations - start)
+        for start in range(0, permutations, PERMUTED):
+            size = min(PERMUTED, permutations - start)
             orders = np.broadcast_to(np.arange(len(names)), (size, classes.max() + 1, len(names)))
             rows = row_at[mdps, rng.permuted(orders, axis=2)[:, classes, columns]]
             other = np.where(rows >= 0, x[rows], np.nan)

@@ -45,7 +45,7 @@ from pharos.solvers.goals import (
     recurrent_classes,
 )
 from pharos.solvers.policy_iteration import DENSE
-from pharos.solvers.reaching import Bounds
+from pharos.solvers.reaching import StateBounds
 from pharos.solvers.values import TableAgent, TablePolicy
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class AverageReward:
 
     mdp: TabularMDP
     kind: str
-    gain: Bounds
+    gain: StateBounds
     policy: np.ndarray
     tolerance: float
 
@@ -97,7 +97,7 @@ class AverageReward:
         """The gain of an episode's first state."""
         return self.at_start(self.gain)
 
-    def at_start(self, bounds: Bounds) -> "GainInterval":
+    def at_start(self, bounds: StateBounds) -> "GainInterval":
         """The mean over an episode's first state of numbers of the states, within bounds (S,)."""
         lower, upper = (
             float(self.mdp.start_probabilities @ each[self.mdp.start_states]) for each in (bounds.lower, bounds.upper)
@@ -107,7 +107,7 @@ class AverageReward:
         return GainInterval(lower - room, upper + room)
 
     @cached_property
-    def bias(self) -> Bounds:
+    def bias(self) -> StateBounds:
         """Surplus of `policy` over its gain: `lower` and `upper` (S,), proven.
 
         h(s) = sum over t of E r_t - g(s), summed in the mean (Cesaro) where the chain is periodic. So the stationary
@@ -541,8 +541,8 @@ def _first_values(mdp: TabularMDP, x: np.ndarray, rewards: np.ndarray | float = 
 
 def _of_states(
     mdp: TabularMDP, select: Selection, lower: np.ndarray, upper: np.ndarray, rewards: np.ndarray | float = 0.0
-) -> Bounds:
-    """Bounds of the states, without a previous action, from those of the nodes (N,)."""
+) -> StateBounds:
+    """StateBounds of the states, without a previous action, from those of the nodes (N,)."""
     if mdp.is_sticky:
         first, bounds = mdp.chance.first, []
         for x, side in ((lower, -1.0), (upper, 1.0)):
@@ -554,7 +554,7 @@ def _of_states(
         lower, upper = bounds
     live = ~np.asarray(mdp.terminal)
     room = 2 * UNIT * np.maximum(np.abs(lower), np.abs(upper))
-    return Bounds(np.where(live, lower - room, 0.0), np.where(live, upper + room, 0.0))
+    return StateBounds(np.where(live, lower - room, 0.0), np.where(live, upper + room, 0.0))
 
 
 def _policy_table(mdp: TabularMDP, sign: float, v: np.ndarray, choices: np.ndarray) -> np.ndarray:
@@ -568,7 +568,7 @@ def _policy_table(mdp: TabularMDP, sign: float, v: np.ndarray, choices: np.ndarr
     return by_node[:, 0].copy() if (by_node == by_node[:, :1]).all() else by_node
 
 
-def _bias(mdp: TabularMDP, select: PolicyTable) -> Bounds:
+def _bias(mdp: TabularMDP, select: PolicyTable) -> StateBounds:
     nodes = WrittenOut.of(mdp, select)
     nodes.matrix.eliminate_zeros()
     members = np.flatnonzero(nodes.live)
@@ -623,4 +623,4 @@ def _bias(mdp: TabularMDP, select: PolicyTable) -> Bounds:
     gain = _of_states(mdp, select, of_nodes[2], of_nodes[3])
     lower, upper = bias.lower - gain.upper, bias.upper - gain.lower
     extra = 2 * UNIT * (np.abs(lower) + np.abs(upper)) + choices.error
-    return Bounds(lower - extra, upper + extra)
+    return StateBounds(lower - extra, upper + extra)

@@ -120,10 +120,15 @@ class Goals:
 
     def policy_table(self, mdp: TabularMDP) -> np.ndarray:
         """The policy as `Solution.policy` has it: (S,) actions, or (S, A + 1) if it looks at the previous action."""
-        by_node = self.policy.reshape(mdp.num_states, mdp.width)
-        if (by_node == by_node[:, :1]).all():
-            return by_node[:, 0].copy()
-        return np.concatenate([by_node, by_node[:, :1]], axis=1)
+        return table_of_choices(mdp, self.policy)
+
+
+def table_of_choices(mdp: TabularMDP, policy: np.ndarray) -> np.ndarray:
+    """Choices (N,) of the nodes as (S,) actions, or (S, A + 1) if they look at the previous action."""
+    by_node = policy.reshape(mdp.num_states, mdp.width)
+    if (by_node == by_node[:, :1]).all():
+        return by_node[:, 0].copy()
+    return np.concatenate([by_node, by_node[:, :1]], axis=1)
 
 
 def total_reward(
@@ -132,14 +137,14 @@ def total_reward(
     """The expected sum of rewards until the end of the best, the worst or a given policy.
 
     Raises:
-        ParameterError: actions are sticky, and not all are available in each state.
         DivergenceError: it is infinite, or there is no policy that has one; the message names a cycle.
         PrecisionError: floats cannot tell it, or prove no bound within the tolerance.
     """
     goals = _goals(mdp, select, tolerance, progress)
     if mdp.available is None or isinstance(select, PolicyTable):
         return goals
-    return replace(goals, policy=stand_ins(mdp.available)[np.arange(mdp.num_states), goals.policy])
+    states = np.repeat(np.arange(mdp.num_states), mdp.width)
+    return replace(goals, policy=stand_ins(mdp.available)[states, goals.policy])
 
 
 def _goals(
@@ -189,7 +194,10 @@ class WrittenOut(NamedTuple):
             table = np.broadcast_to(select.later, (num_states, width, num_actions)).reshape(nodes, num_actions)
             per_node = 1
         else:
-            table, per_node = np.tile(np.eye(num_actions), (nodes, 1)), num_actions
+            acts = (
+                np.tile(np.arange(num_actions), (num_states, 1)) if mdp.available is None else stand_ins(mdp.available)
+            )
+            table, per_node = np.eye(num_actions)[np.repeat(acts, width, axis=0).ravel()], num_actions
         live = ~np.repeat(np.asarray(mdp.terminal), width)
         outcomes = nodes_of_outcomes(mdp.dynamics.matrix(~np.asarray(mdp.terminal)), num_actions, width)
         each_reward = mdp.rewards.ravel()
@@ -311,8 +319,9 @@ class GoalProblem:
 
     def solve_in(
         self, inside: np.ndarray, tolerance: float, progress: Callable[[int, float], None] | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """((N,) values, (N,) error of each) where `inside` (M + 1,) bool holds, at the end 0, else infinite.
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """((N,) values, (N,) error of each, (N,) choices) where `inside` (M + 1,) bool holds, at the end 0, else
+        infinite.
 
         From the nodes inside, the end among them, some policy surely ends without leaving them; choices that may leave
         them are left out.
@@ -333,9 +342,11 @@ class GoalProblem:
             origin=choices.origin[rows],
         )
         v, error = np.full(len(inside), np.inf), np.zeros(len(inside))
-        values, errors, _, _ = _values(part, self.proper(part)[1], tolerance, self._infinite, progress)
+        values, errors, policy, _ = _values(part, self.proper(part)[1], tolerance, self._infinite, progress)
         v[nodes], error[nodes] = np.append(self.sign * values, 0.0), np.append(errors, 0.0)
-        return v[self.node_of[:-2]], error[self.node_of[:-2]]
+        origin = np.full(len(inside) - 1, -1)
+        origin[nodes[:-1]] = part.origin[policy]
+        return v[self.node_of[:-2]], error[self.node_of[:-2]], self.unfolded(origin)
 
     def solve(self, tolerance: float, progress: Callable[[int, float], None] | None = None) -> Goals:
         """Policy iteration, then bounds; in rational numbers where floats cannot tell, or are too short."""

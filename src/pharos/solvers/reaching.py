@@ -12,11 +12,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pharos.errors import ParameterError, UnknownName
+from pharos.errors import ParameterError
 from pharos.kernels import hitting
 from pharos.kernels.hitting import UNIT
-from pharos.mdp import BEST, WORST, Rewards, Selection, TabularMDP, end_components, filled, require_mdp
-from pharos.solvers.goals import GoalProblem, total_reward
+from pharos.mdp import (
+    BEST,
+    WORST,
+    Rewards,
+    Selection,
+    TabularMDP,
+    end_components,
+    filled,
+    names_of,
+    require_mdp,
+    stand_ins,
+)
+from pharos.solvers.goals import GoalProblem, table_of_choices, total_reward
 
 if TYPE_CHECKING:
     from pharos.solvers.goals import Choices
@@ -26,7 +37,7 @@ TERMINAL = "terminal"
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
+class StateBounds:
     """Bounds of a number for each state.
 
     Attributes:
@@ -37,7 +48,20 @@ class Bounds:
     upper: np.ndarray
 
     def __repr__(self) -> str:
-        return f"Bounds(lower={self.lower}, upper={self.upper})"
+        return f"{type(self).__name__}(lower={self.lower}, upper={self.upper})"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Bounds(StateBounds):
+    """Bounds of a number for each state, and a policy.
+
+    Attributes:
+        lower, upper: (S,) float64, proven; both infinite if the number is.
+        policy: (S,) actions that attain it, or (S, A + 1) under sticky actions, by the previous action; meaningless
+            where the number is infinite.
+    """
+
+    policy: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +102,8 @@ class Reachability:
         """
         problem = GoalProblem.of(self._stopping(-self._costs()), BEST, self._arrived)
         surely = problem.proper(problem.choices)[0]
-        v, error = problem.solve_in(surely, self.tolerance)
-        return self._of_states(np.where(np.isfinite(v), v, -np.inf), error, -self._costs(), BEST, -1.0)
+        v, error, policy = problem.solve_in(surely, self.tolerance)
+        return self._of_states(np.where(np.isfinite(v), v, -np.inf), error, policy, -self._costs(), BEST, -1.0)
 
     @cached_property
     def largest_cost(self) -> Bounds:
@@ -94,8 +118,13 @@ class Reachability:
         missed = np.zeros(problem.choices.num_nodes + 1, np.bool_)
         missed[problem.node_of[:-2][components]] = True
         missed[-2] = True  # the trap
-        v, error = problem.solve_in(~_may_reach(problem.choices, missed), self.tolerance)
-        return self._of_states(v, error, self._costs(), BEST, 1.0)
+        v, error, policy = problem.solve_in(~_may_reach(problem.choices, missed), self.tolerance)
+        return self._of_states(v, error, policy, self._costs(), BEST, 1.0)
+
+    @property
+    def stopped(self) -> TabularMDP:
+        """The MDP that ends in the target."""
+        return self._stopping(self.mdp.rewards)
 
     # How ------------------------------------------------------------------------------------------------------------
 
@@ -124,16 +153,16 @@ class Reachability:
         mdp = self._stopping(entering)
         goals = total_reward(mdp, select, self.tolerance)
         error = goals.error + (mdp.dynamics.operations + 8) * UNIT
-        result = self._of_states(goals.v, error, mdp.rewards, select, 1.0)
+        result = self._of_states(goals.v, error, goals.policy, mdp.rewards, select, 1.0)
         for bound in (result.lower, result.upper):
             np.clip(bound, 0.0, 1.0, out=bound)
             bound[self.target] = 1.0
         return result
 
     def _of_states(
-        self, v: np.ndarray, error: np.ndarray, rewards: np.ndarray, select: Selection, sign: float
+        self, v: np.ndarray, error: np.ndarray, policy: np.ndarray, rewards: np.ndarray, select: Selection, sign: float
     ) -> Bounds:
-        """Bounds of the states, from values (N,) of the nodes and the error of each; sign -1 negates them."""
+        """Bounds of the states, from values (N,), errors and choices of the nodes; sign -1 negates them."""
         mdp = self._stopping(rewards)
         bounds = []
         for x in (v - error, v + error):
@@ -146,7 +175,9 @@ class Reachability:
             bounds.append(sign * np.where(np.asarray(mdp.terminal) & np.isfinite(x), 0.0, x))
         lower, upper = bounds if sign > 0 else bounds[::-1]
         room = 8 * UNIT * np.where(np.isfinite(lower), np.abs(lower), 0.0)
-        return Bounds(lower - room, upper + room)
+        if mdp.available is not None:
+            policy = stand_ins(mdp.available)[np.arange(mdp.num_states).repeat(mdp.width), policy]
+        return Bounds(lower - room, upper + room, table_of_choices(mdp, policy))
 
 
 def _may_reach(choices: "Choices", goal: np.ndarray) -> np.ndarray:
@@ -171,7 +202,9 @@ def reach(
     Discount and horizon of the MDP do not count: play goes on until it arrives, or for ever.
 
     Args:
-        target: (S,) bool; or indices of states; or "terminal", every terminal state and the end of an episode.
+        target: (S,) bool; or indices of states; or "terminal", every terminal state and the end of an episode; or a
+            label or an expression over the variables of states, such as "x=3 & !done", see `Names.states_where`. What
+            there is to name, `names_of(mdp)` says.
         costs: (S, A) numbers >= 0 of executed actions. None: the rewards if none is negative, or those negated if none
             is positive.
         tolerance: the largest error of a probability and of a finite cost.
@@ -180,12 +213,13 @@ def reach(
         `upper`. Costs are those *that must arrive*, as `Rmin=? [F target]` and `Rmax=? [F target]` of PRISM and Storm:
         infinite where they cannot, or need not.
     Raises:
-        ParameterError: the target names no state, or costs are negative. UnknownName: the target is no name.
+        ParameterError: the target is no states and no expression, or costs are negative. UnknownName: it names a label
+            or a variable that is not there.
         PrecisionError: floats, and rational numbers within their limits, do not reach the tolerance.
     Cost: as of total rewards, see `value_iteration`.
     Source: Baier and Katoen (2008), chapter 10; Haddad and Monmege (2018).
     """
-    with_end = isinstance(target, str)
+    with_end = isinstance(target, str) and target == TERMINAL
     mask = _mask(mdp, target)
     if costs is not None:
         costs = np.asarray(costs, np.float64)
@@ -197,16 +231,16 @@ def reach(
 
 def _mask(mdp: TabularMDP, target: ArrayLike | str) -> np.ndarray:
     if isinstance(target, str):
-        if target != TERMINAL:
-            raise UnknownName("target", target, [TERMINAL])
-        return np.array(mdp.terminal)
+        if target == TERMINAL:
+            return np.array(mdp.terminal)
+        return names_of(mdp).states_where(target, mdp.num_states)
     array = np.asarray(target)
     if array.dtype == np.bool_ and array.shape == (mdp.num_states,):
         return array
     if array.dtype.kind not in "iu" or array.ndim > 1 or ((array < 0) | (array >= mdp.num_states)).any():
         raise ParameterError(
             f"target is {array.dtype} of shape {array.shape}; expected ({mdp.num_states},) bool, indices of states "
-            f"from 0 to {mdp.num_states - 1}, or {TERMINAL!r}"
+            f"from 0 to {mdp.num_states - 1}, {TERMINAL!r}, a label or an expression"
         )
     mask = np.zeros(mdp.num_states, np.bool_)
     mask[array] = True

@@ -206,6 +206,12 @@ class StateSpace:
         """States (N, D) int64 with these indices (an array of integers or a slice)."""
         return unpack(self.layout, np.atleast_2d(self.packed_states[indices]))
 
+    def column(self, variable: int, block: slice = slice(None)) -> np.ndarray:
+        """(N,) int64, the values of one component in a block of states."""
+        layout = self.layout
+        words = self.packed_states[block, int(layout.word[variable])]
+        return ((words >> layout.shift[variable]) & layout.mask[variable]).astype(np.int64) + layout.low[variable]
+
     def state(self, i: int) -> State:
         """State number i, as a tuple of D integers."""
         self._check_index(i)

@@ -9,9 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pharos.statistics import class_weights, ranks, spearman
+from pharos.statistics import PERMUTED, class_weights, ranks, spearman
 
-BLOCK = 250  # permutations at a time
 MOST_RANKED = 400
 Counts = np.ndarray
 """(R, C) how often each class counts in each of R samples."""
@@ -116,7 +115,7 @@ def permuted_classes(
     rng = np.random.default_rng(seed)
     orders = np.stack([np.arange(number), *(rng.permutation(number) for _ in range(permutations))])
     values, aims = (x - x.mean(axis=0)) / np.where(x.std(axis=0) > 0, x.std(axis=0), 1.0), y[row_at]
-    parts = [_exchanged(values[row_at], aims, some) for some in np.array_split(orders, len(orders) // BLOCK + 1)]
+    parts = [_exchanged(values[row_at], aims, some) for some in np.array_split(orders, len(orders) // PERMUTED + 1)]
     return np.concatenate([one for one, _ in parts]), np.concatenate([other for _, other in parts])
 
 

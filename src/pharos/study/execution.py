@@ -110,6 +110,8 @@ class StudyExecution(Execution[Run]):
         pool: None: processes of this machine.
     """
 
+    exit_busy = _worker.EXIT_BUSY
+
     def __init__(
         self,
         study: Specification,

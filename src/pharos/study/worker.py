@@ -28,6 +28,8 @@ FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 LONGEST = 3e11
 
 BATCHES = "batches"
+EXIT_BUSY = 75
+"""Exit code of a process whose runs another process trains."""
 
 Runner = Callable[[Mapping[str, Any], Path], Any]
 BatchRunner = Callable[[Sequence[Mapping[str, Any]], Sequence[Path], Path], Sequence[str | None]]
@@ -225,7 +227,7 @@ def main(
     for reason in {id(end): end for end in ends if isinstance(end, HalfAsMany)}.values():
         send(([id for id, end in zip(ids, ends, strict=True) if end is reason], str(reason)))
     if BUSY in ends:
-        sys.exit(training.EXIT_BUSY)
+        sys.exit(EXIT_BUSY)
 
 
 def use_one_thread() -> None:

@@ -4,6 +4,7 @@ FOLDER/manifest.json     what is there, written last
 FOLDER/NAME.npy          an array of COMMON, and those of one of the forms below
 FOLDER/observations.npy  where the source shows states: format version 2 or 3
 FOLDER/outcome_*.npy     in format version 3: outcomes, with the reward of each
+FOLDER/label_states.npy, variable_values.npy, choice_names.npy   optional: names of states and actions, in any version
 FOLDER/available.npy     in format version 5: the actions that exist in each state; other files as in version 1, 2 or 3
 """
 
@@ -38,6 +39,9 @@ RESIDUAL = "residual"
 """Entry of the manifest: what the sums of given rows leave open, in probability and in reward; absent where nothing."""
 ROUNDING = "rounding"
 """Entry of the manifest: a bound on the error of rewards that are means; absent if rewards are exact."""
+NAMES = "names"
+"""Entry of the manifest: names of labels, variables and choices, and the checksums of their arrays."""
+LABELS, VARIABLES, CHOICES = "label_states", "variable_values", "choice_names"
 AGAIN = "import it again"
 
 
@@ -132,12 +136,51 @@ def read_array(folder: str | os.PathLike, manifest: Mapping[str, Any], name: str
         FileFormatError: it is missing, damaged or changed.
     """
     path = Path(folder) / f"{name}.npy"
+    return _checked_array(path, manifest["arrays"][name])
+
+
+def read_names(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The names that a folder holds, or None.
+
+    Returns:
+        `labels`, `variables`, `booleans` (of the variables), `choices`: lists of names; and under LABELS (S, labels)
+        bool, VARIABLES (S, variables) integers and CHOICES (S, A) integers, where there are names of this kind.
+    Raises:
+        FileFormatError: an array is missing, damaged, changed, or does not fit.
+    """
+    entry = manifest.get(NAMES)
+    if entry is None:
+        return None
+    kinds = {"labels": LABELS, "variables": VARIABLES, "choices": CHOICES}
+    lists = [entry.get(kind) for kind in (*kinds, "booleans")] if isinstance(entry, dict) else [None]
+    sums = entry.get("arrays") if isinstance(entry, dict) else None
+    if not all(isinstance(each, list) and all(isinstance(name, str) for name in each) for each in lists) or (
+        not isinstance(sums, dict) or set(sums) != {array for kind, array in kinds.items() if entry[kind]}
+    ):
+        raise FileFormatError(f"{folder}: its names are damaged; {AGAIN}")
+    arrays = {name: _checked_array(Path(folder) / f"{name}.npy", checksum) for name, checksum in sums.items()}
+    states, actions = manifest["num_states"], manifest["num_actions"]
+    shapes = {
+        LABELS: (states, len(entry["labels"])),
+        VARIABLES: (states, len(entry["variables"])),
+        CHOICES: (states, actions),
+    }
+    for name, array in arrays.items():
+        fits = array.shape == shapes[name] and array.dtype.kind in ("b" if name == LABELS else "iu")
+        if not fits or (
+            name == CHOICES and array.size and not -1 <= array.min() <= array.max() < len(entry["choices"])
+        ):
+            raise FileFormatError(f"{folder}: {name} has shape {array.shape}; expected {shapes[name]}; {AGAIN}")
+    return {**entry, **arrays}
+
+
+def _checked_array(path: Path, checksum: object) -> np.ndarray:
     try:
         digest = storage.digest_of_file(path)
     except OSError as error:
         wrong = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
         raise FileFormatError(f"{path}: {wrong}; {AGAIN}") from None
-    if digest != manifest["arrays"][name]:
+    if digest != checksum:
         raise FileFormatError(f"{path} was changed after it was written; {AGAIN}")
     try:
         array = np.load(path, allow_pickle=False)

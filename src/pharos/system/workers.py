@@ -49,9 +49,11 @@ class Workers:
     Args:
         preload: modules that one process loads, from which the others are forked, where the system can do that; none
             (or None): each begins anew.
+        groups: whether processes that one of them starts, and leaves behind, are killed when it has ended.
     """
 
-    def __init__(self, *preload: str | None):
+    def __init__(self, *preload: str | None, groups: bool = False):
+        self.groups = groups
         self._context: ForkServerContext | SpawnContext = multiprocessing.get_context("spawn")
         modules = [each for each in preload if each is not None]
         if modules and "forkserver" in multiprocessing.get_all_start_methods():
@@ -78,6 +80,7 @@ class Workers:
             if process.is_alive():
                 process.kill()
                 process.join()
+            self._end_group(process.pid)
 
     def start(
         self, key: str, function: Callable[..., None], arguments: Sequence[Any], definitions: Sequence[object] = ()
@@ -90,7 +93,7 @@ class Workers:
             EOFError, ConnectionError: the process from which it is to be forked is gone.
         """
         receiver, sender = self._context.Pipe(duplex=False)
-        settings = dict(os.environ), not self._running
+        settings = dict(os.environ), not self._running, self.groups
         process = self._context.Process(target=_work, args=(function, arguments, sender, *settings), name=key)
         with without_main(*definitions):
             if isinstance(self._context, ForkServerContext):
@@ -130,14 +133,16 @@ class Workers:
                 del self._running[key]
                 process.join()
                 code = process.exitcode
+                self._end_group(process.pid)
                 process.close()
                 if key not in self._begun:
                     check_guard(code)
                 yield key, code
 
-    def pid(self, key: str) -> int | None:
-        """The number of a process that runs."""
-        return self._running[key][0].pid
+    def _end_group(self, leader: int | None) -> None:
+        if self.groups and leader is not None and hasattr(os, "killpg") and leader != os.getpgrp():
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(leader, signal.SIGKILL)
 
     def kill(self, key: str) -> None:
         """Kill a process; its end is an event."""
@@ -150,6 +155,7 @@ def _work(
     sender: connection.Connection,
     environment: Mapping[str, str],
     announces: bool,
+    leads: bool,
 ) -> None:
     """The body of a process; `environment` are the variables of the one that started it, now.
 
@@ -157,7 +163,11 @@ def _work(
 
     Args:
         announces: whether it says that it compiles: others compile the same.
+        leads: whether it and the processes that it starts are a group of their own.
     """
+    if leads:
+        with contextlib.suppress(OSError, AttributeError):  # it leads one; Windows
+            os.setsid()
     compiling.announces = compiling.announces and announces
     threads = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
     os.environ.clear()
@@ -174,19 +184,6 @@ def _work(
     send(_Begun())  # an exit code is that of the work from here on
     function(*arguments, send)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends by itself: an exception in what is given back is printed
-
-
-def begin_group() -> None:
-    """Make this process, and those that it starts, a group of their own, which `end_group` ends."""
-    with contextlib.suppress(OSError, AttributeError):  # it leads one; Windows
-        os.setsid()
-
-
-def end_group(leader: int | None) -> None:
-    """Kill what is left of the group of a process that has ended; nothing if there is none."""
-    if leader is not None and hasattr(os, "killpg") and leader != os.getpgrp():
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(leader, signal.SIGKILL)
 
 
 def end_cleanly() -> None:

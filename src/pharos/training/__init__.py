@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from pharos.training.curve import Curve, Evaluation, RegretCurve, evaluate_agent
     from pharos.training.execution import (
         ATTEMPTS,
-        EXIT_BUSY,
         Execution,
         TrainingProgress,
         Work,

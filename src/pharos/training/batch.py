@@ -318,7 +318,10 @@ class Program:
         """Write and keep the result of each run; its seconds are its share of those of the batch."""
         size = {"runs": len(self.runs), "seconds": seconds, "device": self.runs[0].tasks.device}
         share = seconds - compiled if self.is_alone else seconds / len(self.runs)
-        entries = {"compiling_seconds": compiled} if self.is_alone else {"batch": size}
+        entries: dict[str, Any] = {"compiling_seconds": compiled} if self.is_alone else {"batch": size}
+        notes: dict[str, str] = getattr(self.learner, "notes", dict)()
+        if notes:
+            entries["notes"] = notes
         for i, run in enumerate(self.runs):
             if run.place is None:
                 continue
@@ -334,7 +337,7 @@ class Program:
             rows = [{name: row[name] for name in _results.COLUMNS} for row in curve]
             policy = self.learner.policy(i)
             learnt = None if isinstance(policy, Evaluation) else policy
-            end = TrainingResult(config, result, rows, learnt, folder, share)
+            end = TrainingResult(config, result, rows, learnt, folder, share, notes)
             self.tell(("end", run.place, end))
         self._remove_checkpoint()
         if self.is_alone and (folder := self.runs[0].folder) is not None:

@@ -24,9 +24,10 @@ import contextlib
 import copy
 import os
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NoReturn, Protocol, SupportsIndex
+from typing import Any, NoReturn, SupportsIndex
 
 import gymnasium
 import numpy as np
@@ -104,7 +105,7 @@ class StepBudget:
         """Raise ParameterError in any other process, whose steps would not be counted."""
         if os.getpid() != self.process:
             raise ParameterError(
-                f"the environment of the benchmark was made in process {self.process}, which counts its steps; found "
+                f"the environment of the run was made in process {self.process}, which counts its steps; found "
                 f"process {os.getpid()} (AsyncVectorEnv, SubprocVecEnv, a fork); {SEVERAL}"
             )
 
@@ -163,8 +164,7 @@ class CountedEnv(gymnasium.Wrapper):
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
         raise ParameterError(
-            f"the environment of the benchmark cannot be pickled: its steps are counted in this process alone; "
-            f"{SEVERAL}"
+            f"the environment of the run cannot be pickled: its steps are counted in this process alone; {SEVERAL}"
         )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -177,12 +177,12 @@ class CountedEnv(gymnasium.Wrapper):
         self.budget.check_process()
         if options:
             raise ParameterError(
-                f"reset has the options {', '.join(map(str, options))}; expected none: episodes of the benchmark begin "
-                f"where the task says"
+                f"reset has the options {', '.join(map(str, options))}; expected none: episodes of the run begin "
+                f"where its task says"
             )
         if seed is not None and self._last_seed == seed - 1:
             raise ParameterError(
-                f"the environment of the benchmark was reset with seed {self._last_seed}, then with {seed}, without a "
+                f"the environment of the run was reset with seed {self._last_seed}, then with {seed}, without a "
                 f"step between: it stands several times in a vector environment; {SEVERAL}"
             )
         self._last_seed = seed
@@ -280,6 +280,8 @@ def _answer(answers: PolicyAnswers, policy: PolicyLike, observations: Any, count
     except Exception as error:
         kind = f"{getattr(observations, 'shape', '')} {getattr(observations, 'dtype', '')}".strip()
         hint = "" if not hasattr(policy, "state_dict") else "; of a network: lambda seen: " + NETWORK_POLICY
+        if hasattr(getattr(policy, "__self__", policy), "predict"):
+            hint = "; of Stable-Baselines3: the model itself"
         raise ParameterError(
             f"the policy raised {in_one_line(error)}, asked about {count} observations, an array {kind}; expected a "
             f"function of such arrays that returns ({count}, A) probabilities or ({count},) actions{hint}"
@@ -296,41 +298,36 @@ def _check_again(table: np.ndarray, again: np.ndarray) -> None:
         )
 
 
-class PolicySink(Protocol):
-    """An environment with a budget, and what becomes of the policies that are learnt on it."""
-
-    env: CountedEnv
-    budget: StepBudget
-
-    def record(self, policy: PolicyLike) -> None:
-        """Let a policy be the one in force from this step on."""
-        ...
-
-
 class PolicyRecorder:
     """A run: an environment with a budget, policies as they are learnt, and the curve that they make.
 
-    A policy is asked about every state when it is recorded; it is evaluated when the curve is asked for.
+    A policy is asked about every state when it is recorded. It counts at the points after its step, or at it.
 
     Args:
         task: of the run.
-        steps: that may be taken. evaluations: points of the curve.
+        steps: that may be taken. interval: between evaluation points; the last one is the end.
         seed: of the environment.
     Attributes:
         env: the environment. budget: its steps so far.
         count: policies so far.
+        in_force: the policy of the points to come, a table or its value; uniform play before the first.
+        ended: finished episodes, and the sum of their returns, at the point that was passed last.
+        at_point: called at each point.
     """
 
-    def __init__(self, task: Task, *, steps: int, evaluations: int, seed: int):
-        self.task, self.evaluations = task, evaluations
-        self.budget = StepBudget(steps, steps // evaluations)
+    def __init__(self, task: Task, *, steps: int, interval: int, seed: int):
+        self.task = task
+        self.budget = StepBudget(steps, interval)
         self.env = CountedEnv(task, self.budget, seed)
         self.count = 0
+        self.in_force: PolicyLike | Evaluation = uniform_policy(task)
+        self.ended = 0, 0.0
+        self.at_point: Callable[[int], object] = self._remember
+        self._points = deque([*range(interval, steps, interval), steps])  # to come
+        self._num_points = len(self._points)
         self._first_step = steps  # of the first policy
         self._snapshots = Snapshots(task)
-        self._last: PolicyLike | Evaluation = uniform_policy(task)
-        self._in_force: list[PolicyLike | Evaluation] = [self._last]  # at the start, and at each point so far
-        self._values: dict[int, tuple[PolicyLike | Evaluation, Evaluation]] = {}  # of policies by id, kept alive
+        self._passed: list[tuple[int, int, float, PolicyLike | Evaluation]] = [(0, 0, 0.0, self.in_force)]
 
     def record(self, policy: PolicyLike) -> None:
         """Let a policy be the one in force from this step on.
@@ -340,36 +337,54 @@ class PolicyRecorder:
         """
         if self.count and not self.budget.steps:
             raise not_stepped(self.budget.limit)
-        num_points = (self.budget.steps - 1) // self.budget.interval  # evaluation points before this step
-        self._in_force += [self._last] * (num_points + 1 - len(self._in_force))
-        self._last = self._snapshots.taken(policy)
+        self.pass_points(self.budget.steps)
+        self.in_force = self._snapshots.taken(policy)
         if not self.count:
             self._first_step = self.budget.steps
         self.count += 1
 
+    def pass_points(self, step: float) -> None:
+        """Call `at_point` at the points before a step, with the policy in force."""
+        while self._points and self._points[0] < step:
+            point = self._points.popleft()
+            self.ended = self._ended_at(point)
+            self.at_point(point)
+
+    def _remember(self, point: int) -> None:
+        """Remember the policy in force, for the curve."""
+        self._passed.append((point, *self.ended, self.in_force))
+
+    def _ended_at(self, point: int) -> tuple[int, float]:
+        budget = self.budget
+        number = point // budget.interval
+        is_passed = point % budget.interval == 0 and number <= len(budget.at)
+        return budget.at[number - 1] if is_passed else (budget.episodes, budget.returns)
+
     def curve(self) -> Curve:
-        """The curve, with the last policy in force at all points that were not reached.
+        """The curve, with the last policy in force at all points that were not passed.
 
         Raises:
             ParameterError: it ends with another policy than uniform play, and no step was counted.
         """
-        budget = self.budget
-        in_force = self._in_force + [self._last] * (self.evaluations + 1 - len(self._in_force))
-        at = budget.at + [(budget.episodes, budget.returns)] * (self.evaluations - len(budget.at))
-        curve = Curve(self.task, counted_steps=budget.steps)
-        for place, (policy, ended) in enumerate(zip(in_force, [(0, 0.0), *at], strict=True)):
-            if id(policy) not in self._values:
-                value = policy if isinstance(policy, Evaluation) else evaluate_agent(policy, self.task)
-                self._values[id(policy)] = policy, value
-            curve.add(place * budget.interval, *ended, policy, self._values[id(policy)][1])
-        uniform, ended_with = (curve.rows[place]["normalized_regret"] for place in (0, -1))
-        if not budget.steps and abs(ended_with - uniform) > TOLERANCE:
-            raise not_stepped(budget.limit)
+        curve = Curve(self.task, counted_steps=self.budget.steps)
+        values: dict[int, Evaluation] = {}  # by the identity of the policy
+        to_come = ((point, *self._ended_at(point), self.in_force) for point in self._points)
+        for point, episodes, returns, policy in [*self._passed, *to_come]:
+            if id(policy) not in values:
+                values[id(policy)] = policy if isinstance(policy, Evaluation) else evaluate_agent(policy, self.task)
+            curve.add(point, episodes, returns, policy, values[id(policy)])
+        self.check_steps(curve)
         return curve
+
+    def check_steps(self, curve: Curve) -> None:
+        """Raise ParameterError if a curve ends elsewhere than it begins, and no step was counted."""
+        first, last = (curve.rows[place]["normalized_regret"] for place in (0, -1))
+        if not self.budget.steps and abs(last - first) > TOLERANCE:
+            raise not_stepped(self.budget.limit)
 
     def notes(self) -> dict[str, str]:
         """Sentences on what looks like a mistake of the agent, by kind: found, expected, what to try."""
-        budget, points = self.budget, self.evaluations
+        budget, points = self.budget, self._num_points
         notes = {}
         random = min(points, max(0, -(-self._first_step // budget.interval) - 1))
         if not self.count:
@@ -417,12 +432,12 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
         ParameterError: it is no generator of policies; or it has a second policy, or ends with another one than uniform
             play, when no step was counted; or whatever its code raises.
     """
-    recorder = PolicyRecorder(task, steps=steps, evaluations=evaluations, seed=seed)
+    recorder = PolicyRecorder(task, steps=steps, interval=steps // evaluations, seed=seed)
     generate(learn, recorder, seed)
     return recorder.curve()
 
 
-def generate(learn: Callable[..., Any], recorder: PolicySink, seed: int) -> None:
+def generate(learn: Callable[..., Any], recorder: PolicyRecorder, seed: int) -> None:
     """Train with a generator, and record its policies until it, or its budget, has ended; raises as `generated_curve`.
 
     After a refused step one more policy counts. A generator that yields IGNORED policies in a row without a step is

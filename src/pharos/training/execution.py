@@ -31,8 +31,6 @@ ATTEMPTS = 3
 """How often a group is begun whose process is killed, before it is halved, or fails."""
 BUSY_SECONDS = 0.5
 WAITING_SECONDS = 1.0
-EXIT_BUSY = 75
-"""Exit code of a process whose runs another process trains."""
 # How often in a row the process that forks workers is begun again
 LOST_SERVERS = 10
 
@@ -62,9 +60,13 @@ class Execution(Generic[R]):
     Attributes:
         waiting: (the earliest time to begin, runs). running: key of the process -> (runs, when it began).
         lost_servers: how often in a row the process that forks workers was gone.
+        exit_busy: exit code of a process whose runs another process trains; None: nobody else is at them.
+        is_divisible: whether a group whose process was killed too often is halved.
     """
 
     lost_servers = 0
+    exit_busy: int | None = None
+    is_divisible = True
 
     def __init__(
         self,
@@ -211,18 +213,20 @@ class Execution(Generic[R]):
             code: exit code; or, of other pools, why it has died.
         """
         group, _ = self.running.pop(key)
-        left = [run for run in group if not self.is_over(run, ended=code in (0, EXIT_BUSY))]
+        left = [run for run in group if not self.is_over(run, ended=code in (0, self.exit_busy))]
         if code == SERVER_LOST and left and self.lost_servers < LOST_SERVERS:
             self.lost_servers += 1  # the worker may well live: the next attempt waits for it
-        elif code != EXIT_BUSY:
+        elif code != self.exit_busy:
             self._repeat(key, left, code if isinstance(code, str) else self._in_words(code))
             return
         if left:  # another process is at them
             self.waiting.append((time.monotonic() + BUSY_SECONDS, left))
 
     def _in_words(self, code: int) -> str:
-        how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
-        return f"its process ended {how}, {pluralize(self.attempts, 'time')}; was there memory enough?"
+        name = signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
+        how = f"by {name}" if code < 0 else f"with exit code {code}"
+        advice = "was there memory enough?" if code == -signal.SIGKILL else "look at what it wrote to standard error"
+        return f"its process ended {how}{f', {self.attempts} times' * (self.attempts > 1)}; {advice}"
 
     def _repeat(self, key: str, group: list[R], reason: str) -> None:
         """Let runs without results wait again, up to `attempts` times; then halve them, or let a single run fail."""
@@ -231,13 +235,15 @@ class Execution(Generic[R]):
         most = max((self.kills[id(run)] for run in group), default=0)
         if group and most < self.attempts:
             self.waiting.append((0.0, group))
-        elif len(group) > 1 and most == self.attempts:
+        elif len(group) > 1 and most == self.attempts and self.is_divisible:
             self.kills.update({id(run): 0 for run in group})
             self.halve(key, group)
         else:
+            if most > self.attempts:
+                advice = "it was ended: raise --timeout, or look for a loop without an end"
+                reason = f"took longer than {self.timeout:g} s; {advice}"
             for run in group:
-                is_late = self.kills[id(run)] > self.attempts
-                self.fail(run, f"took longer than {self.timeout:g} s" if is_late else reason)
+                self.fail(run, reason)
 
 
 def stored_batches(checkpoints: Path | None) -> dict[Path, frozenset[str]]:

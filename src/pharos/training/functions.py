@@ -5,7 +5,6 @@ seed alone.
 """
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,37 +15,20 @@ import numpy as np
 from pharos.agents import COMPILED, GENERATOR, generator_of, register_form
 from pharos.errors import ParameterError
 from pharos.policies import PolicyLike
-from pharos.training.budget import (
-    TOLERANCE,
-    CountedEnv,
-    Snapshots,
-    StepBudget,
-    generate,
-    not_stepped,
-    uniform_policy,
-)
+from pharos.training.budget import PolicyRecorder, generate, uniform_policy
 from pharos.training.curve import Evaluation, evaluate_agent
 from pharos.training.jax_agents import compiled_curves
 from pharos.training.results import write_policy
 
 
-class GeneratorLearner:
-    """Learner of one run: learn(env, steps, seed, **hyperparameters) yields policies; the last one counts.
-
-    A policy is asked about all states when it is yielded. It is evaluated at the points after its step, or at it.
-    """
+class GeneratorLearner(PolicyRecorder):
+    """Learner of one run: learn(env, steps, seed, **hyperparameters) yields policies."""
 
     def __init__(self, runs: Sequence[Any], learn: Callable[..., Any]):
         (run,) = runs
+        config = run.config
+        super().__init__(run.task, steps=config.steps, interval=config.evaluation_interval, seed=config.seed)
         self.run, self.function = run, learn
-        self.budget = StepBudget(run.config.steps, run.config.evaluation_interval)
-        self.env = CountedEnv(run.task, self.budget, run.config.seed)
-        self.count = 0  # policies so far
-        self.in_force: PolicyLike | Evaluation = uniform_policy(run.task)
-        self._snapshots = Snapshots(run.task)
-        self._waiting: deque[int] = deque()  # points to come
-        self._at_point: Callable[[int], object]
-        self.ended = (0, 0.0)  # episodes, and the sum of their returns, at the point that is evaluated
 
     @property
     def episodes(self) -> np.ndarray:
@@ -64,31 +46,11 @@ class GeneratorLearner:
                 when no step was counted; or yields very many policies without a step while it has some; or whatever its
                 code raises.
         """
-        self._waiting, self._at_point = deque(points), at_point
+        self.at_point = at_point
         generate(partial(generator_of(self.function), **self.run.hyperparameters), self, self.run.config.seed)
         self.run.curve.counted_steps = self.budget.steps
-        self._evaluate(math.inf)
-        first, last = (self.run.curve.rows[place]["normalized_regret"] for place in (0, -1))
-        if not self.budget.steps and abs(last - first) > TOLERANCE:
-            raise not_stepped(self.budget.limit)
-
-    def record(self, policy: PolicyLike) -> None:
-        """Let a policy be the one in force from this step on. ParameterError: the second one, and no step counted."""
-        if self.count and not self.budget.steps:
-            raise not_stepped(self.budget.limit)
-        self._evaluate(self.budget.steps)
-        self.in_force = self._snapshots.taken(policy)
-        self.count += 1
-
-    def _evaluate(self, step: float) -> None:
-        """Evaluate the policy in force at the points before a step."""
-        budget = self.budget
-        while self._waiting and self._waiting[0] < step:
-            point = self._waiting.popleft()
-            number = point // budget.interval
-            is_passed = point % budget.interval == 0 and number <= len(budget.at)
-            self.ended = budget.at[number - 1] if is_passed else (budget.episodes, budget.returns)
-            self._at_point(point)
+        self.pass_points(math.inf)
+        self.check_steps(self.run.curve)
 
     def policy(self, i: int) -> PolicyLike | Evaluation:
         return self.in_force

@@ -15,7 +15,7 @@ import re
 import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -344,6 +344,7 @@ class TrainingResult:
         agent: the trained agent: a `QLearning` or a model of Stable-Baselines3; None where the run was finished before.
         folder: of the run, or None.
         seconds: time that it took, without that of compiling.
+        notes: sentences on what looks like a mistake of a function of the user's own, by kind.
     """
 
     config: dict[str, Any]
@@ -352,6 +353,7 @@ class TrainingResult:
     agent: Any
     folder: Path | None
     seconds: float
+    notes: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         config, result = self.config, self.result
@@ -381,7 +383,8 @@ def finished_result(folder: Path, config: RunConfig) -> TrainingResult | None:
     if record.get("status") != "finished":
         return None
     rows = read_rows(folder)
-    return TrainingResult(record["config"], record["result"], rows, None, folder, record["seconds"])
+    notes = record.get("notes", {})
+    return TrainingResult(record["config"], record["result"], rows, None, folder, record["seconds"], notes)
 
 
 def clear_run(folder: Path) -> None:

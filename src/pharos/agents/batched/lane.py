@@ -26,7 +26,6 @@ from pharos.agents.batched.networks import (
 )
 from pharos.agents.batched.runs import BLOCK, BatchRun, ObservationSource, as_networks_see, is_small, resolved
 from pharos.kernels import batched as kernels
-from pharos.mdp import require_all_actions
 
 LARGEST_TABLE = 1 << 28  # bytes of observations as networks take them, on the processor
 SHARE_OF_DEVICE = 0.5  # of a GPU's free memory that a table may take
@@ -197,26 +196,22 @@ class ActionSets:
             for mdp in tables.values()
         ]
         begins = dict(zip(tables, np.cumsum([0, *map(len, sets)]).tolist(), strict=False))
-        self.table = torch.from_numpy(np.concatenate(sets)).to(device)
-        self.begins = torch.tensor([[begins[id(run.mdp.terminal)]] for run in runs], device=device)
+        self._table = np.concatenate(sets)
+        self._begins = np.array([[begins[id(run.mdp.terminal)]] for run in runs])
+        self.table, self.begins = (torch.from_numpy(each).to(device) for each in (self._table, self._begins))
 
     @staticmethod
     def of(runs: Sequence[BatchRun], device: str) -> "ActionSets | None":
-        """The sets of runs; None where all actions are available to all of them.
-
-        Raises:
-            ParameterError: they are not, and actions are sticky or random.
-        """
-        if all(run.mdp.available is None for run in runs):
-            return None
-        for run in runs:
-            if run.mdp.available is not None and not run.mdp.chance.is_none:
-                require_all_actions(run.mdp, "the batched engine under sticky or random actions")
-        return ActionSets(runs, device)
+        """The sets of runs; None where all actions are available to all of them."""
+        return None if all(run.mdp.available is None for run in runs) else ActionSets(runs, device)
 
     def of_states(self, states: torch.Tensor) -> torch.Tensor:
         """(W, B, A) bool, of states (W, B)."""
         return self.table[states + self.begins]
+
+    def of_episodes(self, states: np.ndarray) -> np.ndarray:
+        """(W, E, A) bool, of states (W, E) in main memory."""
+        return np.asarray(self._table[states + self._begins])
 
 
 MASKED = -1e8
@@ -259,12 +254,12 @@ class Lane(Generic[Net]):
         self.num_actions = runs[0].mdp.num_actions
         self.keys = np.array([run.key % 2**64 for run in self.runs], np.uint64)
         self.is_idle = np.arange(width) >= len(runs)
-        self.worlds = BatchedEpisodes(self.runs, self.keys, self.copies, runs[0].observe.frames)
+        self.sets = ActionSets.of(self.runs, device)
+        self.worlds = BatchedEpisodes(self.runs, self.keys, self.copies, runs[0].observe.frames, self.sets)
         self.depth = self.worlds.depth
         self.actions = np.zeros((width, self.copies), np.int64)
         self.seen = (ObservationTable if device == "cpu" else DeviceObservationTable)(self.runs, device)
         self._buffers: dict[int, torch.Tensor] = {}
-        self.sets = ActionSets.of(self.runs, device)
         self.network = self.network_for(self.seen.shape)
         self._own_networks = [
             self.network if view.shape == self.seen.shape else self.network_for(view.shape) for view in self.seen.views
@@ -493,7 +488,14 @@ class BatchedEpisodes:
         next_history: (W, E, k), what is seen after the last step, before a new episode begins.
     """
 
-    def __init__(self, runs: Sequence[BatchRun], keys: np.ndarray, copies: int, frames: int = 1):
+    def __init__(
+        self,
+        runs: Sequence[BatchRun],
+        keys: np.ndarray,
+        copies: int,
+        frames: int = 1,
+        sets: ActionSets | None = None,
+    ):
         width = len(runs)
         by_table: dict[Any, list[int]] = {}
         for i, run in enumerate(runs):
@@ -502,6 +504,9 @@ class BatchedEpisodes:
         self.worlds = [World(runs[places[0]], places) for places in by_table.values()]
         self.keys = keys
         self._chances = np.array([(*run.mdp.chance.triple, run.mdp.chance.first_chosen) for run in runs], np.float64)
+        # what is executed is drawn by the sets then, not in the kernel of all
+        self._sets = None if all(run.mdp.chance.is_none for run in runs) else sets
+        self._none = np.tile([1.0, 0.0, 0.0, 1.0], (width, 1))
         self._limits = np.array([run.time_limit for run in runs], np.int64)
         self._gammas = np.array([run.gamma for run in runs], np.float64)
         chances = [run.chance for run in runs]
@@ -532,7 +537,12 @@ class BatchedEpisodes:
 
     def step(self, step: int, actions: np.ndarray, *, counts: bool) -> None:
         """Execute actions (W, E); finished episodes are added up where `counts` is true."""
-        setting = (self.keys, step, self._chances, self._limits, self._gammas)
+        chances = self._chances
+        if self._sets is not None:
+            choices, actions, chances = actions, np.empty_like(actions), self._none
+            sets = self._sets.of_episodes(self.state)
+            kernels.execute_in_sets(self.keys, step, self._chances, sets, self.previous, choices, actions)
+        setting = (self.keys, step, chances, self._limits, self._gammas)
         episodes = (self.state, self.previous, self.elapsed, self.running, self.discount, self.episodes, self.returns)
         transition = (self.next_state, self.reward, self.flags)
         for world in self.worlds:

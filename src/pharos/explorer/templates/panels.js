@@ -44,6 +44,7 @@ const panels = {
       position.start ? h("span", {}, position.start === 1 ? "start" : `start, ${percent(position.start)}`) : null,
       position.layer >= 0 ? h("span", {}, `layer ${position.layer.toLocaleString("en")}`) : null,
       about.is_sticky ? h("span", {}, position.previous === null ? "no action before" : `before: ${about.actions[position.previous]}`) : null,
+      (position.labels || []).map((label) => h("span", {}, label)),
       position.terminal ? h("span", { class: "end" }, "terminal") : null);
     fill("variables", this.groups().map(({ name, rows }) => {
       const changed = before && rows.flat().some((i) => before.values[i] !== position.values[i]);
@@ -58,7 +59,7 @@ const panels = {
     const { about } = world;
     fill("tiles", about.policies.map((policy) => {
       const action = policy === "uniform" ? null : chosenBy(position, policy);
-      const does = position.terminal ? "the episode has ended" : policy === "uniform" ? "every action alike" : action === null ? "was not asked here" : `chooses ${about.actions[action]}`;
+      const does = position.terminal ? "the episode has ended" : policy === "uniform" ? "every action alike" : action === null ? "was not asked here" : `chooses ${position.actions[action].name ?? about.actions[action]}`;
       return tile(policy === "optimal" ? "optimal value V*" : `value, ${NAMES[policy]} policy`, text(position.v[policy], 6), does);
     }));
     if (position.terminal) { fill("actions", h("p", { class: "muted" }, "A terminal state: nothing follows, and its value is 0.")); $("choices-note").textContent = ""; return; }
@@ -71,7 +72,7 @@ const panels = {
       const gap = each.best ? h("span", { class: "none" }, "best") : h("span", { class: "gap" }, bar, h("span", {}, text(each.gap, 4)));
       const key = this.keyOf(action);
       return h("tr", { class: each.best ? "best" : null },
-        h("td", { "data-label": "Action" }, h("button", { type: "button", class: "act", onclick: () => act(action) }, h("kbd", {}, key || " "), about.actions[action])),
+        h("td", { "data-label": "Action" }, h("button", { type: "button", class: "act", onclick: () => act(action) }, h("kbd", {}, key || " "), each.name ?? about.actions[action])),
         h("td", { class: "number", "data-label": "Q*", title: others.map((name) => `${NAMES[name]}: ${text(each.q_of[name], 6)}`).join(", ") }, text(each.q, 6)),
         h("td", { class: "number", "data-label": "Gap" }, gap),
         about.policies.map((name) => h("td", { "data-label": `${NAMES[name]}` }, share(each.policies[name]))),
