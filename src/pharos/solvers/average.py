@@ -53,6 +53,8 @@ if TYPE_CHECKING:
 
 # Sweeps before policies are improved, and in all; the damping, which makes chains aperiodic.
 FIRST_SWEEPS, MOST_SWEEPS, DAMPING = 32, 100_000, 0.5
+# Outcomes that all sweeps of one component may read, some ten seconds.
+MOST_READ = 3e9
 # Damped steps after which the likeliest node of a class is the one to come back to.
 HOMING = 32
 # Improvements of a policy, at most.
@@ -140,8 +142,8 @@ def average_reward(
     Returns:
         An `AverageReward` with `gain`, `gain_at_start`, `policy` and `bias`.
     Raises:
-        ParameterError: the policy has the wrong shape; or actions are sticky, and not all are available in each state.
-        UnknownName: no such policy. PrecisionError: floats, within limits of time, prove no bound within the tolerance.
+        ParameterError: the policy has the wrong shape. UnknownName: no such policy.
+        PrecisionError: floats, within limits of time, prove no bound within the tolerance.
     Cost: nodes and outcomes are written out, 12 bytes an outcome; sweeps, and linear equations of some policies of each
         end component; of components of more than 20,000 nodes where elimination fills little in, else sweeps alone.
     Source: Puterman (2005), chapters 8 and 9; Ashok et al. (2017).
@@ -268,7 +270,8 @@ class MeanPayoff:
         if self._is_met(sweeps.h, tolerance) or self._improve(tolerance) or self._in_rational_numbers():
             return
         is_settled = False
-        while not (self._is_met(sweeps.h, tolerance) or is_settled or sweeps.count >= MOST_SWEEPS):
+        most = min(MOST_SWEEPS, MOST_READ / (self.choices.matrix.nnz + len(self.choices.owner)))
+        while not (self._is_met(sweeps.h, tolerance) or is_settled or sweeps.count >= most):
             is_settled = sweeps.go_on(sweeps.count, tolerance)
         self._bound(sweeps.h)
 
@@ -514,7 +517,7 @@ def _swept_ends(problem: GoalProblem, tolerance: float) -> tuple[np.ndarray, np.
     largest = float(np.abs(choices.rewards).max(initial=0.0))
     step = (choices.terms + 24) * UNIT * largest + choices.deviation * 2 * largest
     lower, upper = (np.append(np.full(choices.num_nodes, each), 0.0) for each in (-largest, largest))
-    for sweep in range(MOST_SWEEPS):
+    for sweep in range(int(min(MOST_SWEEPS, MOST_READ / (2 * choices.matrix.nnz)))):
         for bound, side in ((lower, -1.0), (upper, 1.0)):
             values = (choices.rewards + choices.matrix @ bound) / leaving
             moved = np.maximum.reduceat(values, choices.rows[:-1]) + side * step
@@ -536,7 +539,7 @@ def _first_values(mdp: TabularMDP, x: np.ndarray, rewards: np.ndarray | float = 
     """(S, A) rewards, plus the numbers x (N,) of the nodes that executing an action leads to."""
     numbers = np.zeros((mdp.num_states + 1, mdp.width))
     numbers[:-1] = x.reshape(mdp.num_states, mdp.width)
-    return np.asarray(rewards + mdp.dynamics.expected(numbers))
+    return np.asarray(rewards + mdp.acting(mdp.dynamics.expected(numbers), slice(None)))
 
 
 def _of_states(
