@@ -151,8 +151,8 @@ def page(rows: list[Row], most: int) -> str:
         "# Published values of goals",
         "",
         "The [quantitative verification benchmark set](https://qcomp.org/benchmarks) publishes exact results, which",
-        "Storm computed, of models in PRISM's language, Modest, PPDDL and JANI. All of MDPs and Markov chains with at most",
-        f"{most:,} states were asked for by their names, as `pharos import prism FILE --property NAME` does, and",
+        "Storm computed, of models in PRISM's language, Modest, PPDDL and JANI. All of MDPs and Markov chains with at",
+        f"most {most:,} states were asked for by their names, as `pharos import prism FILE --property NAME` does, and",
         "answered by `pharos.reach` at gamma 1 without a horizon, in 64-bit floats.",
         "",
         f"**{len(right)} of {len(rows) - len(unanswered)} proven intervals hold the published number.** Of these, "
