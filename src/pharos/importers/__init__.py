@@ -37,6 +37,7 @@ __all__ = [
     "minigrid_grids",
     "procgen",
     "save",
+    "save_recording",
     "stepping",
     "storm",
     "storm_import",
