@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -357,6 +358,23 @@ def test_solving_until_the_end_and_reaching(answer):
     assert "no upper limit" in command_line.usage_error(
         "solve", "breakout", "height=7", "columns=3", "--objective", "total"
     )
+
+
+def test_the_long_run(answer, tmp_path):
+    solved = answer("solve", "endless_sea", "size=4", "--objective", "average", "--out", tmp_path / "sea.npz")
+    assert solved["gain_at_start"]["lower"] <= 0.25 <= solved["gain_at_start"]["upper"] < 0.25 + 1e-6
+    assert solved["uniform_gain_at_start"]["upper"] < 0.25 and "gamma" not in solved
+    with np.load(tmp_path / "sea.npz") as arrays:
+        assert arrays["gain_lower"].shape == arrays["bias_upper"].shape == (10,)
+        np.save(tmp_path / "sea.npy", arrays["policy"])
+    evaluated = answer("evaluate", "endless_sea", "size=4", "--objective", "average", "--policy", tmp_path / "sea.npy")
+    assert evaluated["average_regret"]["lower"] == 0 <= evaluated["average_regret"]["upper"] < 1e-6
+    assert evaluated["optimal_gain_at_start"] == solved["gain_at_start"]
+    assert abs(evaluated["normalized_average_regret"]) < 1e-6
+    for command in ("solve", "evaluate"):
+        assert "neither a discount nor a horizon" in command_line.usage_error(
+            command, "endless_sea", "--objective", "average", "--gamma", "0.9"
+        )
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from pharos.cli.options import (
     total_of,
 )
 from pharos.cli.policies import readable_policy, with_policy
-from pharos.errors import DivergenceError, FileFormatError, ParameterError, UnknownName
+from pharos.errors import DivergenceError, FileFormatError, ParameterError, PrecisionError, UnknownName
 from pharos.solvers import Solving
 from pharos.system import compiling
 from pharos.system.wording import pluralize
@@ -71,6 +71,8 @@ def solve(
         mdp = total_of(mdp, gamma, horizon, objective)
     if reach is not None:
         return reaching(target, mdp, reach, solving.tolerance, chance, out, policy_rows if print_policy else 0)
+    if objective == "average":
+        return averaging(target, mdp, solving.tolerance, chance, out, policy_rows if print_policy else 0)
     from pharos.solvers import uniform_value, value_iteration
     from pharos.system import storage
 
@@ -200,6 +202,59 @@ def reaching(
     return with_policy(reply, rows)
 
 
+def averaging(
+    target: Target, mdp: "TabularMDP", tolerance: float, chance: "ChanceSetting", out: Path | None, policy_rows: int
+) -> Answer:
+    """The answer about the average reward of a step in the long run; with so many rows of its policy."""
+    import numpy as np
+
+    from pharos.solvers import average_reward
+    from pharos.system import storage
+
+    began = time.perf_counter()
+    with progress_line("solving") as report, termination():
+        report("optimal average")
+        best = average_reward(mdp, tolerance=tolerance)
+        report("average of the uniform policy")
+        uniform = average_reward(mdp, "uniform", tolerance=tolerance)
+        report("bias")
+        try:
+            bias = best.bias
+        except PrecisionError:  # the equations of the policy are too large
+            bias = None
+    if out is not None and out.suffix.lower() == ".npy":
+        storage.replace_array(out, best.policy, follow=True)
+    elif out is not None:
+        arrays = {"gain": best.gain} | ({} if bias is None else {"bias": bias})
+        sides = {f"{name}_{side}": getattr(each, side) for name, each in arrays.items() for side in ("lower", "upper")}
+        with storage.replacing(out, follow=True) as file:
+            np.savez_compressed(file, **sides, policy=best.policy)
+    gain, of_uniform = best.gain_at_start, uniform.gain_at_start
+    answer = {
+        "gain_at_start": gain._asdict(),
+        "uniform_gain_at_start": of_uniform._asdict(),
+        "bias_at_start": None if bias is None else best.at_start(bias)._asdict(),
+        "seconds": time.perf_counter() - began,
+        "compiling_seconds": compiling.seconds(),
+        **{each: getattr(chance, each) for each in ACTING},
+        "tolerance": tolerance,
+        "num_states": mdp.num_states,
+        "num_actions": mdp.num_actions,
+        "file": None if out is None else str(out),
+    }
+    facts = [
+        ("optimal average reward a step", gain),
+        ("of the uniform policy", of_uniform),
+        ("bias at the start", "too many equations" if bias is None else best.at_start(bias)),
+        ("chance", chance.in_words(mdp.dynamics.has_chance)),
+        ("states", f"{mdp.num_states:,} x {pluralize(mdp.num_actions, 'action')}"),
+        *compiling_fact(),
+        *([] if out is None else [("written", out)]),
+    ]
+    reply = Answer(answer, (f"long run of {target.title}", facts))
+    return with_policy(reply, readable_policy(mdp, best.policy, policy_rows)) if policy_rows else reply
+
+
 def save(path: Path, solution: "Solution") -> None:
     """Write the policy (.npy), or values and policy (.npz)."""
     import numpy as np
@@ -240,6 +295,7 @@ def evaluate(
     policy: str = "uniform",
     gamma: Gamma = None,
     horizon: Horizon = None,
+    objective: Objective = None,
     chance: Chance,
     tolerance: Tolerance = 1e-6,
     building: Building,
@@ -256,7 +312,7 @@ def evaluate(
     from pharos.regret import ReferenceValues, regret
 
     decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
-    source = "given"
+    source, of_command = "given", (gamma, horizon)
     if decisions is not None and decisions.task is not None:
         own, names = decisions.task, ("gamma", "horizon", *ACTING)
         overridden = {name for name in names if context.get_parameter_source(name).name == "COMMANDLINE"}  # type: ignore[union-attr]
@@ -269,7 +325,9 @@ def evaluate(
         table = goal.mdp()
         gamma, horizon = table.gamma if gamma is None else gamma, table.horizon if horizon is None else horizon
         goal = goal.as_environment()
-    mdp = goal.mdp(building, gamma=gamma, horizon=horizon, chance=chance)
+    mdp = total_of(goal.mdp(building, gamma=gamma, horizon=horizon, chance=chance), *of_command, objective)
+    if objective == "average":
+        return averaged(goal, mdp, policy, decisions, tolerance, chance, source)
     with progress_line("evaluating"):
         values = {name: _worth(solution_of(mdp, name, None, tolerance)) for name in POLICIES}
         if decisions is None:
@@ -317,6 +375,51 @@ def evaluate(
         ("chance", chance.in_words(mdp.dynamics.has_chance)),
     ]
     return Answer(answer, (f"{policy} policy on {target.title}", facts))
+
+
+def averaged(
+    goal: Target,
+    mdp: "TabularMDP",
+    policy: str,
+    decisions: Given | None,
+    tolerance: float,
+    chance: "ChanceSetting",
+    source: str,
+) -> Answer:
+    """The answer about the average reward of a policy, and its regret a step."""
+    from pharos.policies import average_regret
+    from pharos.regret import regret_scale
+
+    began = time.perf_counter()
+    with progress_line("evaluating"):
+        if decisions is None:
+            result = average_regret(mdp, policy, tolerance)
+        else:
+            result = average_regret(mdp, decisions.policy, tolerance, **decisions.observer_options)
+        uniform, worst = (average_regret(mdp, name, tolerance, optimal=result.optimal) for name in ("uniform", "worst"))
+    middle, scale = (sum(each) / 2 for each in (result.regret, uniform.regret))
+    relative = middle / regret_scale(scale, 0.0, tolerance)
+    answer = {
+        "policy": policy,
+        "gain_at_start": result.gain._asdict(),
+        "average_regret": result.regret._asdict(),
+        "normalized_average_regret": relative,
+        "optimal_gain_at_start": result.optimal._asdict(),
+        "uniform_gain_at_start": uniform.gain._asdict(),
+        "worst_gain_at_start": worst.gain._asdict(),
+        "seconds": time.perf_counter() - began,
+        **{name: getattr(chance, name) for name in ACTING},
+        "setting": source,
+    }
+    facts = [
+        ("average reward a step", result.gain),
+        ("average regret a step", result.regret),
+        ("normalised regret", "-" if math.isnan(relative) else f"{relative:.6g}  (0: optimal, 1: uniform)"),
+        ("optimal, uniform, worst", f"{result.optimal}, {uniform.gain}, {worst.gain}"),
+        *([] if source == "given" else [("setting", source)]),
+        ("chance", chance.in_words(mdp.dynamics.has_chance)),
+    ]
+    return Answer(answer, (f"{policy} policy on {goal.title}, in the long run", facts))
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,11 @@ Seconds = Annotated[float, typer.Option(min=0)]
 Discount = Annotated[float, typer.Option(min=0, max=1)]
 Gamma = Annotated[float | None, typer.Option(min=0, max=1, help="Discount; 0.99 when not given, or 1 with a horizon.")]
 Objective = Annotated[
-    Literal["discounted", "total"] | None,
-    typer.Option(help="discounted, or total: gamma 1 and no horizon, not even a world's own. By --gamma if not given."),
+    Literal["discounted", "total", "average"] | None,
+    typer.Option(
+        help="discounted; total: gamma 1 and no horizon, not even a world's own; average: reward a step in the long "
+        "run. By --gamma if not given."
+    ),
 ]
 Horizon = Annotated[
     int | None, typer.Option(min=1, help="Steps after which an episode ends; without end when not given.")
@@ -143,9 +146,12 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def total_of(mdp: "TabularMDP", gamma: float | None, horizon: int | None, objective: str | None) -> "TabularMDP":
-    """The MDP, with gamma 1 and no horizon if the objective is the total reward."""
-    if objective != "total":
+    """The MDP, with gamma 1 and no horizon if the objective is the total reward, or that of a step in the long run."""
+    if objective not in ("total", "average"):
         return mdp
+    if objective == "average" and (gamma is not None or horizon is not None):
+        what = f"--horizon {horizon}" if horizon is not None else f"--gamma {gamma:g}"
+        raise ParameterError(f"--objective average has neither a discount nor a horizon; found {what}")
     if gamma not in (None, 1.0) or horizon is not None:
         what = f"--horizon {horizon}" if horizon is not None else f"--gamma {gamma:g}"
         raise ParameterError(f"--objective total has gamma 1 and no horizon; found {what}")

@@ -119,9 +119,7 @@ class Exploration:
         self.env, self.space, self.learnt, self.chance = env, space, learnt, chance
         self.title = title or (env.name if env is not None else "MDP")
         self.names = names_of(mdp)
-        self.actions = (
-            env.actions if env is not None else self.names.actions or tuple(map(str, range(mdp.num_actions)))
-        )
+        self.actions = env.actions if env is not None else self.names.actions or tuple(map(str, range(mdp.num_actions)))
         self.states: States = _states_of(mdp, space)
         progress("optimal values")
         self.solutions: dict[str, Solution] = {OPTIMAL: value_iteration(mdp)}

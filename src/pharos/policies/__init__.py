@@ -17,8 +17,10 @@ from pharos.policies.policy import (
     reachable_rows,
 )
 from pharos.policies.value import (
+    AverageRegret,
     Evaluation,
     ReachedSolution,
+    average_regret,
     evaluate_policy,
     is_small_table,
     is_walk,
@@ -28,5 +30,7 @@ from pharos.policies.value import (
 )
 
 __all__ = [
+    "AverageRegret",
+    "average_regret",
     "evaluate_policy",
 ]

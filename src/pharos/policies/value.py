@@ -13,7 +13,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypedDict, Unpack
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 
@@ -404,6 +404,64 @@ def evaluate_policy(
             f"{', '.join(observer_options)} given for a policy that sees no observations; name the observation"
         )
     return solvers.evaluate_policy(mdp, policy, solving)
+
+
+class AverageRegret(NamedTuple):
+    """Loss of a policy a step in the long run, from the start; each number within proven bounds.
+
+    Attributes:
+        regret: the optimal gain less that of the policy. gain, optimal: of the policy, and of the best one.
+    """
+
+    regret: solvers.GainInterval
+    gain: solvers.GainInterval
+    optimal: solvers.GainInterval
+
+
+@require_mdp
+def average_regret(
+    mdp: TabularMDP,
+    policy: PolicyLike | str,
+    tolerance: float = 1e-6,
+    *,
+    observation: object = None,
+    optimal: solvers.GainInterval | None = None,
+    **observer_options: Unpack[ObserverOptions],
+) -> AverageRegret:
+    """The average regret a step of a policy in the long run: the optimal gain less its own, from the start.
+
+    Args:
+        policy: as `evaluate_policy` takes it, or "uniform", "worst" or "optimal". One that sees observations may see
+            several frames, or have a memory.
+        tolerance: each gain is within this of the middle of its bounds.
+        observation, observer_options: as `evaluate_policy` takes them.
+        optimal: the optimal gain at the start, if it is there already.
+    Returns:
+        An `AverageRegret` of the intervals `regret`, `gain` and `optimal`. Regret is never negative.
+    Raises:
+        ParameterError: the policy has the wrong shape, or its rows are not probabilities; or as `evaluate_policy`.
+        PrecisionError: floats, within limits of time, prove no bound within the tolerance.
+    Cost: that of `average_reward`, twice.
+    Source: Auer, Jaksch and Ortner (2009), "Near-optimal regret bounds for reinforcement learning".
+    """
+    best = solvers.average_reward(mdp, tolerance=tolerance).gain_at_start if optimal is None else optimal
+    if isinstance(policy, str):
+        own = solvers.average_reward(mdp, policy, tolerance=tolerance).gain_at_start
+    elif observation is not None or isinstance(policy, Policy | RecurrentPolicy | SB3Model):
+        options, previous = observer_options.get("observation_options"), observer_options.get("previous_action", False)
+        observer = _observer_of(mdp, observation or "vector", dict(options or {}), previous)
+        limits: AnswerOptions = {
+            "deterministic": observer_options.get("deterministic", False),
+            "masks": observer_options.get("masks"),
+        }
+        answers = answers_of(policy, mdp, observer, **limits)
+        answers.reach()
+        own = solvers.average_reward(*answers.reached_mdp(), tolerance=tolerance).gain_at_start
+    else:
+        own = solvers.average_reward(mdp, policy, tolerance=tolerance).gain_at_start
+    room = 2.0**-52 * max(abs(each) for each in (*best, *own))
+    lost = solvers.GainInterval(max(best.lower - own.upper - room, 0.0), max(best.upper - own.lower + room, 0.0))
+    return AverageRegret(lost, own, best)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

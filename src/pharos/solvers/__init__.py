@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from pharos.system import lazy
 
 if TYPE_CHECKING:
-    from pharos.solvers.average import AverageReward, average_reward
+    from pharos.solvers.average import AverageReward, GainInterval, average_reward
     from pharos.solvers.options import Solving, SolvingOptions
     from pharos.solvers.policy_iteration import chain
     from pharos.solvers.reaching import Bounds, Reachability, reach
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AverageReward",
     "Bounds",
+    "GainInterval",
     "Reachability",
     "Solution",
     "Solving",

@@ -57,11 +57,11 @@ FIRST_SWEEPS, MOST_SWEEPS, DAMPING = 32, 100_000, 0.5
 HOMING = 32
 # Improvements of a policy, at most.
 MOST_IMPROVEMENTS = 200
-POLICIES = {"optimal": BEST, "worst": WORST}
-"""Names of the policies that are found -> selections."""
+POLICIES = ("optimal", "worst")
+"""Names of the policies that are found."""
 
 
-class Interval(NamedTuple):
+class GainInterval(NamedTuple):
     """A number between two proven bounds."""
 
     lower: float
@@ -93,18 +93,22 @@ class AverageReward:
     tolerance: float
 
     @property
-    def gain_at_start(self) -> "Interval":
+    def gain_at_start(self) -> "GainInterval":
         """The gain of an episode's first state."""
-        lower, upper = (self._of_starts(each) for each in (self.gain.lower, self.gain.upper))
-        room = 64 * UNIT * max(abs(lower), abs(upper))  # of the mean itself
-        return Interval(lower - room, upper + room)
+        return self.at_start(self.gain)
 
-    def _of_starts(self, numbers: np.ndarray) -> float:
-        return float(self.mdp.start_probabilities @ numbers[self.mdp.start_states])
+    def at_start(self, bounds: Bounds) -> "GainInterval":
+        """The mean over an episode's first state of numbers of the states, within bounds (S,)."""
+        lower, upper = (
+            float(self.mdp.start_probabilities @ each[self.mdp.start_states]) for each in (bounds.lower, bounds.upper)
+        )
+        terms = len(self.mdp.start_states) + 4
+        room = terms * UNIT * float(np.abs([bounds.lower, bounds.upper])[:, self.mdp.start_states].max())
+        return GainInterval(lower - room, upper + room)
 
     @cached_property
     def bias(self) -> Bounds:
-        """What `policy` earns beyond its gain: `lower` and `upper` (S,), proven.
+        """Surplus of `policy` over its gain: `lower` and `upper` (S,), proven.
 
         h(s) = sum over t of E r_t - g(s), summed in the mean (Cesaro) where the chain is periodic. So the stationary
         mean of h is 0 in each recurrent class, and h is 0 at the end. Of two states of one class the difference says
@@ -136,7 +140,7 @@ def average_reward(
     Returns:
         An `AverageReward` with `gain`, `gain_at_start`, `policy` and `bias`.
     Raises:
-        ParameterError: the policy has the wrong shape; or actions are sticky, and not all are available in each state.
+        ParameterError: the policy has the wrong shape.
         UnknownName: no such policy. PrecisionError: floats, within limits of time, prove no bound within the tolerance.
     Cost: nodes and outcomes are written out, 12 bytes an outcome; sweeps, and linear equations of some policies of each
         end component; of components of more than 20,000 nodes where elimination fills little in, else sweeps alone.
@@ -164,7 +168,7 @@ def _selection(mdp: TabularMDP, policy: TablePolicy | str | None) -> Selection:
             return PolicyTable.of(mdp)
         if policy is not None and policy not in POLICIES:
             raise UnknownName("policy", policy, [*POLICIES, "uniform"])
-        return POLICIES[policy or "optimal"]
+        return WORST if policy == "worst" else BEST
     return PolicyTable.of(mdp, policy.policy_table() if isinstance(policy, TableAgent) else policy)
 
 
@@ -296,7 +300,8 @@ class MeanPayoff:
             total, slack, best = self._bound(h)
             if self.upper - self.lower <= 2 * tolerance * (1 - 2.0**-20):
                 return True
-            is_better = total[best] - total[policy] > slack[best] + slack[policy]
+            own = total[policy]  # the gain everywhere, but for rounding, which h has, too
+            is_better = total[best] - own > slack[best] + slack[policy] + 2 * (own.max() - own.min())
             if not is_better.any():
                 return False
             policy = np.where(is_better, best, policy)
@@ -500,7 +505,7 @@ def _ends(
 
 
 def _swept_ends(problem: GoalProblem, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As `_ends`, by sweeps from above and from below: there is no component left, so that both meet.
+    """The same as `_ends`, by sweeps from above and from below: there is no component left, so that both meet.
 
     Source: Haddad and Monmege (2018), "Interval iteration algorithm for MDPs and IMDPs".
     """
@@ -542,10 +547,10 @@ def _of_states(
         first, bounds = mdp.chance.first, []
         for x, side in ((lower, -1.0), (upper, 1.0)):
             q = _first_values(mdp, x, rewards)
-            chosen = select.first_value(q)
+            value = select.first_value(q)
             room = (mdp.dynamics.operations + 2 * mdp.num_actions + 24) * UNIT * np.abs(q).max(initial=0.0)
             room += mdp.residual.deviation(1.0, float(np.abs(x).max(initial=0.0)))
-            bounds.append(first.choice(q, chosen if first.chosen else np.zeros_like(chosen))[:, 0] + side * room)
+            bounds.append(first.choice(q, value if first.chosen else np.zeros_like(value))[:, 0] + side * room)
         lower, upper = bounds
     live = ~np.asarray(mdp.terminal)
     room = 2 * UNIT * np.maximum(np.abs(lower), np.abs(upper))

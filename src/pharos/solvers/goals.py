@@ -346,7 +346,7 @@ class GoalProblem:
         v[nodes], error[nodes] = np.append(self.sign * values, 0.0), np.append(errors, 0.0)
         origin = np.full(len(inside) - 1, -1)
         origin[nodes[:-1]] = part.origin[policy]
-        return v[self.node_of[:-2]], error[self.node_of[:-2]], self._unfolded(origin)
+        return v[self.node_of[:-2]], error[self.node_of[:-2]], self.unfolded(origin)
 
     def solve(self, tolerance: float, progress: Callable[[int, float], None] | None = None) -> Goals:
         """Policy iteration, then bounds; in rational numbers where floats cannot tell, or are too short."""

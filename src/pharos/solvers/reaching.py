@@ -43,12 +43,12 @@ class Bounds:
     Attributes:
         lower, upper: (S,) float64, proven; both infinite if the number is.
         policy: (S,) actions that attain it, or (S, A + 1) under sticky actions, by the previous action; meaningless
-            where the number is infinite.
+            where the number is infinite. None: the number is of a policy that was given.
     """
 
     lower: np.ndarray
     upper: np.ndarray
-    policy: np.ndarray
+    policy: np.ndarray | None = None
 
     def __repr__(self) -> str:
         return f"Bounds(lower={self.lower}, upper={self.upper})"
