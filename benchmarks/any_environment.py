@@ -2,7 +2,8 @@
 
     python benchmarks/any_environment.py [--max-states 5000] [--only TEXT] [--markdown FILE]
 
-Tries what is installed of gymnasium, minigrid, minatar, gym-classics, mo-gymnasium, popgym and pettingzoo. Processor time of one thread. Merged: states that bisimulation.minimize leaves.
+Tries what is installed of gymnasium, minigrid, minatar, gym-classics, mo-gymnasium, popgym and pettingzoo. Processor
+time of one thread. Merged: states that bisimulation.minimize leaves.
 """
 
 import argparse

@@ -338,3 +338,40 @@ class KillsItself(Slips):
         if self.cell == 3 and os.path.exists(self.armed):
             os.kill(os.getpid(), signal.SIGKILL)
         return super().step(action)
+
+
+class Number(int):
+    """An integer of a class of its own."""
+
+
+class KeepsNumbers(Walk):
+    """The state is in objects of classes of the user's own, which have no fields."""
+
+    def reset(self, *, seed=None, options=None):
+        self.place = Number(0)
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        self.place = Number((self.place + 1 + action) % 5)
+        return 0, 1.0, self.place == 4, False, {}
+
+
+class CountsInTheClass(Walk):
+    count = 0
+
+    def step(self, action):
+        type(self).count += 1
+        cell, reward, *rest = super().step(action)
+        return cell, reward + self.count % 3, *rest
+
+
+class Heavy(Walk):
+    """Some hundred states of 40 kB each."""
+
+    def reset(self, *, seed=None, options=None):
+        self.pad = np.zeros(5_000)
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        self.pad = self.pad + 2 * action + 1
+        return 0, 1.0, self.pad[0] > 150, False, {}

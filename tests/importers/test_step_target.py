@@ -131,9 +131,11 @@ def test_two_imports_do_not_meet(tmp_path, here):
 
 @pytest.mark.slow
 def test_two_processes_find_the_same(tmp_path, here):
-    for workers in (1, 2):
-        imported("planted.py:Clock", tmp_path / str(workers), workers=workers)
-    assert contents(tmp_path / "1") == contents(tmp_path / "2")
+    for target in ("Clock", "Heavy"):  # what is sent at once is more than a pipe holds
+        one, two = (tmp_path / f"{target}{workers}" for workers in (1, 2))
+        imported(f"planted.py:{target}", one, seconds=9.0)
+        imported(f"planted.py:{target}", two, seconds=9.0, workers=2)
+        assert contents(one) == contents(two)
     with pytest.raises(RuleError, match="global generator"):
         imported("planted.py:HiddenPython", tmp_path / "3", workers=2)
     with pytest.raises(ParameterError, match="other processes cannot import its factory"):

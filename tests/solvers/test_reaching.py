@@ -35,6 +35,26 @@ def test_they_are_those_of_the_best_and_the_worst_policy(mdp, target, is_random)
         assert result.least_cost.upper[s] == result.largest_cost.upper[s] == 0
 
 
+@pytest.mark.long
+@examples(60, mdps_with_cycles(rewards=(0.0, 1.0, 0.1)), st.sets(st.integers(0, 4), min_size=1))
+def test_their_policies_attain_them(mdp, target):
+    target = sorted({t for t in target if t < mdp.num_states} or {0})
+    result = pharos.reach(mdp, target)
+    arrived = np.append(result.target, False).astype(float)
+    over = result.stopped.terminal[:, None]
+    entering = result.stopped.with_rewards(np.where(over, 0.0, mdp.dynamics.expected(arrived)))
+    for bounds in (result.maximum, result.minimum):
+        worth = pharos.evaluate_policy(entering, bounds.policy, 1e-6)
+        expected = np.where(result.target, 1.0, worth.v)
+        assert (expected >= bounds.lower - worth.error_bound - 1e-6).all()
+        assert (expected <= bounds.upper + worth.error_bound + 1e-6).all()
+    for bounds in (result.least_cost, result.largest_cost):
+        if np.isfinite(bounds.upper).all():
+            tolerance = max(1e-6, 1e-12 * bounds.upper.max())
+            worth = pharos.evaluate_policy(result.stopped, bounds.policy, tolerance)
+            assert np.abs(worth.v - bounds.upper).max() <= worth.error_bound + 2 * tolerance
+
+
 def test_haddad_monmege():
     mdp = haddad_monmege(20, 0.7)
     result = pharos.reach(mdp, [mdp.num_states - 1])

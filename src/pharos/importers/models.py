@@ -181,7 +181,7 @@ def storm_import(
     outcomes = outcomes._replace(probabilities=probabilities)
     mdp = _mdp(model, outcomes, gamma, horizon)
     counts = np.array([len(_choices(model, s)) for s in range(model.nr_states)])
-    names_of_model, reach = _names(model, actions, None if query is None or query.is_total else query.goal)
+    names_of_model, reach = _names(model, actions, None if query is None or query.is_total else query)
     mdp = replace(
         with_sets(mdp, np.arange(actions) < counts[:, None]),
         residual=Residual.of(residuals, np.maximum.reduceat(np.abs(outcomes.rewards), outcomes.offsets[:-1])),
@@ -193,7 +193,7 @@ def storm_import(
     return StormImport(mdp, outcomes if _differ(outcomes) else None, question)
 
 
-def _names(model: Any, num_actions: int, goal: np.ndarray | None) -> tuple[Names, str]:
+def _names(model: Any, num_actions: int, query: "Query | None") -> tuple[Names, str]:
     """(names of the model's labels, variables and choices, label of the states to be reached)."""
     states = model.nr_states
     labels = {}
@@ -202,8 +202,9 @@ def _names(model: Any, num_actions: int, goal: np.ndarray | None) -> tuple[Names
             labels[label] = np.zeros(states, np.bool_)
             labels[label][list(model.labeling.get_states(label))] = True
     reach = TARGET
-    if goal is not None:
-        same = [label for label, mask in labels.items() if (mask == goal).all()]
+    if query is not None:
+        goal = query.goal
+        same = [label for label, mask in labels.items() if f'"{label}"' in query.text and (mask == goal).all()]
         while reach in labels and reach not in same:
             reach += "_"
         reach = same[0] if same else reach
@@ -393,8 +394,9 @@ def _program(path: Path, constants: str) -> tuple[Any, dict[str, Any]]:
     program, listed = (
         stormpy.parse_jani_model(str(path)) if path.suffix == ".jani" else (stormpy.parse_prism_program(str(path)), [])
     )
-    properties = {each.get_name(): each for each in listed}
-    return stormpy.instantiate_constants(program, constants)[0] if constants else program, properties
+    if constants:  # of the properties too, which Storm else reads with any value
+        program, listed = stormpy.instantiate_constants(program, constants, listed)
+    return program, {each.get_name(): each for each in listed}
 
 
 OPTIMUM = re.compile(r"^\s*(?:filter\(\w+,\s*)?[PRT](?:\{[^}]*\})?(?:max|min)")

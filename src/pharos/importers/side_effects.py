@@ -5,7 +5,6 @@ comparing their states, and the line of code that drew is found by running the s
 """
 
 import contextlib
-import io
 import os
 import random as python_random
 import re
@@ -34,20 +33,35 @@ LONGEST_LINE = 120
 COLORS = re.compile("\x1b\\[[0-9;]*m")
 
 
-class _Sink(io.TextIOBase):
-    """Text that is printed: its first line, and how many there were."""
+class _Printed:
+    """Text that was printed: its first line, and how many there were."""
 
     def __init__(self) -> None:
         self.first, self.count = "", 0
 
-    def writable(self) -> bool:
-        return True
-
-    def write(self, text: str) -> int:
+    def add(self, text: str) -> None:
         self.count += text.count("\n")
         if not self.first:
             self.first = capped(" ".join(COLORS.sub("", text).split()), LONGEST_LINE)
+
+
+class _Sink:
+    """A stream that catches what this thread writes; other threads, which may draw a bar, write as before."""
+
+    def __init__(self, stream: Any, printed: _Printed):
+        self._stream, self._printed, self._thread = stream, printed, threading.get_ident()
+
+    def write(self, text: str) -> int:
+        if threading.get_ident() != self._thread:
+            return self._stream.write(text)
+        self._printed.add(text)
         return len(text)
+
+    def isatty(self) -> bool:
+        return threading.get_ident() != self._thread and self._stream.isatty()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 class SideEffects:
@@ -58,7 +72,7 @@ class SideEffects:
     """
 
     def __init__(self) -> None:
-        self._printed = _Sink()
+        self._printed = _Printed()
         self._warnings: dict[str, int] = {}
         self._reseeded = False
         self._threads = threading.active_count()
@@ -83,8 +97,8 @@ class SideEffects:
     def watched(self) -> Iterator[None]:
         """Catch what is printed, and warnings."""
         with (
-            contextlib.redirect_stdout(self._printed),
-            contextlib.redirect_stderr(self._printed),
+            contextlib.redirect_stdout(_Sink(sys.stdout, self._printed)),  # type: ignore[type-var]
+            contextlib.redirect_stderr(_Sink(sys.stderr, self._printed)),  # type: ignore[type-var]
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("always")

@@ -46,6 +46,8 @@ OUTSIDE = ("pygame", "pyglet", "matplotlib", "weakref", "threading", "logging", 
 """Libraries whose objects are no state: windows, figures, locks."""
 PLAIN = frozenset([int, float, bool, str, bytes, type(None), complex])
 CONTAINERS = frozenset([dict, list, set, frozenset, np.ndarray])
+HEAP_TYPE = 1 << 9
+"""Flag of classes that are written in Python."""
 LEAST_SHARED_BYTES = 200
 PROBING_STEPS = 300
 
@@ -312,6 +314,15 @@ class EnvironmentSnapshots:
         return None
 
 
+def field_names(env: Stepped) -> set[str]:
+    """Names of the fields of an environment and of all objects in it."""
+    names, feeder = set[str](), _Feeder(lambda _: None, frozenset())
+    for each in chain_of(env):
+        names |= set(_fields_of(each))
+        feeder.feed(each)
+    return names.union(*(_fields_of(value) for _, value in feeder.places.values()))
+
+
 def digest_of(value: Any) -> bytes:
     """Digest of any value, as of the field of an environment."""
     hasher = hashlib.blake2b(digest_size=16)
@@ -357,6 +368,8 @@ class _Feeder:
             self.put(b"~")
         elif isinstance(value, tuple):
             self._feed_items(f"({kind.__qualname__}", value)
+            if getattr(value, "__dict__", None):
+                self._feed_fields(value)
         elif isinstance(value, types.FunctionType):
             self._feed_function(value)
         elif _is_outside(kind):
@@ -435,10 +448,8 @@ class _Feeder:
             if name not in self.ignore:
                 self.put(name.encode())
                 self.feed(item)
-        has_own_state = not _without_pickle_methods(value) and (
-            kind.__reduce__ is not object.__reduce__ or kind.__reduce_ex__ is not object.__reduce_ex__
-        )
-        if has_own_state or not (fields or hasattr(value, "__dict__") or hasattr(kind, "__slots__")):
+        is_hidden = _has_hidden_state(kind) and not _without_pickle_methods(value)
+        if is_hidden or not (fields or hasattr(value, "__dict__") or hasattr(kind, "__slots__")):
             self._feed_reduced(value)
 
     def _feed_reduced(self, value: Any) -> None:
@@ -454,6 +465,15 @@ class _Feeder:
         for part in rest[1:]:
             for item in part or ():
                 self.feed(item)
+
+
+def _holds_hidden_state(kind: Any) -> bool:
+    """Whether objects of a class hold what is not in their fields: by methods for pickle, or a base class in C."""
+    has_methods = kind.__reduce__ is not object.__reduce__ or kind.__reduce_ex__ is not object.__reduce_ex__
+    return has_methods or any(not base.__flags__ & HEAP_TYPE for base in kind.__mro__[:-1])
+
+
+_has_hidden_state = cast(Callable[[Any], bool], functools.cache(_holds_hidden_state))
 
 
 def _contents(cell: Any) -> Any:

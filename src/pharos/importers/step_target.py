@@ -183,7 +183,7 @@ class StepTarget:
         return mdp, recording
 
     def _identity(self, options: SteppingOptions, horizon: int | None) -> dict[str, Any]:
-        """What decides about the states and their numbers."""
+        """Names, options and versions that decide about the states and their numbers."""
         import gymnasium
 
         codes = {"factory": self.factory, "key": self.key, "reward": self.reward}

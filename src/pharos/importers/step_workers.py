@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from pharos.importers.stepping import SteppedEnvironment
 
 BLOCK = 16
-"""States that a process gets at once."""
-BLOCKS_EACH = 2
+"""States that a process gets at once. It gets the next when it has handed over their outcomes: one that sends does not
+listen."""
+BLOCKS_AHEAD = 3
 
 
 def step_for_others(factory: Any, options: Any, jobs: connection.Connection, send: Any) -> None:
@@ -52,7 +53,7 @@ class ExpansionsElsewhere:
     """
 
     def __init__(self, source: "SteppedEnvironment", workers: int):
-        self.room = BLOCK * BLOCKS_EACH * workers
+        self.room = BLOCK * BLOCKS_AHEAD * workers
         self._buffer: list[Any] = []
         self._waiting: deque[tuple[int, list[Any]]] = deque()
         self._at_work: dict[int, str] = {}
@@ -64,6 +65,7 @@ class ExpansionsElsewhere:
         source.snapshots.is_closed = True
         self._workers = Workers(__name__, "pharos.importers")
         self._pipes: dict[str, connection.Connection] = {}
+        self._ready: set[str] = set()
         try:
             for number in range(workers):
                 self._start(f"stepping {number + 1}", source)
@@ -117,14 +119,13 @@ class ExpansionsElsewhere:
         self._buffer = []
 
     def _hand_out(self) -> None:
-        """Give blocks to processes that have less than BLOCKS_EACH."""
+        """Give blocks to processes that have none."""
+        busy = set(self._at_work.values())
         for key, pipe in self._pipes.items():
-            busy = sum(name == key for name in self._at_work.values())
-            while self._waiting and busy < BLOCKS_EACH:
+            if self._waiting and key in self._ready and key not in busy:
                 number, block = self._waiting.popleft()
-                pipe.send((number, block))
                 self._at_work[number] = key
-                busy += 1
+                pipe.send((number, block))
 
     def _listen(self) -> None:
         """Wait for messages of the processes."""
@@ -136,6 +137,8 @@ class ExpansionsElsewhere:
                 raise parts[0](parts[1])
             if kind == "ready" and parts[0] != self._digest:
                 raise RuleError(f"{self._name}: two processes make it differently; try one worker (--workers 1)")
+            if kind == "ready":
+                self._ready.add(key)
             if kind == "rows":
                 number, rows = parts
                 del self._at_work[number]

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from pharos.errors import ParameterError, PharosError, RuleError
+from pharos.errors import ParameterError, PharosError, RuleError, UnknownName
 from pharos.importers import side_effects
 from pharos.importers.chance import MOST_OUTCOMES, DrawError, DrawTree, line_of_code, placed
 from pharos.importers.folder import IMAGE, VECTOR, ImportedOutcomes
@@ -31,7 +31,7 @@ from pharos.importers.search import (
     mdp_of,
 )
 from pharos.importers.side_effects import SideEffects
-from pharos.importers.snapshots import EnvironmentSnapshots, bare, chain_of, digest_of, integers_of
+from pharos.importers.snapshots import EnvironmentSnapshots, bare, chain_of, digest_of, field_names, integers_of
 from pharos.importers.step_checkpoint import StepCheckpoint
 from pharos.importers.step_workers import ExpansionsElsewhere
 from pharos.importers.wrappers import Stepped, as_integer, reset
@@ -345,6 +345,9 @@ class SteppedEnvironment:
     def _prepare(self) -> None:
         """Reset once, so that generators are there that are made when they are first used; and share large tables."""
         observation = self._reset(self._env, 0 if self.options.seed is None else self.options.seed)
+        names = field_names(self._env) if self.options.ignore else set[str]()
+        for name in sorted(self.options.ignore - names):
+            raise UnknownName(f"field of {self.name}", name, names)
         self.snapshots.share_constants(self._env, self._play, self.options.copied)
         self._observation = observation
         self._blank = self.snapshots.save(self._env)
