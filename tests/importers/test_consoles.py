@@ -18,6 +18,7 @@ from pharos import exporters, hardness, importers
 from pharos.errors import FolderLocked, MissingExtra, ParameterError, StateSpaceTooLarge, UnknownName
 from pharos.importers import consoles, layers
 from pharos.system import storage
+from patience import wait_for
 from refusals import refusal
 from toy_console import ToyConsole, naive_layers
 
@@ -225,8 +226,7 @@ def test_a_killed_import_is_resumed_by_the_same_command(tmp_path):
     pytest.importorskip("ale_py")
     words = ["import", "atari", "freeway", "--horizon", "7", "--out", str(tmp_path / "killed")]
     process = subprocess.Popen([sys.executable, "-m", "pharos", *words], env=os.environ)
-    while process.poll() is None and not (tmp_path / "killed" / ".building" / "layer-00002.npz").exists():
-        pass
+    wait_for((tmp_path / "killed" / ".building" / "layer-00002.npz").exists, process)
     process.send_signal(signal.SIGKILL)
     process.wait()
     answer(*words)
