@@ -14,11 +14,11 @@ import pytest
 
 import pharos
 from command_line import answer, run
+from patience import wait_for
 from pharos import exporters, hardness, importers
 from pharos.errors import FolderLocked, MissingExtra, ParameterError, StateSpaceTooLarge, UnknownName
 from pharos.importers import consoles, layers
 from pharos.system import storage
-from patience import wait_for
 from refusals import refusal
 from toy_console import ToyConsole, naive_layers
 
