@@ -7,13 +7,13 @@ rewards, row 0 the start, -1 the end.
 import io
 import os
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP, paid_outcomes, require_all_actions, require_mdp
-from pharos.system import storage
+from pharos.system import distinct_rows, mdp_files, storage
 
 __all__ = ["bridge", "drn", "gym_p"]
 
@@ -127,7 +127,9 @@ def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     """Write an MDP as BRIDGE does: npz with `transitions` int64 (S, A) and `rewards` float32 (S, A).
 
     States keep their numbers, unless the start is not 0: it then changes places with 0. Transitions into terminal
-    states become -1.
+    states become -1. If all actions of a terminal state end the episode in the table itself, as in BRIDGE's files, it
+    stays a state with -1 in each column. Images that the MDP's folder has recorded become `screens` (D, H, W, 3) and
+    `screen_mapping` (S,).
 
     Raises:
         ParameterError: the MDP has chance or several start states, which the form cannot say; or the name does not end
@@ -141,12 +143,30 @@ def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
         raise ParameterError(f"{mdp}: BRIDGE's files hold deterministic MDPs with one start state; expected such a one")
     table = np.array(mdp.dynamics.deterministic_table(), np.int64)
     inside = table >= 0
-    table[inside & np.asarray(mdp.terminal)[table]] = -1
+    ends = np.asarray(mdp.terminal) & inside.any(axis=1)
+    table[inside & ends[table]] = -1
     order = np.arange(len(table))
     start = int(mdp.start_states[0])
     order[[0, start]] = order[[start, 0]]
     table = np.where(table[order] >= 0, order[table[order]], -1)
     rewards = mdp.rewards[order].astype(np.float32)
+    arrays: dict[str, Any] = {"transitions": np.asfortranarray(table), "rewards": rewards, **_screens(mdp, order)}
     with storage.replacing(path, follow=True) as file:
-        np.savez_compressed(file, transitions=np.asfortranarray(table), rewards=rewards)
+        np.savez_compressed(file, allow_pickle=False, **arrays)
     return path
+
+
+def _screens(mdp: TabularMDP, order: np.ndarray) -> dict[str, np.ndarray]:
+    """Distinct images of a folder and the image of each state; nothing if there are none."""
+    if mdp.folder is None or not mdp_files.is_folder(mdp.folder):
+        return {}
+    manifest = mdp_files.read_manifest(mdp.folder)
+    if manifest.get(mdp_files.OBSERVATIONS) != "image":
+        return {}
+    shown = mdp_files.read_rows(mdp.folder, manifest)
+    assert shown is not None
+    rows = shown if isinstance(shown, distinct_rows.DistinctRows) else distinct_rows.collected(shown)
+    return {
+        "screens": rows.distinct(np.arange(rows.num_distinct)),
+        "screen_mapping": rows.index[order].astype(np.int64),
+    }

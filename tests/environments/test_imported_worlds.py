@@ -1,11 +1,15 @@
 """Imported MDPs as environments: what is true of the table is true of what is stepped, trained on, drawn and built."""
 
 import json
+import zlib
 from collections import Counter
 
 import gymnasium
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 import fake_training
 import pharos
@@ -13,6 +17,8 @@ from command_line import answer, run
 from pharos import drawing, importers, training
 from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import TabularMDP
+from pharos.observations import recorded
+from pharos.system import distinct_rows, storage
 from refusals import refusal
 
 # In state 0, action 0 goes to 1 or ends with 0.25; action 1 goes to 1 or 2; 2 is terminal. State 3 is never reached.
@@ -95,7 +101,7 @@ def test_steps_of_many_environments_have_the_probabilities_of_the_table(folders)
 def test_what_was_recorded_is_observed_and_drawn(folders):
     env = pharos.make(str(folders["outcomes"]))
     seen = pharos.observe(env, "recorded")
-    shown = np.load(folders["outcomes"] / "observations.npy")
+    shown = np.arange(4 * 2 * 3 * 3, dtype=np.uint8).reshape(4, 2, 3, 3)
     assert seen.space == gymnasium.spaces.Box(0, 255, (2, 3, 3), np.uint8)
     assert (seen(np.array([[2], [4], [0]])) == np.stack([shown[2], 0 * shown[0], shown[0]])).all()
     stretched = pharos.observe(env, "recorded", stretch=True)(np.array([[3]]))[0]
@@ -167,8 +173,181 @@ def test_an_imported_world_without_a_folder_is_refused():
 def test_observations_raise_the_version_and_nothing_else_does(folders, tmp_path):
     plain = importers.save(in_every_form()["matrices"], tmp_path / "plain", actions=("stay", "go"))
     files = [path / "manifest.json" for path in (plain, *folders.values())]
-    assert [json.loads(file.read_text())["format_version"] for file in files] == [1, 2, 2]
+    assert [json.loads(file.read_text())["format_version"] for file in files] == [1, 6, 6]
     assert importers.load(folders["matrices"]).rewards.tolist() == R.tolist()
+
+
+def sealed_with(folder, **changes):
+    """Change entries of a folder's manifest, and seal it again, as whoever hands over a folder can."""
+    path = folder / "manifest.json"
+    path.write_text(json.dumps(storage.sealed(json.loads(path.read_text()) | changes)))
+
+
+def test_folders_of_an_earlier_pharos_show_what_they_recorded(tmp_path):
+    folder = importers.save(in_every_form()["matrices"], tmp_path / "old")
+    shown = np.arange(4 * 2 * 3 * 3, dtype=np.uint8).reshape(4, 2, 3, 3)
+    np.save(folder / "observations.npy", shown)
+    arrays = json.loads((folder / "manifest.json").read_text())["arrays"]
+    arrays["observations"] = storage.digest_of_file(folder / "observations.npy")
+    sealed_with(folder, format_version=2, observations="image", arrays=arrays)
+    seen = pharos.observe(pharos.make(str(folder)), "recorded")
+    assert (seen(np.array([[2], [4], [0]])) == np.stack([shown[2], 0 * shown[0], shown[0]])).all()
+    grey = pharos.observe(pharos.make(str(folder)), "recorded", grey=True)(np.array([[2], [4]]))
+    assert grey.shape == (2, 2, 3, 1) and (grey[1] == 0).all()
+
+
+def test_equal_observations_are_stored_once_and_read_a_chunk_at_a_time(monkeypatch, tmp_path):
+    monkeypatch.setattr(distinct_rows, "CHUNK_BYTES", 2 * 18)
+    shown = np.random.default_rng(0).integers(256, size=(4, 2, 3, 3), dtype=np.uint8)
+    shown[3] = shown[0]
+    folder = importers.save(in_every_form()["matrices"], tmp_path / "chunks", observations=shown)
+    stored = json.loads((folder / "manifest.json").read_text())["observation_rows"]
+    assert (stored["rows"], stored["rows_in_chunk"], len(stored["bytes"])) == (3, 2, 2)
+    assert np.load(folder / "observation_index.npy").tolist() == [0, 1, 2, 0]
+    data = (folder / "observations.bin").read_bytes()
+    (folder / "observations.bin").write_bytes(data[:-1] + b"?")  # in the second chunk
+    rows = pharos.make(str(folder)).recorded
+    assert (rows[[3, 1]] == shown[[3, 1]]).all() and (rows[0] == shown[0]).all()
+    assert "observations.bin was changed" in refusal(FileFormatError, rows.__getitem__, 2)
+    (folder / "observations.bin").unlink()
+    assert "observations.bin: no such file" in refusal(FileFormatError, lambda: pharos.make(str(folder)).recorded)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"rows": 4}, "expected 4 rows"),
+        ({"rows": 3, "shape": [2, 3, 4]}, "expected 72"),
+        ({"rows": 3, "shape": [2, 3, 2]}, "expected 36"),
+        ({"rows": 2}, "expected one row from 0 to 1 a state"),
+        ({"rows": "3"}, "observation_rows is"),
+        ({"shape": [2, -3, 3]}, "observation_rows is"),
+        ({"shape": [1 << 40, 1 << 40, 3]}, "larger than its chunk can hold"),
+        ({"dtype": "|O"}, "observation_rows is"),
+        ({"bytes": [1 << 40]}, "was changed"),
+        ({"checksums": None}, "its observations are damaged"),
+    ],
+)
+def test_recordings_that_do_not_fit_their_files_are_refused_in_one_line(entry, message, tmp_path):
+    shown = np.random.default_rng(0).integers(256, size=(4, 2, 3, 3), dtype=np.uint8)
+    shown[3] = shown[0]
+    folder = importers.save(in_every_form()["matrices"], tmp_path / "kept", observations=shown)
+    stored = json.loads((folder / "manifest.json").read_text())["observation_rows"]
+    stored |= {"rows_in_chunk": 3} | entry
+    sealed_with(folder, observation_rows=stored)
+    assert message in refusal(FileFormatError, lambda: pharos.make(str(folder)).recorded[np.arange(4)])
+
+
+def test_a_chunk_that_inflates_beyond_its_rows_is_read_no_further(tmp_path):
+    shown = np.zeros((4, 2, 3, 3), np.uint8)
+    folder = importers.save(in_every_form()["matrices"], tmp_path / "bomb", observations=shown)
+    bomb = zlib.compress(bytes(1 << 24))
+    (folder / "observations.bin").write_bytes(bomb)
+    stored = json.loads((folder / "manifest.json").read_text())["observation_rows"]
+    stored |= {"bytes": [len(bomb)], "checksums": [storage.digest_of_bytes(bomb)]}
+    sealed_with(folder, observation_rows=stored)
+    said = refusal(FileFormatError, lambda: pharos.make(str(folder)).recorded[0])
+    assert "a chunk of rows has 19 bytes or more; expected 18" in said and "observations.bin" in said
+
+
+@given(
+    values=arrays(
+        st.sampled_from([np.uint8, np.int16, np.float32, np.float64, np.bool_]),
+        st.tuples(st.integers(1, 9), st.just(2)),
+    ),
+    in_chunk=st.integers(1, 4),
+)
+def test_collected_rows_are_those_of_the_array(values, in_chunk):
+    collector = distinct_rows.RowCollector(values.shape[1:], values.dtype)
+    collector.rows_in_chunk = in_chunk
+    index = np.array([collector.add(row) for row in values])
+    rows = collector.rows(index)
+    assert rows[np.arange(len(values))].tobytes() == values.tobytes()
+    assert rows.num_distinct == len({row.tobytes() for row in values})
+    few = int(index[: len(values) // 2].max(initial=0)) + 1
+    short = distinct_rows.shortened(rows.with_index(index[: len(values) // 2]), few)
+    assert short[np.arange(len(values) // 2)].tobytes() == values[: len(values) // 2].tobytes()
+    assert short.num_distinct == few and short.num_chunks == -(-few // in_chunk)
+
+
+# What agents see ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def screens(tmp_path_factory):
+    """Screens (4, 24, 16, 3) of an MDP, and its folder."""
+    shown = np.random.default_rng(0).integers(256, size=(4, 24, 16, 3), dtype=np.uint8)
+    place = tmp_path_factory.mktemp("screens") / "kept"
+    return shown, importers.save(in_every_form()["outcomes"], place, time_limit=6, observations=shown)
+
+
+@pytest.mark.parametrize("name", ["grey", "gray"])
+def test_grey_is_luminance_and_size_averages_areas(name, screens):
+    shown, folder = screens
+    env, states = pharos.make(str(folder)), np.arange(4)[:, None]
+    luminance = shown @ np.array([0.299, 0.587, 0.114])
+    grey = pharos.observe(env, "recorded", **{name: True})
+    assert grey.space.shape == (24, 16, 1) and abs(grey(states)[..., 0] - luminance).max() <= 1
+    small = pharos.observe(env, "recorded", size=(12, 8))
+    areas = shown.reshape(4, 12, 2, 8, 2, 3).mean(axis=(2, 4))
+    assert small.space.shape == (12, 8, 3) and abs(small(states) - areas).max() <= 1
+    both = pharos.observe(env, "recorded", **{name: True}, size=8)
+    assert both.space == gymnasium.spaces.Box(0, 255, (8, 8, 1), np.uint8)
+    assert (both(np.array([[4]])) == 0).all() and (both(states)[1] == both.one(np.array([1]))).all()
+
+
+def test_a_table_of_looks_and_looks_one_by_one_are_the_same(screens, monkeypatch):
+    _, folder = screens
+    options, states = {"grey": True, "size": 8}, np.array([[3], [4], [0], [3]])
+    kept = pharos.observe(pharos.make(str(folder)), "recorded", **options)(states)
+    monkeypatch.setattr(recorded, "LARGEST_TABLE", 0)
+    assert (pharos.observe(pharos.make(str(folder)), "recorded", **options)(states) == kept).all()
+
+
+def test_frames_are_the_last_screens_of_an_episode(screens):
+    shown, folder = screens
+    env = pharos.GymEnv(str(folder), observation="recorded", observation_options={"frames": 3})
+    seen, info = env.reset(seed=1)
+    history = [shown[0]] * 3
+    assert (seen == np.concatenate(history, axis=2)).all() and seen.shape == (24, 16, 9)
+    for step in range(40):
+        seen, _, terminated, truncated, info = env.step(step % 2)
+        state = int(info["state"][0])
+        history = [*history[1:], shown[state] if state < 4 else np.zeros_like(shown[0])]
+        assert (seen == np.concatenate(history, axis=2)).all()
+        if terminated or truncated:
+            env.reset()
+            history = [shown[0]] * 3
+
+
+@pytest.mark.parametrize(
+    ("shown", "options", "message"),
+    [
+        (np.zeros((4, 3)), {"grey": True}, "grey, size and frames are for recorded images"),
+        (np.zeros((4, 3)), {"frames": 2}, "grey, size and frames are for recorded images"),
+        (np.zeros((4, 5, 5, 3), np.uint8), {"size": 0}, "size is 0"),
+        (np.zeros((4, 5, 5, 3), np.uint8), {"size": (5, 5, 5)}, "size is (5, 5, 5)"),
+        (np.zeros((4, 5, 5, 3), np.uint8), {"size": "84"}, "size is '84'"),
+        (np.zeros((4, 5, 5, 3), np.uint8), {"frames": 4}, "more than rows or columns"),
+    ],
+)
+def test_options_for_images_are_refused_where_there_are_none(shown, options, message, tmp_path):
+    folder = importers.save(in_every_form()["matrices"], tmp_path / "kept", observations=shown)
+    assert message in refusal(ParameterError, pharos.observe, pharos.make(str(folder)), "recorded", **options)
+
+
+@pytest.mark.long
+def test_the_batched_engine_trains_on_stacked_grey_screens(screens):
+    _, folder = screens
+    result = pharos.train(
+        "dqn",
+        str(folder),
+        steps=60,
+        observation="recorded",
+        observation_options={"grey": True, "size": 36, "frames": 2},
+        hyperparameters={"learning_starts": 20, "buffer_size": 50},
+    )
+    assert np.isfinite(result.result["normalized_regret"])
 
 
 def test_count_says_states_transitions_and_depth_and_keeps_nothing(folders, monkeypatch, tmp_path):

@@ -283,25 +283,52 @@ def test_the_interval_holds_the_truth_where_values_are_off_by_all_of_their_bound
     assert regularized.lower <= 5 / 0.1 + 1 / (0.25 + 0.1) <= regularized.upper
 
 
+def gaps_of_every_step(table, rewards, gamma, horizon):
+    """All gaps above 0, in exact fractions, of the states that each step may be in."""
+    exact = [[Fraction(float(reward)) for reward in row] for row in rewards]
+    (size, actions), reached = table.shape, [{0}]
+    for _ in range(horizon - 1):
+        reached.append({int(t) for s in reached[-1] for t in table[s]})
+    values, gaps = [Fraction(0)] * size, []
+    for states in reversed(reached):
+        q = [[exact[s][a] + Fraction(gamma) * values[table[s, a]] for a in range(actions)] for s in range(size)]
+        values = [max(row) for row in q]
+        gaps += [values[s] - q[s][a] for s in states for a in range(actions) if q[s][a] < values[s]]
+    return values, gaps
+
+
 @pytest.mark.parametrize("gamma", [0.5, 0.9, 1.0])
 def test_intervals_of_gaps_of_every_step_hold_the_exact_fractions(gamma):
     rng = np.random.default_rng(0)
     table, rewards, horizon = rng.integers(0, 4, (4, 3)), 0.1 + rng.random((4, 3)), 6
     mdp = TabularMDP.from_arrays(table, rewards, gamma=gamma, horizon=horizon)
     result = hardness.gaps(mdp)
-    exact = [[Fraction(float(reward)) for reward in row] for row in rewards]
-    reached = [{0}]
-    for _ in range(horizon - 1):
-        reached.append({int(t) for s in reached[-1] for t in table[s]})
-    values, gaps = [Fraction(0)] * 4, []
-    for states in reversed(reached):
-        q = [[exact[s][a] + Fraction(gamma) * values[table[s, a]] for a in range(3)] for s in range(4)]
-        values = [max(row) for row in q]
-        gaps += [values[s] - q[s][a] for s in states for a in range(3) if q[s][a] < values[s]]
+    _, gaps = gaps_of_every_step(table, rewards, gamma, horizon)
     assert (result.count, result.unresolved) == (len(gaps), 0)
     assert Fraction(result.lower) <= sum(1 / gap for gap in gaps) <= Fraction(result.upper)
     assert Fraction(result.certified_minimal.lower) <= min(gaps) <= Fraction(result.certified_minimal.upper)
     assert result.error >= 2 * pharos.value_iteration(mdp).error_bound > 0
+
+
+@examples(100, st.integers(0, 2**32 - 1), st.sampled_from([1.0, 0.25, 2.0**20]), st.sampled_from([1, 6, 40]))
+def test_whole_rewards_without_discount_have_exact_values_and_every_tie_is_proven(seed, unit, horizon):
+    rng = np.random.default_rng(seed)
+    table, rewards = rng.integers(0, 5, (5, 3)), unit * rng.integers(-2, 3, (5, 3))
+    mdp = TabularMDP.from_arrays(table, rewards, gamma=1.0, horizon=horizon)
+    values, gaps = gaps_of_every_step(table, rewards, 1.0, horizon)
+    solution, result = pharos.value_iteration(mdp), hardness.gaps(mdp)
+    assert solution.error_bound == 0 and [Fraction(float(v)) for v in solution.v] == values
+    assert pharos.evaluate_policy(mdp, solution.policy).error_bound == 0
+    assert (result.count, result.unresolved) == (len(gaps), 0)
+    assert result.certified_sum.exact
+    assert result.sum_of_reciprocals == pytest.approx(float(sum((1 / gap for gap in gaps), Fraction(0))), rel=1e-12)
+
+
+def test_rewards_that_are_no_sums_of_halves_have_an_error():
+    mdp = TabularMDP.from_arrays([[0, 1], [1, 0]], [[0.1, 0.2], [0.3, 0.7]], gamma=1.0, horizon=20)
+    assert pharos.value_iteration(mdp).error_bound > 0
+    large = TabularMDP.from_arrays([[0, 1], [1, 0]], [[2.0**53, 1.0], [1.0, 0.0]], gamma=1.0, horizon=2)
+    assert pharos.value_iteration(large).error_bound > 0
 
 
 @pytest.mark.parametrize("seed", range(5))

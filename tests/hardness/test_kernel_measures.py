@@ -14,7 +14,7 @@ from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness import Network, Representation, Schedule, kernel_regret, tangent_kernel
 from pharos.hardness.representation.learning import return_on_graph
-from pharos.mdp import TabularMDP, lazy_actions
+from pharos.mdp import TabularMDP, lazy_actions, random_actions, sticky_actions
 from pharos.observations import representation
 from refusals import failing, refusal
 from strategies import FEW, deterministic_mdps, examples, outcome_mdps, with_chance
@@ -535,3 +535,69 @@ def test_a_network_of_ones_own_has_its_empirical_kernel(grid, tmp_path):
     np.testing.assert_allclose(seen.kernel(states[:5], states[3:]), whole[:5, 3:], rtol=1e-4)
     for name, line in OWN_ERRORS.items():
         assert line in usage_error(*words[:-3], f"{file}:{name}")
+
+
+OF_KERNELS = (
+    kernel_regret,
+    hardness.kernel_policy_regret,
+    hardness.kernel_learning_time,
+    hardness.kernel_sample_complexity,
+    hardness.sampled_regret,
+)
+
+
+# Action sets ----------------------------------------------------------------------------------------------------------
+
+
+def with_a_column(mdp, at):
+    """The same outcome table with one more action, at a place of its own, that is available nowhere."""
+    successors, probabilities, rewards = mdp
+    places = [*range(at), 0, *range(at, successors.shape[1])]
+    more = np.where(np.arange(len(places)) == at, -np.inf, rewards[:, places])
+    return successors[:, places], probabilities[:, places], more
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("sticky", "random"), [(0.0, 0.0), (0.3, 0.0), (0.3, 0.25)])
+@pytest.mark.parametrize("at", [0, 2])
+def test_an_action_that_is_nowhere_available_changes_no_measure(sticky, random, at):
+    rng = np.random.default_rng(3)
+    table = rng.integers(0, 7, (7, 2, 2)), rng.dirichlet([1, 1], (7, 2)), rng.random((7, 2))
+    options = {"gamma": 1.0, "horizon": 9, "initial": [0, 1]}
+    some, more = (
+        random_actions(sticky_actions(TabularMDP.from_outcomes(*each, **options), sticky), random)
+        for each in (table, with_a_column(table, at))
+    )
+    assert more.available.sum() == 14
+    look_alike = Representation.of_matrix(kernel_of(7), [0, 1, 2, 3, 4, 5, 0])
+    for kernel in (Representation.of_matrix(kernel_of(7)), look_alike):
+        for measure in OF_KERNELS:
+            one, other = (measure(mdp, kernel, schedule=SHORT) for mdp in (some, more))
+            assert one.value == pytest.approx(other.value, rel=1e-9)
+        floors = [hardness.aliasing_floor(mdp, kernel, schedule=SHORT) for mdp in (some, more)]
+        assert floors[0] == pytest.approx(floors[1], abs=1e-12)
+
+
+@pytest.mark.slow
+def test_names_of_actions_that_differ_between_states_change_nothing_for_a_table():
+    """Two of three actions in each state, others in each: the table's curve is that of the two."""
+    rng = np.random.default_rng(4)
+    successors, probabilities, rewards = (
+        rng.integers(0, 6, (6, 2, 2)),
+        rng.dirichlet([1, 1], (6, 2)),
+        rng.random((6, 2)),
+    )
+    lacks = rng.integers(0, 3, 6)
+    places = np.array([[0 if a == lack else a - (a > lack) for a in range(3)] for lack in lacks])
+    rows = np.arange(6)[:, None]
+    paid = np.where(np.arange(3) == lacks[:, None], -np.inf, rewards[rows, places])
+    options = {"gamma": 1.0, "horizon": 9, "initial": [0, 1]}
+    two = TabularMDP.from_outcomes(successors, probabilities, rewards, **options)
+    three = TabularMDP.from_outcomes(successors[rows, places], probabilities[rows, places], paid, **options)
+    for measure in OF_KERNELS[:2]:
+        one, other = (measure(mdp, Representation.of_matrix(np.eye(6)), schedule=SHORT) for mdp in (two, three))
+        np.testing.assert_allclose(one.tabular.greedy, other.tabular.greedy, atol=1e-12)
+        np.testing.assert_allclose(one.curve.played, other.curve.played, atol=1e-12)
+        assert np.ptp(one.tabular.greedy) > 0
+    with pytest.raises(UndefinedMeasure, match="look alike, and other actions are available"):
+        kernel_regret(three, Representation.of_matrix(np.eye(6), np.zeros(6, int)), schedule=SHORT)

@@ -13,7 +13,7 @@ from naive import hitting as naive_hitting
 from patience import PATIENCE
 from pharos import hardness
 from pharos.errors import UndefinedMeasure
-from pharos.hardness.hitting_times import HittingBounds, HittingTimes
+from pharos.hardness.hitting_times import HittingBounds, HittingTimes, multiplications
 from pharos.hardness.interval import Budget, BudgetClock
 from pharos.hardness.stochastic_diameter import HubBounds, _Diameter
 from pharos.kernels import hitting
@@ -236,6 +236,26 @@ def test_a_target_that_is_not_the_farthest_or_beyond_the_budget_costs_no_linear_
     j, count, _ = problem.open(0)
     bounds = problem.solve(j, count, 1e-12, enough, BudgetClock(hardness.Budget(seconds=seconds), None))
     assert not bounds.meets(1e-12) and bounds.lower <= 490 <= bounds.upper
+
+
+@pytest.mark.parametrize("shape", [(400,), (30, 30), (150, 8), (9, 9, 9), (6, 6, 5, 5), None])
+def test_the_cost_of_a_linear_solve_is_known_before_it_begins(shape):
+    """Multiplications by the factors that SuperLU finds: of walks on grids, and of one that leads anywhere."""
+    if shape is None:
+        walk = np.random.default_rng(0).integers(0, 600, (600, 3))
+    else:
+        cells = np.indices(shape).reshape(len(shape), -1)
+        moves = (cells + sign * np.eye(len(shape), dtype=int)[:, [k]] for k in range(len(shape)) for sign in (-1, 1))
+        walk = np.stack([np.ravel_multi_index(each, shape, mode="clip") for each in moves], axis=1)
+    choices = ExpandedMDP.of(random_actions(TabularMDP.from_arrays(walk, np.zeros(walk.shape), gamma=0.9), 0.9), False)
+    problem = HittingTimes(choices)
+    _, count, _ = problem.open(0)
+    _, factors = problem._factored(count)
+    columns, rows = np.diff(factors.factors.L.tocsc().indptr), np.diff(factors.factors.U.tocsr().indptr)
+    counted = float(columns.astype(float) @ rows)
+    assert counted / 4 <= multiplications(problem._layers(count)) <= 40 * counted
+    assert not problem._outlasts(count, BudgetClock(Budget(seconds=PATIENCE), None))
+    assert problem._outlasts(count, BudgetClock(Budget(seconds=counted * 1e-11), None))
 
 
 def test_the_farthest_target_so_far_makes_the_guess_for_the_next():

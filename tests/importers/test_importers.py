@@ -518,3 +518,22 @@ def test_means_of_rewards_that_nearly_cancel_are_within_their_bound(other):
     assert 0 < abs(Fraction(float(solution.v[0])) - truth) <= Fraction(solution.error_bound)
     exact = importers.gymnasium({0: {0: [(1.0, 0, 7e6, True)]}}, gamma=0.9)
     assert exact.reward_table.rounding == 0 and pharos.value_iteration(exact).v[0] == 7e6
+
+
+def test_toy_text_keeps_the_names_of_its_documentation(tmp_path):
+    lake = importers.gymnasium(gymnasium.make("FrozenLake-v1"))
+    assert lake.names.actions == ("left", "down", "right", "up")
+    assert lake.names.state(6) == "row=1 column=2"
+    taxi = gymnasium.make("Taxi-v4").unwrapped
+    names = importers.gymnasium(taxi, check=False).names
+    assert names.actions[4:] == ("pickup", "dropoff")
+    for s in (0, 123, 499):
+        assert [int(column[s]) for column in names.variables.values()] == [int(value) for value in taxi.decode(s)]
+    assert importers.gymnasium({0: {0: [(1.0, 0, 0.0, True)]}}).names is None
+    done = run("import", "gymnasium", "CliffWalking-v1", "--out", tmp_path / "cliff", "--no-check")
+    assert done.exit_code == 0
+    assert pharos.make(str(tmp_path / "cliff")).actions == ("up", "right", "down", "left")
+    # the way along the cliff: up, eleven times right, and down
+    rows = json.loads(run("solve", tmp_path / "cliff", "--print-policy", "--json").stdout)["policy_rows"]
+    assert [row["name"] for row in rows] == ["up", *["right"] * 11, "down"]
+    assert rows[0]["variables"] == {"row": 3, "column": 0}

@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+from fractions import Fraction
 from types import SimpleNamespace
 
 import numpy as np
@@ -356,3 +357,201 @@ def test_measures_count_the_choices_that_a_model_has(tmp_path):
     assert pharos.hardness.sum_of_reciprocal_gaps(mdp) == pytest.approx(6.814815, abs=1e-6)
     uniform = 0.5 * (1 + 0.9 * v1) + 0.5 * (1.5 + 0.9 * (0.9 + 0.45 + 0.225) / 4)
     assert pharos.solvers.uniform_value(mdp).value_at_start == pytest.approx(uniform)
+
+
+# Properties -----------------------------------------------------------------------------------------------------------
+
+ASKED = {  # of the shared coin with K = 2: the published values of 2-2
+    'Rmax{"steps"}=? [F "finished"]': ("finished", "largest_cost", 75),
+    'R{"steps"}min=? [F "finished"]': ("finished", "least_cost", 48),
+    'Rmin=? [F "finished"]': ("finished", "least_cost", 48),
+    'Pmax=? [F "finished" & !"agree"]': ("target", "maximum", 13 / 120),
+    'Pmin=? [F "finished" & "all_coins_equal_1"]': ("target", "minimum", 49 / 128),
+    'Pmax=? [F pc1=3 & pc2=3 & !coin1=coin2]': ("target", "maximum", 13 / 120),
+    'Pmin=? [true U "finished"]': ("finished", "minimum", 1),
+    'Pmax=? [F false]': ("target", "maximum", 0),
+}  # fmt: skip
+
+
+@needs_storm
+@pytest.mark.parametrize("text", ASKED)
+def test_a_property_is_answered_with_a_proven_interval(text, tmp_path):
+    label, name, value = ASKED[text]
+    words = (models.prism_mdp_coin_2_2, "--property", text, "--out", tmp_path / "coin", "--json")
+    done = run("import", "prism", *words)
+    assert done.exit_code == 0, done.stderr
+    answer = json.loads(done.stdout)["property"]
+    assert (answer["reach"], answer["answer"], answer["infinite"]) == (label, name, False)
+    assert answer["lower"] <= value <= answer["upper"] < answer["lower"] + 1e-6
+    again = json.loads(run("solve", tmp_path / "coin", "--reach", label, "--json").stdout)["reach"][name]
+    assert (again["lower"], again["upper"]) == pytest.approx((answer["lower"], answer["upper"]), abs=1e-6)
+
+
+@needs_storm
+def test_properties_of_jani_files_are_asked_by_name(tmp_path):
+    for name, value in (("Probability to throw a six", 1 / 6), ("Expected number of coin flips", 11 / 3)):
+        words = (models.jani_dtmc_die, "--property", name, "--out", tmp_path / "die", "--json")
+        answer = json.loads(run("import", "prism", *words).stdout)["property"]
+        assert answer["lower"] - 1e-15 <= value <= answer["upper"] + 1e-15 and answer["upper"] - answer["lower"] < 1e-6
+    message = refusal(ParameterError, importers.storm, models.jani_dtmc_die, property="seven")
+    assert "properties of the file: Probability to throw a six, Expected number of coin flips" in message
+
+
+JANI = {
+    "jani-version": 1, "name": "walk", "type": "dtmc", "features": [],
+    "constants": [{"name": "N", "type": "int"}],
+    "variables": [{"name": "x", "type": {"kind": "bounded", "base": "int", "lower-bound": 0, "upper-bound": 9},
+                   "initial-value": 0}],
+    "automata": [{"name": "m", "locations": [{"name": "l"}], "initial-locations": ["l"], "edges": [
+        {"location": "l", "guard": {"exp": {"op": "<", "left": "x", "right": 9}}, "destinations": [
+            {"location": "l", "probability": {"exp": 0.5},
+             "assignments": [{"ref": "x", "value": {"op": "+", "left": "x", "right": 1}}]},
+            {"location": "l", "probability": {"exp": 0.5}, "assignments": [{"ref": "x", "value": 9}]}]}]}],
+    "system": {"elements": [{"automaton": "m"}]},
+    "properties": [{"name": "there", "expression": {
+        "op": "filter", "fun": "max", "states": {"op": "initial"},
+        "values": {"op": "Pmax", "exp": {"op": "F", "exp": {"op": "=", "left": "x", "right": "N"}}}}}],
+}  # fmt: skip
+
+
+@needs_storm
+def test_constants_of_a_jani_file_are_those_of_its_properties(tmp_path):
+    """Storm gives a constant in a property, where it is not said, any value, and says nothing."""
+    (tmp_path / "walk.jani").write_text(json.dumps(JANI))
+    for n in (1, 2, 5):
+        mdp, _, question = importers.storm_import(tmp_path / "walk.jani", constants=f"N={n}", property="there")
+        bounds = pharos.reach(mdp, question.reach).maximum
+        start = int(mdp.starts[0])
+        assert bounds.lower[start] <= 0.5**n <= bounds.upper[start] < 0.5**n + 1e-9
+        assert mdp.names.labels[question.reach].sum() == 1
+    assert question.of_starts == "max"
+
+
+STEPS = """mdp
+module m
+  x : [0..3] init 0;
+  open : bool init false;
+  [walk] x<3 -> 0.5:(x'=x+1) + 0.5:(x'=x)&(open'=true);
+  [jump] x=0 -> (x'=3)&(open'=true);
+  [wait] x=3 -> true;
+endmodule
+rewards "cost"  [walk] true : 1;  [jump] true : 9;  endrewards
+rewards "fuel"  [walk] true : 2;  endrewards
+label "target" = x=1;
+"""
+
+
+@needs_storm
+def test_what_must_hold_until_then_and_labels_of_the_same_name(tmp_path):
+    (tmp_path / "steps.prism").write_text(STEPS)
+    mdp, _, question = importers.storm_import(tmp_path / "steps.prism", property="Pmax=? [!open U x=2]")
+    assert (question.reach, question.answer) == ("target_", "maximum")  # the model has a label "target"
+    assert list(mdp.names.labels) == ["deadlock", "init", "target", "target_"]
+    bounds = pharos.reach(mdp, question.reach).maximum
+    assert bounds.lower[mdp.starts[0]] <= 0.25 <= bounds.upper[mdp.starts[0]]  # two steps without opening
+    assert pharos.value_iteration(mdp).value_at_start == pytest.approx(0.25)
+    names = mdp.names
+    start = int(mdp.starts[0])
+    assert sorted(names.action(start, a) for a in (0, 1)) == ["jump", "walk"]
+    assert set(names.variables) == {"x", "open"} and names.labels_of(start) == ["init"]
+    mdp, _, question = importers.storm_import(tmp_path / "steps.prism", property='Rmin{"cost"}=? [F x=3]')
+    cost = pharos.reach(mdp, question.reach).least_cost
+    assert cost.lower[start] <= 6 <= cost.upper[start]
+
+
+@needs_storm
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"property": "P=? [F x=3]"}, "says neither max nor min"),
+        ({"property": "Pmax>=0.5 [F x=3]"}, "is not answered; expected P, Pmax or Pmin=? [F target]"),
+        ({"property": "Pmax=? [F<=5 x=3]"}, "steps are --target with --horizon"),
+        ({"property": "Pmax=? [F y=3]"}, "Storm cannot read it"),
+        ({"property": 'Rmax{"gold"}=? [F x=3]'}, "unknown reward structure"),
+        ({"property": "Rmax=? [F x=3]"}, "unknown reward structure"),  # there are two
+        ({"property": "Pmax=? [F x=3]", "target": "target"}, "leave out --reward and --target"),
+        ({"target": "x=3 &"}, "is no label (deadlock, init, target), and as an expression Storm cannot read it"),
+        ({"target": "exit"}, "unknown label"),
+    ],
+)
+def test_properties_that_are_not_answered_are_refused_in_one_line(options, words, tmp_path):
+    (tmp_path / "steps.prism").write_text(STEPS)
+    assert words in refusal(ParameterError, importers.storm, tmp_path / "steps.prism", **options)
+
+
+@needs_storm
+def test_a_target_may_be_an_expression(tmp_path):
+    (tmp_path / "steps.prism").write_text(STEPS)
+    for text, states in (("!x=3 & open", 3), ("target | x>=2", 6), ('"target" & !open', 1)):
+        mdp = importers.storm(tmp_path / "steps.prism", target=text, reward="cost")
+        assert mdp.terminal.sum() == mdp.names.labels["target_"].sum() == states, text
+
+
+# Another solver -------------------------------------------------------------------------------------------------------
+
+PARTS = [("1",), ("1/2", "1/2"), ("1/4", "3/4"), ("1/8", "3/8", "1/2"), ("1/64", "63/64")]
+"""Exact in floats, so that Storm's rational numbers are those of the same MDP."""
+
+
+def random_model(rng):
+    """A small MDP in PRISM's language: cycles, components without a way out, choices that pay nothing."""
+    states = int(rng.integers(3, 9))
+    commands, rewards = [], []
+    for s in range(states):
+        if s == states - 2:  # no way out, for nothing
+            commands.append(f"[] s={s} -> true")
+            continue
+        for a in range(int(rng.integers(1, 4))):
+            parts = PARTS[rng.integers(len(PARTS))]
+            commands.append(f"[a{s}_{a}] s={s} -> " + " + ".join(f"{p}:(s'={rng.integers(states)})" for p in parts))
+            rewards.append(f"[a{s}_{a}] true : {rng.choice([0, 0, 1, 3])};")
+    module = "".join(f"  {command};\n" for command in commands)
+    paid = "\n".join(rewards)
+    return f"""mdp
+module m
+  s : [0..{states - 1}] init 0;
+{module}endmodule
+rewards "cost"
+{paid}
+endrewards
+label "goal" = s={states - 1};
+"""
+
+
+@needs_storm
+@pytest.mark.long
+def test_random_mdps_as_storm_solves_them_soundly_and_in_rational_numbers(tmp_path):
+    """300 MDPs: the exact value lies in the proven interval, and the interval of Storm's sound methods meets it."""
+    import stormpy
+
+    rng, path = np.random.default_rng(0), tmp_path / "model.prism"
+    queries = {
+        'Pmax=? [F "goal"]': "maximum",
+        'Pmin=? [F "goal"]': "minimum",
+        'R{"cost"}min=? [F "goal"]': "least_cost",
+        'R{"cost"}max=? [F "goal"]': "largest_cost",
+    }
+    infinite = between = 0
+    for number in range(300):
+        path.write_text(random_model(rng))
+        mdp = importers.storm(path, reward="cost", target="goal")
+        result = pharos.reach(mdp, "goal")
+        program = stormpy.parse_prism_program(str(path))
+        sound, exact = stormpy.build_model(program), stormpy.build_model[stormpy.Rational](program)
+        start = int(mdp.starts[0])
+        for text, name in queries.items():
+            query = stormpy.parse_properties(text, program)[0]
+            bounds = getattr(result, name)
+            lower, upper = bounds.lower[start], bounds.upper[start]
+            value = stormpy.model_checking(exact, query)[exact.initial_states[0]].value
+            if str(value) == "inf":
+                assert lower == upper == np.inf, (number, text)
+                infinite += 1
+                continue
+            value = Fraction(str(value))
+            assert Fraction(lower) <= value <= Fraction(upper), (number, text)
+            assert upper - lower <= 2e-6
+            by_storm = float(stormpy.model_checking(sound, query)[sound.initial_states[0]].value)
+            assert lower - 1e-5 * max(1, lower) <= by_storm <= upper + 1e-5 * max(1, upper), (number, text)
+            between += 0 < value < 1
+    assert infinite > 100 and between > 100

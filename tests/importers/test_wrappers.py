@@ -12,7 +12,7 @@ from gymnasium import wrappers
 import pharos
 from pharos import importers
 from pharos.errors import FileFormatError, ParameterError, RuleError
-from pharos.importers.gymnasium import _is_unlikely
+from pharos.importers.gymnasium import is_unlikely
 from refusals import refusal
 
 VALUE = pytest.approx(0.9**5)  # of the dry lake
@@ -348,7 +348,7 @@ def test_counts_that_are_refused_are_less_likely_than_one_in_a_million(p):
     n = 2000
     probability, refused, distribution = 0.0, 0, np.array([p, 1 - p])
     for k in range(n + 1):
-        if _is_unlikely(np.array([k, n - k]), distribution):
+        if is_unlikely(np.array([k, n - k]), distribution):
             refused += 1
             log = math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
             probability += math.exp(log + k * math.log(p) + (n - k) * math.log1p(-p))

@@ -35,12 +35,51 @@ def test_they_are_those_of_the_best_and_the_worst_policy(mdp, target, is_random)
         assert result.least_cost.upper[s] == result.largest_cost.upper[s] == 0
 
 
+@pytest.mark.long
+@examples(60, mdps_with_cycles(rewards=(0.0, 1.0, 0.1)), st.sets(st.integers(0, 4), min_size=1))
+def test_their_policies_attain_them(mdp, target):
+    target = sorted({t for t in target if t < mdp.num_states} or {0})
+    result = pharos.reach(mdp, target)
+    arrived = np.append(result.target, False).astype(float)
+    over = result.stopped.terminal[:, None]
+    entering = result.stopped.with_rewards(np.where(over, 0.0, mdp.dynamics.expected(arrived)))
+    for bounds in (result.maximum, result.minimum):
+        worth = pharos.evaluate_policy(entering, bounds.policy, 1e-6)
+        expected = np.where(result.target, 1.0, worth.v)
+        assert (expected >= bounds.lower - worth.error_bound - 1e-6).all()
+        assert (expected <= bounds.upper + worth.error_bound + 1e-6).all()
+    for bounds in (result.least_cost, result.largest_cost):
+        if np.isfinite(bounds.upper).all():
+            tolerance = max(1e-6, 1e-12 * bounds.upper.max())
+            worth = pharos.evaluate_policy(result.stopped, bounds.policy, tolerance)
+            assert np.abs(worth.v - bounds.upper).max() <= worth.error_bound + 2 * tolerance
+
+
 def test_haddad_monmege():
     mdp = haddad_monmege(20, 0.7)
     result = pharos.reach(mdp, [mdp.num_states - 1])
     for bounds in (result.maximum, result.minimum):
         assert bounds.lower[20] <= 0.7 <= bounds.upper[20] < bounds.lower[20] + 1e-6
     assert result.least_cost.lower[20] == math.inf
+
+
+def herman(size):
+    """The ring of Herman (1990): who equals the neighbour on the left holds a token, and draws; others copy it."""
+    P = np.ones((2**size, 2**size))
+    bits = np.arange(2**size)[:, None] >> np.arange(size) & 1
+    left = np.roll(bits, 1, axis=1)
+    for i in range(size):
+        follows = bits[None, :, i] == left[:, i, None]
+        P *= np.where((bits == left)[:, i, None], 0.5, follows)
+    return TabularMDP.from_matrices([P], np.zeros((2**size, 1)), gamma=1.0), (bits == left).sum(axis=1) == 1
+
+
+@pytest.mark.parametrize(("size", "steps"), [(3, 4 / 3), (5, 16 / 5), (7, 48 / 7), (9, 12)])
+def test_the_ring_of_herman_is_stable_after_the_published_number_of_steps(size, steps):
+    mdp, is_stable = herman(size)
+    bounds = pharos.reach(mdp, is_stable, costs=np.ones((2**size, 1))).largest_cost
+    assert bounds.lower.max() <= steps * (1 + 1e-15) and steps * (1 - 1e-15) <= bounds.upper.max()
+    assert (bounds.upper - bounds.lower).max() < 1e-9
 
 
 def costs():

@@ -161,6 +161,30 @@ def test_the_grid_of_the_textbook():
     assert pharos.value_iteration(grid()).v.tolist() == [0, -1, -2, -3, -1, -2, -3, -2, -2, -3, -2, -1, -3, -2, -1, 0]
 
 
+def test_the_world_of_four_by_three():
+    """Russell and Norvig (2021), figure 16.3: utilities of the world with a wall, for -0.04 a step."""
+    cells = [(x, y) for y in (1, 2, 3) for x in (1, 2, 3, 4) if (x, y) != (2, 2)]
+    ends = {(4, 3): 1.0, (4, 2): -1.0}
+    moves = [(0, 1), (1, 0), (0, -1), (-1, 0)]
+
+    def after(cell, move):
+        to = (cell[0] + move[0], cell[1] + move[1])
+        return to if to in cells else cell
+
+    P, R = np.zeros((4, 11, 11)), np.zeros((11, 4))
+    for s, cell in enumerate(cells):
+        for a in range(4):
+            for turn, p in ((0, 0.8), (1, 0.1), (-1, 0.1)):
+                to = cell if cell in ends else after(cell, moves[(a + turn) % 4])
+                P[a, s, cells.index(to)] += p
+                R[s, a] += p * ends.get(to, 0.0) if cell not in ends else 0.0
+            R[s, a] -= 0.04 * (cell not in ends)
+    solution = pharos.value_iteration(TabularMDP.from_matrices(list(P), R, gamma=1.0))
+    utilities = [0.705, 0.655, 0.611, 0.388, 0.762, 0.660, 0.0, 0.812, 0.868, 0.918, 0.0]
+    assert np.abs(solution.v - utilities).max() <= 0.0005 + solution.error_bound
+    assert solution.error_bound < 1e-12
+
+
 def test_the_slippery_lake_without_a_limit():
     mdp = pharos.build(pharos.make("frozen_lake", slippery=True)).mdp(gamma=1.0).with_horizon(None)
     solution = pharos.value_iteration(mdp)

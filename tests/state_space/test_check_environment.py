@@ -404,6 +404,19 @@ def test_the_built_state_space_is_compared(monkeypatch):
     assert "built, it leads to states [1, 1]; expected [0, 1]" in message(Corridor())
 
 
+def test_a_rule_that_prints_is_named_before_it_prints(capsys):
+    def show(state):
+        print(state)
+
+    def transition(self, state, action, out):
+        show(state)
+        out[0] = state[0]
+
+    with pytest.raises(RuleError, match="transition prints: remove it"):
+        pharos.check_environment(corridor(transition=transition))
+    assert capsys.readouterr().out == ""
+
+
 # Notes ---------------------------------------------------------------------------------------------------------------
 
 

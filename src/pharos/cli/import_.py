@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, written
+from pharos.cli.answers import Answer, complain, progress_line, termination, written
 from pharos.cli.command import Commands
 from pharos.cli.options import Count, Discount, Gamma, Target, Tolerance, check_format
 from pharos.errors import DivergenceError, ParameterError, PharosError, UnknownName
@@ -23,7 +23,7 @@ from pharos.system.wording import capped, pluralize
 if TYPE_CHECKING:
     import numpy as np
 
-    from pharos.importers import Question
+    from pharos.importers import Question, Recording, SteppedStates
     from pharos.mdp import TabularMDP
 
 app = Commands(help="Bring an MDP from elsewhere into a folder.", no_args_is_help=True)
@@ -100,6 +100,168 @@ def gymnasium(
     limit, outcomes = env.spec.max_episode_steps if env.spec else None, importers.gymnasium_outcomes(env)
     importers.save(mdp, out, source=f"Gymnasium: {words}", time_limit=limit, outcomes=outcomes)
     return _answer(words, mdp, out)
+
+
+@app.command("env")
+def env(
+    target: str,
+    *,
+    out: Out,
+    option: Mapping[str, Any],
+    seed: int | None = None,
+    key: Annotated[str | None, "CODE"] = None,
+    ignore: str = "",
+    reward: Annotated[str | None, "CODE"] = None,
+    weights: str = "",
+    gamma: Gamma = None,
+    horizon: Episode = None,
+    max_states: Count = 100_000,
+    max_outcomes: Count = 3_000,
+    workers: Count = 1,
+    check: bool = True,
+) -> Answer:
+    """Import any environment of Gymnasium by stepping it from every state; the same command resumes.
+
+    Args:
+        target: gymnasium:ID, module:factory or file.py:factory; wrappers count.
+        option: Of the environment or the factory, such as is_slippery=false.
+        seed: Of one reset; else all starts are imported.
+        key: module:function or file.py:function (environment) -> equal for equal states; pairs are checked.
+        ignore: FIELD,FIELD: no part of the state, such as counters of steps.
+        reward: module:function or file.py:function (reward) -> number.
+        weights: 1,0.5 of a vector of rewards.
+        max_states: More are an error.
+        max_outcomes: Of the draws of one step.
+        workers: Processes that share the work.
+        check: Play the environment and compare.
+    """
+    from pharos import importers
+
+    source = importers.StepTarget(target, option, key=key, reward=reward, weights=weights)
+    with progress_line(f"stepping {target}") as show:
+        mdp, recording = source.import_into(
+            out,
+            seed=seed,
+            ignore=tuple(name for name in ignore.split(",") if name),
+            gamma=gamma,
+            horizon=horizon,
+            max_states=max_states,
+            max_outcomes=max_outcomes,
+            workers=workers,
+            check=check,
+            progress=lambda states, seconds, _: show(_stepping_text(states, seconds)),
+        )
+    for note in recording.notes:
+        complain(note)
+    answer = _answer(source.words, mdp, out)
+    return answer._replace(json={**answer.json, "notes": list(recording.notes)})
+
+
+def _stepping_text(states: "SteppedStates", seconds: float) -> str:
+    left = states.num_states - states.num_expanded
+    rate = (states.num_expanded - states.num_resumed) / max(seconds, 1e-9)
+    return f"{states.num_states:,} states, {left:,} to expand, step {states.depths[-1]}, {rate:,.0f} states/s"
+
+
+Noops = Annotated[int, typer.Option(min=0)]
+
+
+@app.command("atari")
+def atari(
+    game: str,
+    *,
+    out: Out,
+    horizon: Count = 10,
+    frame_skip: Count = 30,
+    noops: Noops = 0,
+    all_actions: bool = False,
+    life_loss_ends: bool = True,
+    settle: Annotated[int | None, typer.Option(min=0)] = None,
+    raw: bool = False,
+    max_states: Count = 100_000,
+    workers: Count = 1,
+) -> Answer:
+    """Enumerate an Atari game over its first steps, as BRIDGE does. The same command resumes an interrupted import.
+
+    Args:
+        game: A ROM of ale-py, such as freeway.
+        horizon: Steps of an episode.
+        frame_skip: Frames of a step, during which the action is held.
+        noops: Frames without an action before the first step.
+        all_actions: All 18 actions, in place of those that the game uses.
+        life_loss_ends: The loss of a life ends the episode.
+        settle: Steps without an action after the last one, whose rewards count; 200 in skiing, else 0.
+        raw: Keep states that cannot be told apart.
+        max_states: Refuse more states than these.
+        workers: Processes that share the work; the result is the same.
+    """
+    from pharos import importers
+
+    with progress_line("importing") as tell, termination():
+        mdp, recording = importers.atari(
+            game,
+            horizon=horizon,
+            frame_skip=frame_skip,
+            noops=noops,
+            all_actions=all_actions,
+            life_loss_ends=life_loss_ends,
+            settle=settle,
+            raw=raw,
+            max_states=max_states,
+            workers=workers,
+            folder=importers.building_folder(out),
+            progress=tell,
+        )
+        return _recorded_answer(game, mdp, recording, out)
+
+
+@app.command("procgen")
+def procgen(
+    game: str,
+    *,
+    out: Out,
+    level: Annotated[int, typer.Option(min=0)] = 0,
+    mode: str = "easy",
+    horizon: Count = 10,
+    frame_skip: Annotated[int | None, typer.Option(min=1)] = None,
+    noops: Noops = 0,
+    all_actions: bool = False,
+    raw: bool = False,
+    max_states: Count = 100_000,
+    workers: Count = 1,
+) -> Answer:
+    """Enumerate a level of a Procgen game over its first steps. The same command resumes an interrupted import.
+
+    Args:
+        game: Such as maze.
+        level: Seed of the level.
+        mode: easy, hard, extreme, memory or exploration.
+        horizon: Steps of an episode.
+        frame_skip: Steps of Procgen in a step, during which the action is held; BRIDGE's when not given.
+        noops: Steps of Procgen without an action before the first step.
+        all_actions: All 15 actions, in place of those that BRIDGE takes.
+        raw: Keep states that cannot be told apart.
+        max_states: Refuse more states than these.
+        workers: Processes that share the work; the result is the same.
+    """
+    from pharos import importers
+
+    with progress_line("importing") as tell, termination():
+        mdp, recording = importers.procgen(
+            game,
+            level=level,
+            mode=mode,
+            horizon=horizon,
+            frame_skip=frame_skip,
+            noops=noops,
+            all_actions=all_actions,
+            raw=raw,
+            max_states=max_states,
+            workers=workers,
+            folder=importers.building_folder(out),
+            progress=tell,
+        )
+        return _recorded_answer(f"{game}, level {level}", mdp, recording, out)
 
 
 @app.command("prism")
@@ -195,6 +357,22 @@ def _answer(
     }
     size = f"{mdp.num_states:,} x {pluralize(mdp.num_actions, 'action')}"
     return Answer(answer, (name, [("states", size), ("horizon", mdp.horizon), ("folder", out), *facts]))
+
+
+def _recorded_answer(name: str, mdp: "TabularMDP", recording: "Recording", out: Path) -> Answer:
+    """Keep what an emulator showed, and say how many states were merged."""
+    from pharos import importers
+
+    importers.save_recording(mdp, recording, out)
+    merged, screens = recording.num_raw_states - mdp.num_states, recording.observations.num_distinct
+    more = {
+        "num_raw_states": recording.num_raw_states,
+        "num_merged_states": merged,
+        "num_distinct_observations": screens,
+        "layers": recording.layers,
+    }
+    words = f"{merged:,} of {recording.num_raw_states:,}, by equal screens, rewards and successors"
+    return _answer(name, mdp, out, more, [("merged", words), ("distinct screens", f"{screens:,}")])
 
 
 # Export ---------------------------------------------------------------------------------------------------------------

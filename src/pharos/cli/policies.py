@@ -29,7 +29,7 @@ class PolicyRows:
 
     @property
     def keys(self) -> dict[str, Any]:
-        """What the JSON object has of it."""
+        """Entries of the JSON object."""
         return {"policy_rows": self.rows, "policy_left_out": self.left_out}
 
     def lines(self) -> list[str]:
@@ -112,8 +112,8 @@ def _visited(mdp: "TabularMDP", policy: "np.ndarray") -> "np.ndarray":
         is_new[places[first]] = False
         levels.append(frontier)
         states, previous = frontier.T
-        chosen = policy[states] if policy.ndim == 1 else policy[states, previous]
-        choices = np.eye(none)[chosen]
+        actions = policy[states] if policy.ndim == 1 else policy[states, previous]
+        choices = np.eye(none)[actions]
         if mdp.horizon is not None:
             choices = np.ones_like(choices) if mdp.available is None else mdp.available[states].astype(np.float64)
         node, action = np.nonzero(mdp.chance.at(states).weights(choices, previous))
@@ -126,10 +126,10 @@ def _visited(mdp: "TabularMDP", policy: "np.ndarray") -> "np.ndarray":
 
 def with_policy(answer: Answer, rows: PolicyRows) -> Answer:
     """The answer with a policy below its table, and in its JSON object."""
-    title, facts = answer.text  # type: ignore[misc]
+    facts: Any = answer.text
 
     def say() -> None:
-        print_facts(title, facts)
+        print_facts(*facts)
         print("\n".join(rows.lines()))
 
     return Answer({**answer.json, **rows.keys}, say)

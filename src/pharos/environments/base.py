@@ -23,6 +23,9 @@ import numpy as np
 from pharos.errors import ParameterError, RuleError
 from pharos.system.wording import capped
 
+if TYPE_CHECKING:
+    from pharos.system.distinct_rows import DistinctRows
+
 # Parameters -----------------------------------------------------------------------------------------------------------
 #
 # Declared in the fields of a dataclass, and checked when an instance is made:
@@ -557,7 +560,7 @@ class Environment:
         """Write 1, 2, ... into planes (M, rows, columns) uint8: what `draw` does not tell of the state."""
 
     @property
-    def recorded(self) -> np.ndarray | None:
+    def recorded(self) -> "np.ndarray | DistinctRows | None":
         """(states, ...) recorded observation of each state, for the observation "recorded"; the base class has None."""
         return None
 

@@ -12,8 +12,9 @@ import numpy as np
 
 from pharos.environments.base import Environment, Layer, store
 from pharos.errors import FileFormatError, ParameterError
-from pharos.system import mdp_files, storage
+from pharos.system import distinct_rows, mdp_files, storage
 from pharos.system.arrays import OutcomeRows, rounding_of_sums
+from pharos.system.distinct_rows import DistinctRows
 
 TIME_LIMIT = 1000  # of an MDP that has no horizon, and whose source has no limit
 MOST_ENTRIES = 1 << 28  # of a table of outcomes, written out
@@ -150,8 +151,13 @@ class ImportedWorld(Environment):
             return None
         if kind == "image":
             return shown[state[0]]
-        stretched = shown[state[0]] * (255 // np.maximum(shown.max(axis=(0, 1, 2)), 1)).astype(np.uint8)
+        stretched = shown[state[0]] * self._stretch
         return np.ascontiguousarray(stretched.transpose(1, 0, 2))
+
+    @cached_property
+    def _stretch(self) -> np.ndarray:
+        assert self.recorded is not None
+        return distinct_rows.stretch(self.recorded)
 
     # The table --------------------------------------------------------------------------------------------------------
 
@@ -193,14 +199,19 @@ class ImportedWorld(Environment):
         return self.rewards[:, :, None] if paid is None else paid
 
     @cached_property
-    def recorded(self) -> np.ndarray | None:  # type: ignore[override]
-        """(S, ...) recorded observation of each state, zeros for the end; None if the import recorded nothing."""
-        if mdp_files.OBSERVATIONS not in self.manifest["arrays"]:
+    def recorded(self) -> np.ndarray | DistinctRows | None:  # type: ignore[override]
+        """(S, ...) recorded observation of each state, zeros for the end; None if the import recorded nothing.
+
+        Rows of a large recording are read when they are looked at.
+        """
+        shown = mdp_files.read_rows(self.folder, self.manifest)
+        if shown is None:
             return None
-        shown = mdp_files.read_array(self.folder, self.manifest, mdp_files.OBSERVATIONS)
         if len(shown) != self.manifest["num_states"]:
             raise FileFormatError(f"{self.folder}: {len(shown)} observations for {self.manifest['num_states']} states")
-        return self._with_end(shown, 0)
+        if isinstance(shown, np.ndarray):
+            return self._with_end(shown, 0)
+        return shown.with_zeros(len(self.successors) - len(shown))
 
     @property
     def num_numbered(self) -> int:

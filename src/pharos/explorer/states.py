@@ -130,10 +130,11 @@ class NamedStates:
         return np.all([part[:, variable] == value for variable, value in fixed.items()] or [np.ones(len(part))], axis=0)
 
     def number(self, values: Sequence[int]) -> int:
-        same = np.flatnonzero((self._columns == np.asarray(values)).all(axis=1)) if len(values) == len(self.low) else []
-        if not len(same):
-            raise ParameterError(f"no state has the values {tuple(values)} of {', '.join(self.names)}")
-        return int(same[0])
+        if len(values) == len(self.low):
+            same = np.flatnonzero((self._columns == np.asarray(values)).all(axis=1))
+            if len(same):
+                return int(same[0])
+        raise ParameterError(f"no state has the values {tuple(values)} of {', '.join(self.names)}")
 
 
 @dataclass(frozen=True)

@@ -240,6 +240,8 @@ class UnresolvedTies:
 
     def __init__(self, mdp: TabularMDP, tolerance: float, error: float, is_definition: bool):
         self.mdp, self.tolerance, self.error, self.is_definition = mdp, tolerance, error, is_definition
+        # values without any error are sums of whole multiples of a power of two, and so are the differences of two
+        self.is_exact = error == 0.0 and mdp.gamma == 1.0 and mdp.is_deterministic and mdp.chance.is_none
         self.small = self.equal = 0
         self.proof = TieProof(mdp)
 
@@ -253,12 +255,14 @@ class UnresolvedTies:
             return
         self.small += small
         self.equal += equal
-        if not self.small and self.proof.holds:
+        if not self.small and self.proof.holds and not self.is_exact:
             own = part.step.own[part.states[0] : part.states[-1] + 1] if part.is_whole else part.step.own[part.states]
             self.proof.add_block(part, own)
 
     def unresolved(self, parts: Iterator[GapBlock]) -> int:
         """Number of ties that are not proven; `parts`: all blocks once more, for proofs one by one."""
+        if self.is_exact and not self.is_definition:
+            return 0
         if self.is_definition or (not self.small and self.proof.holds):
             return self.small
         if self.small or not self.equal:

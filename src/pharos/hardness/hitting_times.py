@@ -118,7 +118,7 @@ SWEEPS = 40
 WIDEST = 8_000
 # Sweeps that a linear solve takes as long as: FILL_IN times the cube of that number of nodes, by the outcomes.
 FILL_IN = 1 / 30
-# Seconds that a sweep takes for each outcome on a slow core: a linear solve that would outlast the budget is not begun.
+# Seconds of a multiplication of a linear solve on a slow core: one that would outlast the budget is not begun.
 SECONDS_EACH = 2e-9
 # Times half of `SWEEPS` that are made in any case.
 LEAST = 6
@@ -258,7 +258,7 @@ class HittingTimes:
         allow."""
         bounds, failures, stalls, apart = self._converged(j, count, tolerance, enough, spending), 0, 0, math.inf
         while not bounds.meets(tolerance) and bounds.upper > enough and not spending.is_over:
-            if count > SOLVABLE or self._width(count) > self._widest(spending):
+            if count > SOLVABLE or self._outlasts(count, spending):
                 if bounds.limited:
                     return bounds
                 bounds = self.sweep(j, count, 8 * SWEEPS, enough, spending)
@@ -293,7 +293,7 @@ class HittingTimes:
         The rate is that of three times `SWEEPS` / 2 sweeps: moves along the slow mode set single ones back.
         """
         bounds = self.sweep(j, count, SWEEPS // 2, enough, spending)
-        as_long = FILL_IN * self._width(count) ** 3 / max(self.support[1].size, 1)
+        as_long = FILL_IN * int(self._layers(count).max(initial=0)) ** 3 / max(self.support[1].size, 1)
         left = max(LEAST, int(as_long / (SWEEPS // 2)) - 1)
         unbounded = max(LEAST // 2, left // 4)  # of these: while nothing is proven, no rate is known
         apart, goal = [bounds.apart], CLOSER * tolerance
@@ -312,14 +312,14 @@ class HittingTimes:
                     break
         return bounds
 
-    @staticmethod
-    def _widest(spending: BudgetClock) -> float:
-        """Width up to which linear solves are tried, given the time that is left."""
-        return min(WIDEST, (max(spending.seconds_left, 0.0) / (FILL_IN * SECONDS_EACH)) ** (1 / 3))
+    def _outlasts(self, count: int, spending: BudgetClock) -> bool:
+        """Whether a linear solve takes more than memory and the time that is left."""
+        layers = self._layers(count)
+        return layers.max(initial=0) > WIDEST or multiplications(layers) * SECONDS_EACH > spending.seconds_left
 
-    def _width(self, count: int) -> int:
-        """Most nodes at the same distance from the target."""
-        return int(np.bincount(self.distance[self.order[:count]]).max(initial=0))
+    def _layers(self, count: int) -> np.ndarray:
+        """Numbers of nodes at each distance from the target."""
+        return np.bincount(self.distance[self.order[:count]])
 
     def _factored(self, count: int) -> "tuple[np.ndarray, Factors] | None":
         """(inner nodes, factors of 1 - P of the greedy policy); None where no policy is proper. Rows are made to sum to
@@ -366,7 +366,7 @@ class HittingTimes:
                 break
             if np.abs(correction).max(initial=0.0) > 1e-3 * tolerance * high[inner].max(initial=0.0):
                 continue
-            bounds, above = self._moved(high, low, count, factored)
+            bounds, above = self._moved(high, low, count, factored, spending)
             if bounds.high - bounds.low < best.high - best.low:
                 best = bounds
                 j[:] = above
@@ -375,7 +375,12 @@ class HittingTimes:
         return best
 
     def _moved(
-        self, high: np.ndarray, low: np.ndarray, count: int, factored: tuple[np.ndarray, "Factors"]
+        self,
+        high: np.ndarray,
+        low: np.ndarray,
+        count: int,
+        factored: tuple[np.ndarray, "Factors"],
+        spending: BudgetClock,
     ) -> tuple[HittingBounds, np.ndarray]:
         """(bounds of J* relative to J + W, J + W rounded up); a policy that is greedy in J - W in place of that in J
         where ties need it."""
@@ -391,7 +396,7 @@ class HittingTimes:
         for _ in range(REFINEMENTS):
             below_high, below_low = added(high, low, -margin)
             residual, error, (_, below) = self._residuals(below_high, below_low, count)
-            if below <= 1e-9:
+            if below <= 1e-9 or spending.is_over:
                 break
             again = self._factored(count)
             if again is None:
@@ -432,6 +437,15 @@ class Factors:
         """(inner nodes,) the solution, given the right side."""
         solution: np.ndarray = self.factors.solve(right[self.first])[self.unknown]
         return solution
+
+
+def multiplications(layers: np.ndarray) -> float:
+    """Multiplications of an elimination, about: of one layer after the other, each as if it were full with the next.
+
+    Args:
+        layers: (D,) numbers of nodes at each distance from the target.
+    """
+    return float((layers.astype(float) ** 3).sum())
 
 
 def factors_of(choices: ExpandedMDP, policy: np.ndarray, inner: np.ndarray) -> Factors | None:

@@ -658,8 +658,9 @@ def _time(chain: np.ndarray, epsilon: float, tell: Callable[[str], object]) -> t
     """(t_mix, distance there): squares until it is near enough, then bisection by the squares on the way."""
     size = len(chain)
     epsilon += ROUNDING
-    system = np.vstack([chain.T - np.eye(size), np.ones(size)])
-    stationary = np.linalg.lstsq(system, np.append(np.zeros(size), 1.0), rcond=None)[0]
+    system = chain.T - np.eye(size)  # of which one equation follows from the others
+    system[-1] = 1.0
+    stationary = np.linalg.solve(system, np.append(np.zeros(size - 1), 1.0))
 
     def distance(power: np.ndarray) -> float:
         return float(0.5 * np.abs(power - stationary).sum(axis=1).max())

@@ -1,8 +1,10 @@
-"""MDPs from elsewhere, and folders that keep them: files of BRIDGE, tables of Gymnasium, matrices, MiniGrid, Storm.
+"""MDPs from elsewhere, and folders that keep them: files of BRIDGE, tables of Gymnasium, matrices, MiniGrid, Storm,
+games of Atari and Procgen.
 
 Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """
 
+from pharos.importers.consoles import Recording, atari, building_folder, procgen, save_recording
 from pharos.importers.files import bridge, bridge_screens, has_screens, how_to_import
 from pharos.importers.folder import environment, is_folder, load, save
 from pharos.importers.gymnasium import (
@@ -14,9 +16,16 @@ from pharos.importers.gymnasium import (
     minigrid_recording,
 )
 from pharos.importers.models import Question, storm, storm_import, storm_recording
+from pharos.importers.one_player import OnePlayer
+from pharos.importers.search import SteppedStates
+from pharos.importers.step_target import StepTarget
+from pharos.importers.stepping import StepRecording, stepping
 
 __all__ = [
+    "OnePlayer",
     "Question",
+    "Recording",
+    "atari",
     "bridge",
     "bridge_screens",
     "environment",
@@ -26,7 +35,10 @@ __all__ = [
     "matrices",
     "minigrid",
     "minigrid_grids",
+    "procgen",
     "save",
+    "save_recording",
+    "stepping",
     "storm",
     "storm_import",
     "storm_recording",

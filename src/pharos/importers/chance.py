@@ -5,6 +5,7 @@ which its draws can come out, depth first. A draw of `random()` stays a range of
 `u < p` splits it in two, with the probabilities of the two parts. Whatever needs the number itself is refused.
 """
 
+import bisect
 import functools
 import itertools
 import math
@@ -19,7 +20,7 @@ import numpy as np
 
 from pharos.errors import RuleError
 
-MOST_DRAWS = 500
+MOST_DRAWS = 200
 """Draws with several outcomes in one step; more are taken for a rejection that never ends."""
 MOST_OUTCOMES = 3_000
 """Ways in which the draws of one step may come out."""
@@ -49,7 +50,7 @@ def placed(text: str, line: str) -> str:
     return f"{text} ({line})" if line else text
 
 
-class Branches:
+class DrawTree:
     """Outcomes of the draws of a step, enumerated depth first.
 
     Args:
@@ -57,12 +58,14 @@ class Branches:
     Attributes:
         probability: of the run that goes on, as an exact fraction.
         sampler: draws one outcome at random in place of enumerating, where it is set.
+        refusal: of the last draw that was refused, which the environment's code may have caught.
     """
 
     def __init__(self, most: int = MOST_OUTCOMES):
         self.most = most
         self.probability = ONE
         self.sampler: python_random.Random | None = None
+        self.refusal: DrawError | None = None
         self._choices: list[int] = []
         self._sizes: list[int] = []
         self._depth = 0
@@ -95,20 +98,33 @@ class Branches:
             f"sampling or a shuffle? start from one layout with a seed (--seed 0), or replace the draw"
         )
 
+    def refused(self, text: str) -> DrawError:
+        """An error for the environment's code, which is kept, as that code may catch it."""
+        self.refusal = DrawError(text)
+        return self.refusal
+
+    def check(self) -> None:
+        """Raise the error of a draw that was refused, if there was one."""
+        refusal, self.refusal = self.refusal, None
+        if refusal is not None:
+            raise refusal
+
     def replay(self, script: Sequence[int]) -> None:
         """Let the next draws come out as they did in a run with this script."""
         self._choices, self._sizes = list(script), [0] * len(script)
         self._depth, self.probability = 0, ONE
 
-    def draw(self, weights: Sequence[Fraction]) -> int:
+    def draw(self, weights: Sequence[Fraction], *, are_positive: bool = False) -> int:
         """Index of the outcome that this run has; weights are probabilities that sum to 1, those of 0 never drawn."""
-        live = [i for i, weight in enumerate(weights) if weight > 0]
+        live: Sequence[int] = range(len(weights))
+        if not are_positive:
+            live = [i for i, weight in enumerate(weights) if weight > 0]
         if len(live) == 1:
             return live[0]
         if self.sampler is not None:
             return self.sampler.choices(live, [float(weights[i]) for i in live])[0]
         if self._depth >= MOST_DRAWS:
-            raise DrawError(
+            raise self.refused(
                 placed(f"more than {MOST_DRAWS} draws in one step: rejection sampling, which may never end", here())
                 + "; start from one layout with a seed (--seed 0), or draw among what is accepted"
             )
@@ -117,7 +133,7 @@ class Branches:
             self._sizes.append(len(live))
         self._sizes[self._depth] = len(live)
         if self._choices[self._depth] >= len(live):
-            raise DrawError(f"two runs with the same draws drew differently{here() and f' ({here()})'}")
+            raise self.refused(f"two runs with the same draws drew differently{here() and f' ({here()})'}")
         index = live[self._choices[self._depth]]
         self._depth += 1
         self.probability *= weights[index]
@@ -134,9 +150,9 @@ def _evenly(count: int) -> tuple[Fraction, ...]:
     return (Fraction(1, count),) * count
 
 
-def _refuse_continuous(call: str, line: str = "") -> DrawError:
+def _continuous(branches: DrawTree, call: str, line: str = "") -> DrawError:
     where = placed(f"{call}", line or here())
-    return DrawError(
+    return branches.refused(
         f"drew {where}; a distribution without finitely many outcomes cannot be enumerated; draw from a list, or start "
         f"from one state with a seed (--seed 0) if only the start is drawn so"
     )
@@ -145,24 +161,50 @@ def _refuse_continuous(call: str, line: str = "") -> DrawError:
 class _Unit:
     """A number drawn evenly from [0, 1), of which only a range is known: [low, high)."""
 
-    def __init__(self, branches: Branches):
+    def __init__(self, branches: DrawTree):
         self.branches = branches
         self.low, self.high = Fraction(0), ONE
         self.line = here()
 
-    def below(self, values: Sequence[Fraction]) -> list[bool]:
-        """Whether the number is below each value, after it was narrowed to one of the ranges between them."""
-        cuts = sorted({value for value in values if self.low < value < self.high})
-        if cuts:
-            edges = [self.low, *cuts, self.high]
-            width = self.high - self.low
-            index = self.branches.draw([(right - left) / width for left, right in itertools.pairwise(edges)])
-            self.low, self.high = edges[index], edges[index + 1]
-        return [value >= self.high for value in values]
+    def below(self, values: tuple, scale: Fraction, offset: Fraction) -> np.ndarray:
+        """Whether scale u + offset is below each value, after u was narrowed to one of the ranges between them."""
+        edges, weights, ranks = _ranges(values, scale, offset, self.low, self.high)
+        index = self.branches.draw(weights, are_positive=True)
+        self.low, self.high = edges[index], edges[index + 1]
+        return ranks > index if scale > 0 else ranks <= index
+
+
+@functools.lru_cache(1024)
+def _ranges(
+    values: tuple, scale: Fraction, offset: Fraction, low: Fraction, high: Fraction
+) -> tuple[list[Fraction], list[Fraction], np.ndarray]:
+    """(edges of the ranges between values, their probabilities, how many ranges lie below each value)."""
+    limits = [(_exact(value) - offset) / scale for value in values]
+    edges = [low, *sorted({limit for limit in limits if low < limit < high}), high]
+    weights = [(right - left) / (high - low) for left, right in itertools.pairwise(edges)]
+    return edges, weights, np.array([bisect.bisect_right(edges, limit, 1) - 1 for limit in limits], int)
 
 
 def _exact(value: Any) -> Fraction:
     return value if isinstance(value, Fraction) else Fraction(float(value))
+
+
+UFUNCS = {
+    "less": ("__lt__", "__gt__"),
+    "less_equal": ("__le__", "__ge__"),
+    "greater": ("__gt__", "__lt__"),
+    "greater_equal": ("__ge__", "__le__"),
+    "add": ("__add__", "__radd__"),
+    "subtract": ("__sub__", "__rsub__"),
+    "multiply": ("__mul__", "__rmul__"),
+    "divide": ("__truediv__", "__rtruediv__"),
+    "negative": ("__neg__",),
+    "floor": ("__floor__",),
+    "ceil": ("__ceil__",),
+    "trunc": ("__trunc__",),
+    "rint": ("__round__",),
+}
+"""Functions of NumPy -> the methods of a random number, where it is the first and the second argument."""
 
 
 class RandomNumber:
@@ -171,7 +213,6 @@ class RandomNumber:
     Whether a comparison includes the end makes no difference, as single numbers have probability 0.
     """
 
-    __array_ufunc__ = None  # so that NumPy leaves comparisons to this class
     __hash__ = None  # type: ignore[assignment]
 
     def __init__(self, unit: _Unit, scale: Fraction = ONE, offset: Fraction = Fraction(0)):
@@ -179,14 +220,27 @@ class RandomNumber:
 
     def _is_below(self, values: Any) -> Any:
         """Whether the number is below a value, or each value of an array."""
-        array = np.asarray(values)
-        if array.dtype == object and array.ndim == 0 and isinstance(values, RandomNumber):
+        if isinstance(values, RandomNumber):
             raise self._refusal()
-        limits = [(_exact(value) - self._offset) / self._scale for value in array.ravel()]
-        answers = self._unit.below(limits)
-        if self._scale < 0:
-            answers = [not answer for answer in answers]
-        return np.array(answers).reshape(array.shape) if array.ndim else answers[0]
+        if np.ndim(values) == 0:
+            return bool(self._unit.below((values,), self._scale, self._offset)[0])
+        array = np.asarray(values)
+        if any(isinstance(value, RandomNumber) for value in array.flat if array.dtype == object):
+            raise self._refusal()
+        return self._unit.below(tuple(array.ravel().tolist()), self._scale, self._offset).reshape(array.shape)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **_: Any) -> Any:
+        """Answers to NumPy's functions: comparisons, whole parts, sums and products."""
+        names = UFUNCS.get(ufunc.__name__) if method == "__call__" else None
+        if names is None:
+            raise self._refusal()
+        if len(inputs) == 1:
+            return getattr(self, names[0])()
+        is_first = inputs[0] is self
+        answer = getattr(self, names[0 if is_first else 1])(inputs[is_first])
+        if answer is NotImplemented:
+            raise self._refusal()
+        return answer
 
     def __lt__(self, other: Any) -> Any:
         return self._is_below(other)
@@ -206,7 +260,9 @@ class RandomNumber:
 
     def _moved(self, scale: Any, offset: Any) -> Any:
         """scale x + offset, for numbers or an array of them."""
-        if np.ndim(scale) or np.ndim(offset) or isinstance(scale, RandomNumber) or isinstance(offset, RandomNumber):
+        if np.ndim(scale) or np.ndim(offset):
+            return NotImplemented
+        if isinstance(scale, RandomNumber) or isinstance(offset, RandomNumber):
             raise self._refusal()
         scale, offset = _exact(scale), _exact(offset)
         if scale == 0:
@@ -238,10 +294,8 @@ class RandomNumber:
         low, high = math.floor(min(ends)), math.ceil(max(ends))
         if high - low > self._unit.branches.most:
             raise self._refusal()
-        below = [bool(self._is_below(Fraction(k))) for k in range(low + 1, high)] if high - low <= 2 else None
-        if below is not None:
-            return low + sum(not each for each in below)
-        return low + int(np.count_nonzero(~self._is_below(np.array([Fraction(k) for k in range(low + 1, high)]))))
+        below = self._is_below(np.array([Fraction(k) for k in range(low + 1, high)], object))
+        return low + len(below) - int(np.count_nonzero(below))
 
     def __trunc__(self) -> int:
         whole = math.floor(self)
@@ -263,19 +317,15 @@ class RandomNumber:
         return True
 
     def _refusal(self) -> DrawError:
-        return _refuse_continuous("random(), and used the number itself and not a comparison with it", self._unit.line)
+        return _continuous(
+            self._unit.branches, "random(), and used the number itself and not a comparison with it", self._unit.line
+        )
 
-    def __float__(self) -> float:
+    def _refuse(self, *_: Any, **__: Any) -> Any:
         raise self._refusal()
 
-    def __index__(self) -> int:
-        raise self._refusal()
-
-    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
-        raise self._refusal()
-
-    def __reduce__(self) -> Any:
-        raise self._refusal()
+    __float__ = __index__ = __complex__ = __array__ = __reduce__ = _refuse
+    __pow__ = __rpow__ = __mod__ = __rmod__ = __floordiv__ = __rfloordiv__ = __rtruediv__ = __abs__ = _refuse
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -283,30 +333,39 @@ class RandomNumber:
         raise self._refusal()
 
 
+def _array_of(items: Sequence[Any]) -> np.ndarray:
+    """An array of objects, set one by one, as NumPy would ask each for its numbers."""
+    array = np.empty(len(items), object)
+    for i, item in enumerate(items):
+        array[i] = item
+    return array
+
+
 class BranchingGenerator:
     """Stands in for the generators of NumPy: `Generator` and `RandomState`."""
 
-    def __init__(self, branches: Branches):
+    def __init__(self, branches: DrawTree):
         self._branches = branches
 
     def __deepcopy__(self, _: object) -> "BranchingGenerator":
         return self
 
+    def __copy__(self) -> "BranchingGenerator":
+        return self
+
     def _index(self, count: int, weights: Sequence[Fraction] | None = None) -> int:
         if count > self._branches.most:
-            raise _refuse_continuous(f"one of {count:,} numbers")
+            raise _continuous(self._branches, f"one of {count:,} numbers")
         if count < 1:
             raise ValueError("low >= high")
-        return self._branches.draw(_evenly(count) if weights is None else weights)
+        return self._branches.draw(_evenly(count) if weights is None else weights, are_positive=weights is None)
 
     def _many(self, size: Any, draw: Callable[[], Any], kind: Any = None) -> np.ndarray:
         shape = (int(size),) if np.ndim(size) == 0 else tuple(int(n) for n in size)
         items = [draw() for _ in range(math.prod(shape))]
         if not any(isinstance(item, RandomNumber) for item in items):
             return np.array(items, kind).reshape(shape)
-        array = np.empty(len(items), object)
-        array[:] = items
-        return array.reshape(shape)
+        return _array_of(items).reshape(shape)
 
     def integers(
         self, low: Any, high: Any = None, size: Any = None, dtype: Any = np.int64, endpoint: bool = False
@@ -330,10 +389,8 @@ class BranchingGenerator:
         """A number from [low, high)."""
         if np.ndim(low) or np.ndim(high):
             lows, highs = np.broadcast_arrays(low, high)
-            each = zip(lows.flat, highs.flat, strict=True)
-            array = np.empty(lows.size, object)
-            array[:] = [self.uniform(a, b) for a, b in each]
-            return array.reshape(lows.shape)
+            pairs = zip(lows.flat, highs.flat, strict=True)
+            return _array_of([self.uniform(low, high) for low, high in pairs]).reshape(lows.shape)
         if size is not None and size != ():
             return self._many(size, lambda: self.uniform(low, high))
         scale, offset = _exact(high) - _exact(low), _exact(low)
@@ -351,7 +408,7 @@ class BranchingGenerator:
         if replace:
             return self._many(size, lambda: self._one_of(items, weights))
         if weights is not None:
-            raise _refuse_continuous("choice() without replacement with probabilities")
+            raise _continuous(self._branches, "choice() without replacement with probabilities")
         rest = list(items)
         return self._many(size, lambda: rest.pop(self._index(len(rest))))
 
@@ -421,7 +478,7 @@ class BranchingGenerator:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        raise _refuse_continuous(f"{name}()")
+        raise _continuous(self._branches, f"{name}()")
 
 
 class BranchingPythonGenerator(BranchingGenerator):

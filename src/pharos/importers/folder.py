@@ -12,7 +12,8 @@ import numpy as np
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, FolderLocked, ParameterError
 from pharos.mdp import Names, OutcomeTable, Residual, TabularMDP, checked_sets, lacking, whole_number, with_sets
-from pharos.system import mdp_files, storage
+from pharos.system import distinct_rows, mdp_files, storage
+from pharos.system.distinct_rows import DistinctRows
 from pharos.system.mdp_files import (
     AGAIN,
     COMMON,
@@ -42,6 +43,8 @@ class ImportedOutcomes(NamedTuple):
 
 
 IMAGE, GRID, VECTOR = "image", "grid", "vector"
+BUILDING = ".building"
+"""Folder, within that of an MDP, of what an import that is not finished has so far."""
 OBSERVED = {IMAGE: 4, GRID: 4, VECTOR: 2}
 """Kinds of observations that a source may show -> dimensions of their array."""
 FOREIGN = ": is not empty and holds no imported MDP; choose another folder"
@@ -54,7 +57,7 @@ def save(
     source: str = "",
     actions: Sequence[str] | None = None,
     time_limit: int | None = None,
-    observations: np.ndarray | None = None,
+    observations: np.ndarray | DistinctRows | None = None,
     observed: str | None = None,
     outcomes: ImportedOutcomes | None = None,
 ) -> Path:
@@ -67,7 +70,8 @@ def save(
         actions: names of the actions; None: those of `mdp.names`, else their numbers. Labels, variables and names of
             choices of `mdp.names` are kept as well.
         time_limit: steps after which training cuts an episode off where the MDP has no horizon; None: 1,000.
-        observations: what the source shows of each state, which agents may see as the observation "recorded".
+        observations: what the source shows of each state, which agents may see as the observation "recorded". Equal
+            ones are stored once, and all are deflated.
         observed: what they are: "image", (S, H, W, 3) uint8; "grid", (S, columns, rows, C) uint8 codes of things;
             "vector", (S, N) numbers; None: "image" where they are (S, H, W, 3), else "vector".
         outcomes: of all states and actions, with the reward of each, which episodes are paid then; None: they are paid
@@ -78,24 +82,25 @@ def save(
     """
     if actions is None and mdp.names is not None:
         actions = mdp.names.actions
-    description = _description(mdp, actions, time_limit, observations, observed)
+    shown = observations if isinstance(observations, DistinctRows | None) else np.asarray(observations)
+    description = _description(mdp, actions, time_limit, shown, observed)
     outcome_arrays = {} if outcomes is None else _checked_outcomes(mdp, outcomes)
     folder = Path(folder)
     _check_without_chance(mdp)
-    # Asked again, as another process may have begun there, or ended, in between
-    if _is_foreign(folder) and not (folder / storage.LOCK).exists() and _is_foreign(folder):
-        raise ParameterError(f"{folder}{FOREIGN}")
+    check_free(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    shown = {} if observations is None else {OBSERVATIONS: np.asarray(observations)}
-    arrays = _arrays_of(mdp) | shown | outcome_arrays
-    version = mdp_files.PAID_VERSION if outcome_arrays else mdp_files.OBSERVED_VERSION if shown else mdp_files.VERSION
+    rows = distinct_rows.collected(shown) if isinstance(shown, np.ndarray) else shown
+    arrays = _arrays_of(mdp) | outcome_arrays | ({} if rows is None else {mdp_files.INDEX: _narrow(rows.index)})
+    version = mdp_files.PAID_VERSION if outcome_arrays else mdp_files.VERSION
     version = version if mdp.available is None else mdp_files.SETS_VERSION
+    version = version if rows is None else mdp_files.CHUNKS_VERSION
     with storage.waiting_lock(folder, FolderLocked, "importing", _warn):
         if _is_foreign(folder):
             raise ParameterError(f"{folder}{FOREIGN}")
         if not is_folder(folder):  # a mark, so that a killed import is repeated there
             storage.replace_json(folder / MANIFEST, {"format": FORMAT, "format_version": "unfinished"})
         checksums = _written(folder, arrays)
+        stored = {} if rows is None else {mdp_files.ROWS: mdp_files.write_rows(folder, rows)}
         names, name_arrays = _names_of(mdp)
         if names:
             description[mdp_files.NAMES] = {**names, "arrays": _written(folder, name_arrays)}
@@ -109,12 +114,20 @@ def save(
             "horizon": None if mdp.horizon is None else int(mdp.horizon),
             "arrays": checksums,
             **description,
+            **stored,
             **({mdp_files.RESIDUAL: list(mdp.residual)} if any(mdp.residual) else {}),
             **({mdp_files.ROUNDING: mdp.reward_table.rounding} if mdp.reward_table.rounding else {}),
         }
         storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
         (folder / storage.LOCK).unlink()  # whoever waits for it replaces what is whole
     return folder
+
+
+def check_free(folder: Path) -> None:
+    """ParameterError if an MDP cannot be saved in a folder, as it holds something else."""
+    # Asked again, as another process may have begun there, or ended, in between
+    if _is_foreign(folder) and not (folder / storage.LOCK).exists() and _is_foreign(folder):
+        raise ParameterError(f"{folder}{FOREIGN}")
 
 
 def _written(folder: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, str]:
@@ -166,7 +179,7 @@ def _read_names(folder: Path, manifest: Mapping[str, Any]) -> Names | None:
     stored, actions = mdp_files.read_names(folder, manifest), manifest.get("actions")
     if stored is None:
         return None if actions is None else Names(actions=tuple(actions))
-    values = stored.get(mdp_files.VARIABLES)
+    values = stored[mdp_files.VARIABLES] if stored["variables"] else np.empty((0, 0))
     return Names(
         labels={name: stored[mdp_files.LABELS][:, i] for i, name in enumerate(stored["labels"])},
         variables={
@@ -181,7 +194,7 @@ def _read_names(folder: Path, manifest: Mapping[str, Any]) -> Names | None:
 
 def _is_foreign(folder: Path) -> bool:
     names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    others = {name for name in names - {storage.LOCK, storage.CLAIM} if not storage.is_temporary(name)}
+    others = {name for name in names - {storage.LOCK, storage.CLAIM, BUILDING} if not storage.is_temporary(name)}
     return bool(others) and not is_folder(folder)
 
 
@@ -207,7 +220,7 @@ def _description(
     mdp: TabularMDP,
     actions: Sequence[str] | None,
     time_limit: int | None,
-    observations: np.ndarray | None,
+    shown: np.ndarray | DistinctRows | None,
     observed: str | None,
 ) -> dict[str, Any]:
     """Entries of the manifest on actions, time limit and observations; ParameterError if they do not fit the MDP."""
@@ -218,10 +231,9 @@ def _description(
         description["actions"] = list(actions)
     if time_limit is not None:
         description["time_limit"] = whole_number(time_limit, "time_limit", "a number of steps of at least 1")
-    if observations is not None:
-        shown = np.asarray(observations)
+    if shown is not None:
         kind = observed or (IMAGE if shown.ndim == 4 else VECTOR)
-        fits = kind in OBSERVED and shown.ndim == OBSERVED[kind] and len(shown) == mdp.num_states and shown.size
+        fits = kind in OBSERVED and shown.ndim == OBSERVED[kind] and len(shown) == mdp.num_states and all(shown.shape)
         if not fits or (shown.dtype.kind not in "biuf" if kind == VECTOR else shown.dtype != np.uint8):
             raise ParameterError(
                 f"observations have shape {shown.shape} and type {shown.dtype}; expected {mdp.num_states} images "
@@ -248,7 +260,8 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
         return make("imported", folder=os.fspath(mdp.folder))
     place = storage.cache_directory() / "imported"
     parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
-    contents = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon, str(mdp.chance), sorted(parts.items())]
+    shape = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon]
+    contents: list[Any] = [*shape, str(mdp.chance), sorted(parts.items())]
     names, name_arrays = _names_of(mdp)
     if mdp.names is not None:
         digests = [storage.digest_of_bytes(np.ascontiguousarray(each).data) for each in name_arrays.values()]

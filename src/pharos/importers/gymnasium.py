@@ -23,7 +23,7 @@ from pharos.errors import FileFormatError, MissingExtra, ParameterError, RuleErr
 from pharos.importers.files import MINIGRID_STEPS
 from pharos.importers.folder import ImportedOutcomes
 from pharos.importers.wrappers import Layers, as_integer, check_wrappers, first_number, parts_of, reset
-from pharos.mdp import Residual, Rewards, TabularMDP, normalized_rows, rounding_of_mean
+from pharos.mdp import Names, Residual, Rewards, TabularMDP, normalized_rows, rounding_of_mean
 from pharos.system.wording import capped
 
 SAMPLED_STEPS = 10_000
@@ -96,7 +96,34 @@ def gymnasium(
     else:
         setting: dict[str, Any] = {"gamma": gamma, "initial": initial, "horizon": horizon, "ends": ends}
         mdp = TabularMDP.from_matrices(probabilities, means.array, **setting)
-    return replace(mdp, residual=residual, reward_table=means)
+    return replace(mdp, residual=residual, reward_table=means, names=_names_of(inner, *means.shape))
+
+
+TOY_ACTIONS = {
+    "FrozenLakeEnv": ("left", "down", "right", "up"),
+    "CliffWalkingEnv": ("up", "right", "down", "left"),
+    "TaxiEnv": ("south", "north", "east", "west", "pickup", "dropoff"),
+    "BlackjackEnv": ("stick", "hit"),
+}
+"""Names of the actions of Gymnasium's toy text, from its documentation, by class."""
+TAXI = ("row", "column", "passenger", "destination")
+
+
+def _names_of(inner: object, num_states: int, num_actions: int) -> Names | None:
+    """Names of the actions and variables of Gymnasium's own toy text; None: another environment, or a table."""
+    cls = type(inner)
+    actions = TOY_ACTIONS.get(cls.__name__) if cls.__module__.startswith("gymnasium.envs.toy_text") else None
+    if actions is None or len(actions) != num_actions:
+        return None
+    numbers = np.arange(num_states)
+    width = getattr(inner, "ncol", None) or (getattr(inner, "shape", None) or (0, 0))[1]
+    if cls.__name__ == "TaxiEnv" and num_states == 500:
+        variables = dict(zip(TAXI, np.unravel_index(numbers, (5, 5, 5, 4)), strict=True))
+    elif width and num_states % width == 0:
+        variables = {"row": numbers // width, "column": numbers % width}
+    else:
+        variables = {}
+    return Names(variables=variables, actions=actions)
 
 
 def gymnasium_outcomes(env: object, *, rewards: OutcomeRewards | None = None) -> ImportedOutcomes | None:
@@ -319,7 +346,7 @@ def _start(env: object, inner: object, states: int, is_stepped: bool) -> np.ndar
     starts = np.flatnonzero(counts)
     if start is None and len(starts) == 1 and counts.sum() == count:
         return np.eye(states)[starts[0]]
-    if start is not None and (not len(starts) or (not counts[start == 0].any() and not _is_unlikely(counts, start))):
+    if start is not None and (not len(starts) or (not counts[start == 0].any() and not is_unlikely(counts, start))):
         return start
     listed = ", ".join([*map(str, starts[:5]), *(["..."] if len(starts) > 5 else [])]) or "no state's number"
     says = "it has no initial_state_distrib" if start is None else f"its {name} says otherwise"
@@ -340,7 +367,7 @@ def _distribution(env: object, name: str, value: object, states: int) -> np.ndar
     return start
 
 
-def _is_unlikely(counts: np.ndarray, probabilities: np.ndarray, comparisons: int = 1) -> bool:
+def is_unlikely(counts: np.ndarray, probabilities: np.ndarray, comparisons: int = 1) -> bool:
     """Whether such counts are less likely than LEAST_PROBABILITY, of several comparisons together."""
     return _probability_of(counts, probabilities) < LEAST_PROBABILITY / comparisons
 
@@ -430,7 +457,7 @@ def _compare_frequencies(env: object, inner: object, table: list, samples: dict[
         named.setdefault(shares, (state, action))
     tests += [(*named[shares], shares, sampled) for shares, sampled in groups.items()]
     for state, action, shares, sampled in tests:
-        if _is_unlikely(sampled, np.array(shares), len(tests)):
+        if is_unlikely(sampled, np.array(shares), len(tests)):
             chance = _probability_of(sampled, np.array(shares))
             raise FileFormatError(
                 f"{name_of(env)}: in state {state}, action {action} (and those with the same probabilities) had its "
@@ -541,7 +568,9 @@ def minigrid(
     """
     driver = _Driver(env, seed, remember_carried)
     table, rewards = driver.explore(actions, max_states)
-    return TabularMDP.from_arrays(table, rewards, gamma=gamma, horizon=horizon)
+    names = [action.name for action in driver.env.actions]
+    names = names[: table.shape[1]] if actions is None else [names[action] for action in actions]
+    return TabularMDP.from_arrays(table, rewards, gamma=gamma, horizon=horizon).with_names(actions=names)
 
 
 def minigrid_recording(
@@ -559,7 +588,8 @@ def minigrid_recording(
     table, rewards = driver.explore(None, MOST_STATES)
     names = tuple(action.name for action in driver.env.actions)[: table.shape[1]]
     grids = np.stack([driver.image(state) for state in driver.snapshots])
-    return TabularMDP.from_arrays(table, rewards, gamma=1.0, horizon=horizon), grids, names
+    mdp = TabularMDP.from_arrays(table, rewards, gamma=1.0, horizon=horizon)
+    return mdp.with_names(actions=names), grids, names
 
 
 def minigrid_grids(

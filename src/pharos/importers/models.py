@@ -28,6 +28,8 @@ TARGET = "target"
 """Label under which the states of an expression or of a property are kept."""
 MAXIMUM, MINIMUM, LEAST_COST, LARGEST_COST = "maximum", "minimum", "least_cost", "largest_cost"
 """Answers of `pharos.reach`, by which properties are answered."""
+STEPS = "the number of steps"
+"""Stands for a reward structure, in properties Tmin and Tmax."""
 LARGEST_TOTAL, LEAST_TOTAL = "largest_total", "least_total"
 """Answers of properties R [C]: the optimal and the worst value at gamma 1 without a horizon."""
 
@@ -87,8 +89,8 @@ def storm(
             structure, reaching one pays 1, so that the optimal value at gamma 1 is the maximal probability of reaching
             it.
         property: instead of these two, a property in PRISM's language, or the name of one in a JANI file:
-            P, Pmax or Pmin=? [F target] or [avoid U target], R{"reward"}, Rmax or Rmin=? [F target] or [C]. Its target
-            ends the episode, as do, of U, the states from which it cannot be reached any more.
+            P, Pmax or Pmin=? [F target] or [a U target]; R{"reward"}, Rmax or Rmin=? [F target] or [C]; Tmax or
+            Tmin=? [F target], of steps. Its target ends the episode, and of U the states in which `a` does not hold.
         gamma, horizon: of the MDP.
     Raises:
         MissingExtra: stormpy is not installed.
@@ -144,33 +146,34 @@ def storm_import(
     model = built.model
     labels = sorted(model.labeling.get_labels())
     names = list(model.reward_models)
-    asked, ended = built.asked, np.zeros(model.nr_states, np.bool_)
-    if asked is not None:
-        reward = asked.reward
-        if reward == "" or (reward is not None and reward not in names):
+    query, ended = built.query, np.zeros(model.nr_states, np.bool_)
+    if query is not None:
+        reward = query.reward
+        if reward == "" or (reward not in (None, STEPS, *names)):
             if reward or len(names) != 1:
                 raise UnknownName(f"reward structure of {path}", reward, names)
             reward = names[0]
-        ended = asked.reached | asked.failed
+        ended = query.goal | query.failed
     elif target is not None:
         ended[list(model.labeling.get_states(target))] = True
     elif reward is None and len(names) == 1:
         reward = names[0]
-    if reward is not None and reward not in names:
+    if reward not in (None, STEPS, *names):
         raise UnknownName(f"reward structure of {path}", reward, names)
     if reward is None and target is None and property is None:
         raise ParameterError(
             f"{path}: nothing says what is paid; give a reward structure ({', '.join(names) or 'it has none'}), a "
             f"target: a label ({', '.join(labels)}) or an expression; or a property"
         )
-    reached = ended if asked is None else asked.reached
-    outcomes = _outcomes(model, ended, reached, None if reward is None else model.reward_models[reward])
+    goal = ended if query is None else query.goal
+    paying = Steps() if reward == STEPS else None if reward is None else model.reward_models[reward]
+    outcomes = _outcomes(model, ended, goal, paying)
     actions = (len(outcomes.offsets) - 1) // model.nr_states
 
     def refuse(row: int, total: float) -> FileFormatError:
-        where, said = f"state {row // actions}, choice {row % actions}", built.refusal
+        where, words = f"state {row // actions}, choice {row % actions}", built.refusal
         return FileFormatError(
-            f"{path}: the probabilities of {where} sum to {total:.9g}; expected 1{said and f'; Storm: {said}'}"
+            f"{path}: the probabilities of {where} sum to {total:.9g}; expected 1{words and f'; Storm: {words}'}"
         )
 
     of = np.repeat(np.arange(len(outcomes.offsets) - 1), np.diff(outcomes.offsets))
@@ -178,19 +181,19 @@ def storm_import(
     outcomes = outcomes._replace(probabilities=probabilities)
     mdp = _mdp(model, outcomes, gamma, horizon)
     counts = np.array([len(_choices(model, s)) for s in range(model.nr_states)])
-    names_of_model, reach = _names(model, actions, None if asked is None or asked.is_total else asked.reached)
+    names_of_model, reach = _names(model, actions, None if query is None or query.is_total else query)
     mdp = replace(
         with_sets(mdp, np.arange(actions) < counts[:, None]),
         residual=Residual.of(residuals, np.maximum.reduceat(np.abs(outcomes.rewards), outcomes.offsets[:-1])),
         names=names_of_model,
     )
     question = None
-    if asked is not None and property is not None:
-        question = Question(asked.text, None if asked.is_total else reach, asked.answer, asked.of_starts)
+    if query is not None and property is not None:
+        question = Question(query.text, None if query.is_total else reach, query.answer, query.of_starts)
     return StormImport(mdp, outcomes if _differ(outcomes) else None, question)
 
 
-def _names(model: Any, num_actions: int, reached: np.ndarray | None) -> tuple[Names, str]:
+def _names(model: Any, num_actions: int, query: "Query | None") -> tuple[Names, str]:
     """(names of the model's labels, variables and choices, label of the states to be reached)."""
     states = model.nr_states
     labels = {}
@@ -199,12 +202,13 @@ def _names(model: Any, num_actions: int, reached: np.ndarray | None) -> tuple[Na
             labels[label] = np.zeros(states, np.bool_)
             labels[label][list(model.labeling.get_states(label))] = True
     reach = TARGET
-    if reached is not None:
-        same = [label for label, mask in labels.items() if (mask == reached).all()]
+    if query is not None:
+        goal = query.goal
+        same = [label for label, mask in labels.items() if f'"{label}"' in query.text and (mask == goal).all()]
         while reach in labels and reach not in same:
             reach += "_"
         reach = same[0] if same else reach
-        labels[reach] = reached
+        labels[reach] = goal
     variables = _variables(model, states) if model.has_state_valuations() else {}
     if not model.has_choice_labeling():
         return Names(labels, variables), reach
@@ -235,10 +239,10 @@ def _variables(model: Any, states: int) -> dict[str, np.ndarray]:
     return columns
 
 
-def _outcomes(model: Any, ended: np.ndarray, reached: np.ndarray, reward_model: Any) -> ImportedOutcomes:
+def _outcomes(model: Any, ended: np.ndarray, goal: np.ndarray, reward_model: Any) -> ImportedOutcomes:
     """Outcomes of every state and action with their rewards; states in `ended` lead to the end of the episode.
 
-    Without rewards, a transition into `reached` pays 1.
+    Without rewards, a transition into `goal` pays 1.
     """
     matrix, states = model.transition_matrix, model.nr_states
     choices = [_choices(model, s) for s in range(states)]
@@ -254,7 +258,7 @@ def _outcomes(model: Any, ended: np.ndarray, reached: np.ndarray, reward_model: 
             row = row or [(-1, 1.0)]
             successors += [successor for successor, _ in row]
             probabilities += [p for _, p in row]
-            rewards += [0.0] if ended[s] else _rewards(reward_model, s, choice, successors[offsets[-1] :], reached)
+            rewards += [0.0] if ended[s] else _rewards(reward_model, s, choice, successors[offsets[-1] :], goal)
             offsets.append(len(successors))
     return ImportedOutcomes(
         np.array(offsets), np.array(successors, np.int64), np.array(probabilities), np.array(rewards, np.float64)
@@ -267,10 +271,10 @@ def _choices(model: Any, state: int) -> range:
     return range(matrix.get_row_group_start(state), matrix.get_row_group_end(state))
 
 
-def _rewards(reward_model: Any, state: int, choice: int, successors: list[int], reached: np.ndarray) -> list[float]:
+def _rewards(reward_model: Any, state: int, choice: int, successors: list[int], goal: np.ndarray) -> list[float]:
     """Reward of a choice with each successor: the sum of the rewards of state, choice and transition."""
     if reward_model is None:
-        return [float(successor >= 0 and reached[successor]) for successor in successors]
+        return [float(successor >= 0 and goal[successor]) for successor in successors]
     always = 0.0
     if reward_model.has_state_rewards:
         always += float(reward_model.get_state_reward(state))
@@ -309,17 +313,28 @@ NOT_ONE = re.compile("do not s[uo]me? to one")
 """In the refusal of Storm's checks, which compare sums with 1 as exact fractions; "some" for synchronised commands."""
 
 
-class Asked(NamedTuple):
+class Steps:
+    """The reward structure that pays 1 with every choice, of properties Tmin and Tmax: expected numbers of steps."""
+
+    has_state_rewards = has_transition_rewards = False
+    has_state_action_rewards = True
+
+    @staticmethod
+    def get_state_action_reward(_: int) -> float:
+        return 1.0
+
+
+class Query(NamedTuple):
     """States of a target or a property, and what it asks.
 
     Attributes:
-        text: the property. reached, failed: (S,) bool, where it has come true, and where it cannot any more.
-        reward: name of its reward structure, "" for the only one; None: probabilities.
+        text: the property. goal, failed: (S,) bool, where it has come true, and where it cannot any more.
+        reward: name of its reward structure, "" for the only one, STEPS for steps; None: probabilities.
         answer, of_starts: as of `Question`. is_total: whether rewards are added up for ever.
     """
 
     text: str
-    reached: np.ndarray
+    goal: np.ndarray
     failed: np.ndarray
     reward: str | None = None
     answer: str = MAXIMUM
@@ -332,7 +347,7 @@ class Built(NamedTuple):
 
     model: Any
     refusal: str
-    asked: Asked | None
+    query: Query | None
 
 
 def _model(path: Path, constants: str, target: str | None, property: str | None) -> Built:
@@ -354,7 +369,7 @@ def _model(path: Path, constants: str, target: str | None, property: str | None)
             if target is not None and target not in model.labeling.get_labels():
                 formula = _target(path, program, model, target)
                 model, refusal = _checked_model(path, program, formula)
-            asked = None if formula is None else _asked(model, formula)
+            query = None if formula is None else _query_of(model, formula)
         except (FileFormatError, ParameterError):
             raise
         except Exception as error:  # of Storm, which has many, and of the bindings
@@ -363,11 +378,11 @@ def _model(path: Path, constants: str, target: str | None, property: str | None)
     kind = str(model.model_type).rpartition(".")[2]
     if kind not in ("DTMC", "MDP"):
         raise FileFormatError(f"{path}: is a model of type {kind}; expected an MDP or a DTMC")
-    if asked is not None and property is not None and kind == "MDP" and not OPTIMUM.search(asked.text):
+    if query is not None and property is not None and kind == "MDP" and not OPTIMUM.search(query.text):
         raise ParameterError(
-            f"{path}: {asked.text}: says neither max nor min; expected one of them, such as Pmax=? or Rmin=?"
+            f"{path}: {query.text}: says neither max nor min; expected one of them, such as Pmax=? or Rmin=?"
         )
-    return Built(model, refusal, asked)
+    return Built(model, refusal, query)
 
 
 def _program(path: Path, constants: str) -> tuple[Any, dict[str, Any]]:
@@ -379,16 +394,20 @@ def _program(path: Path, constants: str) -> tuple[Any, dict[str, Any]]:
     program, listed = (
         stormpy.parse_jani_model(str(path)) if path.suffix == ".jani" else (stormpy.parse_prism_program(str(path)), [])
     )
-    properties = {each.get_name(): each for each in listed}
-    return stormpy.instantiate_constants(program, constants)[0] if constants else program, properties
+    if constants:  # of the properties too, which Storm else reads with any value
+        program, listed = stormpy.instantiate_constants(program, constants, listed)
+    return program, {each.get_name(): each for each in listed}
 
 
-OPTIMUM = re.compile(r"^\s*(?:filter\(\w+,\s*)?[PR](?:\{[^}]*\})?(?:max|min)")
+OPTIMUM = re.compile(r"^\s*(?:filter\(\w+,\s*)?[PRT](?:\{[^}]*\})?(?:max|min)")
 REWARD_LAST = re.compile(r"\bR(max|min)\s*(\{[^}]*\})")
 """PRISM's Rmax{"steps"}, which Storm writes R{"steps"}max."""
 DENIED = re.compile(r"!\s*(\w+\s*(?:<=|>=|!=|=|<|>)\s*-?\w+)")
 """!x=3, which is !(x=3) in PRISM, and refused by Storm."""
-FORMS = 'P, Pmax or Pmin=? [F target] or [a U b]; R, Rmax or Rmin=? [F target] or [C], of a reward structure R{"name"}'
+FORMS = (
+    'P, Pmax or Pmin=? [F target] or [a U b]; R, Rmax or Rmin=? [F target] or [C], of a reward structure R{"name"}; '
+    "Tmax or Tmin=? [F target]"
+)
 
 
 def _formula(path: Path, program: Any, properties: dict[str, Any], text: str) -> Any:
@@ -439,8 +458,8 @@ def _quoted(word: str, labels: set[str], program: Any) -> str:
     return word if word in variables else f'"{word}"'
 
 
-def _asked(model: Any, prop: Any) -> Asked:
-    """What a property of Storm asks, and the states that it speaks of.
+def _query_of(model: Any, prop: Any) -> Query:
+    """The query of a property of Storm, and the states that it speaks of.
 
     Raises:
         ParameterError: it asks what pharos does not answer.
@@ -459,25 +478,29 @@ def _asked(model: Any, prop: Any) -> Asked:
         mask[list(stormpy.model_checking(model, condition).get_truth_values_vector())] = True
         return mask
 
-    kind = {"ProbabilityOperatorFormula": "P", "RewardOperatorFormula": "R"}.get(type(formula).__name__)
+    kind = {"ProbabilityOperatorFormula": "P", "RewardOperatorFormula": "R", "TimeOperatorFormula": "T"}.get(
+        type(formula).__name__
+    )
     if kind is None or formula.has_bound:
         raise refused()
     path, nothing = formula.subformula, np.zeros(states, np.bool_)
     is_least = formula.has_optimality_type and str(formula.optimality_type).endswith("MINIMIZE")
-    said = re.search(r"Obtain the (\w+) of the", str(prop))
-    of_starts = {"maximum": "max", "minimum": "min"}.get(said[1] if said else "", "mean")
-    asked = Asked(text, nothing, nothing, None, MINIMUM if is_least else MAXIMUM, of_starts)
+    match = re.search(r"Obtain the (\w+) of the", str(prop))
+    of_starts = {"maximum": "max", "minimum": "min"}.get(match[1] if match else "", "mean")
+    query = Query(text, nothing, nothing, None, MINIMUM if is_least else MAXIMUM, of_starts)
     shape = type(path).__name__
+    if kind == "T":
+        query = query._replace(reward=STEPS, answer=LEAST_COST if is_least else LARGEST_COST)
     if kind == "R":
         named = re.match(r'R\{"([^"]*)"\}', text)  # its `reward_name` fails if there is none
-        asked = asked._replace(reward=named[1] if named else "", answer=LEAST_COST if is_least else LARGEST_COST)
+        query = query._replace(reward=named[1] if named else "", answer=LEAST_COST if is_least else LARGEST_COST)
         if str(path) == "C":
-            return asked._replace(answer=LEAST_TOTAL if is_least else LARGEST_TOTAL, is_total=True)
+            return query._replace(answer=LEAST_TOTAL if is_least else LARGEST_TOTAL, is_total=True)
     if shape == "EventuallyFormula":
-        return asked._replace(reached=where(path.subformula))
+        return query._replace(goal=where(path.subformula))
     if shape == "UntilFormula" and kind == "P":
-        reached = where(path.right_subformula)
-        return asked._replace(reached=reached, failed=~where(path.left_subformula) & ~reached)
+        goal = where(path.right_subformula)
+        return query._replace(goal=goal, failed=~where(path.left_subformula) & ~goal)
     raise refused()
 
 

@@ -19,6 +19,7 @@ from pharos.importers.folder import ImportedOutcomes
 from pharos.mdp import Residual, Rewards, TabularMDP, lacking, normalized_rows, rounding_of_mean
 
 END = -1
+REPORT_SECONDS = 0.1
 
 
 class Arrival(NamedTuple):
@@ -42,15 +43,14 @@ class Arrival(NamedTuple):
 
 
 class Steppable(Protocol):
-    """A source of states.
-
-    Attributes:
-        name: for messages.
-        num_actions: the same in all states.
-    """
+    """A source of states, with the same number of actions in each; its `name` is for messages."""
 
     name: str
-    num_actions: int
+
+    @property
+    def num_actions(self) -> int:
+        """Number of actions."""
+        ...
 
     def starts(self) -> list[Arrival]:
         """The states in which episodes start, with their probabilities."""
@@ -78,6 +78,10 @@ class Expansions(Protocol):
         """The outcomes of the first state that was submitted and not fetched so far."""
         ...
 
+    def close(self) -> None:
+        """End what works for it."""
+        ...
+
 
 class ExpansionsHere:
     """States that are expanded in this process, one after the other."""
@@ -96,9 +100,12 @@ class ExpansionsHere:
         """The outcomes of the state."""
         return self._source.expand(self._saved)
 
+    def close(self) -> None:
+        """Nothing works elsewhere."""
+
 
 @dataclass
-class Exploration:
+class SteppedStates:
     """States and transitions so far: those of the states below `num_expanded`, in the order of their discovery.
 
     Attributes:
@@ -107,6 +114,7 @@ class Exploration:
         starts: state -> probability.
         offsets, next_states, probabilities, rewards: outcomes of each state and action, row s A + a.
         layers: number of states at each depth.
+        num_resumed: states that were expanded by another process, which was interrupted.
     """
 
     num_actions: int
@@ -122,6 +130,7 @@ class Exploration:
     probabilities: array = field(default_factory=lambda: array("d"))
     rewards: array = field(default_factory=lambda: array("d"))
     layers: list[int] = field(default_factory=list)
+    num_resumed: int = 0
     numbers: dict[bytes, int] = field(default_factory=dict)
 
     @property
@@ -166,7 +175,7 @@ class Exploration:
 
 
 @dataclass
-class Search:
+class BreadthFirst:
     """One enumeration, which can be stopped and goes on from what it has.
 
     Args:
@@ -175,21 +184,21 @@ class Search:
         max_states: more are an error.
         too_large: text for that error, with what the user can do.
         report: called now and then with (exploration, seconds, whether it is finished).
-        on_state: called with each new (number, saved state).
+        on_state: called with (depth, saved state) of each new one.
         checkpoint: called after each expanded state.
     """
 
     source: Steppable
     horizon: int | None = None
     max_states: int = 100_000
-    too_large: Callable[[Exploration], str] = lambda _: ""
-    report: Callable[[Exploration, float, bool], None] = lambda *_: None
+    too_large: Callable[[SteppedStates], str] = lambda _: ""
+    report: Callable[[SteppedStates, float, bool], None] = lambda *_: None
     on_state: Callable[[int, Any], None] = lambda *_: None
-    checkpoint: Callable[[Exploration], None] = lambda _: None
+    checkpoint: Callable[[SteppedStates], None] = lambda _: None
 
-    def begin(self) -> tuple[Exploration, dict[int, Any]]:
+    def begin(self) -> tuple[SteppedStates, dict[int, Any]]:
         """(an exploration with the start states, the saved state of each)."""
-        exploration, frontier = Exploration(self.source.num_actions), dict[int, Any]()
+        exploration, frontier = SteppedStates(self.source.num_actions), dict[int, Any]()
         totals: dict[int, Fraction | float] = {}
         for arrival in self.source.starts():
             if arrival.key is None:
@@ -199,7 +208,7 @@ class Search:
         exploration.starts = {number: float(p) for number, p in totals.items()}
         return exploration, frontier
 
-    def run(self, exploration: Exploration, frontier: dict[int, Any], pool: Expansions) -> None:
+    def run(self, exploration: SteppedStates, frontier: dict[int, Any], pool: Expansions) -> None:
         """Expand all states, in their order.
 
         Args:
@@ -207,6 +216,7 @@ class Search:
         Raises:
             StateSpaceTooLarge: there are more than `max_states`.
         """
+        exploration.num_resumed = exploration.num_expanded
         submitted, since, shown = exploration.num_expanded, time.monotonic(), 0.0
         while (state := exploration.num_expanded) < exploration.num_states:
             while submitted < exploration.num_states and submitted - state < pool.room:
@@ -215,13 +225,13 @@ class Search:
             self._add(exploration, frontier, state, pool.fetch())
             self.checkpoint(exploration)
             seconds = time.monotonic() - since
-            if seconds - shown > 0.1:
+            if seconds - shown > REPORT_SECONDS:
                 self.report(exploration, seconds, False)
                 shown = seconds
         self.report(exploration, time.monotonic() - since, True)
 
     def _add(
-        self, exploration: Exploration, frontier: dict[int, Any], state: int, rows: Iterable[Sequence[Arrival]]
+        self, exploration: SteppedStates, frontier: dict[int, Any], state: int, rows: Iterable[Sequence[Arrival]]
     ) -> None:
         """Add the outcomes of a state, and the states that they lead to."""
         is_last = self.horizon is not None and exploration.depths[state] + 1 >= self.horizon
@@ -237,7 +247,7 @@ class Search:
             exploration.add_row(shares)
 
     def _number(
-        self, exploration: Exploration, frontier: dict[int, Any], arrival: Arrival, parent: int, action: int
+        self, exploration: SteppedStates, frontier: dict[int, Any], arrival: Arrival, parent: int, action: int
     ) -> int:
         """Number of the state that was arrived in, which may be new."""
         assert arrival.key is not None
@@ -247,12 +257,12 @@ class Search:
                 raise StateSpaceTooLarge(self.too_large(exploration))
             number = exploration.add_state(arrival, parent, action)
             frontier[number] = arrival.saved
-            self.on_state(number, arrival.saved)
+            self.on_state(exploration.depths[number], arrival.saved)
         return number
 
 
 def mdp_of(
-    exploration: Exploration, *, gamma: float, horizon: int | None
+    exploration: SteppedStates, *, gamma: float, horizon: int | None
 ) -> tuple[TabularMDP, ImportedOutcomes | None]:
     """The MDP of a finished exploration; and its outcomes, None where no action pays different rewards."""
     outcomes, actions = exploration.outcomes(), exploration.num_actions

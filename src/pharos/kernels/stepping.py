@@ -558,7 +558,8 @@ def learn(
 
     outcomes: (offsets (S A + 1,), states (N,), -1 for the end; rewards (N,); cumulative probabilities of a row (N,)).
     terminal: (S,); group: (S,) the observation of each state; starts, cumulative (K,): of episodes; chance: (chosen,
-    previous, uniform, first_chosen); limit: steps of an episode.
+    previous, uniform, first_chosen), with the sets of observations (C, A) behind where some actions are not available;
+    limit: steps of an episode.
     kernel: (K (C, C) or (0, 0), F (C, m), diagonal (C,)); learnt, target: each (q (A, C), weights (A, m)), of which
     target stays as it is. memory: (observations (M,), actions (M,), next observations (M,), -1 for an end, rewards
     (M,)), a ring; visits: (C, A) numbers of choices.
@@ -586,10 +587,14 @@ def learn(
         epsilon = first_epsilon + share * (last_epsilon - first_epsilon) if t >= begin else 1.0
         action = 0
         if uniform_number(word, 0) < epsilon:
-            action = integer_below(word, 0, num_actions)
+            action = action_of_set(chance, num_actions, word, c)
         else:  # greedy, ties at random
             best, ties = _value(kernel, learned, c, 0), 1
+            if not set_has(chance, c, 0):
+                best = -np.inf
             for a in range(1, num_actions):
+                if not set_has(chance, c, a):
+                    continue
                 q = _value(kernel, learned, c, a)
                 if q > best:
                     best, ties, action = q, 1, a
@@ -598,7 +603,7 @@ def learn(
                     if uniform_number(word, 0) * ties < 1.0:
                         action = a
         # one step of the MDP: the outcome by its cumulated probability
-        executed = redrawn_action(action, place[1], chance, num_actions, word, s)
+        executed = redrawn_action(action, place[1], chance, num_actions, word, c)
         row = s * num_actions + executed
         k, last = offsets[row], offsets[row + 1] - 1
         if k < last:
@@ -631,9 +636,11 @@ def learn(
                 batch[i] = j
                 y = rewards[j]
                 if next_observations[j] >= 0:
-                    best = _value(kernel, target, next_observations[j], 0)
+                    d = next_observations[j]
+                    best = _value(kernel, target, d, 0) if set_has(chance, d, 0) else -np.inf
                     for a in range(1, num_actions):
-                        best = max(best, _value(kernel, target, next_observations[j], a))
+                        if set_has(chance, d, a):
+                            best = max(best, _value(kernel, target, d, a))
                     y += gamma * best
                 errors[i] = y - _value(kernel, learned, observations[j], actions[j])
             # largest step of this minibatch that does not overshoot, by the row sums of its kernel (Gershgorin)

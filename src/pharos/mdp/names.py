@@ -83,7 +83,7 @@ class Names:
 
     @property
     def in_words(self) -> str:
-        """What there is: "terminal; labels done, goal; variables x (0 to 7), open (true, false)"."""
+        """Targets that there are: "terminal; labels done, goal; variables x (0 to 7), open (true, false)"."""
         ranges = [f"{name} ({_range_in_words(column)})" for name, column in self.variables.items()]
         parts = ["terminal"]
         parts += [f"labels {', '.join(sorted(self.labels))}"] if self.labels else []

@@ -114,6 +114,14 @@ class Rewards:
         rounding = rounding_of_mean(2, largest) if largest >= 0 else 0.0
         return collector.finish(max(self.rounding, other.rounding) + rounding)
 
+    @cached_property
+    def unit(self) -> float:
+        """The largest power of two, 1 at most, of which all rewards are whole multiples; 0 where they are rounded, or
+        more than a palette has."""
+        if not len(self.palette) or self.rounding:
+            return 0.0
+        return 1.0 / max(float(each).as_integer_ratio()[1] for each in self.palette)
+
     @property
     def lowest(self) -> float:
         """The smallest reward."""

@@ -139,7 +139,7 @@ _BUILT_IN = {
     "number": "vector:Number",
     "hash": "vector:Hash",
     "mixed": "vector:Mixed",
-    "recorded": "vector:Recorded",
+    "recorded": "recorded:Recorded",
 }
 _registered: dict[str, tuple[Function, object]] = {}
 

@@ -59,8 +59,8 @@ MOST_READ = 3e9
 HOMING = 32
 # Improvements of a policy, at most.
 MOST_IMPROVEMENTS = 200
-POLICIES = {"optimal": BEST, "worst": WORST}
-"""Names of the policies that are found -> selections."""
+POLICIES = ("optimal", "worst")
+"""Names of the policies that are found."""
 
 
 class GainInterval(NamedTuple):
@@ -170,7 +170,7 @@ def _selection(mdp: TabularMDP, policy: TablePolicy | str | None) -> Selection:
             return PolicyTable.of(mdp)
         if policy is not None and policy not in POLICIES:
             raise UnknownName("policy", policy, [*POLICIES, "uniform"])
-        return POLICIES[policy or "optimal"]
+        return WORST if policy == "worst" else BEST
     return PolicyTable.of(mdp, policy.policy_table() if isinstance(policy, TableAgent) else policy)
 
 

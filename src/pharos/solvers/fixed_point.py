@@ -90,6 +90,10 @@ class Backup(Generic[M]):
         self.operations = per_state + select.operations(mdp.num_actions) + mdp.dynamics.operations
         self.largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
         self.rounding_of_rewards = mdp.reward_table.rounding
+        # without chance and discount, sums of whole multiples of a power of two are exact as long as 53 bits hold them
+        is_sum = mdp.gamma == 1.0 and chance.is_none and mdp.dynamics.is_deterministic
+        is_pure = not isinstance(select, PolicyTable) or select.actions is not None
+        self._exact_to = 2.0**53 * mdp.reward_table.unit if is_sum and is_pure else 0.0
 
     def factor_of(self, mass: float) -> float:
         """Contraction factor, where the probabilities of choosing sum to at most `mass`."""
@@ -124,8 +128,10 @@ class Backup(Generic[M]):
 
     def rounding(self, largest: float) -> float:
         """A bound on the rounding error of one backup of entries up to `largest`: half a unit for each operation, and
-        what storing it costs.
+        what storing it costs. 0 where whole numbers are added up, and 53 bits hold them.
         """
+        if self._exact_to and largest + self.largest_reward <= self._exact_to:
+            return self.stored(largest)
         return float(self.rounding_of(self.largest_reward, largest)) + self.stored(largest)
 
     def rounding_of(self, rewards: Numbers, largest: Numbers) -> Numbers:

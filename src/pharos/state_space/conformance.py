@@ -24,7 +24,7 @@ import numpy as np
 from pharos.drawing import ground_of, shape_of
 from pharos.environments import Environment, Layer, State, classes, start_distribution
 from pharos.errors import ParameterError, RuleError, UnknownName
-from pharos.rules import mutable_attributes, pack, unpack
+from pharos.rules import mentioned_names, mutable_attributes, pack, unpack
 from pharos.state_space.guarded_rules import SUM_TOLERANCE, InterpretedCheck
 
 if TYPE_CHECKING:
@@ -419,6 +419,11 @@ def check_declarations(env: Environment) -> None:
         if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
             raise RuleError(f"{env}: {attribute} is {value!r}; expected an integer of at least 1")
     _ = env.has_chance  # which looks at `outcomes`
+    for rule in RULES:
+        if "print" in mentioned_names([getattr(cls, rule)], cls):
+            raise RuleError(
+                f"{env}: {rule} prints: remove it; rules compute a state, and a compiled one prints no array"
+            )
     # parameters, which must survive JSON
     try:
         again = cls(**json.loads(json.dumps(env.parameters, allow_nan=False)))

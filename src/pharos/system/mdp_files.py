@@ -2,10 +2,12 @@
 
 FOLDER/manifest.json     what is there, written last
 FOLDER/NAME.npy          an array of COMMON, and those of one of the forms below
-FOLDER/observations.npy  where the source shows states: format version 2 or 3
 FOLDER/outcome_*.npy     in format version 3: outcomes, with the reward of each
 FOLDER/label_states.npy, variable_values.npy, choice_names.npy   optional: names of states and actions, in any version
-FOLDER/available.npy     in format version 5: the actions that exist in each state; other files as in version 1, 2 or 3
+FOLDER/available.npy     in format version 5: the actions that exist in each state; other files as in version 1 or 3
+FOLDER/observations.bin  in format version 6: what the source shows, distinct rows in deflated chunks, and
+FOLDER/observation_index.npy  the row of each state; other files as in version 1, 3 or 5
+FOLDER/observations.npy  in format version 2, 3 or 5 of an earlier pharos: what the source shows, a row a state
 """
 
 import math
@@ -18,21 +20,27 @@ import numpy as np
 
 from pharos.errors import FileFormatError
 from pharos.system import storage
+from pharos.system.distinct_rows import DistinctRows
+from pharos.system.wording import capped
 
 FORMAT, VERSION, MANIFEST = "pharos mdp", 1, "manifest.json"
 OBSERVED_VERSION = 2
-"""Of folders with observations."""
+"""Of folders of an earlier pharos with observations, one row a state."""
 PAID_VERSION = 3
 """Of folders that know the reward of each outcome, with observations or without."""
 SETS_VERSION = 5
 """Of folders in which some actions are not available in some states. 4 is another extension of 3."""
-VERSIONS = (VERSION, OBSERVED_VERSION, PAID_VERSION, SETS_VERSION)
+CHUNKS_VERSION = 6
+"""Of folders with observations: distinct rows in chunks, and the row of each state."""
+VERSIONS = (VERSION, OBSERVED_VERSION, PAID_VERSION, SETS_VERSION, CHUNKS_VERSION)
 
 COMMON = ("rewards", "terminal", "start_states", "start_probabilities")
 TABLE = ("next_states",)
 MATRIX = ("transitions_data", "transitions_indices", "transitions_indptr")
 OUTCOMES = ("successors",)  # and, where they are: offsets; probabilities, or codes and palette
 OBSERVATIONS = "observations"
+INDEX, CHUNKS, ROWS = "observation_index", "observations.bin", "observation_rows"
+"""The row of each state, an array; the chunks of distinct rows, a file; what is in them, an entry of the manifest."""
 PAID = ("outcome_offsets", "outcome_states", "outcome_probabilities", "outcome_rewards")
 AVAILABLE = "available"
 RESIDUAL = "residual"
@@ -42,6 +50,8 @@ ROUNDING = "rounding"
 NAMES = "names"
 """Entry of the manifest: names of labels, variables and choices, and the checksums of their arrays."""
 LABELS, VARIABLES, CHOICES = "label_states", "variable_values", "choice_names"
+MOST_INFLATED = 1100
+"""Bytes that a byte of a deflated chunk stands for, at most: 1,032 (RFC 1951)."""
 AGAIN = "import it again"
 
 
@@ -94,14 +104,86 @@ def read_arrays(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> dict[
         kind = (*OUTCOMES, *offsets, *(("probabilities",) if "probabilities" in checksums else ("codes", "palette")))
     names = (*COMMON, *kind)
     version = manifest["format_version"]
-    may_have_shown = version in (PAID_VERSION, SETS_VERSION) and OBSERVATIONS in checksums
-    shown = (OBSERVATIONS,) * (version == OBSERVED_VERSION or may_have_shown)
-    has_paid = version == PAID_VERSION or (version == SETS_VERSION and PAID[0] in checksums)
+    has_shown = version == OBSERVED_VERSION or (version in (PAID_VERSION, SETS_VERSION) and OBSERVATIONS in checksums)
+    shown = (OBSERVATIONS,) * has_shown + (INDEX,) * (version == CHUNKS_VERSION)
+    has_paid = version == PAID_VERSION or (version in (SETS_VERSION, CHUNKS_VERSION) and PAID[0] in checksums)
+    has_sets = version == SETS_VERSION or (version == CHUNKS_VERSION and AVAILABLE in checksums)
     outcomes = PAID * has_paid
-    names = (*names, *(AVAILABLE,) * (version == SETS_VERSION))
+    names = (*names, *(AVAILABLE,) * has_sets)
     if set(checksums) != {*names, *shown, *outcomes}:
         raise ValueError(f"its arrays are {', '.join(checksums)}; expected {', '.join((*names, *shown, *outcomes))}")
     return {name: read_array(folder, manifest, name) for name in (*names, *outcomes)}
+
+
+def write_rows(folder: Path, rows: DistinctRows) -> dict[str, Any]:
+    """Write the chunks of observations, one after another; returns what the manifest says of them."""
+    lengths, checksums = [], []
+    with storage.replacing(folder / CHUNKS) as file:
+        for number in range(rows.num_chunks):
+            chunk = rows.chunk(number)
+            file.write(chunk)
+            lengths.append(len(chunk))
+            checksums.append(storage.digest_of_bytes(chunk))
+    return {
+        "rows": rows.num_distinct,
+        "rows_in_chunk": rows.rows_in_chunk,
+        "shape": list(rows.shape[1:]),
+        "dtype": rows.dtype.str,
+        "bytes": lengths,
+        "checksums": checksums,
+    }
+
+
+def read_rows(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> np.ndarray | DistinctRows | None:
+    """Return the observations of the states; None if there are none. Chunks are read and checked when they are used.
+
+    Raises:
+        FileFormatError: they are missing, damaged or changed, also when a chunk is read.
+    """
+    if manifest["format_version"] != CHUNKS_VERSION:
+        return read_array(folder, manifest, OBSERVATIONS) if OBSERVATIONS in manifest["arrays"] else None
+    path, index = Path(folder) / CHUNKS, read_array(folder, manifest, INDEX)
+    try:
+        entry = manifest[ROWS]
+        count, in_chunk, shape, lengths, checksums = (
+            entry[key] for key in ("rows", "rows_in_chunk", "shape", "bytes", "checksums")
+        )
+        dtype = np.dtype(str(entry["dtype"]))
+        whole = [count, in_chunk, *shape, *lengths]
+        if not all(type(each) is int and each >= 1 for each in whole) or dtype.kind not in "biuf":
+            raise ValueError(f"{ROWS} is {capped(entry)}")
+        if not len(lengths) == len(checksums) == -(-count // in_chunk):
+            raise ValueError(f"there are {len(lengths)} chunks of {in_chunk} rows; expected {count} rows")
+        largest = MOST_INFLATED * (lengths[0] + 1)
+        if math.prod(shape) * dtype.itemsize * min(count, in_chunk) > largest:
+            raise ValueError(f"a row of shape {capped(shape)} is larger than its chunk can hold")
+        if index.ndim != 1 or index.dtype.kind not in "iu" or not len(index) or index.min() < 0 or index.max() >= count:
+            raise ValueError(f"{INDEX} has shape {index.shape}; expected one row from 0 to {count - 1} a state")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise FileFormatError(f"{folder}: its observations are damaged: {reason}; {AGAIN}") from None
+    try:
+        storage.check_regular(path)
+        if path.stat().st_size != sum(lengths):
+            raise FileFormatError(f"{path} was changed after it was written; {AGAIN}")
+    except OSError as error:
+        wrong = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+        raise FileFormatError(f"{path}: {wrong}; {AGAIN}") from None
+    ends = np.cumsum(lengths, dtype=np.int64).tolist()
+
+    def chunk(number: int) -> bytes:
+        try:
+            with open(path, "rb") as file:
+                file.seek(ends[number] - lengths[number])
+                data = file.read(lengths[number])
+        except OSError as error:
+            wrong = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+            raise FileFormatError(f"{path}: {wrong}; {AGAIN}") from None
+        if storage.digest_of_bytes(data) != checksums[number]:
+            raise FileFormatError(f"{path} was changed after it was written; {AGAIN}")
+        return data
+
+    return DistinctRows(index, shape, dtype, count, in_chunk, chunk, str(path))
 
 
 def residual_of(manifest: Mapping[str, Any]) -> tuple[float, float]:

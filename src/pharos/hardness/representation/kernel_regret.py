@@ -255,11 +255,11 @@ class PolicyLearner(IdealisedLearner):
         rows, steps = [], self.rollouts.gradient_steps
         for step in range(0, self.schedule.steps, self.rollouts.steps):
             self.tell(f"step {step:,} of {self.schedule.steps:,}")
-            behaviour = softmax(logits)
+            behaviour = softmax(observations.masked(logits))
             policy, memory = behaviour[observations.groups], Memory(self.mdp, self.states)
             played, length = memory.play(self.visits(policy), policy, 1)
             played = played if self.is_return else self.value(policy)
-            greedy = self.value(greedy_policy(logits)[observations.groups])
+            greedy = self.value(greedy_policy(logits, observations.sets)[observations.groups])
             count = min(self.rollouts.steps, self.schedule.steps - step) / length
             rows.append((step, self.regret(greedy), self.regret(played), count))
             v = values[observations.groups, 0]
@@ -273,7 +273,8 @@ class PolicyLearner(IdealisedLearner):
             gain = visits * standardised(returns - v[:, None], visits)
             if largest > 0:
                 pull, up = observations.sums(gain), observations.sums(np.maximum(gain, 0.0))
-                logits = ascended(logits, pull, up, apply, 1 / (MARGIN * largest), self.rollouts)
+                rate = 1 / (MARGIN * largest)
+                logits = ascended(observations.masked(logits), pull, up, apply, rate, self.rollouts)
         return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))
 
     def _returns(
@@ -297,7 +298,7 @@ def ascended(
     Args:
         pull: (C, A) weighted advantages, summed over the states of an observation; up: the positive ones alone.
         rollouts: how many steps; where p / pi is `clip_range` above 1 the positive ones count no more, where it is as
-            far below the negative ones.
+            far below the negative ones. Logits of actions that are not available are -inf.
     """
     behaviour = np.maximum(softmax(logits), 1e-30)
     far = np.inf if rollouts.clip_range is None else rollouts.clip_range
@@ -307,7 +308,8 @@ def ascended(
         counted = np.where(ratio > 1 + far, pull - up, np.where(ratio < 1 - far, up, pull))
         of_action = counted * policy / behaviour
         logits = logits + rate * apply(of_action - policy * of_action.sum(axis=1, keepdims=True))
-        logits = np.maximum(logits - logits.max(axis=1, keepdims=True), -SPAN)
+        shifted = logits - logits.max(axis=1, keepdims=True)
+        logits = np.where(shifted > -np.inf, np.maximum(shifted, -SPAN), -np.inf)  # those of no action stay so
     return logits
 
 
@@ -400,7 +402,8 @@ def kernel_learning_time(
     """
 
     def time(kernel: np.ndarray, weights: np.ndarray, q: np.ndarray) -> float:
-        advantage = q - q.max(axis=1, keepdims=True)
+        best = q.max(axis=1, keepdims=True, where=np.isfinite(q), initial=-np.inf)
+        advantage = np.where(np.isfinite(q), q - best, 0.0)
         eigenvalues, energy = _spectrum(kernel, advantage, weights)
         return _time(eigenvalues / eigenvalues.sum(), energy)
 
@@ -431,7 +434,7 @@ def kernel_sample_complexity(
     def samples(kernel: np.ndarray, weights: np.ndarray, q: np.ndarray) -> float:
         mean = kernel @ weights
         centred = kernel - mean[:, None] - mean[None] + weights @ mean
-        return _samples(*_spectrum(centred, q - weights @ q, weights))
+        return _samples(*_spectrum(centred, _centred(q, weights), weights))
 
     return _spectral("kernel_sample_complexity", mdp, representation, schedule, horizon, samples, progress or str)
 
@@ -456,10 +459,11 @@ def aliasing_floor(
     """
     setting = _setting(mdp, representation, schedule, horizon, "aliasing_floor", progress or str)
     states = np.flatnonzero(setting.states > 0)
-    weights, q, observations = setting.states[states], setting.q[states], Grouped(representation.classes, states)
+    weights, q = setting.states[states], setting.q[states]
+    observations = Grouped(representation.classes, states, mdp.available)
     if len(observations) == len(states):
         return 0.0
-    centred = q - weights @ q
+    centred = _centred(q, weights)
     total = float(weights @ (centred**2).sum(axis=1))
     if total <= 1e-24:
         raise UndefinedMeasure("aliasing_floor: the optimal values are the same everywhere")
@@ -479,6 +483,17 @@ def _setting(
     return standard_occupancy(mdp, (schedule or Schedule()).gamma, episode, tell)
 
 
+def _centred(q: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Values q (N, A) less the mean of their action under weights (N,); 0 for actions that are not available (-inf)."""
+    if np.isfinite(q).all():
+        return np.asarray(q - weights @ q)
+    is_available = np.isfinite(q)
+    values = np.where(is_available, q, 0.0)
+    share = weights @ is_available
+    mean = np.divide(weights @ values, share, out=np.zeros_like(share), where=share > 0)
+    return np.where(is_available, values - mean, 0.0)
+
+
 def _spectral(
     name: str,
     mdp: TabularMDP,
@@ -488,10 +503,11 @@ def _spectral(
     function: Callable[[np.ndarray, np.ndarray, np.ndarray], float],
     tell: Callable[[str], object],
 ) -> Spectral:
-    """Spectral result of a function of (kernel (C, C), weights (C,), mean values (C, A)) of the observations."""
+    """Spectral result of a function of (kernel (C, C), weights (C,), mean values (C, A)) of the observations; values of
+    actions that are not available are -inf."""
     setting = _setting(mdp, representation, schedule, horizon, name, tell)
     states = np.flatnonzero(setting.states > 0)
-    observations = Grouped(representation.classes, states)
+    observations = Grouped(representation.classes, states, mdp.available)
     weights = observations.sums(setting.states[states])
     q = observations.sums(setting.states[states, None] * setting.q[states]) / weights[:, None]
 

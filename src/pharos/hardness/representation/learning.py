@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.visitation import Propagation, drawn, standard_occupancy
-from pharos.mdp import TabularMDP, mdp_within, states_within, whole_number
+from pharos.mdp import TabularMDP, mdp_within, states_within, uniform_choice, whole_number
 from pharos.regret import regret_scale
 from pharos.solvers import Solution, chain, evaluate_policy, uniform_value, value_iteration
 
@@ -77,10 +77,6 @@ class Representation:
             raise ParameterError(
                 f"the representation is of {len(self.classes)} states; expected {mdp.num_states}, those of the MDP"
             )
-        if mdp.available is not None:
-            raise UndefinedMeasure(
-                f"{measure} is defined for MDPs in which every action is available everywhere: {mdp}"
-            )
         steps = next((each for each in (horizon, mdp.horizon, self.time_limit) if each is not None), None)
         if steps is None:
             raise UndefinedMeasure(f"{measure} is defined for episodes of T steps: give a horizon")
@@ -93,11 +89,29 @@ class Grouped:
     Attributes:
         representatives: (C,) one state of each observation.
         groups: (N,) the observation of each of the states, 0 .. C - 1.
+        sets: (C, A) bool, the available actions; None: all are.
+    Raises:
+        UndefinedMeasure: states that look alike do not have the same actions.
     """
 
-    def __init__(self, classes: np.ndarray, states: np.ndarray):
+    def __init__(self, classes: np.ndarray, states: np.ndarray, available: np.ndarray | None = None):
+        """available: (S, A) bool, the available actions of the states; None: all are."""
         _, first, groups = np.unique(classes[states], return_index=True, return_inverse=True)
         self.representatives, self.groups = states[first], groups.ravel()
+        self.sets = None if available is None else available[self.representatives]
+        if available is not None and self.sets is not None:
+            differs = (available[states] != self.sets[self.groups]).any(axis=1)
+            if differs.any():
+                state = int(states[np.argmax(differs)])
+                other = int(self.representatives[self.groups[np.argmax(differs)]])
+                raise UndefinedMeasure(
+                    f"states {other} and {state} look alike, and other actions are available in them: measures of a "
+                    "representation are defined where what is seen says which are"
+                )
+
+    def masked(self, values: np.ndarray, otherwise: float = -np.inf) -> np.ndarray:
+        """Values (C, A), with another number for actions that are not available."""
+        return values if self.sets is None else np.where(self.sets, values, otherwise)
 
     def __len__(self) -> int:
         return len(self.representatives)
@@ -462,14 +476,16 @@ class IdealisedLearner:
             self.numbers = numbers[self.states]
         else:
             self.states = self.numbers = np.flatnonzero(is_reachable & ~np.asarray(mdp.terminal))
-        self.observations = Grouped(representation.classes, self.numbers)
-        self.table = Grouped(np.arange(mdp.num_states), self.numbers)
+        self.observations = Grouped(representation.classes, self.numbers, mdp.available)
+        self.table = Grouped(np.arange(mdp.num_states), self.numbers, mdp.available)
+        self.uniform = uniform_choice(self.mdp)
         self.visits = OfPolicies(lambda policy: visits_of(self.mdp, self.everywhere(policy), self.episode))
         self.value = OfPolicies(self._value)
 
     def curve(self, observations: Grouped, apply: KernelOperator) -> LearningCurve:
         """Learn from observations, the groups of states that look alike, with a kernel over them."""
         schedule, actions = self.schedule, self.mdp.num_actions
+        uniform = self.uniform[self.states]
         values = np.zeros((len(observations), actions))
         memory = Memory(self.mdp, self.states)
         vector = np.full((len(observations), 1), len(observations) ** -0.5)
@@ -477,14 +493,14 @@ class IdealisedLearner:
         for step in range(0, schedule.steps, schedule.period):
             self.tell(f"step {step:,} of {schedule.steps:,}")
             period, epsilon = min(schedule.period, schedule.steps - step), schedule.epsilon(step)
-            greedy = greedy_policy(values)[observations.groups]
-            policy = (1 - epsilon) * greedy + epsilon / actions
+            greedy = greedy_policy(values, observations.sets)[observations.groups]
+            policy = (1 - epsilon) * greedy + (epsilon / actions if observations.sets is None else epsilon * uniform)
             played, length = memory.play(self.visits(policy), policy, period)
             played = played if self.is_return else self.value(policy)
             rows.append((step, self.regret(self.value(greedy)), self.regret(played), period / length))
             if step < schedule.learning_starts:
                 continue
-            q = values[observations.groups]
+            q = observations.masked(values)[observations.groups]
             target, visits = memory.targets(q.max(axis=1), schedule.gamma)
             weights = observations.sums(visits / visits.sum())
             total = observations.sums(visits / visits.sum() * target)
@@ -535,7 +551,7 @@ class IdealisedLearner:
     def _value(self, policy: np.ndarray) -> float:
         """Start value of a policy (N, A)."""
         is_pure = policy.max(axis=1).min() == 1.0
-        actions = np.zeros(self.mdp.num_states, np.int64)
+        actions = self.uniform.argmax(axis=1)
         actions[self.states] = policy.argmax(axis=1)
         if self.is_return and is_pure and self.mdp.is_deterministic:
             return return_on_graph(self.mdp, actions, self.episode)
@@ -549,7 +565,7 @@ class IdealisedLearner:
 
     def everywhere(self, policy: np.ndarray) -> np.ndarray:
         """(S, A) probabilities of a policy (N, A), uniform in states outside `states`."""
-        table = np.full((self.mdp.num_states, self.mdp.num_actions), 1 / self.mdp.num_actions)
+        table = self.uniform.copy()
         table[self.states] = policy
         return table
 
@@ -616,16 +632,20 @@ class Memory:
 
     def targets(self, v: np.ndarray, gamma: float) -> tuple[np.ndarray, np.ndarray]:
         """((N, A), (N, A)): the mean target of each choice, by the values v (N,) of states; and its visits."""
-        chance, x = self.mdp.chance, np.zeros(self.mdp.num_states + 1)
+        chance, x = self.mdp.chance.at(self.states), np.zeros(self.mdp.num_states + 1)
         x[self.states] = v
         q = self.rewards + gamma * self.mdp.dynamics.expected(x, self.states)
-        later = self.later.sum(axis=1)
         if not self.mdp.is_sticky:
-            return chance.chosen_values(q), later
-        mean, visits = q.mean(axis=1, keepdims=True), self.first + later
-        choice = chance.first_chosen * self.first + chance.chosen * later
-        uniform = chance.first_uniform * self.first + chance.uniform * later
-        total = choice * q + uniform * mean + chance.previous * np.einsum("sba,sb->sa", self.later, q)
+            return chance.chosen_values(q), self.later.sum(axis=1)
+        first, repeating = self.first, self.later
+        if chance.available is not None:  # a previous action that is not available counts as none
+            can_be = chance.available[:, :, None]
+            first, repeating = first + np.where(can_be, 0.0, repeating).sum(axis=1), np.where(can_be, repeating, 0.0)
+        later = repeating.sum(axis=1)
+        mean, visits = chance.mean(q), first + later
+        choice = chance.first_chosen * first + chance.chosen * later
+        uniform = chance.first_uniform * first + chance.uniform * later
+        total = choice * q + uniform * mean + chance.previous * np.einsum("sba,sb->sa", repeating, q)
         return np.divide(total, visits, out=q.copy(), where=visits > 0), visits
 
 
@@ -671,7 +691,10 @@ def visits_of(mdp: TabularMDP, policy: np.ndarray, episode: int) -> ExpectedVisi
     return ExpectedVisits(first, later, walk.executed(first, later))
 
 
-def greedy_policy(values: np.ndarray) -> np.ndarray:
-    """(C, A) probabilities: the best action, or all that are as good up to rounding alike."""
-    best = values >= (values.max(axis=1) - TIES * np.abs(values).max(axis=1))[:, None]
+def greedy_policy(values: np.ndarray, sets: np.ndarray | None = None) -> np.ndarray:
+    """(C, A) probabilities: the best action of the sets (C, A), or all that are as good up to rounding alike."""
+    possible: Any = True if sets is None else sets
+    largest = np.abs(values).max(axis=1, where=possible, initial=0.0)
+    most = values.max(axis=1, where=possible, initial=-np.inf)
+    best = (values >= (most - TIES * largest)[:, None]) & possible
     return best / best.sum(axis=1, keepdims=True)

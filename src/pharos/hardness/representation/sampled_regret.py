@@ -258,7 +258,7 @@ class SampledLearner(IdealisedLearner):
 
     def _regret_of(self, q: np.ndarray, observations: Grouped) -> float:
         """Regret of the policy that is greedy in values (C, A)."""
-        return self.regret(self.value(greedy_policy(q)[observations.groups]))
+        return self.regret(self.value(greedy_policy(q, observations.sets)[observations.groups]))
 
     def walk(
         self, observations: Grouped, operator: KernelOperator, looks: np.ndarray, seed: int
@@ -283,7 +283,8 @@ class SampledLearner(IdealisedLearner):
             schedule.exploration_fraction * schedule.steps,
             *(int(schedule.learning_starts), int(schedule.gradient_steps), int(schedule.period), sampling.batch_size),
         )
-        chance = (*mdp.chance.triple[:2], float(mdp.chance.first_chosen))
+        chance = (*mdp.chance.triple[:2], 0.0, float(mdp.chance.first_chosen))
+        sets = () if observations.sets is None else (np.ascontiguousarray(observations.sets),)
         cumulative = np.append(np.cumsum(mdp.start_probabilities[:-1]), 1.0)
         vector, largest_step = np.full((count, 1), count**-0.5), 0.0
         stops = np.unique([*looks, *range(0, schedule.steps, schedule.period)])
@@ -301,7 +302,7 @@ class SampledLearner(IdealisedLearner):
                 largest_step = 1 / (MARGIN * largest) if largest > 0 else math.inf
             kernels.learn(
                 *(self.outcomes, np.asarray(mdp.terminal, np.bool_), group),
-                *(np.asarray(mdp.start_states, np.int64), cumulative, (chance[0], chance[1], 0.0, chance[2])),
+                *(np.asarray(mdp.start_states, np.int64), cumulative, (*chance, *sets)),
                 *(self.episode, kernel, learnt, target, memory, visits, place, word, noise, numbers),
                 *(largest_step, int(next_stop - step)),
             )
