@@ -26,7 +26,8 @@ GAMES = {  # horizon, and other options of the import
     "tennis": (3, {}),
     "space_invaders": (5, {"noops": 120}),
 }
-HEAD = "| game | T | states | merged to | screens | actions | optimum | random | effective horizon | an optimal play |"
+COLUMNS = "game, T, states, merged to, screens, actions, optimum, random, diameter, effective horizon, play"
+HEAD = f"| {COLUMNS.replace(', ', ' | ')} |"
 
 
 def table_and_screens(game: str, horizon: int, options: dict) -> tuple[pharos.TabularMDP, importers.Recording]:
@@ -58,10 +59,11 @@ def row(game: str) -> str:
     drawing.save_gif(file, pictures, frames_per_second=2, at_least=160)
     words = " ".join(f"{key}={value}" for key, value in options.items())
     numbers = f"{recording.num_raw_states:,} | {mdp.num_states:,} | {recording.observations.num_distinct:,}"
-    values = f"{solution.value_at_start:g} | {uniform.value_at_start:.3g}"
-    effective = hardness.effective_horizon(mdp).value
+    values = f"{mdp.num_actions} | {solution.value_at_start:g} | {uniform.value_at_start:.3g}"
+    effective, diameter = hardness.effective_horizon(mdp).value, hardness.diameter(mdp)
+    far = f"{diameter.lower:g}" if diameter.exact else f"{diameter.lower:g} to {diameter.upper:g}"
     return (
-        f"| {f'`{game}` {words}'.strip()} | {horizon} | {numbers} | {mdp.num_actions} | {values} | {effective:g} | "
+        f"| {f'`{game}` {words}'.strip()} | {horizon} | {numbers} | {values} | {far} | {effective:g} | "
         f"![{game}](gallery/{file.name}) |"
     )
 

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ import pytest
 
 import pharos
 from command_line import answer, run
+from patience import wait_for
 from pharos import exporters, hardness, importers
 from pharos.errors import FolderLocked, MissingExtra, ParameterError, StateSpaceTooLarge, UnknownName
 from pharos.importers import consoles, layers
@@ -45,6 +47,7 @@ def test_layers_are_those_of_plain_python(horizon):
     assert sum(found.sizes) == len(next_states) and found.num_steps == rewards.size
 
 
+@pytest.mark.slow
 def test_two_processes_share_a_layer_and_find_the_same():
     assert parts(explored(6, workers=2)) == parts(explored(6))
 
@@ -166,16 +169,46 @@ def test_fresh_episodes_of_a_game_walk_through_its_table(game):
     for _ in range(20):
         screen, info = env.reset(seed=0)
         state, lives = 0, info["lives"]
-        for _ in range(4):
+        for step in range(4):
             assert (recording.observations[state] == screen).all()
             action = int(rng.integers(mdp.num_actions))
             screen, reward, terminated, _, info = env.step(action)
             assert mdp.rewards[state, action] == reward
             state = table[state, action]
             if state < 0:
+                assert terminated or info["lives"] < lives or step == 3
                 break
             assert not terminated and info["lives"] == lives
     env.close()
+
+
+@pytest.mark.slow
+def test_raw_imports_keep_what_merging_would_merge():
+    pytest.importorskip("ale_py")
+    raw, recording = importers.atari("freeway", horizon=5, frame_skip=4, raw=True)
+    merged, others = importers.atari("freeway", horizon=5, frame_skip=4)
+    assert raw.num_states == recording.num_raw_states == sum(recording.layers) > merged.num_states
+    again = pharos.mdp.minimize(raw, observations=recording.observations[np.arange(raw.num_states)])
+    assert (table_of(again.mdp) == table_of(merged)).all() and (again.mdp.rewards == merged.rewards).all()
+    assert (recording.observations[again.representatives] == others.observations[np.arange(merged.num_states)]).all()
+
+
+@pytest.mark.slow
+def test_options_change_the_game_as_they_say():
+    pytest.importorskip("ale_py")
+    _, recording = importers.atari("freeway", horizon=1, frame_skip=4)
+    _, later = importers.atari("freeway", horizon=1, frame_skip=4, noops=4)
+    step = importers.atari("freeway", horizon=2, frame_skip=4, raw=True)[1].observations
+    assert (later.observations[0] == step[1]).all() and (later.observations[0] != recording.observations[0]).any()
+    assert importers.atari("freeway", horizon=1, frame_skip=1, all_actions=True)[0].num_actions == 18
+    console = consoles.AtariGame("breakout", 30)
+    state, lives, steps = console.load(console.start()), console.ale.lives(), 0
+    ends = False
+    while not ends and steps < 40:  # fire, then stand still
+        _, ends = console.step(state, 1 if steps == 0 else 0)
+        state, steps = console.load(console.save()), steps + 1
+    assert ends and console.ale.lives() == lives - 1 and not console.ale.game_over()
+    assert not consoles.AtariGame("breakout", 30, life_loss_ends=False).step(state, 0)[1]
 
 
 @pytest.mark.slow
@@ -193,8 +226,7 @@ def test_a_killed_import_is_resumed_by_the_same_command(tmp_path):
     pytest.importorskip("ale_py")
     words = ["import", "atari", "freeway", "--horizon", "7", "--out", str(tmp_path / "killed")]
     process = subprocess.Popen([sys.executable, "-m", "pharos", *words], env=os.environ)
-    while process.poll() is None and not (tmp_path / "killed" / ".building" / "layer-00002.npz").exists():
-        pass
+    wait_for((tmp_path / "killed" / ".building" / "layer-00002.npz").exists, process)
     process.send_signal(signal.SIGKILL)
     process.wait()
     answer(*words)
@@ -240,6 +272,7 @@ def test_wrong_options_are_refused_before_anything_is_loaded(function, options, 
     assert message in refusal(ParameterError, getattr(importers, function), game, **options)
 
 
+@pytest.mark.slow
 def test_no_ops_that_end_the_game_are_refused():
     pytest.importorskip("ale_py")
     assert "ends after" in refusal(ParameterError, importers.atari, "skiing", horizon=1, frame_skip=1, noops=10_000)
@@ -304,3 +337,20 @@ def test_a_maze_is_the_published_table_of_bridge():
     ours, theirs = (canonical(table_of(each), each.rewards) for each in (mdp, published))
     assert len(ours[0]) == 243 and ours[:2] == theirs[:2]
     assert len(recording.actions) == 9
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from procgen import ProcgenGym3Env
+    rng = np.random.default_rng(0)
+    options = {"distribution_mode": "easy", "start_level": 0, "num_levels": 1, "rand_seed": 0, "num_threads": 0}
+    for _ in range(20):
+        env, state = ProcgenGym3Env(num=1, env_name="maze", **options), 0
+        for step in range(30):
+            assert (env.observe()[1]["rgb"][0] == recording.observations[state]).all()
+            action = int(rng.integers(9))
+            env.act(np.array([action]))
+            reward, _, is_first = env.observe()
+            assert reward[0] == mdp.rewards[state, action]
+            state = table_of(mdp)[state, action]
+            assert (state < 0) == bool(is_first[0]) or step == 29
+            if state < 0:
+                break
