@@ -354,7 +354,9 @@ def test_solving_until_the_end_and_reaching(answer):
     assert "no horizon; found --gamma 0.9" in command_line.usage_error(
         "solve", *lake, "--objective", "total", "--gamma", "0.9"
     )
-    assert "unknown label or variable" in command_line.usage_error("solve", *lake, "--reach", "somewhere")
+    assert "unknown label or variable 'somewhere'; there are terminal; variables row" in command_line.usage_error(
+        "solve", *lake, "--reach", "somewhere"
+    )
     assert "no upper limit" in command_line.usage_error(
         "solve", "breakout", "height=7", "columns=3", "--objective", "total"
     )
