@@ -150,29 +150,27 @@ def page(rows: list[Row], most: int) -> str:
     lines = [
         "# Published values of goals",
         "",
-        "The [quantitative verification benchmark set](https://qcomp.org/benchmarks) publishes exact results, rational "
-        "numbers that",
-        "Storm computed, for models of PRISM, Modest, PPDDL and JANI. Each of them with at most "
-        f"{most:,} states, MDPs and Markov",
-        "chains, was imported by the name of its property, as `pharos import prism FILE --property NAME` does, and "
-        "answered by",
-        "`pharos.reach` at gamma 1 without a horizon, in 64-bit floats.",
+        "The [quantitative verification benchmark set](https://qcomp.org/benchmarks) publishes exact results, which",
+        "Storm computed, of models in PRISM's language, Modest, PPDDL and JANI. All of MDPs and Markov chains with at",
+        f"most {most:,} states were asked for by their names, as `pharos import prism FILE --property NAME` does, and",
+        "answered by `pharos.reach` at gamma 1 without a horizon, in 64-bit floats.",
         "",
-        f"**{len(right)} of {len(rows) - len(unanswered)} intervals hold the published number**, and "
-        f"{sum(row.is_tight for row in right)} of these are within 1e-6 (of the number, if it is above 1).",
-        f"{len(unanswered)} more results are of properties that pharos does not answer: steps or rewards are bounded.",
+        f"**{len(right)} of {len(rows) - len(unanswered)} proven intervals hold the published number.** Of these, "
+        f"{sum(row.is_tight for row in right)} are within 1e-6, or 1e-6 of the",
+        f"number if it is above 1. {len(unanswered)} more results are of properties with bounds on steps or rewards, "
+        "which pharos does not answer.",
         "",
         "```",
         "python benchmarks/qcomp.py CHECKOUT --states 30000 --out docs/evidence/goals.md",
         "```",
         "",
-        "| family | results | right | not answered | states, up to | widest |",
+        "| family | results | right | not answered | states, up to | widest, of numbers above 1 relative |",
         "|---|---|---|---|---|---|",
     ]
     for family in families:
         own = [row for row in rows if row.case.family == family]
         good = [row for row in own if row.holds]
-        widths = [row.upper - row.lower for row in good if math.isfinite(row.upper)]
+        widths = [(row.upper - row.lower) / max(1.0, row.upper) for row in good if math.isfinite(row.upper)]
         lines.append(
             f"| {family} | {len(own)} | {len(good)} | {sum(bool(row.problem) for row in own)} | "
             f"{max(row.states for row in own):,} | {max(widths, default=0.0) / 2:.1e} |"

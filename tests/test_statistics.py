@@ -217,8 +217,18 @@ def test_the_interval_of_a_crossing_is_that_of_plain_python(regrets, target):
         return
     levels = [1.0, 2.0, 4.0, 8.0]
     low, high = fieller_interval(np.array(levels), [np.array(each) for each in regrets], target)
-    assert low == pytest.approx(naive.crossing_of_limit(levels, regrets, 1, target), abs=1e-9)
-    assert high == pytest.approx(naive.crossing_of_limit(levels, regrets, -1, target), abs=1e-9)
+    ends = sorted(naive.crossing_of_limit(levels, regrets, sign, target) for sign in (1, -1))
+    assert (low, high) == (pytest.approx(ends[0], abs=1e-9), pytest.approx(ends[1], abs=1e-9))
+
+
+def test_a_noisy_last_level_opens_no_interval_that_levels_below_exclude():
+    levels = np.array([7, 15, 31, 63, 127, 255, 511.0])
+    rungs = [[0.03, 0.07, 0.03], [0.8, 0.77, 0.9], [1, 1, 0.67], [1, 0.53, 1], [0.8, 0.8, 0.6], [1, 1, 1], [1, 1, 0.7]]
+    low, high = fieller_interval(levels, [np.array(each) for each in rungs], 0.5)
+    assert 7 < low < 15 and low < high < 15  # 0.8, 0.77, 0.9 at level 15: its lower limit is 0.65
+    turned = [1.0 - np.array(each) for each in rungs[::-1]]  # the same seen from the other end
+    ends = fieller_interval(-levels[::-1], turned, 0.5)
+    assert ends == (pytest.approx(-high), pytest.approx(-low))
 
 
 def test_ends_of_the_interval_of_a_crossing_are_where_students_interval_ends_at_the_target():

@@ -192,9 +192,11 @@ def interquartile_interval(strata: Strata, bounds: tuple[float, float] = UNBOUND
 def fieller_interval(levels: np.ndarray, strata: Strata, target: float) -> tuple[float, float]:
     """Return the 95 % interval of the level at which a mean that is linear between levels crosses a target from below.
 
-    It holds the levels at which Student's interval of the interpolated mean contains the target: from the first one
-    whose upper limit reaches it to the last one whose lower limit does not exceed it. Both ends are roots, found to
-    rounding between neighbours of 256 points of a segment.
+    It holds the levels at which Student's interval of the interpolated mean contains the target, with limits made
+    increasing, as the mean is: the upper limit at a level is the smallest from there on, the lower one the largest up
+    to there. So it runs from the last level whose upper limit is below the target to the first one whose lower limit is
+    above it; where the first lies behind the second, between them. Both ends are roots, found to rounding between
+    neighbours of 256 points of a segment.
 
     Args:
         levels: (L,) increasing. strata: for each level the values of its runs.
@@ -227,20 +229,20 @@ def fieller_interval(levels: np.ndarray, strata: Strata, target: float) -> tuple
             half = np.where(total > 0.0, stdtrit(degrees, (1.0 + CONFIDENCE) / 2.0) * np.sqrt(total), 0.0)
         return (1.0 - share) * means[left] + share * means[right] + side * half - target
 
-    def level(outside: float, inside: float, side: int) -> float:
-        root = brentq(excess, outside, inside, args=(side,), xtol=1e-15)
+    def level(left: float, right: float, side: int) -> float:
+        root = brentq(excess, left, right, args=(side,), xtol=1e-15)
         return float(np.interp(root, np.arange(last + 1), levels))
 
     grid = np.linspace(0.0, last, GRID * last + 1)
-    reaching, staying = np.flatnonzero(excess(grid, 1) >= 0.0), np.flatnonzero(excess(grid, -1) <= 0.0)
-    low, high = (float(levels[-1]), float(levels[0]))  # without a level that holds the target
-    if reaching.size:
-        first = reaching[0]
-        low = level(grid[first - 1], grid[first], 1) if first > 0 else -math.inf
-    if staying.size:
-        first = staying[-1]
-        high = level(grid[first + 1], grid[first], -1) if first < len(grid) - 1 else math.inf
-    return low, high
+    below, above = np.flatnonzero(excess(grid, 1) < 0.0), np.flatnonzero(excess(grid, -1) > 0.0)
+    low, high = -math.inf, math.inf
+    if below.size:
+        end = below[-1]
+        low = level(grid[end], grid[end + 1], 1) if end < len(grid) - 1 else float(levels[-1])
+    if above.size:
+        end = above[0]
+        high = level(grid[end - 1], grid[end], -1) if end > 0 else float(levels[0])
+    return min(low, high), max(low, high)
 
 
 def _variances(strata: Strata) -> np.ndarray:

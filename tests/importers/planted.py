@@ -1,6 +1,7 @@
 """Small environments for tests of importers.stepping, each with one thing planted. Factories are functions here, so
 that other processes can import them."""
 
+import copy
 import itertools
 import os
 import random
@@ -375,3 +376,33 @@ class Heavy(Walk):
     def step(self, action):
         self.pad = self.pad + 2 * action + 1
         return 0, 1.0, self.pad[0] > 150, False, {}
+
+
+class ManyGenerators(Walk):
+    """Draws from generators of three kinds, within other objects, and from a space."""
+
+    def __init__(self):
+        super().__init__()
+        self.dice = {"python": random.Random(1), "old": [np.random.RandomState(2)]}
+
+    def move(self, action):
+        first = self.dice["python"].randint(0, 1)
+        second = self.dice["old"][0].randint(2)
+        third = int(self.action_space.sample())
+        return 1 if first and second and third else 0
+
+
+GENERATOR = np.random.default_rng(0)
+
+
+class GeneratorOfTheModule(Walk):
+    def move(self, action):
+        return int(GENERATOR.integers(2))
+
+
+class CopiesItself(Slips):
+    """Draws from a copy of its generator, which so gives the same number in every step of an episode."""
+
+    def move(self, action):
+        twin = copy.deepcopy(self)
+        return Slips.move(twin, action)

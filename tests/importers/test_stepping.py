@@ -219,6 +219,12 @@ def test_a_slip_has_its_probability():
     assert rows == {0: 0.25, 1: 0.75}
 
 
+def test_generators_of_all_kinds_are_followed():
+    mdp, _ = importers.stepping(planted.ManyGenerators)
+    _, states, p, _ = rows_of(mdp, None)
+    assert dict(zip(states[:2].tolist(), p[:2].tolist(), strict=True)) == {0: 7 / 8, 1: 1 / 8}
+
+
 def test_wrappers_count():
     mdp, _ = importers.stepping(planted.sticky, gamma=0.9)
     plain, _ = importers.stepping(planted.Walk, gamma=0.9)
@@ -291,6 +297,8 @@ REFUSED = {
     planted.HiddenNumpy: rf"drew from a global generator .*\(planted\.py, line {first_line(planted.HiddenNumpy)}\)",
     planted.ReadsTheTime: r"with the same draws ended in different states \(planted\.py, line \d+\)",
     planted.DrawsAnew: r"with the same draws ended in different states",
+    planted.GeneratorOfTheModule: r"with the same draws ended in different states",
+    planted.CopiesItself: r"played with its own generators, .* which stepping gives the probabilities 0\.25, 0\.75",
     planted.CountsInTheClass: r"with the same draws ended in different states",
     planted.LazyGenerator: r"made a generator of its own \(numpy\.random\._generator\.Generator\)",
     planted.Rejects: r"more than 200 draws in one step: rejection sampling.*\(planted\.py, line \d+\)",

@@ -54,7 +54,10 @@ def crossing(levels, means, at=0.5):
 
 
 def crossing_of_limit(levels, tasks, sign, at=0.5):
-    """First (sign 1) or last (sign -1) level where the upper or lower limit of the mean is `at`, infinite beyond."""
+    """Last level where the upper limit (sign 1) of the mean is `at`, or first one where the lower (sign -1) is.
+
+    Infinite where no level excludes what lies beyond; the end of the ladder where all levels do.
+    """
 
     def limit(position):
         left = min(int(position), len(levels) - 2)
@@ -67,15 +70,15 @@ def crossing_of_limit(levels, tasks, sign, at=0.5):
         return middle + sign * stats.t.ppf(0.975, degrees) * math.sqrt(total) - at
 
     grid = [index / 64 for index in range(64 * (len(levels) - 1) + 1)]
-    grid = grid if sign > 0 else grid[::-1]
-    if sign * limit(grid[0]) >= 0:
-        return -sign * math.inf
+    grid = grid[::-1] if sign > 0 else grid
+    if sign * limit(grid[0]) < 0:
+        return levels[-1] if sign > 0 else levels[0]
     for before, after in itertools.pairwise(grid):
-        if sign * limit(after) >= 0:
+        if sign * limit(after) < 0:
             position = optimize.brentq(limit, before, after)
             left = min(int(position), len(levels) - 2)
             return levels[left] + (position - left) * (levels[left + 1] - levels[left])
-    return levels[-1] if sign > 0 else levels[0]
+    return -sign * math.inf
 
 
 def holm(p_values):

@@ -237,6 +237,21 @@ def test_the_taxicab_whose_towns_have_sets_of_actions():
     assert pharos.average_reward(mdp, "uniform").gain_at_start == pytest.approx(of_sets)
 
 
+@pytest.mark.parametrize("chance", [(0.25, 0.0), (0.3, 0.2)])
+def test_the_taxicab_whose_actions_stick(chance):
+    """(1 - gamma) V_gamma is near the gain, in whatever way the sets of actions and chance go together."""
+    sets = np.array([[False, True, True], [True, True, False], [True] * 3])
+    mdp = TabularMDP.from_matrices(np.array(TAXICAB[0]), np.array(TAXICAB[1]), axes="SAS", available=sets)
+    mdp = pharos.random_actions(pharos.sticky_actions(mdp, chance[0]), chance[1])
+    near = mdp.with_gamma(1 - 1e-6)
+    for policy, solve in (("optimal", pharos.value_iteration), ("uniform", pharos.solvers.values.uniform_value)):
+        solution, result = solve(near, 1.0), pharos.average_reward(mdp, policy)
+        assert result.gain_at_start.lower == pytest.approx(1e-6 * solution.value_at_start, abs=1e-4)
+    best = pharos.average_reward(mdp)
+    again = pharos.average_reward(mdp, best.policy)
+    assert again.gain_at_start == pytest.approx(best.gain_at_start, abs=2e-6)
+
+
 def test_a_component_inside_a_component_and_one_that_is_left():
     """0 and 1 take turns for 1 a step; 1 may go on to 2, which may come back, so that all are one component; 3 cannot
     be left, and pays 2; 4 ends, or goes to 3 with probability 1/4.

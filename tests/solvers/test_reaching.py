@@ -63,6 +63,25 @@ def test_haddad_monmege():
     assert result.least_cost.lower[20] == math.inf
 
 
+def herman(size):
+    """The ring of Herman (1990): who equals the neighbour on the left holds a token, and draws; others copy it."""
+    P = np.ones((2**size, 2**size))
+    bits = np.arange(2**size)[:, None] >> np.arange(size) & 1
+    left = np.roll(bits, 1, axis=1)
+    for i in range(size):
+        follows = bits[None, :, i] == left[:, i, None]
+        P *= np.where((bits == left)[:, i, None], 0.5, follows)
+    return TabularMDP.from_matrices([P], np.zeros((2**size, 1)), gamma=1.0), (bits == left).sum(axis=1) == 1
+
+
+@pytest.mark.parametrize(("size", "steps"), [(3, 4 / 3), (5, 16 / 5), (7, 48 / 7), (9, 12)])
+def test_the_ring_of_herman_is_stable_after_the_published_number_of_steps(size, steps):
+    mdp, is_stable = herman(size)
+    bounds = pharos.reach(mdp, is_stable, costs=np.ones((2**size, 1))).largest_cost
+    assert bounds.lower.max() <= steps * (1 + 1e-15) and steps * (1 - 1e-15) <= bounds.upper.max()
+    assert (bounds.upper - bounds.lower).max() < 1e-9
+
+
 def costs():
     """[fast] pays 3 and arrives with 1/2, [slow] pays 4 and arrives, [wait] pays nothing."""
     return TabularMDP.from_outcomes(

@@ -130,6 +130,13 @@ def test_what_looks_like_a_mistake_is_a_note_of_the_run_and_of_the_summary(mine)
     assert "seed 0 and 1 more: yielded no policy" in " ".join(command(*words).stdout.split())
 
 
+@pytest.mark.long
+def test_where_uniform_play_is_optimal_no_normalised_regret_is_shown(mine):
+    words = ("train", "simple_grid/4x4-plain", "--agent", "q_learning", "--steps", "300", "--horizon", "1000")
+    for more in ((), ("--seeds", "0:2")):
+        assert "uniform play is optimal as well" in " ".join(command(*words, *more).stdout.split())
+
+
 def test_it_learns_and_is_loaded_again_where_it_is_trusted(mine):
     run = train(mine, GRID, observation="one_hot", steps=2000, evaluation_interval=500, out="run")
     assert run.result["final_regret"] == pytest.approx(0.0, abs=1e-9)

@@ -196,13 +196,15 @@ def ladder_panel(
     shapes = regret_axis(left, right, down(1), bottom)
     shapes += [label(across(level), bottom + 15, f"{level:.3g}", "middle", "faint") for level in levels]
     shapes.append(label((left + right) / 2, bottom + 32, unit, "middle"))
-    low, high = map(across, ends(frontier))
-    shapes.append(
-        element("rect", x=low, y=top, width=max(1.0, high - low), height=bottom - top, class_="f0", opacity="0.16")
-    )
-    if not frontier.censored:
-        shapes.append(line(across(frontier.value), top, across(frontier.value), bottom, "l0"))
-    shapes.append(label(left, top - 10, f"frontier {frontier_text(frontier)}"))
+    if np.isnan(frontier.value):
+        shapes.append(label(left, top - 10, frontier_text(frontier)))
+    else:
+        low, high = map(across, ends(frontier))
+        band = {"x": low, "y": top, "width": max(1.0, high - low), "height": bottom - top}
+        shapes.append(element("rect", **band, class_="f0", opacity="0.16"))
+        if not frontier.censored:
+            shapes.append(line(across(frontier.value), top, across(frontier.value), bottom, "l0"))
+        shapes.append(label(left, top - 10, f"frontier {frontier_text(frontier)}"))
     points = [(across(level), down(y)) for level, y in zip(levels, theory, strict=True) if y is not None]
     if points:
         shapes.append(curve(points, "theory"))
@@ -328,7 +330,9 @@ def ends(interval: ConfidenceInterval) -> tuple[float, float]:
 
 
 def frontier_text(frontier: ConfidenceInterval, unit: str = "", interval: bool = True) -> str:
-    """A frontier in words: `9.4 bits (8.3 to 10.8)`, `beyond 24 bits (from 19)`, `below 4 bits`."""
+    """A frontier in words: `9.4 bits (8.3 to 10.8)`, `beyond 24 bits (19 or more)`, `below 4 bits`."""
+    if np.isnan(frontier.value):
+        return "no frontier of one rung"
     side = {"above": "beyond ", "below": "below ", "": ""}[frontier.censored]
     text = f"{side}{frontier.value:.3g}{' ' if unit else ''}{unit}"
     low, high = ends(frontier)

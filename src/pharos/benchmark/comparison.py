@@ -17,7 +17,15 @@ from pathlib import Path
 import numpy as np
 
 from pharos.benchmark.results import AgentResults
-from pharos.benchmark.scores import ConfidenceInterval, axis_score, check_suite, run_scores
+from pharos.benchmark.scores import (
+    ConfidenceInterval,
+    as_one_run,
+    axis_score,
+    check_suite,
+    equal_seeds,
+    has_equal_seeds,
+    run_scores,
+)
 from pharos.benchmark.suite import Suite, load_suite
 from pharos.errors import ParameterError
 from pharos.statistics import (
@@ -35,7 +43,10 @@ SIGNIFICANCE = 1.0 - CONFIDENCE
 POWER = 0.8
 SEEDS = (3, 5, 10, 20)
 MOST_SEEDS = 100_000
+LEAST = 0.02  # a difference of scores that matters
 BETTER, WORSE, UNDECIDED, UNKNOWN = "better", "worse", "not shown to differ", "one seed"
+NEGLIGIBLE = f"less than {LEAST:g} apart"
+EQUAL_SEEDS = "equal seeds"
 
 
 @dataclass(frozen=True)
@@ -48,7 +59,9 @@ class Difference:
         improvement: how probable it is that a run of the first scores higher, ties half, mean over the tasks.
         p_value: two-sided; NaN with one seed.
         adjusted: the same after Holm's correction in its family.
-        verdict: "better" or "worse" where adjusted < 0.05, else "not shown to differ"; "one seed" without a p-value.
+        verdict: "better" or "worse" where adjusted < 0.05 and the scores are 0.02 apart or more, "less than 0.02 apart"
+            where they are not; else "not shown to differ". Without a p-value "one seed", or "equal seeds" where those
+            of one agent are one run.
     """
 
     ours: float
@@ -126,7 +139,8 @@ def compare(
     for each in (ours, theirs):
         check_suite(each, suite)
     # Scores of the tasks that both have run
-    x, y = run_scores(ours), run_scores(theirs)
+    unknown = EQUAL_SEEDS if has_equal_seeds(ours) or has_equal_seeds(theirs) else UNKNOWN
+    x, y = run_scores(as_one_run(ours)), run_scores(as_one_run(theirs))
     common = [task.name for task in suite.tasks if task.name in x and task.name in y]
     if not common:
         raise ParameterError(
@@ -147,14 +161,29 @@ def compare(
     return Comparison(
         ours.agent,
         theirs.agent,
-        _judged({"": _difference(x, y, core)})[""] if core else None,
+        _judged({"": _difference(x, y, core)}, unknown)[""] if core else None,
         {
             axis: AxisComparison(axis, units[axis], each, axes[axis], frontier_difference(*axes[axis]))
-            for axis, each in _judged(differences).items()
+            for axis, each in _judged(differences, unknown).items()
         },
-        _judged({name: _difference(x, y, [name]) for name in common}),
+        _judged({name: _difference(x, y, [name]) for name in common}, unknown),
         left_out,
     )
+
+
+def compare_groups(
+    ours: AgentResults, theirs: AgentResults, groups: Mapping[str, Sequence[str]]
+) -> dict[str, Difference]:
+    """The difference of the mean scores on each group of tasks, with Holm's correction over the groups.
+
+    Args:
+        ours, theirs: results on one suite.
+        groups: name -> names of tasks; tasks that one of them lacks are left out, and so are groups without a task.
+    """
+    unknown = EQUAL_SEEDS if has_equal_seeds(ours) or has_equal_seeds(theirs) else UNKNOWN
+    x, y = run_scores(as_one_run(ours)), run_scores(as_one_run(theirs))
+    common = {group: [name for name in names if name in x and name in y] for group, names in groups.items()}
+    return _judged({group: _difference(x, y, names) for group, names in common.items() if names}, unknown)
 
 
 def power(
@@ -168,11 +197,17 @@ def power(
         results, suite: as for `compare`.
         difference: of scores, to be found with power 0.8.
     Raises:
-        ParameterError: fewer than two seeds, a difference that is not positive, or another suite.
+        ParameterError: fewer than two seeds, or seeds that are one run; a difference that is not positive, or another
+            suite.
     """
     results = results_of(results)
     suite = suite_of_results(results, suite)
     check_suite(results, suite)
+    if has_equal_seeds(results):
+        raise ParameterError(
+            f"results of {results.agent}: {equal_seeds(results.curves)}; expected runs that differ, to see how they "
+            f"vary"
+        )
     if len(results.seeds) < 2:
         raise ParameterError(f"results of {results.agent} have one seed; expected two or more, to see how seeds vary")
     if difference is not None and not difference > 0:
@@ -243,15 +278,19 @@ def _difference(x: Mapping[str, np.ndarray], y: Mapping[str, np.ndarray], names:
     )
 
 
-def _judged(differences: Mapping[str, Difference]) -> dict[str, Difference]:
-    """The differences of one family, with Holm's correction and verdicts."""
-    judged = {}
+def _judged(differences: Mapping[str, Difference], unknown: str = UNKNOWN) -> dict[str, Difference]:
+    """The differences of one family, with Holm's correction and verdicts; `unknown` is that without a p-value."""
     adjusted = holm([each.p_value for each in differences.values()]).tolist()
-    for (name, each), p in zip(differences.items(), adjusted, strict=True):
-        shown = BETTER if each.interval.value > 0 else WORSE
-        verdict = UNKNOWN if math.isnan(p) else shown if p < SIGNIFICANCE else UNDECIDED
-        judged[name] = replace(each, adjusted=p, verdict=verdict)
-    return judged
+    return {
+        name: replace(each, adjusted=p, verdict=_verdict(each.interval.value, p, unknown))
+        for (name, each), p in zip(differences.items(), adjusted, strict=True)
+    }
+
+
+def _verdict(difference: float, p_value: float, unknown: str) -> str:
+    if not p_value < SIGNIFICANCE:
+        return unknown if math.isnan(p_value) else UNDECIDED
+    return NEGLIGIBLE if abs(difference) < LEAST else BETTER if difference > 0 else WORSE
 
 
 def _seeds_for(variances: np.ndarray, difference: float) -> int | None:

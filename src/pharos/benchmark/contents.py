@@ -12,9 +12,18 @@ import numpy as np
 
 from pharos.agents import agents
 from pharos.benchmark.charts import ends, frontier_text
-from pharos.benchmark.comparison import Comparison, compare, results_of, suite_of_results
+from pharos.benchmark.comparison import (
+    BETTER,
+    NEGLIGIBLE,
+    UNDECIDED,
+    WORSE,
+    Comparison,
+    compare,
+    results_of,
+    suite_of_results,
+)
 from pharos.benchmark.results import FILE, AgentResults, baselines
-from pharos.benchmark.scores import BenchmarkScore, ConfidenceInterval, run_regrets, run_scores, score
+from pharos.benchmark.scores import BenchmarkScore, ConfidenceInterval, as_one_run, run_regrets, run_scores, score
 from pharos.benchmark.suite import BenchmarkTask, Suite
 from pharos.errors import ParameterError
 from pharos.plots import agent_name
@@ -25,7 +34,7 @@ BESIDE = ("dqn", "ppo", "q_learning")
 LEARNERS = ("dqn", "ppo")  # idealised, with networks
 RESIDUAL = 0.2
 LATE = 0.2  # of an agent that learns late, by which the final score exceeds the mean one, with its whole interval
-WORSE = 0.05  # the same of one that ends worse than it was, by which the final score is lower
+ENDS_WORSE = 0.05  # the same of one that ends worse than it was, by which the final score is lower
 MOST = 5  # reasons of failures on the page
 LONGEST = 400  # letters of an entry of the record on the page
 PHRASES = {
@@ -144,6 +153,8 @@ def sentence(contents: Contents) -> str:
     """Sentence on what the agent can do, in units: a frontier for each axis, with those of the baselines."""
     clauses = []
     for axis, own in contents.agent.score.axes.items():
+        if math.isnan(own.frontier.value):  # of one rung
+            continue
         others = [
             f"{each.name} {frontier_text(each.score.axes[axis].frontier, interval=False)}"
             for each in contents.beside
@@ -152,21 +163,23 @@ def sentence(contents: Contents) -> str:
         text, ends = _split(frontier_text(own.frontier, own.unit))
         inside = "; ".join(part for part in (ends, ", ".join(others)) if part)
         clauses.append(f"{PHRASES.get(axis, axis + ':')} {text}{f' ({inside})' if inside else ''}")
-    return f"{contents.agent.name} {listed(clauses)}." if clauses else _core_sentence(contents)
+    if clauses:
+        return f"{contents.agent.name} {listed(clauses)}."
+    return _core_sentence(contents) if contents.agent.score.has_core else "One rung of a ladder has no frontier."
 
 
 def _core_sentence(contents: Contents) -> str:
     """Sentence on the core alone: below or above which baselines by an interval, and on which tasks it is worst."""
     core, scores = contents.suite.core, contents.agent.score.tasks
     names = sorted((task.name for task in core if task.name in scores), key=lambda name: scores[name].value)
-    groups: dict[str, list[str]] = {word: [] for word in ("below", "above", "not shown to differ from", "beside")}
+    words = {WORSE: "below", BETTER: "above", UNDECIDED: "not shown to differ from", NEGLIGIBLE: "as good as"}
+    groups: dict[str, list[str]] = {word: [] for word in (*words.values(), "beside")}
     for other, comparison in zip(contents.beside, contents.comparisons, strict=True):
         if comparison.core is not None:
-            own, common = comparison.core.interval, sum(name in comparison.tasks for name in names)
-            word = "below" if own.high < 0 else "above" if own.low > 0 else "not shown to differ from"
+            common = sum(name in comparison.tasks for name in names)
             text = f"{other.name}'s {comparison.core.theirs:.2f}"
             text += f" on {pluralize(common, 'task')} in common" if common < len(names) else ""
-            groups["beside" if math.isnan(own.low) else word].append(text)
+            groups[words.get(comparison.core.verdict, "beside")].append(text)
     parts = [f"Core score {number(contents.agent.score.core)} on {pluralize(len(names), 'task')}"]
     parts += [f"{word} {listed(texts)}" for word, texts in groups.items() if texts]
     worst = f"worst on {listed(names[:3])}" if len(names) > 3 else ""
@@ -214,7 +227,8 @@ def learning_curve(agent: ScoredAgent, names: Sequence[str]) -> list[ConfidenceI
     Args:
         names: of the tasks.
     """
-    curves = [np.clip(agent.results.curves[name], 0.0, 1.0) for name in names if name in agent.results.curves]
+    own = as_one_run(agent.results).curves
+    curves = [np.clip(own[name], 0.0, 1.0) for name in names if name in own]
     if len(curves) < len(names):
         return []
     return [ConfidenceInterval.of_mean([own[:, k] for own in curves], (0.0, 1.0)) for k in range(curves[0].shape[1])]
@@ -222,11 +236,12 @@ def learning_curve(agent: ScoredAgent, names: Sequence[str]) -> list[ConfidenceI
 
 def learning_sentence(contents: Contents) -> str:
     """Sentences on how the agent learns the core: its final and mean score, and tasks still like random play."""
-    own, curves = contents.agent.score, contents.agent.results.curves
+    own, results = contents.agent.score, as_one_run(contents.agent.results)
+    curves = results.curves
     names = [task.name for task in contents.suite.core if task.name in curves]
-    runs, finals = run_scores(contents.agent.results), run_scores(contents.agent.results, last=True)
+    runs, finals = run_scores(results), run_scores(results, last=True)
     gain = ConfidenceInterval.of_mean([finals[name] - runs[name] for name in names])
-    word = ": it learns late" if gain.low > LATE else ": it ends worse than it was" if gain.high < -WORSE else ""
+    word = ": it learns late" if gain.low > LATE else ": it ends worse than it was" if gain.high < -ENDS_WORSE else ""
     text = f"Ends at a score of {own.final.value:.2f}, averages {own.core.value:.2f}{word}."
     evaluations = curves[names[0]].shape[1]
     third = max(1, evaluations // 3)

@@ -22,18 +22,17 @@ from pharos.benchmark.charts import (
     plane,
     radar,
 )
+from pharos.benchmark.comparison import EQUAL_SEEDS, LEAST, UNKNOWN, WORSE, compare_groups
 from pharos.benchmark.contents import (
     LEARNERS,
     PREDICTORS,
     RESIDUAL,
     Contents,
-    ScoredAgent,
     Source,
     contents_of,
     description,
     excerpt,
     final_regret,
-    kind_of,
     learning_curve,
     learning_sentence,
     listed,
@@ -46,11 +45,24 @@ from pharos.benchmark.contents import (
     signed,
     unclipped_regret,
 )
+from pharos.benchmark.diagnosis import (
+    fall_everywhere,
+    falls,
+    groups_of,
+    lowest_rungs,
+    nearest,
+    seeds_sentence,
+    strengths,
+    without_verdict,
+    worst_groups,
+)
 from pharos.benchmark.latex import latex_of
+from pharos.benchmark.properties import known_properties
 from pharos.benchmark.suite import BenchmarkTask, Ladder, Suite
 from pharos.system import storage
 from pharos.system.wording import pluralize
 
+NO_VERDICT = (UNKNOWN, EQUAL_SEEDS)
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 
@@ -104,6 +116,9 @@ def page(contents: Contents) -> str:
 def _lead(contents: Contents) -> list[Element]:
     own = contents.agent.score
     lines = [element("p", sentence(contents), class_="lead")]
+    lines += [element("p", text, class_="warning") for text in seeds_sentence(contents.agents)]
+    if broken := fall_everywhere(contents):
+        lines.append(element("p", broken, class_="warning"))
     core = f"Core score {number(own.core)} on {pluralize(contents.num_run(contents.suite.core), 'task')}"
     core += "".join(f"; {each.name} {each.score.core.value:.2f}" for each in contents.beside if each.score.has_core)
     rest = {"Final score": own.final, "interquartile mean": own.iqm}
@@ -181,39 +196,61 @@ def _ladder(contents: Contents, ladder: Ladder) -> Element:
 
 
 def _core(contents: Contents) -> Element | None:
-    if not contents.comparisons:
-        return None
     names = {task.name for task in contents.suite.core}
-    differences = [
-        {name: each for name, each in comparison.tasks.items() if name in names} for comparison in contents.comparisons
-    ]
-    distances = [sum(abs(each.interval.value) for each in own.values()) / max(1, len(own)) for own in differences]
-    kind = kind_of(contents.agent.results)
-    common = [k for k, own in enumerate(differences) if own]
-    same = [k for k in common if kind == kind_of(contents.beside[k].results) and kind not in ("both", "none")]
-    if not common:
+    if (near := nearest(contents)) is None:
         return None
-    nearest = min(same or common, key=distances.__getitem__)
-    other = contents.beside[nearest]
+    place, distance, same = near
+    other = contents.beside[place]
+    differences = {name: each for name, each in contents.comparisons[place].tasks.items() if name in names}
     rows: list[list[str | Element]] = []
-    for name, each in sorted(differences[nearest].items(), key=lambda item: item[1].interval.value):
+    for name, each in sorted(differences.items(), key=lambda item: item[1].interval.value):
         scores = (f"{agent.score.tasks[name].value:.2f}" for agent in (contents.agent, other))
-        cell = _task(contents.suite.task(name))
-        rows.append([cell, *scores, signed(each.interval), difference_bar(each.interval), each.verdict])
-    heads = ["task", "score", other.name, "difference", "", "verdict"]
+        task = contents.suite.task(name)
+        fixed = known_properties().get(task.digest)
+        constant = "–" if fixed is None else f"{min(1.0, max(0.0, 1.0 - fixed.constant)):.2f}"
+        rows.append(
+            [_task(task), *scores, constant, signed(each.interval), difference_bar(each.interval), each.verdict]
+        )
+    heads = ["task", "score", other.name, "one action", "difference", "", "verdict"]
     verdict = "The verdict is after Holm's correction over tasks."
-    if _is_single(contents.agent, other):
-        heads, rows, verdict = heads[:-1], [row[:-1] for row in rows], "One seed: no verdict."
+    if reasons := {each.verdict for each in differences.values()} & {*NO_VERDICT}:
+        heads, rows, verdict = heads[:-1], [row[:-1] for row in rows], f"{min(reasons).capitalize()}: no verdict."
     return _section(
         f"Core tasks beside {other.name}",
         f"Of the baselines, {other.name} is {'of the same kind' if same else 'the nearest'}: scores are "
-        f"{distances[nearest]:.2f} apart on the average task. Sorted by difference, the worst first. {verdict}",
-        _table(heads, rows, numeric=(1, 2, 3)),
+        f"{distance:.2f} apart on the average task. Sorted by difference, the worst first. {verdict} "
+        "One action: the best policy that always plays the same one.",
+        _table(heads, rows, numeric=(1, 2, 3, 4)),
     )
 
 
-def _is_single(one: ScoredAgent, other: ScoredAgent) -> bool:
-    return min(len(each.results.seeds) for each in (one, other)) == 1
+def _groups(contents: Contents) -> Element | None:
+    if (near := nearest(contents)) is None:
+        return None
+    other = contents.beside[near[0]]
+    parts = []
+    for caption, groups in zip(("by what is seen", "by property"), groups_of(contents), strict=True):
+        differences = compare_groups(contents.agent.results, other.results, groups)
+        if len(differences) < 2:
+            continue
+        rows: list[list[str | Element]] = []
+        for group, each in differences.items():
+            scores = (f"{score:.2f}" for score in (each.ours, each.theirs))
+            bar = difference_bar(each.interval)
+            rows.append([group, str(len(groups[group])), *scores, signed(each.interval), bar, each.verdict])
+        heads = [caption, "tasks", "score", other.name, "difference", "", "verdict"]
+        parts.append(_table(heads, rows, numeric=(1, 2, 3, 4)))
+        if text := worst_groups(differences):
+            parts.append(element("p", text))
+    if not parts:
+        return None
+    return _section(
+        f"Core tasks in groups, beside {other.name}",
+        "Means over the tasks of a group. A fault that spares one group and hits another has its name here: a kind of "
+        "observation (features, the network's input), several sizes of rewards (clipping), ends by time alone "
+        "(truncation taken for an end). The verdicts of each table are after Holm's correction over its rows.",
+        *parts,
+    )
 
 
 def _plane(contents: Contents) -> Element | None:
@@ -239,31 +276,25 @@ def _plane(contents: Contents) -> Element | None:
 def _words(contents: Contents) -> Element | None:
     if not contents.comparisons or not contents.agent.score.axes:
         return None
-    worse: list[str] = []
-    better: list[str] = []
-    undecided: list[str] = []
-    single = [other.name for other in contents.beside if _is_single(contents.agent, other)]
-    for axis, own in contents.agent.score.axes.items():
-        groups: list[list[str]] = [[], [], []]
-        for other, comparison in zip(contents.beside, contents.comparisons, strict=True):
-            if axis in comparison.axes and other.name not in single:
-                difference = comparison.axes[axis].frontier
-                group = groups[0 if difference.high < 0 else 1 if difference.low > 0 else 2]
-                group.append(f"{other.name} {frontier_text(other.score.axes[axis].frontier)}")
-        for lines, names in zip((worse, better, undecided), groups, strict=True):
-            if names:
-                lines.append(f"{axis}: {frontier_text(own.frontier, own.unit)}; {', '.join(names)}")
-    parts = []
-    for title, lines in (("Worse", worse), ("Better", better), ("Not shown to differ", undecided)):
-        if lines:
-            parts += [element("h3", title), _list(lines)]
-    if single:
-        parts.append(element("p", f"One seed: no verdict beside {listed(single)}."))
-    if not worse and len(single) < len(contents.beside):
-        parts.insert(0, element("p", "No frontier is shown to lie below a baseline's."))
+    title = "Strengths and weaknesses in words"
+    if broken := fall_everywhere(contents):
+        return _section(title, "", element("p", broken))
+    lines = strengths(contents)
+    parts = [part for verdict, texts in lines.items() for part in (element("h3", verdict.capitalize()), _list(texts))]
+    for reason, names in without_verdict(contents).items():
+        parts.append(element("p", f"{reason.capitalize()}: no verdict beside {listed(names)}."))
+    if lines and WORSE not in lines:
+        parts.insert(0, element("p", "On no axis is the score shown to lie below a baseline's."))
+    parts += [element("p", text) for text in lowest_rungs(contents)]
+    if rows := falls(contents):
+        parts.append(element("p", "Each axis as a fall from its own first rung: a fall is what the axis adds."))
+        beside = [f"{each.name}: lowest rung, fall" for each in contents.beside]
+        heads = ["axis", "score on the lowest rung", "fall above it", *beside]
+        parts.append(_table(heads, rows, numeric=range(1, len(heads))))
     return _section(
-        "Strengths and weaknesses in words",
-        "Frontiers differ where the interval of their difference excludes 0; 95 % for each pair.",
+        title,
+        "By the scores of axes, as `pharos benchmark compare` says them, after Holm's correction over axes; frontiers "
+        f"say how much that is in the unit of the axis. Scores less than {LEAST:g} apart have no verdict.",
         *parts,
     )
 
@@ -329,6 +360,7 @@ SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
     _ladders,
     _words,
     _core,
+    _groups,
     _plane,
     _residuals,
     _provenance,

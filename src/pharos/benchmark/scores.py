@@ -15,7 +15,7 @@ interquartile mean, the optimality gap and the strata.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -81,6 +81,9 @@ class ConfidenceInterval:
     __str__ = text
 
 
+UNKNOWN = ConfidenceInterval(math.nan)
+
+
 def _digits(number: float) -> str:
     return f"{number:.3f}" if abs(number) < 1.0005 else f"{number:.3g}"
 
@@ -92,13 +95,17 @@ class AxisScore:
     Attributes:
         unit: of the frontier.
         score: mean over the rungs, in [0, 1].
-        frontier: level where the mean normalised regret crosses 0.5.
+        frontier: level where the mean normalised regret crosses 0.5; NaN where one rung alone was run.
+        lowest: score on the first rung; NaN where it was not run.
+        fall: `lowest` less the mean score on the rungs above it: what the axis adds to the difficulty of its world.
     """
 
     axis: str
     unit: str
     score: ConfidenceInterval
     frontier: ConfidenceInterval
+    lowest: ConfidenceInterval = field(default=UNKNOWN)
+    fall: ConfidenceInterval = field(default=UNKNOWN)
 
     def to_dict(self) -> Mapping[str, Mapping[str, object]]:
         """Score and frontier, for JSON."""
@@ -150,6 +157,7 @@ def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
     Cost: milliseconds.
     """
     check_suite(results, suite)
+    seeds, results = len(results.seeds), as_one_run(results)
     runs, finals, regrets = run_scores(results), run_scores(results, last=True), run_regrets(results)
     core = sorted(task.name for task in suite.core if task.name in runs)
     names = sorted(task.name for task in suite.tasks if task.name in runs)
@@ -162,7 +170,7 @@ def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
         optimality_gap=ConfidenceInterval.of_mean([np.maximum(regrets[name], 0.0) for name in core], (0.0, math.inf)),
         axes={ladder.axis: axis for ladder in suite.ladders if (axis := axis_score(ladder, runs)) is not None},
         tasks={name: ConfidenceInterval.of_mean([runs[name]], (0.0, 1.0)) for name in names},
-        preliminary=len(results.seeds) < ENOUGH_SEEDS or bool(missing),
+        preliminary=seeds < ENOUGH_SEEDS or bool(missing),
         below_random=tuple(name for name in names if regret_intervals[name].low > 1.0),
         missing=missing,
     )
@@ -179,9 +187,23 @@ def axis_score(ladder: "Ladder", runs: Mapping[str, np.ndarray]) -> AxisScore | 
         return None
     own = [runs[task.name] for task in rungs]
     levels = np.array([task.level for task in rungs], np.float64)
+    several = len(rungs) > 1
     return AxisScore(
-        ladder.axis, ladder.unit, ConfidenceInterval.of_mean(own, (0.0, 1.0)), frontier(levels, [1.0 - x for x in own])
+        ladder.axis,
+        ladder.unit,
+        ConfidenceInterval.of_mean(own, (0.0, 1.0)),
+        frontier(levels, [1.0 - x for x in own]) if several else UNKNOWN,
+        *((ConfidenceInterval.of_mean(own[:1], (0.0, 1.0)), _fall(own)) if rungs[0] is ladder.tasks[0] else ()),
     )
+
+
+def _fall(rungs: Sequence[np.ndarray]) -> ConfidenceInterval:
+    """Mean on the first rung less the mean over the others, with Student's interval; NaN with one rung."""
+    if len(rungs) < 2:
+        return UNKNOWN
+    weights = [1.0, *[-1.0 / (len(rungs) - 1)] * (len(rungs) - 1)]
+    value = float(sum(weight * own.mean() for weight, own in zip(weights, rungs, strict=True)))
+    return ConfidenceInterval(*statistics.student_interval(value, *statistics.standard_error(rungs, weights)))
 
 
 def check_suite(results: "AgentResults", suite: "Suite", whose: str = "") -> None:
@@ -205,6 +227,26 @@ def check_suite(results: "AgentResults", suite: "Suite", whose: str = "") -> Non
         )
 
 
+def equal_seeds(curves: Mapping[str, np.ndarray]) -> str:
+    """A sentence if all seeds have equal curves on more than a third of the tasks where any run learns, else ""."""
+    from pharos.benchmark import execution  # which imports this file
+
+    return execution.equal_seeds(curves)
+
+
+def has_equal_seeds(results: "AgentResults") -> bool:
+    """Whether the seeds are one run, by `equal_seeds`; not where no run learns, as those of a fixed policy."""
+    return bool(equal_seeds(results.curves))
+
+
+def as_one_run(results: "AgentResults") -> "AgentResults":
+    """The results; where their seeds are one run, their mean as a single one, so that nothing has an interval."""
+    if not has_equal_seeds(results):
+        return results
+    curves = {name: curve.mean(axis=0, keepdims=True) for name, curve in results.curves.items()}
+    return replace(results, seeds=results.seeds[:1], curves=curves)
+
+
 def run_regrets(results: "AgentResults", *, last: bool = False) -> dict[str, np.ndarray]:
     """Return for each task the normalised regret of its runs, (seeds,): mean over evaluations, or at the last one."""
     return {name: curves[:, -1] if last else curves.mean(axis=1) for name, curves in results.curves.items()}
@@ -222,8 +264,8 @@ def frontier(levels: np.ndarray, regrets: Sequence[np.ndarray]) -> ConfidenceInt
     """Return the level where mean normalised regret crosses 0.5, linear between rungs, with its interval.
 
     Means over seeds are made increasing along the rungs (isotonic regression, equal weights). The interval holds the
-    levels where Student's interval of the mean, interpolated between two rungs, contains 0.5 (Fieller): from the first
-    level whose upper limit reaches it to the last whose lower limit does not exceed it.
+    levels where Student's interval of the mean, interpolated between two rungs, contains 0.5 (Fieller), with limits
+    that increase as the mean does: a noisy rung opens no interval that rungs below it exclude.
 
     Args:
         levels: (R,) increasing. regrets: for each rung the mean regret of its runs in [0, 1].

@@ -141,7 +141,11 @@ def run(
     ]
     if outcome.scores.has_core:
         facts += [("score of the core", f"{outcome.score}{', preliminary' if outcome.scores.preliminary else ''}")]
-    facts += [(f"frontier of {axis}", f"{each.frontier} {each.unit}") for axis, each in outcome.axes.items()]
+    facts += [
+        (f"frontier of {axis}", f"{each.frontier} {each.unit}")
+        for axis, each in outcome.axes.items()
+        if each.frontier.value == each.frontier.value  # one rung has none
+    ]
     facts += [*note_facts(outcome.notes), ("results", out)]
     answer = {
         "agent": results.agent,
@@ -468,7 +472,10 @@ def _print_comparison(comparison: "Comparison", tasks: bool) -> None:
         number = pluralize(len(comparison.left_out), "task")
         left_out = ", ".join(comparison.left_out[:3]) + (", ..." if len(comparison.left_out) > 3 else "")
         notes.append(f"without {number} that one of them has not run: {left_out}")
-    if any(each.p_value != each.p_value for each in comparison.tasks.values()):
+    verdicts = {each.verdict for each in comparison.tasks.values()}
+    if "equal seeds" in verdicts:
+        notes.append("the seeds of one of them are one run: no interval, no verdict; does `learn` use its seed?")
+    if "one seed" in verdicts:
         notes.append("one seed has no interval; run two or more of both")
     names = (comparison.ours, comparison.theirs, "difference", "P(improvement)", "p (Holm)")
     columns = ("", *(f">{name}" for name in names), "verdict")

@@ -203,9 +203,14 @@ def reaching(
 
 
 def averaging(
-    target: Target, mdp: "TabularMDP", tolerance: float, chance: "ChanceSetting", out: Path | None, policy_rows: int
+    target: Target,
+    mdp: "TabularMDP",
+    tolerance: float,
+    chance: "ChanceSetting",
+    out: Path | None,
+    policy_rows: int,
 ) -> Answer:
-    """The answer about the average reward of a step in the long run; with so many rows of its policy."""
+    """The answer about the average reward of a step in the long run."""
     import numpy as np
 
     from pharos.solvers import average_reward
@@ -251,8 +256,8 @@ def averaging(
         *compiling_fact(),
         *([] if out is None else [("written", out)]),
     ]
-    reply = Answer(answer, (f"long run of {target.title}", facts))
-    return with_policy(reply, readable_policy(mdp, best.policy, policy_rows)) if policy_rows else reply
+    result = Answer(answer, (f"long run of {target.title}", facts))
+    return with_policy(result, readable_policy(mdp, best.policy, policy_rows)) if policy_rows else result
 
 
 def save(path: Path, solution: "Solution") -> None:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 OPTIONS = "agent observation observation_options steps engine hyperparameters evaluation_interval"
 CHANCE = "sticky random lazy reward_noise reward_delay"
+UNIFORM_IS_OPTIMAL = "-  (uniform play is optimal as well: give a shorter --horizon, or a --gamma below 1)"
 BEFORE = "loading, building, compiling, first evaluation"
 
 
@@ -135,6 +136,12 @@ def _train_many(title: str, *, seeds: list[int], steps: int, out: Path | None, *
     return Answer(answer, (f"{title}, {pluralize(len(seeds), 'seed')}", facts), bool(failed))
 
 
+def _is_uniform_optimal(result: Mapping[str, Any]) -> bool:
+    """Whether uniform play is as good as optimal to six digits, so that no regret says anything in its unit."""
+    best, uniform = result["value_optimal"], result["value_uniform"]
+    return best is not None and uniform is not None and math.isclose(best, uniform, rel_tol=1e-6)
+
+
 def _quartiles(values: list[float | None]) -> list[float] | None:
     """Lower quartile, median, upper quartile; None where there is no number."""
     import numpy as np
@@ -153,6 +160,8 @@ def _facts_of_many(
     for name, quartiles in spread.items():
         low, middle, high = quartiles or (math.nan,) * 3
         facts.append((in_words(name), f"median {middle:.4g}, quartiles {low:.4g} to {high:.4g}"))
+    if any(_is_uniform_optimal(run.result) for run in results.values()):
+        facts = [(name, UNIFORM_IS_OPTIMAL if name == "normalised regret" else value) for name, value in facts]
     if results:
         some = next(iter(results.values())).result
         best = sum(run.result["final_regret"] < 1e-6 for run in results.values())
@@ -186,6 +195,7 @@ def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, ob
     best, uniform = result["value_optimal"], result["value_uniform"]
     learnt, played = result["cumulative_regret"], result["cumulative_realised_regret"]
     shown = "-" if regret is None or math.isnan(regret) else f"{regret:.4g}  (0: optimal, 1: uniform)"
+    shown = UNIFORM_IS_OPTIMAL if _is_uniform_optimal(result) else shown
     return [
         ("final value", f"{result['final_value']:.6g}  (optimal {best:.6g}, uniform {uniform:.6g})"),
         ("final regret", f"{result['final_regret']:.6g}"),

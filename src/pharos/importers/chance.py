@@ -350,6 +350,9 @@ class BranchingGenerator:
     def __deepcopy__(self, _: object) -> "BranchingGenerator":
         return self
 
+    def __copy__(self) -> "BranchingGenerator":
+        return self
+
     def _index(self, count: int, weights: Sequence[Fraction] | None = None) -> int:
         if count > self._branches.most:
             raise _continuous(self._branches, f"one of {count:,} numbers")

@@ -47,8 +47,6 @@ BUILDING = ".building"
 """Folder, within that of an MDP, of what an import that is not finished has so far."""
 OBSERVED = {IMAGE: 4, GRID: 4, VECTOR: 2}
 """Kinds of observations that a source may show -> dimensions of their array."""
-BUILDING = ".building"
-"""Folder within the one of an MDP, for what is finished while it is made."""
 FOREIGN = ": is not empty and holds no imported MDP; choose another folder"
 
 
@@ -192,12 +190,6 @@ def _read_names(folder: Path, manifest: Mapping[str, Any]) -> Names | None:
         choices=stored.get(mdp_files.CHOICES),
         choice_names=tuple(stored["choices"]),
     )
-
-
-def check_room(folder: str | os.PathLike) -> None:
-    """Raise ParameterError if a folder holds something else than an imported MDP, or the beginning of one."""
-    if _is_foreign(Path(folder)):
-        raise ParameterError(f"{folder}{FOREIGN}")
 
 
 def _is_foreign(folder: Path) -> bool:

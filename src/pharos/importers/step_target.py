@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import FolderLocked, ParameterError, RuleError
-from pharos.importers.folder import BUILDING, check_room, save
+from pharos.importers.folder import BUILDING, check_free, save
 from pharos.importers.search import SteppedStates
 from pharos.importers.step_checkpoint import SECONDS, StepCheckpoint
 from pharos.importers.stepping import SteppingOptions, SteppingRun, StepRecording
@@ -158,7 +158,7 @@ class StepTarget:
         Raises:
             ParameterError: the folder holds something else, or the beginning of another import. As `stepping`.
         """
-        check_room(folder)
+        check_free(folder)
         payment = self.reward or self.weights or None
         stepping_options = SteppingOptions(
             seed=seed, ignore=frozenset(ignore), key=self.key, reward=payment, max_outcomes=max_outcomes

@@ -15,7 +15,7 @@ from pharos.importers.search import Arrival
 from pharos.system.workers import Workers
 
 if TYPE_CHECKING:
-    from pharos.importers.stepping import SteppedEnvironment
+    from pharos.importers.stepped_environment import SteppedEnvironment
 
 BLOCK = 16
 """States that a process gets at once. It gets the next when it has handed over their outcomes: one that sends does not
@@ -25,7 +25,7 @@ BLOCKS_AHEAD = 3
 
 def step_for_others(factory: Any, options: Any, jobs: connection.Connection, send: Any) -> None:
     """The body of a process: expand blocks of states until there are no more."""
-    from pharos.importers.stepping import ConstantChanged, SteppedEnvironment
+    from pharos.importers.stepped_environment import ConstantChanged, SteppedEnvironment
 
     try:
         with side_effects.undone():

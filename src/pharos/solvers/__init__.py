@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from pharos.solvers.average import AverageReward, GainInterval, average_reward
     from pharos.solvers.options import Solving, SolvingOptions
     from pharos.solvers.policy_iteration import chain
-    from pharos.solvers.reaching import Bounds, Reachability, reach
+    from pharos.solvers.reaching import Bounds, Reachability, StateBounds, reach
     from pharos.solvers.solution import Solution
     from pharos.solvers.values import (
         TablePolicy,
@@ -27,6 +27,7 @@ __all__ = [
     "Reachability",
     "Solution",
     "Solving",
+    "StateBounds",
     "average_reward",
     "evaluate_policy",
     "reach",

@@ -45,7 +45,7 @@ from pharos.solvers.goals import (
     recurrent_classes,
 )
 from pharos.solvers.policy_iteration import DENSE
-from pharos.solvers.reaching import Bounds
+from pharos.solvers.reaching import StateBounds
 from pharos.solvers.values import TableAgent, TablePolicy
 
 if TYPE_CHECKING:
@@ -53,6 +53,8 @@ if TYPE_CHECKING:
 
 # Sweeps before policies are improved, and in all; the damping, which makes chains aperiodic.
 FIRST_SWEEPS, MOST_SWEEPS, DAMPING = 32, 100_000, 0.5
+# Outcomes that all sweeps of one component may read, some ten seconds.
+MOST_READ = 3e9
 # Damped steps after which the likeliest node of a class is the one to come back to.
 HOMING = 32
 # Improvements of a policy, at most.
@@ -88,7 +90,7 @@ class AverageReward:
 
     mdp: TabularMDP
     kind: str
-    gain: Bounds
+    gain: StateBounds
     policy: np.ndarray
     tolerance: float
 
@@ -97,7 +99,7 @@ class AverageReward:
         """The gain of an episode's first state."""
         return self.at_start(self.gain)
 
-    def at_start(self, bounds: Bounds) -> "GainInterval":
+    def at_start(self, bounds: StateBounds) -> "GainInterval":
         """The mean over an episode's first state of numbers of the states, within bounds (S,)."""
         lower, upper = (
             float(self.mdp.start_probabilities @ each[self.mdp.start_states]) for each in (bounds.lower, bounds.upper)
@@ -107,7 +109,7 @@ class AverageReward:
         return GainInterval(lower - room, upper + room)
 
     @cached_property
-    def bias(self) -> Bounds:
+    def bias(self) -> StateBounds:
         """Surplus of `policy` over its gain: `lower` and `upper` (S,), proven.
 
         h(s) = sum over t of E r_t - g(s), summed in the mean (Cesaro) where the chain is periodic. So the stationary
@@ -140,8 +142,8 @@ def average_reward(
     Returns:
         An `AverageReward` with `gain`, `gain_at_start`, `policy` and `bias`.
     Raises:
-        ParameterError: the policy has the wrong shape.
-        UnknownName: no such policy. PrecisionError: floats, within limits of time, prove no bound within the tolerance.
+        ParameterError: the policy has the wrong shape. UnknownName: no such policy.
+        PrecisionError: floats, within limits of time, prove no bound within the tolerance.
     Cost: nodes and outcomes are written out, 12 bytes an outcome; sweeps, and linear equations of some policies of each
         end component; of components of more than 20,000 nodes where elimination fills little in, else sweeps alone.
     Source: Puterman (2005), chapters 8 and 9; Ashok et al. (2017).
@@ -268,7 +270,8 @@ class MeanPayoff:
         if self._is_met(sweeps.h, tolerance) or self._improve(tolerance) or self._in_rational_numbers():
             return
         is_settled = False
-        while not (self._is_met(sweeps.h, tolerance) or is_settled or sweeps.count >= MOST_SWEEPS):
+        most = min(MOST_SWEEPS, MOST_READ / (self.choices.matrix.nnz + len(self.choices.owner)))
+        while not (self._is_met(sweeps.h, tolerance) or is_settled or sweeps.count >= most):
             is_settled = sweeps.go_on(sweeps.count, tolerance)
         self._bound(sweeps.h)
 
@@ -514,7 +517,7 @@ def _swept_ends(problem: GoalProblem, tolerance: float) -> tuple[np.ndarray, np.
     largest = float(np.abs(choices.rewards).max(initial=0.0))
     step = (choices.terms + 24) * UNIT * largest + choices.deviation * 2 * largest
     lower, upper = (np.append(np.full(choices.num_nodes, each), 0.0) for each in (-largest, largest))
-    for sweep in range(MOST_SWEEPS):
+    for sweep in range(int(min(MOST_SWEEPS, MOST_READ / (2 * choices.matrix.nnz)))):
         for bound, side in ((lower, -1.0), (upper, 1.0)):
             values = (choices.rewards + choices.matrix @ bound) / leaving
             moved = np.maximum.reduceat(values, choices.rows[:-1]) + side * step
@@ -536,13 +539,13 @@ def _first_values(mdp: TabularMDP, x: np.ndarray, rewards: np.ndarray | float = 
     """(S, A) rewards, plus the numbers x (N,) of the nodes that executing an action leads to."""
     numbers = np.zeros((mdp.num_states + 1, mdp.width))
     numbers[:-1] = x.reshape(mdp.num_states, mdp.width)
-    return np.asarray(rewards + mdp.dynamics.expected(numbers))
+    return np.asarray(rewards + mdp.acting(mdp.dynamics.expected(numbers), slice(None)))
 
 
 def _of_states(
     mdp: TabularMDP, select: Selection, lower: np.ndarray, upper: np.ndarray, rewards: np.ndarray | float = 0.0
-) -> Bounds:
-    """Bounds of the states, without a previous action, from those of the nodes (N,)."""
+) -> StateBounds:
+    """StateBounds of the states, without a previous action, from those of the nodes (N,)."""
     if mdp.is_sticky:
         first, bounds = mdp.chance.first, []
         for x, side in ((lower, -1.0), (upper, 1.0)):
@@ -554,7 +557,7 @@ def _of_states(
         lower, upper = bounds
     live = ~np.asarray(mdp.terminal)
     room = 2 * UNIT * np.maximum(np.abs(lower), np.abs(upper))
-    return Bounds(np.where(live, lower - room, 0.0), np.where(live, upper + room, 0.0))
+    return StateBounds(np.where(live, lower - room, 0.0), np.where(live, upper + room, 0.0))
 
 
 def _policy_table(mdp: TabularMDP, sign: float, v: np.ndarray, choices: np.ndarray) -> np.ndarray:
@@ -568,7 +571,7 @@ def _policy_table(mdp: TabularMDP, sign: float, v: np.ndarray, choices: np.ndarr
     return by_node[:, 0].copy() if (by_node == by_node[:, :1]).all() else by_node
 
 
-def _bias(mdp: TabularMDP, select: PolicyTable) -> Bounds:
+def _bias(mdp: TabularMDP, select: PolicyTable) -> StateBounds:
     nodes = WrittenOut.of(mdp, select)
     nodes.matrix.eliminate_zeros()
     members = np.flatnonzero(nodes.live)
@@ -623,4 +626,4 @@ def _bias(mdp: TabularMDP, select: PolicyTable) -> Bounds:
     gain = _of_states(mdp, select, of_nodes[2], of_nodes[3])
     lower, upper = bias.lower - gain.upper, bias.upper - gain.lower
     extra = 2 * UNIT * (np.abs(lower) + np.abs(upper)) + choices.error
-    return Bounds(lower - extra, upper + extra)
+    return StateBounds(lower - extra, upper + extra)

@@ -37,21 +37,31 @@ TERMINAL = "terminal"
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
+class StateBounds:
     """Bounds of a number for each state.
 
     Attributes:
         lower, upper: (S,) float64, proven; both infinite if the number is.
-        policy: (S,) actions that attain it, or (S, A + 1) under sticky actions, by the previous action; meaningless
-            where the number is infinite. None: the number is of a policy that was given.
     """
 
     lower: np.ndarray
     upper: np.ndarray
-    policy: np.ndarray | None = None
 
     def __repr__(self) -> str:
-        return f"Bounds(lower={self.lower}, upper={self.upper})"
+        return f"{type(self).__name__}(lower={self.lower}, upper={self.upper})"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Bounds(StateBounds):
+    """Bounds of a number for each state, and a policy.
+
+    Attributes:
+        lower, upper: (S,) float64, proven; both infinite if the number is.
+        policy: (S,) actions that attain it, or (S, A + 1) under sticky actions, by the previous action; meaningless
+            where the number is infinite.
+    """
+
+    policy: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,156 @@
+"""Words of the report, which follow from its numbers: verdicts of `compare`, falls of axes, what a mistake looks like.
+
+Nothing here tests anything anew: a verdict is that of the score in `compare`, after Holm's correction, so that page and
+command cannot contradict each other; a frontier is the unit in which it is told.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+
+from pharos.benchmark.charts import frontier_text
+from pharos.benchmark.comparison import BETTER, NEGLIGIBLE, UNDECIDED, WORSE, Comparison, Difference
+from pharos.benchmark.contents import Contents, ScoredAgent, kind_of, listed, number, signed
+from pharos.benchmark.properties import known_properties
+from pharos.benchmark.scores import CROSSING, AxisScore, equal_seeds
+
+VERDICTS = (WORSE, BETTER, NEGLIGIBLE, UNDECIDED)
+
+
+def nearest(contents: Contents) -> tuple[int, float, bool] | None:
+    """Place of the baseline that the agent is held against, mean distance of their scores, whether of the same kind.
+
+    Of those of the agent's kind, else of all, the one whose scores on core tasks are nearest; None without any.
+    """
+    names = {task.name for task in contents.suite.core}
+    distances = {}
+    for k, comparison in enumerate(contents.comparisons):
+        own = [abs(each.interval.value) for name, each in comparison.tasks.items() if name in names]
+        if own:
+            distances[k] = sum(own) / len(own)
+    if not distances:
+        return None
+    kind = kind_of(contents.agent.results)
+    same = [k for k in distances if kind == kind_of(contents.beside[k].results) and kind not in ("both", "none")]
+    place = min(same or distances, key=distances.__getitem__)
+    return place, distances[place], bool(same)
+
+
+def strengths(contents: Contents) -> dict[str, list[str]]:
+    """Lines on the axes for each verdict of `compare` that occurs, in the order of VERDICTS; without it, none.
+
+    A line: the axis with the agent's frontier, then each baseline's frontier and the difference of scores.
+    """
+    lines: dict[str, list[str]] = {verdict: [] for verdict in VERDICTS}
+    for axis, own in contents.agent.score.axes.items():
+        others: dict[str, list[str]] = {verdict: [] for verdict in VERDICTS}
+        for other, comparison in zip(contents.beside, contents.comparisons, strict=True):
+            if axis in comparison.axes and (score := comparison.axes[axis].score).verdict in others:
+                frontier = frontier_text(comparison.axes[axis].frontiers[1], interval=False)
+                others[score.verdict].append(f"{other.name} {frontier}, score {signed(score.interval)}")
+        for verdict, texts in others.items():
+            if texts:
+                lines[verdict].append(f"{axis}: {frontier_text(own.frontier, own.unit)}; {'; '.join(texts)}")
+    return {verdict: texts for verdict, texts in lines.items() if texts}
+
+
+def without_verdict(contents: Contents) -> dict[str, list[str]]:
+    """Names of baselines beside which an axis has no verdict, by the reason: "one seed" or "equal seeds"."""
+    reasons: dict[str, list[str]] = {}
+    for other, comparison in zip(contents.beside, contents.comparisons, strict=True):
+        for reason in {each.score.verdict for each in comparison.axes.values()} - {*VERDICTS}:
+            reasons.setdefault(reason, []).append(other.name)
+    return reasons
+
+
+def is_worse_everywhere(comparison: Comparison) -> bool:
+    """Whether the core and all axes, two or more, are worse."""
+    verdicts = [each.score.verdict for each in comparison.axes.values()]
+    return comparison.core is not None and len(verdicts) > 1 and {comparison.core.verdict, *verdicts} == {WORSE}
+
+
+def fall_everywhere(contents: Contents) -> str:
+    """A sentence if the core and all axes are worse than the nearest baseline's; else empty."""
+    if (near := nearest(contents)) is None or not is_worse_everywhere(contents.comparisons[near[0]]):
+        return ""
+    return (
+        f"Falls everywhere: the core and all {len(contents.comparisons[near[0]].axes)} axes are below "
+        f"{contents.beside[near[0]].name}'s. Look for a bug first; axes say nothing before it is mended."
+    )
+
+
+def fails_on_the_lowest_rung(own: AxisScore) -> bool:
+    """Whether regret on the first rung is above 0.5 by its whole interval."""
+    return not math.isnan(own.lowest.low) and own.lowest.high < CROSSING
+
+
+def lowest_rungs(contents: Contents) -> list[str]:
+    """A sentence for each axis that the agent fails on its lowest rung already."""
+    sentences = []
+    for axis, own in contents.agent.score.axes.items():
+        if fails_on_the_lowest_rung(own):
+            others = [
+                f"{each.name} {each.score.axes[axis].lowest.value:.2f}"
+                for each in contents.beside
+                if axis in each.score.axes and not math.isnan(each.score.axes[axis].lowest.value)
+            ]
+            beside = f" ({', '.join(others)})" if others else ""
+            sentences.append(
+                f"Fails on the lowest rung of {axis} already, with a score of {number(own.lowest)}{beside}: not a "
+                f"matter of {axis}, but of its world."
+            )
+    return sentences
+
+
+def falls(contents: Contents) -> list[list[str]]:
+    """Rows on each axis whose first rung was run, and another one: score there, and fall above it, of all agents.
+
+    The fall is the score on the first rung less the mean of those above it.
+    """
+    rows = []
+    for axis, own in contents.agent.score.axes.items():
+        if math.isnan(own.fall.value):
+            continue
+        others = [
+            f"{each.score.axes[axis].lowest.value:.2f}, {each.score.axes[axis].fall.value:.2f}"
+            if axis in each.score.axes and not math.isnan(each.score.axes[axis].fall.value)
+            else "–"
+            for each in contents.beside
+        ]
+        rows.append([axis, number(own.lowest), number(own.fall), *others])
+    return rows
+
+
+def groups_of(contents: Contents) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+    """Names of core tasks by what is seen, and by property: reward sizes, length, ends, chance, number of actions.
+
+    Properties with one group say nothing, and are left out; so are those of tasks that `known_properties` lacks.
+    """
+    by_observation: dict[str, list[str]] = {}
+    kinds: list[dict[str, list[str]]] = []
+    for task in contents.suite.core:
+        if task.name not in contents.agent.score.tasks:
+            continue
+        by_observation.setdefault(task.observation, []).append(task.name)
+        if (own := known_properties().get(task.digest)) is not None:
+            for place, group in enumerate(own.groups):
+                kinds += [{}] * (place == len(kinds))
+                kinds[place] = {**kinds[place], group: [*kinds[place].get(group, []), task.name]}
+    return by_observation, {group: names for kind in kinds if len(kind) > 1 for group, names in sorted(kind.items())}
+
+
+def worst_groups(groups: Mapping[str, Difference]) -> str:
+    """A sentence on the group with the largest significant loss, if others are shown to lose less than half of it."""
+    losses = {name: each.interval.value for name, each in groups.items() if each.verdict == WORSE}
+    if not losses:
+        return ""
+    worst = min(losses, key=losses.__getitem__)
+    spared = [name for name, each in groups.items() if each.interval.low > losses[worst] / 2]
+    if not spared:
+        return ""
+    return f"The largest loss is on {worst}, {losses[worst]:+.2f}. Less than half of that on {listed(spared)}."
+
+
+def seeds_sentence(agents: Sequence[ScoredAgent]) -> list[str]:
+    """A sentence on each agent whose seeds are one run: the first paragraph of a page on it."""
+    texts = [(each.name, equal_seeds(each.results.curves)) for each in agents]
+    return [f"{name}: {text}. Here nothing of it has an interval or a verdict." for name, text in texts if text]
