@@ -59,10 +59,10 @@ def test_a_search_that_was_interrupted_goes_on_from_its_last_layer(broken_at, mo
 
     expand = layers.Player.expand
 
-    def interrupted(self, depth, states, is_last):
-        if depth == broken_at:
+    def interrupted(self, task, states):
+        if task.depth == broken_at:
             raise Interrupted
-        return expand(self, depth, states, is_last)
+        return expand(self, task, states)
 
     monkeypatch.setattr(layers.Player, "expand", interrupted)
     with pytest.raises(Interrupted):

@@ -86,8 +86,8 @@ def atari(  # noqa: PLR0913  (an option each)
         MissingExtra: ale-py is not installed. UnknownName: it has no such game.
         StateSpaceTooLarge: more than max_states; the message says which horizon fits.
         ParameterError: the game ends within `noops` frames, or the folder holds another game's layers.
-    Cost: horizon x states of a layer x actions x frame_skip frames, 10,000 to 18,000 frames a second and process; 16
-        bytes of memory a state, a saved state of 5 kB for each state of the last layer, 0.1 to 1 kB a distinct screen.
+    Cost: horizon x states of a layer x actions x frame_skip frames, 10,000 to 18,000 frames a second and process; some
+        150 bytes of memory a state, 1 kB a state of the last layer, and 0.1 to 1 kB a distinct screen.
     Source: BRIDGE (Laidlaw, Russell and Dragan 2023), whose freeway_10_fs30 is met state by state.
     """
     horizon, frame_skip, noops = _checked_steps("atari", horizon, frame_skip, noops)

@@ -90,6 +90,21 @@ class ConsoleStep(NamedTuple):
     screen: np.ndarray | None = None
 
 
+class LayerTask(NamedTuple):
+    """What is the same for all states of a layer that is expanded.
+
+    Attributes:
+        depth: of the states.
+        dictionary, next_dictionary: saved states like which these, and those that they lead to, are deflated.
+        is_last: whether the horizon ends the episode afterwards.
+    """
+
+    depth: int
+    dictionary: bytes
+    next_dictionary: bytes
+    is_last: bool
+
+
 class Player:
     """Expands states of a game, in this process or in one of its own."""
 
@@ -98,31 +113,31 @@ class Player:
         self.first = self.game.start()
         self._depth, self._sent = -1, set[bytes]()
 
-    def expand(self, depth: int, states: Sequence[bytes], is_last: bool) -> list[ConsoleStep]:
-        """Steps of all actions in deflated states of one depth. is_last: the horizon ends the episode afterwards."""
-        if depth != self._depth:
-            self._depth, self._sent = depth, set()
+    def expand(self, task: LayerTask, states: Sequence[bytes]) -> list[ConsoleStep]:
+        """Steps of all actions in deflated states of one depth."""
+        if task.depth != self._depth:
+            self._depth, self._sent = task.depth, set()
         steps = []
         for packed in states:
-            state = self.game.load(inflated(packed, self.first))
+            state = self.game.load(inflated(packed, task.dictionary))
             for action in range(len(self.game.actions)):
                 reward, ends = self.game.step(state, action)
                 if ends:
                     steps.append(ConsoleStep(reward, b""))
-                elif is_last:
+                elif task.is_last:
                     key = key_of(self.game.save())
                     steps.append(ConsoleStep(reward + self.game.last_reward(), key))
                 else:
-                    steps.append(self._step(reward))
+                    steps.append(self._step(reward, task.next_dictionary))
         return steps
 
-    def _step(self, reward: float) -> ConsoleStep:
+    def _step(self, reward: float, dictionary: bytes) -> ConsoleStep:
         saved = self.game.save()
         key = key_of(saved)
         if key in self._sent:
             return ConsoleStep(reward, key)
         self._sent.add(key)
-        return ConsoleStep(reward, key, deflated(saved, self.first), self.game.screen())
+        return ConsoleStep(reward, key, deflated(saved, dictionary), self.game.screen())
 
 
 def key_of(saved: bytes) -> bytes:
@@ -130,20 +145,20 @@ def key_of(saved: bytes) -> bytes:
     return bytes.fromhex(storage.digest_of_bytes(saved))
 
 
-def deflated(saved: bytes, first: bytes) -> bytes:
-    """A saved state, by how it differs from the first one: some 5 kB of a game of Atari, of 14 kB."""
-    machine = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, zdict=first[-(1 << 15) :])
+def deflated(saved: bytes, dictionary: bytes) -> bytes:
+    """A saved state, by how it differs from another one: some 1 kB of a game of Atari, of 14 kB."""
+    machine = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, zdict=dictionary[-(1 << 15) :])
     return machine.compress(saved) + machine.flush()
 
 
-def inflated(packed: bytes, first: bytes) -> bytes:
+def inflated(packed: bytes, dictionary: bytes) -> bytes:
     """The saved state of `deflated`.
 
     Raises:
         ValueError: the bytes are something else.
     """
     try:
-        return zlib.decompressobj(zdict=first[-(1 << 15) :]).decompress(packed, LARGEST_STATE)
+        return zlib.decompressobj(zdict=dictionary[-(1 << 15) :]).decompress(packed, LARGEST_STATE)
     except zlib.error as error:
         raise ValueError(f"a saved state cannot be read: {error}") from None
 
@@ -156,7 +171,8 @@ class LayerSearch:
     """States in the order in which they are met first: breadth first, by action.
 
     Attributes:
-        first: the saved start state.
+        dictionary: a saved state like which those of the frontier are deflated: the first one of the layer before, as
+            random generators of a console are renewed every few hundred frames.
         keys: number of each state by its key.
         sizes: number of states of each depth so far.
         rows, rewards: one array of each expanded layer.
@@ -165,7 +181,7 @@ class LayerSearch:
         frontier: deflated states of the deepest layer.
     """
 
-    first: bytes
+    dictionary: bytes
     collector: RowCollector
     keys: dict[bytes, int] = field(default_factory=dict)
     sizes: list[int] = field(default_factory=list)
@@ -247,8 +263,10 @@ def _explored(
             depth = len(search.rows)
             is_last = depth == horizon - 1
             states, search.frontier = search.frontier, []
+            task = LayerTask(depth, search.dictionary, inflated(states[0], search.dictionary), is_last)
+            search.dictionary = task.next_dictionary
             rows, rewards = [], []
-            for done, block in team.expanded(depth, states, is_last):
+            for done, block in team.expanded(task, states):
                 for step in block:
                     rows.append(search.add(step))
                     rewards.append(step.reward)
@@ -302,9 +320,9 @@ def _begin(make: Callable[[], Console]) -> None:
     _player = Player(make)
 
 
-def _expand(depth: int, states: Sequence[bytes], is_last: bool) -> list[ConsoleStep]:
+def _expand(task: LayerTask, states: Sequence[bytes]) -> list[ConsoleStep]:
     assert _player is not None
-    return _player.expand(depth, states, is_last)
+    return _player.expand(task, states)
 
 
 class Team:
@@ -324,22 +342,22 @@ class Team:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
-    def expanded(self, depth: int, states: Sequence[bytes], is_last: bool) -> Iterator[tuple[int, list[ConsoleStep]]]:
+    def expanded(self, task: LayerTask, states: Sequence[bytes]) -> Iterator[tuple[int, list[ConsoleStep]]]:
         """Yield (states done, steps) of the blocks of a layer, in order."""
         blocks = [states[first : first + BLOCK] for first in range(0, len(states), BLOCK)]
         done = 0
-        for block, steps in zip(blocks, self._steps(depth, blocks, is_last), strict=True):
+        for block, steps in zip(blocks, self._steps(task, blocks), strict=True):
             done += len(block)
             yield done, steps
 
-    def _steps(self, depth: int, blocks: Sequence[Sequence[bytes]], is_last: bool) -> Iterator[list[ConsoleStep]]:
+    def _steps(self, task: LayerTask, blocks: Sequence[Sequence[bytes]]) -> Iterator[list[ConsoleStep]]:
         if self._pool is None:
             for block in blocks:
-                yield self._player.expand(depth, block, is_last)
+                yield self._player.expand(task, block)
             return
         try:
             with without_main(self._make):
-                steps = self._pool.map(_expand, [depth] * len(blocks), blocks, [is_last] * len(blocks))
+                steps = self._pool.map(_expand, [task] * len(blocks), blocks)
             yield from steps
         except BrokenProcessPool:
             raise PharosError(
@@ -402,6 +420,7 @@ class KeptLayers:
         search.shown += [1] * (not search.shown)
         search.sizes.append(len(search.keys) - max(before, 1))
         search.screen_numbers += arrays["seen"].tolist()
+        search.dictionary = arrays["dictionary"].tobytes()
         search.frontier = split(arrays["saved"], arrays["saved_lengths"])
         digests = arrays["screen_keys"].tobytes()
         search.collector.resume(
@@ -425,6 +444,7 @@ class KeptLayers:
             "rewards": search.rewards[-1],
             "keys": np.frombuffer(b"".join(keys), np.uint8),
             "seen": np.array(search.screen_numbers[since:], np.int64),
+            "dictionary": np.frombuffer(search.dictionary, np.uint8),
             "saved": saved,
             "saved_lengths": saved_lengths,
             "chunks": chunks,
