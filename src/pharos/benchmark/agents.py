@@ -116,7 +116,7 @@ class Job:
 
 @dataclass(frozen=True)
 class RunResult:
-    """What counts of a finished run.
+    """Curve, steps and notes of a finished run.
 
     Attributes:
         curve: (evaluations,) normalised regret. exact: whether all of it is.
