@@ -336,3 +336,39 @@ def test_total_rewards_under_chance_are_those_of_the_nodes_written_out(world, ch
             error = solution.error_bound + truth.error_bound + 1e-12
             np.testing.assert_allclose(np.ravel(v), truth.v, rtol=0, atol=error)
             assert sets[np.arange(STATES), solution.policy.T].all()
+
+
+@pytest.mark.long
+@examples(60, worlds_that_may_end(), st.sampled_from([(0.25, 0.0), (0.25, 0.5), (1.0, 0.0), (0.0, 0.5)]))
+def test_reaching_under_chance_is_that_of_the_nodes_written_out(world, chance):
+    """The start, where there is no previous action, is one more node, whose choices are executed as on a first step."""
+    P, R, sets = world
+    mdp = TabularMDP.from_matrices(P, np.where(sets, R, -np.inf), gamma=1.0, axes="SAS", ends=True)
+    mdp = pharos.sticky_actions(mdp, chance[0]) if chance[0] else mdp
+    mdp = pharos.random_actions(mdp, chance[1]) if chance[1] else mdp
+    nodes, target = written_out(world, *chance), np.arange(STATES) == STATES - 1
+    costs = np.where(target[:, None], 0.0, np.abs(np.where(sets, R, 0.0)))
+    of_nodes = np.zeros((STATES * ACTIONS, ACTIONS))
+    for s, b in np.ndindex(STATES, ACTIONS):
+        for c in available(sets, s):
+            of_nodes[s * ACTIONS + b, c] = sum(p * costs[s, a] for a, p in executed(sets, s, b, c, *chance).items())
+    lake = pharos.reach(mdp, target, costs=costs)
+    truth = pharos.reach(nodes, np.repeat(target, ACTIONS), costs=of_nodes)
+    for name, best in (("maximum", max), ("minimum", min), ("least_cost", min), ("largest_cost", max)):
+        bounds, expected = getattr(lake, name), getattr(truth, name)
+        middle = (expected.lower + expected.upper) / 2
+        for s in range(STATES - 1):
+            values = []
+            for c in available(sets, s):
+                total = 0.0
+                for a, p in executed(sets, s, ACTIONS, c, *chance).items():
+                    after = sum(q * middle[t * ACTIONS + a] for t, q in enumerate(P[s, a]) if q > 0)
+                    ends = 1 - P[s, a].sum() > 1e-9
+                    paid = costs[s, a] + (np.inf if ends else 0.0) if name.endswith("cost") else 0.0
+                    total += p * (paid + after) if p > 0 else 0.0
+                values.append(total)
+            value = best(values)
+            if np.isinf(value):
+                assert np.isinf(bounds.upper[s])
+            else:
+                assert bounds.lower[s] - 2e-6 <= value <= bounds.upper[s] + 2e-6

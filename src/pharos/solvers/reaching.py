@@ -103,7 +103,8 @@ class Reachability:
         problem = GoalProblem.of(self._stopping(-self._costs()), BEST, self._arrived)
         surely = problem.proper(problem.choices)[0]
         v, error, policy = problem.solve_in(surely, self.tolerance)
-        return self._of_states(np.where(np.isfinite(v), v, -np.inf), error, policy, -self._costs(), BEST, -1.0)
+        v = np.where(np.isfinite(v), v, -np.inf)
+        return self._of_states(v, error, policy, -self._costs(), BEST, -1.0, 0.0 if self.with_end else -np.inf)
 
     @cached_property
     def largest_cost(self) -> Bounds:
@@ -119,7 +120,7 @@ class Reachability:
         missed[problem.node_of[:-2][components]] = True
         missed[-2] = True  # the trap
         v, error, policy = problem.solve_in(~_may_reach(problem.choices, missed), self.tolerance)
-        return self._of_states(v, error, policy, self._costs(), BEST, 1.0)
+        return self._of_states(v, error, policy, self._costs(), BEST, 1.0, 0.0 if self.with_end else np.inf)
 
     @property
     def stopped(self) -> TabularMDP:
@@ -160,16 +161,30 @@ class Reachability:
         return result
 
     def _of_states(
-        self, v: np.ndarray, error: np.ndarray, policy: np.ndarray, rewards: np.ndarray, select: Selection, sign: float
+        self,
+        v: np.ndarray,
+        error: np.ndarray,
+        policy: np.ndarray,
+        rewards: np.ndarray,
+        select: Selection,
+        sign: float,
+        end: float = 0.0,
     ) -> Bounds:
-        """Bounds of the states, from values (N,), errors and choices of the nodes; sign -1 negates them."""
+        """Bounds of the states, from values (N,), errors and choices of the nodes; sign -1 negates them.
+
+        end: the value of an episode that ends without a next state.
+        """
         mdp = self._stopping(rewards)
         bounds = []
         for x in (v - error, v + error):
             if mdp.is_sticky:
-                nodes = np.zeros((mdp.num_states + 1, mdp.width))
+                nodes = np.full((mdp.num_states + 1, mdp.width), end)
                 nodes[:-1] = x.reshape(mdp.num_states, mdp.width)
-                q = mdp.rewards + mdp.dynamics.expected(nodes)
+                is_finite = np.isfinite(nodes)
+                q = mdp.rewards + mdp.dynamics.expected(np.where(is_finite, nodes, 0.0))
+                if not is_finite.all():  # all infinite values have one sign
+                    q[mdp.dynamics.expected((~is_finite).astype(np.float64)) > 0] = nodes[~is_finite][0]
+                q = mdp.acting(q, slice(None))
                 first, best = mdp.chance.first, select.first_value(q)
                 x = first.choice(q, best if first.chosen else np.zeros_like(best))[:, 0]
             bounds.append(sign * np.where(np.asarray(mdp.terminal) & np.isfinite(x), 0.0, x))
