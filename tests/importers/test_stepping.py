@@ -378,6 +378,14 @@ def test_other_threads_print_where_they_did(capsys):
     assert capsys.readouterr().out == "a bar\n"
 
 
+def test_windows_stay_closed():
+    """FrozenLake waits a quarter of a second for each frame that it shows."""
+    lake = partial(gymnasium.make, "FrozenLake-v1", is_slippery=False, render_mode="human")
+    mdp, recording = importers.stepping(lake, horizon=2, check=False)
+    assert mdp.num_states == 5  # the last action is a field: none, and each of four
+    assert recording.notes == ("FrozenLake-v1: it shows itself in a window, without which it was stepped",)
+
+
 def test_what_an_environment_prints_is_one_line_each():
     with warnings.catch_warnings(record=True) as caught:
         _, recording = importers.stepping(planted.Loud)

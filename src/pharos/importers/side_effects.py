@@ -74,7 +74,7 @@ class SideEffects:
     def __init__(self) -> None:
         self._printed = _Printed()
         self._warnings: dict[str, int] = {}
-        self._reseeded = False
+        self._reseeded = self._has_window = False
         self._threads = threading.active_count()
 
     @property
@@ -89,8 +89,8 @@ class SideEffects:
             lines.append(f"it warned: {first}" + (f" (and {others} other warnings)" if others else ""))
         if self._reseeded:
             lines.append("it seeds the global generators of NumPy or Python, which were put back")
-        if _has_window():
-            lines.append("it opened a window of pygame, which was not shown")
+        if self._has_window or _has_window():
+            lines.append("it shows itself in a window, without which it was stepped")
         return lines
 
     @contextlib.contextmanager
@@ -113,6 +113,10 @@ class SideEffects:
     def note_seeding(self) -> None:
         """Remember that the code seeds global generators."""
         self._reseeded = True
+
+    def note_window(self) -> None:
+        """Remember that it has a window for people."""
+        self._has_window = True
 
     def has_new_threads(self) -> bool:
         """Whether there are more threads than before."""

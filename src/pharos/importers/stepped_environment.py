@@ -19,7 +19,7 @@ from pharos.importers import side_effects
 from pharos.importers.chance import MOST_OUTCOMES, DrawError, DrawTree, line_of_code, placed
 from pharos.importers.search import Arrival
 from pharos.importers.side_effects import SideEffects
-from pharos.importers.snapshots import EnvironmentSnapshots, bare, digest_of, field_names, integers_of
+from pharos.importers.snapshots import EnvironmentSnapshots, bare, chain_of, digest_of, field_names, integers_of
 from pharos.importers.step_spaces import SpaceRecorder, listed_actions_of
 from pharos.importers.wrappers import Stepped, reset
 from pharos.system.wording import capped
@@ -103,6 +103,10 @@ class SteppedEnvironment:
         env = self._calling("the factory", self.factory)
         if not (hasattr(env, "reset") and hasattr(env, "step")):
             raise ParameterError(f"{self.name}: made a {capped(env)}; expected an environment with reset and step")
+        for each in chain_of(env):
+            if vars(each).get("render_mode") == "human":  # which waits for the next frame at each step
+                each.render_mode = None
+                self.effects.note_window()
         return bare(env)
 
     def key_of(self, env: Stepped) -> bytes:
