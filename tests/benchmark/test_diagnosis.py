@@ -10,7 +10,7 @@ from naive import benchmark as naive
 from pharos import benchmark
 from pharos.benchmark import AgentResults, compare, power
 from pharos.benchmark.comparison import compare_groups
-from pharos.benchmark.contents import contents_of
+from pharos.benchmark.contents import contents_of, residuals
 from pharos.benchmark.diagnosis import fall_everywhere, falls, groups_of, strengths, without_verdict
 from pharos.benchmark.page import page
 from pharos.benchmark.properties import known_properties, properties_of
@@ -198,7 +198,7 @@ def test_one_run_ten_times_has_neither_intervals_nor_verdicts(seed):
     text = text_of(page(contents_of(equal)))
     header = text.split("Core score")[0]
     assert "mine: all seeds have the same curve on" in header and "Equal seeds: no verdict beside DQN, PPO" in text
-    assert not re.search(r"\b(Worse|Better|Not shown to differ)\b", text.split("in words")[1])
+    assert not re.search(r"\b(Worse|Better|Not shown to differ)\b", text.split("in words")[1].split("Residuals")[0])
 
 
 def test_one_task_with_equal_curves_of_many_is_honest():
@@ -267,3 +267,49 @@ def test_constant_play_stands_beside_each_core_task():
     text = text_of(page(contents_of("dqn"))).split("Core tasks beside")[1]
     row = text.split("\ndiscounting_chain-bonus-1-one_hot\n")[1].split("\n")
     assert "one action" in text and "1.00" in row[:8]  # its best chain is the same action all along
+
+
+# Residuals, and mistakes ----------------------------------------------------------------------------------------------
+
+
+def residual_section(html):
+    return html.split("<h2>Residuals: worse than theory says</h2>")[1].split("</section>")[0]
+
+
+def test_residuals_of_the_shipped_agent_are_those_of_theory_and_those_of_a_fault_its_own():
+    text = residual_section(page(contents_of("ppo")))
+    assert "Theory is too hopeful: PPO of pharos fares alike." in text and "look for a bug here" not in text
+    real = AgentResults.read("ppo")
+    curves = {name: own + (name == "umbrella_chain-8") for name, own in real.curves.items()}
+    text = residual_section(page(contents_of(replace(real, agent="mine.py:PPO", curves=curves))))
+    own, theirs = text.split("Theory is too hopeful")
+    assert "look for a bug here" in own and ">umbrella_chain-8<" in own and own.count("<tr>") == 2
+    assert theirs.count("<tr>") == 1 + len(residuals(contents_of("ppo")))
+
+
+def test_the_kind_is_asked_for_where_the_name_does_not_say_it():
+    results = replace(AgentResults.read("dqn"), agent="mine.py:learn", record={})
+    counts = {each: len(residuals(contents_of(results, predictor=each))) for each in ("dqn", "ppo", "table")}
+    text = residual_section(page(contents_of(results)))
+    assert "does not say its kind" in text and "--predictor dqn, ppo, table or none" in text
+    others = f"Others would list {counts['dqn']} beside the idealised DQN, {counts['ppo']} beside the idealised PPO and"
+    assert others in text
+    for predictor, name in (("dqn", "mine.py:learn"), (None, "mine.py:DQN")):
+        text = residual_section(page(contents_of(replace(results, agent=name), predictor=predictor)))
+        assert "does not say its kind" not in text and f"{counts['ppo']} beside the idealised PPO" in text
+
+
+def test_runs_without_a_policy_and_with_one_at_the_end_are_told():
+    names = [task.name for task in SUITE.tasks]
+    late = np.ones((5, 3)) - np.array([0.0, 0.0, 0.4])
+    for curve, sentence in (
+        (np.ones((5, 3)), "In 40 of 60 runs all 3 evaluations are random play: was no policy yielded?"),
+        (
+            late,
+            "In 40 of 60 runs 2 of 3 evaluations are random play, the first policy counts at the end: yield earlier.",
+        ),
+    ):
+        results_of_most = replace(HEALTHY, curves=HEALTHY.curves | dict.fromkeys(names[:8], curve))
+        assert sentence in text_of(page(contents_of(results_of_most, beside=[], suite=SUITE)))
+        results_of_few = replace(HEALTHY, curves=HEALTHY.curves | dict.fromkeys(names[:2], curve))
+        assert "evaluations are random" not in text_of(page(contents_of(results_of_few, beside=[], suite=SUITE)))

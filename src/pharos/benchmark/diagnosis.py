@@ -6,13 +6,19 @@ command cannot contradict each other; a frontier is the unit in which it is told
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from pharos.benchmark.charts import frontier_text
 from pharos.benchmark.comparison import BETTER, NEGLIGIBLE, UNDECIDED, WORSE, Comparison, Difference
-from pharos.benchmark.contents import Contents, ScoredAgent, kind_of, listed, number, signed
+from pharos.benchmark.contents import PREDICTORS, Contents, ScoredAgent, kind_of, listed, number, residuals, signed
 from pharos.benchmark.properties import known_properties
-from pharos.benchmark.scores import CROSSING, AxisScore, equal_seeds
+from pharos.benchmark.results import AgentResults, baselines
+from pharos.benchmark.scores import CROSSING, AxisScore, equal_seeds, run_scores
+from pharos.benchmark.suite import BenchmarkTask
+from pharos.system.wording import pluralize
 
+SHIPPED = {"dqn": ("dqn",), "ppo": ("ppo",), "table": ("q_learning",), "both": ("dqn", "ppo")}
+OWN = 0.1  # by which the regret of a residual is above that of the shipped agent of the kind
 VERDICTS = (WORSE, BETTER, NEGLIGIBLE, UNDECIDED)
 
 
@@ -79,8 +85,8 @@ def fall_everywhere(contents: Contents) -> str:
 
 
 def fails_on_the_lowest_rung(own: AxisScore) -> bool:
-    """Whether regret on the first rung is above 0.5 by its whole interval."""
-    return not math.isnan(own.lowest.low) and own.lowest.high < CROSSING
+    """Whether regret on the first rung is above 0.5 by its whole interval; not of memory, which that rung asks for."""
+    return own.axis != "memory" and not math.isnan(own.lowest.low) and own.lowest.high < CROSSING
 
 
 def lowest_rungs(contents: Contents) -> list[str]:
@@ -148,6 +154,53 @@ def worst_groups(groups: Mapping[str, Difference]) -> str:
     if not spared:
         return ""
     return f"The largest loss is on {worst}, {losses[worst]:+.2f}. Less than half of that on {listed(spared)}."
+
+
+def shipped_regret(contents: Contents, task: BenchmarkTask) -> float | None:
+    """Normalised regret on a task of the shipped agent of the predictor's kind, the larger of two; None without one."""
+    regrets = []
+    for name in SHIPPED.get(contents.predictor, ()):
+        beside = [each.results for each in contents.beside if each.results.agent == name]
+        shipped = beside or ([AgentResults.read(name)] if name in baselines(contents.suite.name) else [])
+        regrets += [float(1.0 - run_scores(each)[task.name].mean()) for each in shipped if task.name in each.curves]
+    return max(regrets, default=None)
+
+
+def is_own(contents: Contents, task: BenchmarkTask, regret: float) -> bool:
+    """Whether a residual is the agent's own: it is more than 0.1 worse than the shipped agent, or there is none."""
+    shipped = shipped_regret(contents, task)
+    return shipped is None or regret - shipped > OWN
+
+
+def predictor_sentence(contents: Contents) -> str:
+    """Sentence on which idealised learner was taken, and the number of tasks that the others would list."""
+    counts = {
+        name: len(residuals(replace(contents, predictor=name))) for name in PREDICTORS if name != contents.predictor
+    }
+    others = listed([f"{count} beside {PREDICTORS[name]}" for name, count in counts.items()])
+    request = (
+        "The agent's name does not say its kind, so the worse of two was taken, which lists the fewest; say it: "
+        "--predictor dqn, ppo, table or none. "
+    )
+    is_unsaid = contents.predictor == kind_of(contents.agent.results) == "both"
+    return f"{request if is_unsaid else ''}Others would list {others}."
+
+
+def random_play(results: AgentResults) -> list[str]:
+    """Sentences if most runs are random play at all evaluations, or at all but the last one.
+
+    A few may be so by chance: on some tasks always playing one action has the value of uniform play.
+    """
+    random = [abs(curve - 1.0) < 1e-9 for curve in results.curves.values()]
+    never = sum(int(each.all(axis=1).sum()) for each in random)
+    at_end = sum(int((each[:, :-1].all(axis=1) & ~each[:, -1]).sum()) for each in random if each.shape[1] > 1)
+    runs, evaluations = sum(map(len, random)), max((each.shape[1] for each in random), default=0)
+    texts = {
+        f"all {evaluations} evaluations are random play: was no policy yielded?": never,
+        f"{evaluations - 1} of {evaluations} evaluations are random play, the first policy counts at the end: yield "
+        "earlier": at_end,
+    }
+    return [f"In {count:,} of {pluralize(runs, 'run')} {text}." for text, count in texts.items() if 2 * count > runs]
 
 
 def seeds_sentence(agents: Sequence[ScoredAgent]) -> list[str]:

@@ -46,12 +46,18 @@ from pharos.benchmark.contents import (
     unclipped_regret,
 )
 from pharos.benchmark.diagnosis import (
+    OWN,
+    SHIPPED,
     fall_everywhere,
     falls,
     groups_of,
+    is_own,
     lowest_rungs,
     nearest,
+    predictor_sentence,
+    random_play,
     seeds_sentence,
+    shipped_regret,
     strengths,
     without_verdict,
     worst_groups,
@@ -59,6 +65,7 @@ from pharos.benchmark.diagnosis import (
 from pharos.benchmark.latex import latex_of
 from pharos.benchmark.properties import known_properties
 from pharos.benchmark.suite import BenchmarkTask, Ladder, Suite
+from pharos.plots import agent_name
 from pharos.system import storage
 from pharos.system.wording import pluralize
 
@@ -131,7 +138,8 @@ def _lead(contents: Contents) -> list[Element]:
         missing = f", and {pluralize(len(own.missing), 'task')} without results" if own.missing else ""
         text = f"Preliminary: {seeds}{missing}; a result has {contents.suite.protocol.seeds} seeds and all tasks."
         lines.append(element("p", text, class_="warning"))
-    lines += [element("p", text, class_="warning") for text in run_warnings(contents.agent.results)]
+    results = contents.agent.results
+    lines += [element("p", text, class_="warning") for text in (*run_warnings(results), *random_play(results))]
     if own.below_random:
         lines.append(element("p", f"Worse than random play on {', '.join(own.below_random)}.", class_="warning"))
     return lines
@@ -307,18 +315,32 @@ def _residuals(contents: Contents) -> Element:
     means = PREDICTORS[contents.predictor]
     text = (
         f"Tasks where the regret is more than {RESIDUAL:g} above that of {means}, predicted before any run. Theory "
-        "says that an agent of this kind solves them better: look for a bug or a hyperparameter. The last column is "
+        "says that an agent of this kind solves them better: look for a bug or a hyperparameter. At the end is "
         "the regret of the last evaluation: near 0, the agent is slow; near 1, it never learns the task."
     )
+    parts = [element("p", predictor_sentence(contents))]
     if not rows:
-        return _section(title, f"On no task the regret is more than {RESIDUAL:g} above that of {means}.")
-    cells: list[list[str | Element]] = [
-        [_task(task), *(f"{x:.2f}" for x in (own.value, expected)), f"{own.value - expected:+.2f}", f"{final:.2f}"]
-        for task, own, expected in rows
-        for final in [final_regret(contents.agent, task)]
-    ]
-    heads = ["task", "observed", "predicted", "residual", "at the end"]
-    return _section(title, text, _table(heads, cells, numeric=(1, 2, 3, 4)))
+        return _section(title, f"On no task the regret is more than {RESIDUAL:g} above that of {means}.", *parts)
+    lists: tuple[list[list[str | Element]], list[list[str | Element]]] = ([], [])
+    is_beside = False
+    for task, own, expected in rows:
+        final, shipped = final_regret(contents.agent, task), shipped_regret(contents, task)
+        is_beside = is_beside or shipped is not None
+        cells = (own.value, expected), (final, *(() if shipped is None else (shipped,)))
+        first, last = ([f"{x:.2f}" for x in each] for each in cells)
+        row: list[str | Element] = [_task(task), *first, f"{own.value - expected:+.2f}", *last]
+        lists[not is_own(contents, task, own.value)].append(row)
+    heads = ["task", "observed", "predicted", "residual", "at the end", *(["shipped"] if is_beside else [])]
+    names = f"{' and '.join(agent_name(name) for name in SHIPPED[contents.predictor])} of pharos"
+    captions = (
+        f"Worse than theory, and by more than {OWN:g} than {names} (the worse of two): look for a bug here.",
+        f"Theory is too hopeful: {names} fares alike.",
+    )
+    for caption, cells_of_list in zip(captions, lists, strict=True):
+        if cells_of_list:
+            parts += [element("p", caption)] * is_beside
+            parts.append(_table(heads, cells_of_list, numeric=range(1, len(heads))))
+    return _section(title, text, *parts)
 
 
 def _task(task: BenchmarkTask) -> Element:
