@@ -13,13 +13,13 @@ import gymnasium
 import numpy as np
 import planted
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pharos import bisimulation, importers, value_iteration
 from pharos.errors import ParameterError, RuleError, StateSpaceTooLarge, UnknownName
 from pharos.importers.chance import BranchingGenerator, BranchingPythonGenerator, DrawError, DrawTree
 from pharos.importers.side_effects import SideEffects
+from strategies import examples
 
 
 def distribution(draw, generator=BranchingGenerator, most=3_000):
@@ -34,7 +34,7 @@ def distribution(draw, generator=BranchingGenerator, most=3_000):
 # Chance ---------------------------------------------------------------------------------------------------------------
 
 
-@given(st.lists(st.integers(0, 9), min_size=1, max_size=6).filter(any))
+@examples(100, st.lists(st.integers(0, 9), min_size=1, max_size=6).filter(any))
 def test_the_inverse_of_a_distribution_function_gives_back_the_distribution(weights):
     p = np.array(weights) / sum(weights)
     shares = distribution(lambda rng: int(np.argmax(np.cumsum(p) > rng.random())))
@@ -43,7 +43,7 @@ def test_the_inverse_of_a_distribution_function_gives_back_the_distribution(weig
         assert abs(float(shares.get(index, 0)) - probability) <= 2.3e-16
 
 
-@given(st.integers(1, 6), st.integers(-3, 3), st.integers(1, 5))
+@examples(100, st.integers(1, 6), st.integers(-3, 3), st.integers(1, 5))
 def test_whole_parts_of_scaled_numbers_are_uniform(count, low, scale):
     shares = distribution(lambda rng: int(np.floor(rng.uniform(low, low + count))))
     assert shares == {low + k: Fraction(1, count) for k in range(count)}
@@ -242,8 +242,7 @@ def test_all_starts_are_drawn():
     assert len(seeded.start_states) == 1
 
 
-@settings(max_examples=10, deadline=None)
-@given(st.integers(1, 4))
+@examples(10, st.integers(1, 4))
 def test_with_a_horizon_values_are_those_of_all_states(horizon):
     whole, _ = importers.stepping(planted.Slips, check=False)
     part, _ = importers.stepping(planted.Slips, horizon=horizon, check=False)

@@ -91,7 +91,7 @@ class ConsoleStep(NamedTuple):
 
 
 class LayerTask(NamedTuple):
-    """What is the same for all states of a layer that is expanded.
+    """Settings that all states of a layer share when it is expanded.
 
     Attributes:
         depth: of the states.
