@@ -229,7 +229,7 @@ class RandomNumber:
             raise self._refusal()
         return self._unit.below(tuple(array.ravel().tolist()), self._scale, self._offset).reshape(array.shape)
 
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **_: Any) -> Any:
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: object, **_: object) -> Any:
         """Answers to NumPy's functions: comparisons, whole parts, sums and products."""
         names = UFUNCS.get(ufunc.__name__) if method == "__call__" else None
         if names is None:
@@ -242,7 +242,7 @@ class RandomNumber:
             raise self._refusal()
         return answer
 
-    def __lt__(self, other: Any) -> Any:
+    def __lt__(self, other: object) -> Any:
         return self._is_below(other)
 
     __le__ = __lt__
@@ -269,10 +269,10 @@ class RandomNumber:
             return float(offset)
         return RandomNumber(self._unit, self._scale * scale, self._offset * scale + offset)
 
-    def __mul__(self, other: Any) -> Any:
+    def __mul__(self, other: object) -> Any:
         return self._moved(other, 0)
 
-    def __add__(self, other: Any) -> Any:
+    def __add__(self, other: object) -> Any:
         return self._moved(1, other)
 
     __rmul__, __radd__ = __mul__, __add__
@@ -280,7 +280,7 @@ class RandomNumber:
     def __sub__(self, other: Any) -> Any:
         return self._moved(1, -_exact(other) if np.ndim(other) == 0 else other)
 
-    def __rsub__(self, other: Any) -> Any:
+    def __rsub__(self, other: object) -> Any:
         return self._moved(-1, other)
 
     def __neg__(self) -> Any:
@@ -321,7 +321,7 @@ class RandomNumber:
             self._unit.branches, "random(), and used the number itself and not a comparison with it", self._unit.line
         )
 
-    def _refuse(self, *_: Any, **__: Any) -> Any:
+    def _refuse(self, *_: object, **__: object) -> Any:
         raise self._refusal()
 
     __float__ = __index__ = __complex__ = __array__ = __reduce__ = _refuse
@@ -381,7 +381,7 @@ class BranchingGenerator:
         drawn = int(low) + self._index(int(high) - int(low) + bool(endpoint))
         return drawn if dtype is int else np.dtype(dtype).type(drawn)
 
-    def random(self, size: Any = None, *_: Any, **__: Any) -> Any:
+    def random(self, size: object = None, *_: object, **__: object) -> Any:
         """A number from [0, 1)."""
         return self.uniform(size=size)
 
@@ -461,15 +461,15 @@ class BranchingGenerator:
         """Numbers from [0, 1) in an array of this shape."""
         return self.uniform(size=shape or None)
 
-    def random_sample(self, size: Any = None) -> Any:
+    def random_sample(self, size: object = None) -> Any:
         """A number from [0, 1)."""
         return self.uniform(size=size)
 
-    def randint(self, low: Any, high: Any = None, size: Any = None, dtype: Any = int) -> Any:
+    def randint(self, low: object, high: object = None, size: object = None, dtype: object = int) -> Any:
         """An integer from low on and below high."""
         return self.integers(low, high, size, dtype)
 
-    def seed(self, *_: Any, **__: Any) -> None:
+    def seed(self, *_: object, **__: object) -> None:
         """Seeding changes nothing: every outcome is drawn."""
 
     def __reduce__(self) -> Any:
@@ -509,7 +509,7 @@ class BranchingPythonGenerator(BranchingGenerator):
         rest = list(items)
         return [rest.pop(self._index(len(rest))) for _ in range(k)]
 
-    def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
+    def uniform(self, low: object = 0.0, high: object = 1.0, size: object = None) -> Any:
         """A number from [low, high]."""
         return super().uniform(low, high)
 
@@ -518,7 +518,7 @@ class BranchingPythonGenerator(BranchingGenerator):
         return self._index(1 << bits)
 
 
-def _normalized(weights: Any) -> list[Fraction]:
+def _normalized(weights: object) -> list[Fraction]:
     """Weights as fractions that sum to 1 exactly."""
     shares = [_exact(weight) for weight in np.asarray(weights).ravel()]
     total = sum(shares)

@@ -296,7 +296,7 @@ class AtariGame:
         self.ale.restoreSystemState(state)
         return self._play(self.legal[action])
 
-    def _play(self, action: Any) -> tuple[float, bool]:
+    def _play(self, action: object) -> tuple[float, bool]:
         ale, reward, ends = self.ale, 0, False
         act, lives_left, lives = ale.act, ale.lives, ale.lives() if self.life_loss_ends else 0
         for _ in range(self.frame_skip):

@@ -200,7 +200,7 @@ def name_of(env: object) -> str:
     return "table" if isinstance(env, Mapping | list | tuple) else capped(env)
 
 
-def _rows(env: Any) -> tuple[Any, list[list[list]]]:
+def _rows(env: object) -> tuple[Any, list[list[list]]]:
     """(the environment without wrappers, rows[s][a] of its table); FileFormatError where it has none."""
     inner = getattr(env, "unwrapped", env)
     table = getattr(inner, "P", inner)
@@ -483,7 +483,7 @@ def _copy(inner: object) -> Any:
         return inner
 
 
-def _state_number(observation: Any, states: int, first: int = 0) -> int | None:
+def _state_number(observation: object, states: int, first: int = 0) -> int | None:
     number = as_integer(observation)
     return number - first if isinstance(number, int) and 0 <= number - first < states else None
 

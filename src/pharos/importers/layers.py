@@ -41,7 +41,7 @@ class Console(Protocol):
     def start(self) -> bytes:
         """Begin an episode; the saved start state."""
 
-    def load(self, saved: bytes) -> Any:
+    def load(self, saved: bytes) -> object:
         """A saved state in the form that `step` takes."""
 
     def step(self, state: Any, action: int) -> tuple[float, bool]:

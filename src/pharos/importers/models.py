@@ -410,7 +410,7 @@ FORMS = (
 )
 
 
-def _formula(path: Path, program: Any, properties: dict[str, Any], text: str) -> Any:
+def _formula(path: Path, program: object, properties: dict[str, Any], text: str) -> Any:
     """A property of Storm, by its name in a JANI file, or parsed."""
     if text in properties:
         return properties[text]
@@ -427,7 +427,7 @@ def _formula(path: Path, program: Any, properties: dict[str, Any], text: str) ->
     return parsed[0]
 
 
-def _parsed(text: str, program: Any) -> list[Any]:
+def _parsed(text: str, program: object) -> list[Any]:
     """Properties of Storm, from a text as PRISM reads it."""
     import stormpy
 
@@ -473,7 +473,7 @@ def _query_of(model: Any, prop: Any) -> Query:
         advice = "; steps are --target with --horizon" if "<=" in text.partition("[")[2] else ""
         return ParameterError(f"property {capped(text)!r}: is not answered; expected {FORMS}{advice}")
 
-    def where(condition: Any) -> np.ndarray:
+    def where(condition: object) -> np.ndarray:
         mask = np.zeros(states, np.bool_)
         mask[list(stormpy.model_checking(model, condition).get_truth_values_vector())] = True
         return mask

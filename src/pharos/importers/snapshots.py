@@ -84,7 +84,7 @@ def _blank(kind: type) -> Any:
     return kind.__new__(kind)  # type: ignore[call-overload]
 
 
-def _set_fields(value: Any, fields: dict[str, Any]) -> None:
+def _set_fields(value: object, fields: dict[str, Any]) -> None:
     vars(value).update(fields)
 
 
@@ -92,7 +92,7 @@ def _view(base: np.ndarray, offset: int, shape: tuple, strides: tuple, kind: str
     return np.ndarray(shape, kind, buffer=base, offset=offset, strides=strides)
 
 
-def _without_pickle_methods(value: Any) -> bool:
+def _without_pickle_methods(value: object) -> bool:
     """Whether an object would be made anew of its arguments when it is copied: Gymnasium's EzPickle, and its copies."""
     return "_ezpickle_args" in getattr(value, "__dict__", ())
 
@@ -156,7 +156,7 @@ class EnvironmentSnapshots:
 
     # Saving -----------------------------------------------------------------------------------------------------------
 
-    def save(self, value: Any) -> bytes:
+    def save(self, value: object) -> bytes:
         """A snapshot of an environment, or of a part of it."""
         stored = io.BytesIO()
         pickler = _Pickler(stored, protocol=5)
@@ -175,7 +175,7 @@ class EnvironmentSnapshots:
         reader.persistent_load = self._referred  # type: ignore[method-assign,assignment]
         return reader.load()
 
-    def _culprit(self, env: Any) -> str:
+    def _culprit(self, env: object) -> str:
         """The field of an environment that cannot be copied, for a message."""
         for each in chain_of(env):
             for name, value in sorted(getattr(each, "__dict__", {}).items()):
@@ -189,7 +189,7 @@ class EnvironmentSnapshots:
                     return f"field {name} of {named(each)} ({type(value).__name__}): "
         return ""
 
-    def _reference(self, value: Any) -> Any:
+    def _reference(self, value: object) -> Any:
         """Name of an object that is outside a snapshot; None for the others."""
         kind = type(value)
         if kind in PLAIN:
@@ -205,7 +205,7 @@ class EnvironmentSnapshots:
             return self._generator(value)
         return None if _is_importable(value) else self._add_outside(value)
 
-    def _generator(self, value: Any) -> str:
+    def _generator(self, value: object) -> str:
         if self.is_strict and not isinstance(value, BranchingGenerator):
             raise DrawError(
                 f"made a generator of its own ({type(value).__module__}.{type(value).__name__}), whose draws are not "
@@ -213,7 +213,7 @@ class EnvironmentSnapshots:
             )
         return "python" if isinstance(value, python_random.Random | BranchingPythonGenerator) else "numpy"
 
-    def _add_outside(self, value: Any) -> int:
+    def _add_outside(self, value: object) -> int:
         if self.is_closed:
             raise RuleError(
                 f"made a {type(value).__name__} in a step, which other processes do not have; try one worker"
@@ -323,7 +323,7 @@ def field_names(env: Stepped) -> set[str]:
     return names.union(*(_fields_of(value) for _, value in feeder.places.values()))
 
 
-def digest_of(value: Any) -> bytes:
+def digest_of(value: object) -> bytes:
     """Digest of any value, as of the field of an environment."""
     hasher = hashlib.blake2b(digest_size=16)
     _Feeder(hasher.update, frozenset()).feed(value)
@@ -337,7 +337,7 @@ class _Feeder:
         self.put, self.ignore = put, ignore
         self.places: dict[int, tuple[int, Any]] = {}
 
-    def feed(self, value: Any) -> None:
+    def feed(self, value: object) -> None:
         """Write a value."""
         kind = type(value)
         if kind in PLAIN:
@@ -349,7 +349,7 @@ class _Feeder:
         elif (kind not in CONTAINERS and not self._is_fed_as_name(value)) or kind in CONTAINERS:
             self._feed_once(value)
 
-    def _feed_once(self, value: Any) -> None:
+    def _feed_once(self, value: object) -> None:
         place = self.places.get(id(value))
         if place is not None:
             self.put(f"@{place[0]};".encode())
@@ -394,7 +394,7 @@ class _Feeder:
             if not callable(contents):
                 self.feed(contents)
 
-    def _feed_object(self, value: Any) -> None:
+    def _feed_object(self, value: object) -> None:
         if isinstance(value, np.ndarray):
             self._feed_array(value)
         elif isinstance(value, dict):
@@ -439,7 +439,7 @@ class _Feeder:
             digests.append(hasher.digest())
         self.put(f"s{len(digests)}:".encode() + b"".join(sorted(digests)))
 
-    def _feed_fields(self, value: Any) -> None:
+    def _feed_fields(self, value: object) -> None:
         """Fields of an object of any class."""
         kind = type(value)
         self.put(f"<{kind.__module__}.{kind.__qualname__}".encode())
@@ -452,7 +452,7 @@ class _Feeder:
         if is_hidden or not (fields or hasattr(value, "__dict__") or hasattr(kind, "__slots__")):
             self._feed_reduced(value)
 
-    def _feed_reduced(self, value: Any) -> None:
+    def _feed_reduced(self, value: object) -> None:
         """The parts of which an object of a class in C is made again."""
         parts = value.__reduce_ex__(4)
         if isinstance(parts, str):
@@ -483,7 +483,7 @@ def _contents(cell: Any) -> Any:
         return None
 
 
-def _fields_of(value: Any) -> dict[str, Any]:
+def _fields_of(value: object) -> dict[str, Any]:
     """Attributes of an object: those of its dictionary and of its slots."""
     fields = dict(getattr(value, "__dict__", ()))
     for kind in type(value).__mro__:
@@ -508,7 +508,7 @@ def _holds_no_state(kind: type) -> bool:
 _is_outside = cast(Callable[[Any], bool], functools.cache(_holds_no_state))
 
 
-def _is_importable(value: Any) -> bool:
+def _is_importable(value: object) -> bool:
     """Whether a class or function is found under its name."""
     if not isinstance(value, type | types.FunctionType):
         return False
@@ -518,7 +518,7 @@ def _is_importable(value: Any) -> bool:
     return target is value
 
 
-def _tame(value: Any, generator: BranchingGenerator) -> None:
+def _tame(value: object, generator: BranchingGenerator) -> None:
     """Let a space, and those in it, draw from a generator that branches."""
     if ".spaces." not in f"{type(value).__module__}.":
         return
@@ -553,7 +553,7 @@ def integers_of(env: Stepped, ignore: frozenset[str]) -> dict[str, int]:
     repeated: set[str] = set(ignore) | OWNED
     visited: set[int] = set()
 
-    def visit(value: Any, depth: int) -> None:
+    def visit(value: object, depth: int) -> None:
         for name, item in getattr(value, "__dict__", {}).items():
             if isinstance(item, int | np.integer) and not isinstance(item, bool):
                 repeated.update([name] if name in values else ())

@@ -126,7 +126,7 @@ class StepCheckpoint:
             "rewards": np.array(states.rewards[outcomes], np.float64),
         }
 
-    def _check_identity(self, stored: Any) -> None:
+    def _check_identity(self, stored: object) -> None:
         if stored == self.identity:
             return
         stored = stored if isinstance(stored, dict) else {}

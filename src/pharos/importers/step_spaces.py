@@ -92,7 +92,7 @@ class SpaceRecorder:
             self.notes.append(f"{name}: its observations, {capped(space, 80)}, cannot be flattened; none are recorded")
 
     @staticmethod
-    def _can_flatten(space: Any) -> bool:
+    def _can_flatten(space: object) -> bool:
         from gymnasium import spaces
 
         try:

@@ -40,7 +40,7 @@ class NamedCode:
     folder: str
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: object) -> Any:
         """Answer of the function."""
         return self.function(*arguments, **self.options)
 

@@ -87,7 +87,7 @@ class ExpansionsElsewhere:
         receiver.close()
         self._pipes[key] = sender
 
-    def submit(self, saved: Any) -> None:
+    def submit(self, saved: object) -> None:
         """Add a state."""
         self._buffer.append(saved)
         if len(self._buffer) == BLOCK:
