@@ -36,7 +36,7 @@ from types import SimpleNamespace
 from pharos.system import workers
 
 atexit.register(lambda: (print("ending", flush=True), time.sleep(0.5)))
-workers._work(lambda _: None, (), SimpleNamespace(send=lambda _: None), dict(os.environ), True)
+workers._work(lambda _: None, (), SimpleNamespace(send=lambda _: None), dict(os.environ), True, False)
 """
 
 

@@ -93,7 +93,7 @@ class Backup(Generic[M]):
         # without chance and discount, sums of whole multiples of a power of two are exact as long as 53 bits hold them
         is_sum = mdp.gamma == 1.0 and chance.is_none and mdp.dynamics.is_deterministic
         is_pure = not isinstance(select, PolicyTable) or select.actions is not None
-        self._exact_to = 2.0**53 * mdp.reward_table.unit if is_sum and is_pure else 0.0
+        self._exact_to = 2.0**53 * mdp.reward_table.unit if is_sum and is_pure and mdp.reward_table.unit else -1.0
 
     def factor_of(self, mass: float) -> float:
         """Contraction factor, where the probabilities of choosing sum to at most `mass`."""
@@ -128,18 +128,18 @@ class Backup(Generic[M]):
 
     def rounding(self, largest: float) -> float:
         """A bound on the rounding error of one backup of entries up to `largest`: half a unit for each operation, and
-        what storing it costs. 0 where whole numbers are added up, and 53 bits hold them.
+        what storing it costs.
         """
-        if self._exact_to and largest + self.largest_reward <= self._exact_to:
-            return self.stored(largest)
         return float(self.rounding_of(self.largest_reward, largest)) + self.stored(largest)
 
     def rounding_of(self, rewards: Numbers, largest: Numbers) -> Numbers:
         """A bound on the rounding error of a backup in 64 bits of rewards up to `rewards`, entries up to `largest`.
 
-        Rewards that are means have errors of their own, which any choice between them passes on once.
+        Rewards that are means have errors of their own, which any choice between them passes on once. 0 where whole
+        numbers are added up, and 53 bits hold them.
         """
-        return self.operations * (_UNIT * (rewards + largest) + 2.0**-1074) + self.rounding_of_rewards
+        bound = self.operations * (_UNIT * (rewards + largest) + 2.0**-1074) + self.rounding_of_rewards
+        return bound * np.logical_not(rewards + largest <= self._exact_to)
 
     def stored(self, largest: float) -> float:
         """A bound on the error of storing a backup, where the result is at most `largest`: 0 in 64 bits."""
