@@ -287,6 +287,7 @@ def test_residuals_of_the_shipped_agent_are_those_of_theory_and_those_of_a_fault
     assert theirs.count("<tr>") == 1 + len(residuals(contents_of("ppo")))
 
 
+@pytest.mark.long
 def test_the_kind_is_asked_for_where_the_name_does_not_say_it():
     results = replace(AgentResults.read("dqn"), agent="mine.py:learn", record={})
     counts = {each: len(residuals(contents_of(results, predictor=each))) for each in ("dqn", "ppo", "table")}

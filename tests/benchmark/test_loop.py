@@ -59,7 +59,7 @@ def always(action):
 # Tasks ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_loop_leaves_the_files_of_the_same_generator(suite, tmp_path):
     """The loop is that of LEARN, written out around the environment of each task."""
     (tmp_path / "mine.py").write_text(LEARN)
@@ -182,6 +182,7 @@ def test_a_loop_of_stable_baselines3_takes_the_environment_and_its_model_is_a_po
 # Any target -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_run_of_any_target_has_the_folder_of_train(tmp_path):
     options = {"random": 0.1, "size": 4, "observation": "one_hot"}
     with pharos.Run("frozen_lake", steps=400, out=tmp_path / "run", **options) as run:
@@ -248,7 +249,7 @@ def test_environments_of_a_run_go_into_vector_environments():
 # The check of an agent ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_check_of_an_agent_says_what_is_wrong(tmp_path, monkeypatch):
     file, spoilt = tmp_path / "mine.py", tmp_path / "spoilt.py"
     file.write_text(LEARN)

@@ -211,7 +211,7 @@ def test_options_change_the_game_as_they_say():
     assert not consoles.AtariGame("breakout", 30, life_loss_ends=False).step(state, 0)[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_processes_and_a_kill_change_nothing_of_a_folder(tmp_path):
     pytest.importorskip("ale_py")
     words = ["import", "atari", "freeway", "--horizon", "5", "--frame-skip", "4"]

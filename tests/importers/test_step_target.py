@@ -58,6 +58,7 @@ def test_an_interrupted_import_goes_on_and_ends_with_the_same_bytes(count, tmp_p
     assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
 
 
+@pytest.mark.long
 def test_draws_are_repeated_where_an_import_goes_on(tmp_path, here, monkeypatch):
     from pharos.importers import search
 
@@ -69,7 +70,7 @@ def test_draws_are_repeated_where_an_import_goes_on(tmp_path, here, monkeypatch)
     assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal")
 def test_a_killed_import_goes_on(tmp_path, here):
     armed = tmp_path / "armed"
@@ -129,7 +130,7 @@ def test_two_imports_do_not_meet(tmp_path, here):
         imported("planted.py:Walk", tmp_path / "e")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_processes_find_the_same(tmp_path, here):
     for target in ("Clock", "Heavy"):  # what is sent at once is more than a pipe holds
         one, two = (tmp_path / f"{target}{workers}" for workers in (1, 2))
@@ -197,7 +198,7 @@ def test_environments_that_packages_announce(tmp_path, monkeypatch):
     assert mdp.num_states == 28
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_runs_as_printed(tmp_path, monkeypatch, capsys):
     page = (HERE.parents[2] / "docs" / "your-own-environment.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```(\w*)\n(.*?)```", page, re.DOTALL)

@@ -79,6 +79,7 @@ def conditions():
     return st.recursive(leaves, larger, max_leaves=6)
 
 
+@pytest.mark.long
 @examples(400, conditions())
 def test_expressions_are_those_of_plain_python_with_the_precedence_of_prism(tree):
     text, _, value = tree
@@ -203,6 +204,7 @@ def test_names_that_do_not_fit_are_refused():
     assert "expected 2 names" in refusal(ParameterError, mdp.with_names, actions=["left"])
 
 
+@pytest.mark.long
 def test_own_environments_are_asked_by_their_variables():
     lake = pharos.build(pharos.make("frozen_lake", slippery=True)).mdp()
     assert names_of(lake).in_words == "terminal; variables row (0 to 3), column (0 to 3)"

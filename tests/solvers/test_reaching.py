@@ -14,6 +14,7 @@ from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import examples
 
 
+@pytest.mark.long
 @examples(300, mdps_with_cycles(rewards=(0.0, 0.0, 1.0, 0.1)), st.sets(st.integers(0, 4), min_size=1), st.booleans())
 def test_they_are_those_of_the_best_and_the_worst_policy(mdp, target, is_random):
     mdp = random_actions(mdp, 0.25) if is_random else mdp
