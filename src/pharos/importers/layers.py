@@ -222,7 +222,7 @@ def explored(
     Args:
         make: a new game; importable, as processes of their own call it too.
         identity: what decides the game; layers of another one are refused.
-        folder: of finished layers; None: nothing is store.
+        folder: of finished layers; None: nothing is stored.
         settles: whether the last step may pay more than a step before would.
         progress: called with a line after each layer and now and then.
     Raises:
