@@ -35,7 +35,7 @@ class DrawError(RuleError):
 
 
 def line_of_code(frame: FrameType | None = None) -> str:
-    """The innermost line of the environment's code that is running, as "car.py, line 81"; "" where there is none."""
+    """The innermost line of the environment's code that is running, file and number; "" where there is none."""
     frame = frame or sys._getframe(1)
     while frame is not None:
         path = frame.f_code.co_filename.replace("\\", "/")

@@ -156,7 +156,7 @@ def move_global_generators() -> None:
 
 
 def line_that_changes(run: Callable[[], object], state: Callable[[], object]) -> str:
-    """The line of the environment's code that changes a state while it runs, as "car.py, line 81"; else ""."""
+    """The line of the environment's code that changes a state while it runs, file and number; else ""."""
     before, line, last = state(), "", ""
 
     def trace(frame: FrameType, *_: object) -> Any:
