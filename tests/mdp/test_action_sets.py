@@ -30,9 +30,9 @@ def worlds(draw):
     return P, np.round(rng.normal(size=(STATES, ACTIONS)), 1), sets
 
 
-def of_chance(world, sticky, random):
+def of_chance(world, sticky, random, gamma=GAMMA, ends=False):
     P, R, sets = world
-    mdp = TabularMDP.from_matrices(P, np.where(sets, R, -np.inf), gamma=GAMMA, axes="SAS")
+    mdp = TabularMDP.from_matrices(P, np.where(sets, R, -np.inf), gamma=gamma, axes="SAS", ends=ends)
     mdp = pharos.sticky_actions(mdp, sticky) if sticky else mdp
     return pharos.random_actions(mdp, random) if random else mdp
 
@@ -316,10 +316,7 @@ def outcome_of(solve, mdp):
 @pytest.mark.long
 @examples(150, worlds_that_may_end(), st.sampled_from([(0.25, 0.0), (0.25, 0.5), (1.0, 0.0), (0.0, 0.5)]))
 def test_total_rewards_under_chance_are_those_of_the_nodes_written_out(world, chance):
-    P, R, sets = world
-    mdp = TabularMDP.from_matrices(P, np.where(sets, R, -np.inf), gamma=1.0, axes="SAS", ends=True)
-    mdp = pharos.sticky_actions(mdp, chance[0]) if chance[0] else mdp
-    mdp = pharos.random_actions(mdp, chance[1]) if chance[1] else mdp
+    sets, mdp = world[2], of_chance(world, *chance, gamma=1.0, ends=True)
     nodes = written_out(world, *chance)
     parts, expected = end_components(mdp), end_components(nodes)
     if mdp.is_sticky:
@@ -343,9 +340,7 @@ def test_total_rewards_under_chance_are_those_of_the_nodes_written_out(world, ch
 def test_reaching_under_chance_is_that_of_the_nodes_written_out(world, chance):
     """The start, where there is no previous action, is one more node, whose choices are executed as on a first step."""
     P, R, sets = world
-    mdp = TabularMDP.from_matrices(P, np.where(sets, R, -np.inf), gamma=1.0, axes="SAS", ends=True)
-    mdp = pharos.sticky_actions(mdp, chance[0]) if chance[0] else mdp
-    mdp = pharos.random_actions(mdp, chance[1]) if chance[1] else mdp
+    mdp = of_chance(world, *chance, gamma=1.0, ends=True)
     nodes, target = written_out(world, *chance), np.arange(STATES) == STATES - 1
     costs = np.where(target[:, None], 0.0, np.abs(np.where(sets, R, 0.0)))
     of_nodes = np.zeros((STATES * ACTIONS, ACTIONS))

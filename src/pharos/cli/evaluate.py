@@ -184,13 +184,7 @@ def reaching(
             np.savez_compressed(file, **arrays)
     answer = {
         "reach": numbers,
-        "seconds": time.perf_counter() - began,
-        "compiling_seconds": compiling.seconds(),
-        **{each: getattr(chance, each) for each in ACTING},
-        "tolerance": tolerance,
-        "num_states": mdp.num_states,
-        "num_actions": mdp.num_actions,
-        "file": None if out is None else str(out),
+        **_how_it_was_answered(mdp, tolerance, chance, out, began),
     }
     facts += [("states of the target", f"{numbers['states']:,} of {mdp.num_states:,}")]
     reply = Answer(answer, (f"reaching {name} in {target.title}", facts))
@@ -200,6 +194,21 @@ def reaching(
     best = "maximum" if cost is None or cost["infinite"] else "least_cost"
     rows = readable_policy(result.stopped, arrays[f"{best}_policy"], policy_rows, f"policy of the {REACHED[best]}")
     return with_policy(reply, rows)
+
+
+def _how_it_was_answered(
+    mdp: "TabularMDP", tolerance: float, chance: "ChanceSetting", out: Path | None, began: float
+) -> dict[str, Any]:
+    """Keys of answers to other objectives than values: time, chance, tolerance, size, and the file written."""
+    return {
+        "seconds": time.perf_counter() - began,
+        "compiling_seconds": compiling.seconds(),
+        **{each: getattr(chance, each) for each in ACTING},
+        "tolerance": tolerance,
+        "num_states": mdp.num_states,
+        "num_actions": mdp.num_actions,
+        "file": None if out is None else str(out),
+    }
 
 
 def averaging(
@@ -239,13 +248,7 @@ def averaging(
         "gain_at_start": gain._asdict(),
         "uniform_gain_at_start": of_uniform._asdict(),
         "bias_at_start": None if bias is None else best.at_start(bias)._asdict(),
-        "seconds": time.perf_counter() - began,
-        "compiling_seconds": compiling.seconds(),
-        **{each: getattr(chance, each) for each in ACTING},
-        "tolerance": tolerance,
-        "num_states": mdp.num_states,
-        "num_actions": mdp.num_actions,
-        "file": None if out is None else str(out),
+        **_how_it_was_answered(mdp, tolerance, chance, out, began),
     }
     facts = [
         ("optimal average reward a step", gain),
