@@ -162,6 +162,25 @@ def test_tables(count):
     count(f"400 malformed tables: {refused} refused")
 
 
+TARGET = '(x=3 | y>-1 & !goal) & x+2*y <= 4 & !"goal"'
+
+
+def test_targets(count):
+    """A character of an expression replaced, left out or doubled: refused in one line, or states of which it is true."""
+    table = np.minimum(np.arange(6) + 1, 5)[:, None]
+    mdp = TabularMDP.from_arrays(table, np.zeros((6, 1)), terminal=np.arange(6) == 5)
+    mdp = mdp.with_names(labels={"goal": [5]}, variables={"x": np.arange(6), "y": np.arange(6) - 2})
+    rng, tally = np.random.default_rng(4), Counter()
+    for k in range(600):
+        at, letter = int(rng.integers(len(TARGET))), chr(int(rng.integers(32, 127)))
+        text = TARGET[:at] + (letter, "", 2 * TARGET[at])[k % 3] + TARGET[at + 1 :]
+        reached, _ = tried(lambda text=text: pharos.reach(mdp, text))
+        assert reached is None or (reached.target.shape, reached.target.dtype) == ((6,), bool)
+        tally["refused" if reached is None else "read"] += 1
+    assert min(tally["refused"], tally["read"]) >= 60, tally
+    count(f"{tally.total()} malformed targets: {dict(tally)}")
+
+
 MODEL = """mdp
 module m
   s : [0..3] init 0;
