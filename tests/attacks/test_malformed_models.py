@@ -166,7 +166,7 @@ TARGET = '(x=3 | y>-1 & !goal) & x+2*y <= 4 & !"goal"'
 
 
 def test_targets(count):
-    """A character of an expression replaced, left out or doubled: refused in one line, or states of which it is true."""
+    """A character of an expression replaced, left out or doubled: refused in one line, or states where it holds."""
     table = np.minimum(np.arange(6) + 1, 5)[:, None]
     mdp = TabularMDP.from_arrays(table, np.zeros((6, 1)), terminal=np.arange(6) == 5)
     mdp = mdp.with_names(labels={"goal": [5]}, variables={"x": np.arange(6), "y": np.arange(6) - 2})
