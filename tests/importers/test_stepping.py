@@ -234,6 +234,12 @@ def test_wrappers_count():
     assert value == pytest.approx(value_iteration(pharos.sticky_actions(plain, 0.25), 1e-10).value_at_start, abs=1e-9)
 
 
+def test_a_wrapper_that_draws_shows_each_state_its_own_picture():
+    _, recording = importers.stepping(planted.pictured)
+    assert recording.observed == "image"
+    assert recording.observations[:, 0, :, 0].argmax(axis=1).tolist() == [1, 0, 2, 3]
+
+
 def test_all_starts_are_drawn():
     mdp, _ = importers.stepping(planted.StartsAnywhere)
     assert mdp.start_states.tolist() == [0, 1, 2, 3]
