@@ -164,7 +164,7 @@ def test_keys_rewards_and_weights_are_named(tmp_path, here):
 @pytest.mark.parametrize(
     ("target", "message"),
     [
-        ("FrozenLake-v1", "expected gymnasium:ID, module:factory or file.py:factory"),
+        ("FrozenLake-v1", "expected gymnasium:ID, gymnax:ID, pgx:ID, module:factory or file.py:factory"),
         ("gymnasium:NoSuch-v7", "Gymnasium cannot make it"),
         ("gymnasium:CartPole-v1", "CartPole-v1: reset() drew"),
         ("planted.py:nobody", "expected a function or a class"),

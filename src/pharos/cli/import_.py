@@ -120,10 +120,10 @@ def env(
     workers: Count = 1,
     check: bool = True,
 ) -> Answer:
-    """Import any environment of Gymnasium by stepping it from every state; the same command resumes.
+    """Import any environment of Gymnasium or JAX by stepping it from every state; the same command resumes.
 
     Args:
-        target: gymnasium:ID, module:factory or file.py:factory; wrappers count.
+        target: gymnasium:ID, gymnax:ID, pgx:ID, module:factory, file.py:factory, or jax:file.py:factory.
         option: Of the environment or the factory, such as is_slippery=false.
         seed: Of one reset; else all starts are imported.
         key: module:function or file.py:function (environment) -> equal for equal states; pairs are checked.
