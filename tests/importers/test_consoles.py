@@ -1,5 +1,6 @@
 """Atari and Procgen as tables: BRIDGE's published tables, fresh episodes of the games, and the search by layers."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -72,6 +73,25 @@ def test_a_search_that_was_interrupted_goes_on_from_its_last_layer(broken_at, mo
     assert parts(resumed) == parts(explored(6))
     sizes = explored(6).sizes
     assert resumed.num_steps == 3 * sum(sizes[broken_at:])
+
+
+def test_a_disk_that_is_full_leaves_the_layers_that_were_finished(monkeypatch, tmp_path):
+    fsync, room = os.fsync, 9
+
+    def write(descriptor):
+        nonlocal room
+        room -= 1
+        if room < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(descriptor)
+
+    with monkeypatch.context() as disk, pytest.raises(OSError, match="No space left"):
+        disk.setattr(os, "fsync", write)
+        explored(6, tmp_path)
+    stored = len(list(tmp_path.glob("layer-*.npz")))
+    resumed, whole = explored(6, tmp_path), explored(6)
+    assert parts(resumed) == parts(whole)
+    assert 1 < stored < 5 and resumed.num_steps <= whole.num_steps - 3 * sum(whole.sizes[: stored - 1])
 
 
 def test_layers_of_a_longer_horizon_serve_a_shorter_one(tmp_path):

@@ -27,8 +27,8 @@ from pharos.importers.wrappers import Stepped, reset
 from pharos.system.wording import capped
 
 CHECKED_COPIES = 50
-CHECKED_PAIRS = 200
-"""Pairs of different states with one key that are compared: the first 100, and then each tenth."""
+CHECKED_PAIRS = 1_000
+"""Pairs of different states with one key that are compared: the first half, and then each tenth."""
 WALK_STEPS = 20
 """Steps of a walk from each such pair, as long as nothing is drawn."""
 REPEATED = 100
