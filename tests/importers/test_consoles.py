@@ -20,7 +20,7 @@ from pharos import exporters, hardness, importers
 from pharos.errors import FolderLocked, MissingExtra, ParameterError, StateSpaceTooLarge, UnknownName
 from pharos.importers import consoles, layers
 from pharos.system import storage
-from refusals import refusal
+from refusals import failing, refusal
 from toy_console import ToyConsole, naive_layers
 
 BRIDGE = Path(__file__).parents[1] / "data" / "bridge"
@@ -275,6 +275,9 @@ def test_a_rom_that_is_not_there_and_a_package_that_is_not_are_one_line(monkeypa
     assert "pharos-rl[atari]" in refusal(MissingExtra, importers.atari, "pong")
     monkeypatch.setitem(sys.modules, "procgen", None)
     assert "pip install --no-deps procgen-mirror==0.10.7" in refusal(ParameterError, importers.procgen, "maze")
+    parts_missing = SimpleNamespace(ProcgenGym3Env=failing(ModuleNotFoundError("No module named 'pycparser'")))
+    monkeypatch.setitem(sys.modules, "procgen", parts_missing)
+    assert "(No module named 'pycparser')" in refusal(ParameterError, importers.procgen, "maze")
 
 
 @pytest.mark.parametrize(
