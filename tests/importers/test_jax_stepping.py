@@ -80,6 +80,7 @@ def test_draws_are_those_of_jax(jax):
     assert distribution(jax, lambda key: random.categorical(key, np.log([0.5, 0.5]))) == {(0,): half, (1,): half}
     assert distribution(jax, lambda key: random.permutation(key, 3))[2, 0, 1] == third / 2
     assert len(distribution(jax, lambda key: random.choice(key, 4, (2,), replace=False))) == 12
+    assert distribution(jax, lambda key: random.bernoulli(key, shape=(0,))) == {(): 1}
     assert distribution(jax, lambda key: random.uniform(key, (2,), minval=-1.0) > 0.5)[True, False] == 3 * half / 8
     assert distribution(jax, lambda key: random.bernoulli(key, jnp.float32(0.25) * 1)) == {
         (True,): half / 2,
@@ -117,7 +118,10 @@ REFUSED = {
         lambda jax, key: jax.vmap(jax.random.bernoulli)(jax.random.split(key, 2)),
         r"drew bernoulli\(\).*jax\.vmap",
     ),
-    "many": (lambda jax, key: jax.random.randint(key, (8,), 0, 5), "more than 3,000 outcomes"),
+    "many": (
+        lambda jax, key: jax.random.randint(key, (8,), 0, 5),
+        r"more than 3,000 outcomes \(randint\(\) \(.*\): one of 5, 8 times\)",
+    ),
     "shuffle": (lambda jax, key: jax.random.permutation(key, 10), "3,628,800 outcomes"),
     "loop": (
         lambda jax, key: jax.lax.while_loop(
@@ -163,6 +167,12 @@ def test_counters_are_named_and_what_matters_is_not_ignored(jax):
 
     with pytest.raises(RuleError, match=r"behave differently \(action \d.*: reward 0 and 1\)"):
         stepped(pays_late)
+    from pharos.importers.jax_stepping import jax_source
+    from pharos.importers.stepping import SteppingOptions, SteppingRun
+
+    late = importers.JaxFunctions(pays_late, reset, 2, counters=("steps",))
+    mdp, _ = SteppingRun(lambda: late, SteppingOptions(), horizon=5, source_of=jax_source).finish(None)
+    assert value_iteration(mdp).value_at_start == 1.0 and mdp.num_states > 5
     with pytest.raises(UnknownName, match="'stepz'"):
         stepped(ignore=["stepz"])
     with pytest.raises(StateSpaceTooLarge, match="more than 9 states"):

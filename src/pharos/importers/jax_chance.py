@@ -8,6 +8,7 @@ the code gives as numbers are exact fractions; those that depend on the state ar
 import contextlib
 import itertools
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from functools import partial, wraps
@@ -72,8 +73,10 @@ class TracedFunction:
             raise DrawError(f"{what} draws by other ways than the functions of jax.random, which cannot be followed")
         sizes = [draw.size for draw in tape.draws]
         if math.prod(sizes) > most:
-            words = ", ".join(f"{draw.words}: {draw.size:,}" for draw in tape.draws[:8])
-            raise DrawError(f"{what} has more than {most:,} outcomes ({words})")
+            counts = Counter(f"{draw.words}: one of {draw.size:,}" for draw in tape.draws)
+            words = ", ".join(text + f", {count} times" * (count > 1) for text, count in counts.items())
+            start = "; start from one state with a seed (--seed 0)" if what == "reset()" else ""
+            raise DrawError(f"{what} has more than {most:,} outcomes ({words}){start}")
         combinations = list(itertools.product(*map(range, sizes)))
         self.tapes = np.zeros((len(combinations), MOST_DRAWS), np.int32)
         self.tapes[:, : len(sizes)] = np.array(combinations, np.int32).reshape(len(combinations), len(sizes))
@@ -139,6 +142,8 @@ class Tape:
     def many(self, shape: Any, draw: Callable[[int], Any]) -> Any:
         """An array of draws of this shape; `draw` gets the place of each in it."""
         shape = _shape(shape)
+        if not math.prod(shape):
+            return jnp.zeros(shape, jnp.int32)
         drawn = [jnp.asarray(draw(i)) for i in range(math.prod(shape))]
         return jnp.stack(drawn).reshape(shape + drawn[0].shape) if shape else drawn[0]
 

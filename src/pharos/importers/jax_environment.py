@@ -26,6 +26,7 @@ from pharos.importers.step_spaces import SpaceRecorder
 from pharos.importers.stepped_environment import (
     CHECKED_PAIRS,
     WALK_STEPS,
+    ConstantChanged,
     SteppingOptions,
     difference,
     line_of_error,
@@ -185,7 +186,8 @@ class JaxEnvironment:
                     f"{self.name}: step() returns states of another form than it takes: {capped(after, 200)}"
                 )
         self.state = state
-        ignore = self.options.ignore | frozenset(self.functions.counters)
+        self.counters = sorted(set(self.functions.counters) - self.options.ignore - self.options.copied)
+        ignore = self.options.ignore.union(self.counters)
         self.layout = StateLayout(state, ignore)
         names = {name for field in self.layout.fields for name in field.names}
         for name in sorted(self.options.ignore - names):
@@ -370,6 +372,8 @@ class JaxEnvironment:
             for rows in zip(*sides, strict=True):
                 for action, both in enumerate(zip(*rows, strict=True)):
                     one, other = (Counter(self._shares(outcomes)) for outcomes in both)
+                    if one != other and self.counters:  # one of them matters, and nobody said that they do not
+                        raise ConstantChanged(self.counters[0])
                     if one != other:
                         after = f"action {action}" + f", after {step} others" * bool(step)
                         raise RuleError(

@@ -25,7 +25,8 @@ class JaxFunctions:
         reset: key -> (observation, state).
         actions: their number, or what `step` takes.
         name: for messages. time_limit: in steps; None: it has none.
-        action_names: None: numbers. counters: fields of a state that count and decide nothing.
+        action_names: None: numbers. counters: fields of a state that are left out where they turn
+            out to decide nothing.
     """
 
     step: Callable[[Any, Any, Any], tuple]

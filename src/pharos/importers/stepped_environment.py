@@ -53,7 +53,7 @@ class SteppingOptions:
         reward: (reward of the environment) -> number, or weights of a vector of rewards.
         actions: in place of those of a discrete action space.
         max_outcomes: in which the draws of one step may come out.
-        copied: fields that are never shared between copies, though they seem constant.
+        copied: fields that are never shared between copies, though they seem constant, nor left out as counters.
     """
 
     seed: int | None = None
@@ -66,7 +66,7 @@ class SteppingOptions:
 
 
 class ConstantChanged(Exception):
-    """A table that all copies shared was changed by a step."""
+    """A table that all copies shared was changed by a step, or a counter that was left out matters."""
 
 
 class SteppedEnvironment:
