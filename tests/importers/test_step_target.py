@@ -232,8 +232,8 @@ def test_environments_that_packages_announce(tmp_path, monkeypatch):
 def test_the_page_runs_as_printed(tmp_path, monkeypatch, capsys):
     page = (HERE.parents[2] / "docs" / "your-own-environment.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```(\w*)\n(.*?)```", page, re.DOTALL)
-    shop, python = [text for kind, text in blocks if kind == "python"][:2]  # the others are of JAX
-    commands, printed, array_text = [text for kind, text in blocks if kind != "python"][:3]
+    shop, python = (text for kind, text in blocks if kind == "python")
+    commands, printed, array_text = [text for kind, text in blocks if kind != "python"][:3]  # the others are of JAX
     (tmp_path / "shop.py").write_text(shop)
     monkeypatch.chdir(tmp_path)
     for command, count in zip(commands.splitlines(), (4, 4), strict=True):

@@ -75,8 +75,8 @@ class TracedFunction:
         if math.prod(sizes) > most:
             counts = Counter(f"{draw.words}: one of {draw.size:,}" for draw in tape.draws)
             words = ", ".join(text + f", {count} times" * (count > 1) for text, count in counts.items())
-            start = "; start from one state with a seed (--seed 0)" if what == "reset()" else ""
-            raise DrawError(f"{what} has more than {most:,} outcomes ({words}){start}")
+            advice = "; start from one state with a seed (--seed 0)" if what == "reset()" else ""
+            raise DrawError(f"{what} has more than {most:,} outcomes ({words}){advice}")
         combinations = list(itertools.product(*map(range, sizes)))
         self.tapes = np.zeros((len(combinations), MOST_DRAWS), np.int32)
         self.tapes[:, : len(sizes)] = np.array(combinations, np.int32).reshape(len(combinations), len(sizes))
