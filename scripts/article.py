@@ -18,8 +18,8 @@ import pyarrow.parquet as pq
 from scipy import stats
 
 from pharos import study
+from pharos.prediction.calibration import FILE
 from pharos.prediction.pairs import Pairs
-from pharos.prediction.prediction import FILE
 from pharos.statistics import holm, r_squared, spearman
 from pharos.study.blocks import Run
 from pharos.study.cross_validation import class_predictions, resampled_classes
