@@ -15,7 +15,7 @@ after a line, Spearman's rank correlation, the share of pairs of observations th
 fit, half the width of the 80 % interval and the share of classes left out that it covers; in brackets 95 % intervals
 over classes drawn anew. Classes weigh alike. `orders` prints the pairs of observations by predicted difference.
 `sealed` prints the same of the second sealed test, by block and predictor, and what the interval of before it held.
-`draw` draws predicted against observed regret of both sealed sets. `cost` prints the seconds of a cell and the memory
+`draw` draws predicted against observed regret of the second sealed set. `cost` prints the seconds of a cell and the memory
 that it adds, each in a process of its own that has compiled, by states of a grid, agent and observation.
 """
 
@@ -187,7 +187,7 @@ def said_of(cells, resamples):
 
 
 def draw(file, picture):
-    """Predicted against observed on both sealed sets, a panel for each agent."""
+    """Predicted against observed on the second sealed set, a panel for each agent."""
     from pharos.plots import save
     from pharos.plots.style import COLORS, GRID, panels, styled
 
@@ -196,7 +196,7 @@ def draw(file, picture):
         frame = pd.read_csv(file)
         drawn, axes = panels(2, 3.4, 3.3)
         for axis, agent in zip(axes, primary_predictors(), strict=True):
-            cells = frame[(frame["agent"] == agent) & frame["study"].str.startswith("sealed")]
+            cells = frame[(frame["agent"] == agent) & (frame["study"] == "sealed-2")]
             axis.plot([0, 1.8], [0, 1.8], color=GRID, zorder=0)
             for number, (name, some) in enumerate(cells.groupby(cells["observation"].str.split("[(,]").str[0])):
                 label = name.replace("_", " ")
