@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from functools import partial, wraps
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,8 @@ from jax.extend.core import jaxpr_as_fun
 
 from pharos.importers.chance import DrawError, here, placed
 
+Traced: TypeAlias = Any
+"""An array of JAX or a tree of such, traced or not, or a number."""
 MOST_DRAWS = 64
 """Draws of one step."""
 KEYS = ("key", "PRNGKey", "split", "fold_in", "clone", "key_data", "wrap_key_data", "key_impl")
@@ -60,7 +62,7 @@ class TracedFunction:
     def __init__(self, what: str, function: Callable[..., Any], arguments: Sequence[Any], most: int):
         tape: Tape
 
-        def program(key: Any, values: Any, *rest: Any) -> Any:
+        def program(key: Traced, values: Traced, *rest: Traced) -> Traced:
             nonlocal tape
             tape = Tape(values)
             with _replaced(tape):
@@ -88,12 +90,12 @@ class TracedFunction:
         ]
         self.result, self._flat, self._tree = shapes[0], jaxpr_as_fun(traced), jax.tree.structure(shapes)
 
-    def run(self, tape: Any, *arguments: Any) -> Any:
+    def run(self, tape: Traced, *arguments: Traced) -> Traced:
         """(arrays, probabilities of state-dependent draws) for one tape."""
         return jax.tree.unflatten(self._tree, self._flat(jax.random.key(0), tape, *jax.tree.leaves(arguments)))
 
 
-def _operations(jaxpr: Any) -> set[str]:
+def _operations(jaxpr: Traced) -> set[str]:
     """Names of the operations of a program, those of its branches and loops included."""
     names = set[str]()
     for equation in jaxpr.eqns:
@@ -114,12 +116,12 @@ class Tape:
         draws: so far. shares: traced probabilities of the outcomes of those whose probabilities depend on the state.
     """
 
-    def __init__(self, values: Any):
+    def __init__(self, values: Traced):
         self.values = values
         self.draws: list[Draw] = []
         self.shares: list[Any] = []
 
-    def one_of(self, name: str, key: Any, weights: Sequence[Fraction] | Any) -> Any:
+    def one_of(self, name: str, key: Traced, weights: Sequence[Fraction] | Any) -> Traced:
         """Traced number of the outcome of a draw with these probabilities, fractions or a traced vector."""
         words = placed(f"{name}()", here())
         if len(self.draws) == MOST_DRAWS:
@@ -139,7 +141,7 @@ class Tape:
         self.draws.append(Draw(words, len(live), tuple(weights[i] for i in live)))
         return value if len(live) == len(weights) else jnp.array(live, jnp.int32)[value]
 
-    def many(self, shape: Any, draw: Callable[[int], Any]) -> Any:
+    def many(self, shape: Traced, draw: Callable[[int], Any]) -> Traced:
         """An array of draws of this shape; `draw` gets the place of each in it."""
         shape = _shape(shape)
         if not math.prod(shape):
@@ -148,11 +150,11 @@ class Tape:
         return jnp.stack(drawn).reshape(shape + drawn[0].shape) if shape else drawn[0]
 
 
-def _shape(shape: Any) -> tuple[int, ...]:
+def _shape(shape: Traced) -> tuple[int, ...]:
     return tuple(int(n) for n in shape) if isinstance(shape, Sequence) else (int(shape),)
 
 
-def _is_traced(*values: Any) -> bool:
+def _is_traced(*values: Traced) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
@@ -185,7 +187,7 @@ def _concretely(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function, evaluated at once where nothing is traced: a fixed key makes fixed draws."""
 
     @wraps(function)
-    def evaluated(*arguments: Any, **options: Any) -> Any:
+    def evaluated(*arguments: Traced, **options: object) -> Traced:
         if _is_traced(arguments, options):
             return function(*arguments, **options)
         with jax.ensure_compile_time_eval():
@@ -198,7 +200,7 @@ def _drawing(
     name: str, original: Callable[..., Any], draw: Callable[..., Any] | None, tape: Tape
 ) -> Callable[..., Any]:
     @wraps(original)
-    def drawn(key: Any, *arguments: Any, **options: Any) -> Any:
+    def drawn(key: Traced, *arguments: Traced, **options: object) -> Traced:
         if not _is_traced(key):
             return _concretely(original)(key, *arguments, **options)
         if draw is None:
@@ -211,7 +213,7 @@ def _drawing(
 # Draws ----------------------------------------------------------------------------------------------------------------
 
 
-def _coin(tape: Tape, name: str, key: Any, p: Any) -> Any:
+def _coin(tape: Tape, name: str, key: Traced, p: Traced) -> Traced:
     """Whether an event of probability p happens."""
     if _is_traced(p):
         p = jnp.clip(p, 0, 1)
@@ -220,7 +222,7 @@ def _coin(tape: Tape, name: str, key: Any, p: Any) -> Any:
     return tape.one_of(name, key, (1 - p, p)) == 1
 
 
-def _bernoulli(tape: Tape, key: Any, p: Any = 0.5, shape: Any = None, **_: Any) -> Any:
+def _bernoulli(tape: Tape, key: Traced, p: Traced = 0.5, shape: Traced = None, **_: object) -> Traced:
     shape = np.shape(p) if shape is None else _shape(shape)
     flat = jnp.broadcast_to(p, shape).ravel() if _is_traced(p) else np.broadcast_to(np.asarray(p, float), shape).ravel()
     return tape.many(shape, lambda i: _coin(tape, "bernoulli", key, flat[i]))
@@ -230,12 +232,14 @@ def _evenly(count: int) -> tuple[Fraction, ...]:
     return (Fraction(1, count),) * count
 
 
-def _randint(tape: Tape, key: Any, shape: Any, minval: Any, maxval: Any, dtype: Any = None, **_: Any) -> Any:
+def _randint(
+    tape: Tape, key: Traced, shape: Traced, minval: Traced, maxval: Traced, dtype: Traced = None, **_: object
+) -> Traced:
     if _is_traced(minval, maxval):
         raise _refusal("randint", "its bounds depend on the state")
     lows, highs = (np.broadcast_to(np.asarray(bound), _shape(shape)).ravel() for bound in (minval, maxval))
 
-    def number(i: int) -> Any:
+    def number(i: int) -> Traced:
         count = max(int(highs[i]) - int(lows[i]), 1)
         return int(lows[i]) + tape.one_of("randint", key, _evenly(count))
 
@@ -243,8 +247,15 @@ def _randint(tape: Tape, key: Any, shape: Any, minval: Any, maxval: Any, dtype: 
 
 
 def _choice(
-    tape: Tape, key: Any, a: Any, shape: Any = (), replace: bool = True, p: Any = None, axis: int = 0, **_: Any
-) -> Any:
+    tape: Tape,
+    key: Traced,
+    a: Traced,
+    shape: Traced = (),
+    replace: bool = True,
+    p: Traced = None,
+    axis: int = 0,
+    **_: object,
+) -> Traced:
     items = jnp.arange(a) if np.ndim(a) == 0 else jnp.moveaxis(jnp.asarray(a), axis, 0)
     count, shape = items.shape[0], _shape(shape)
     if replace or not shape:
@@ -255,7 +266,7 @@ def _choice(
     return items[_arrangement(tape, "choice", key, count, math.prod(shape)).reshape(shape)]
 
 
-def _permutation(tape: Tape, key: Any, x: Any, axis: int = 0, independent: bool = False, **_: Any) -> Any:
+def _permutation(tape: Tape, key: Traced, x: Traced, axis: int = 0, independent: bool = False, **_: object) -> Traced:
     items = jnp.arange(x) if np.ndim(x) == 0 else jnp.asarray(x)
     if independent and items.ndim > 1:
         raise _refusal("permutation", "of each row by itself")
@@ -263,7 +274,7 @@ def _permutation(tape: Tape, key: Any, x: Any, axis: int = 0, independent: bool 
     return jnp.take(items, order, axis)
 
 
-def _arrangement(tape: Tape, name: str, key: Any, count: int, length: int) -> Any:
+def _arrangement(tape: Tape, name: str, key: Traced, count: int, length: int) -> Traced:
     """Numbers of `length` of `count` things, in any order."""
     number = math.perm(count, length)
     if number > 10_000:
@@ -272,14 +283,14 @@ def _arrangement(tape: Tape, name: str, key: Any, count: int, length: int) -> An
     return jnp.asarray(table)[tape.one_of(name, key, _evenly(number))]
 
 
-def _categorical(tape: Tape, key: Any, logits: Any, axis: int = -1, shape: Any = None, **_: Any) -> Any:
+def _categorical(tape: Tape, key: Traced, logits: Traced, axis: int = -1, shape: Traced = None, **_: object) -> Traced:
     rows = jnp.moveaxis(logits, axis, -1) if _is_traced(logits) else np.moveaxis(np.asarray(logits, float), axis, -1)
     outer = rows.shape[:-1]
     if shape is not None and _shape(shape) != outer and outer:
         raise _refusal("categorical", "of logits that are repeated")
     rows = rows.reshape(-1, rows.shape[-1])
 
-    def number(i: int) -> Any:
+    def number(i: int) -> Traced:
         row = rows[i] if outer else rows[0]
         weights = jax.nn.softmax(row) if _is_traced(row) else _normalized(np.exp(row - row.max()))
         return tape.one_of("categorical", key, weights)
@@ -287,7 +298,7 @@ def _categorical(tape: Tape, key: Any, logits: Any, axis: int = -1, shape: Any =
     return tape.many(outer if shape is None else shape, number)
 
 
-def _normalized(weights: Any) -> Any:
+def _normalized(weights: Traced) -> Traced:
     """Probabilities: fractions that sum to 1, or a traced vector."""
     if _is_traced(weights):
         return weights / jnp.sum(weights)
@@ -298,14 +309,14 @@ def _normalized(weights: Any) -> Any:
 class _Uniform:
     """Numbers drawn evenly from [low, high), each of which may be compared once."""
 
-    def __init__(self, draw: Callable[[Any], Any], places: np.ndarray, low: Any, high: Any, compared: set[int]):
+    def __init__(self, draw: Callable[[Any], Any], places: np.ndarray, low: Traced, high: Traced, compared: set[int]):
         self._draw, self._places, self._low, self._high, self._compared = draw, places, low, high, compared
         self.shape = places.shape
 
-    def __getitem__(self, place: Any) -> "_Uniform":
+    def __getitem__(self, place: Traced) -> "_Uniform":
         return _Uniform(self._draw, self._places[place], self._low, self._high, self._compared)
 
-    def _is_below(self, limit: Any) -> Any:
+    def _is_below(self, limit: Traced) -> Traced:
         places = self._places.ravel().tolist()
         if isinstance(limit, _Uniform) or np.shape(limit) not in ((), self.shape) or self._compared & set(places):
             raise _refusal("uniform", "its number may be compared once, with one number")
@@ -315,17 +326,17 @@ class _Uniform:
         drawn = [self._draw(flat[i]) for i in range(len(places))]
         return jnp.stack(drawn).reshape(self.shape) if self.shape else drawn[0]
 
-    def __lt__(self, limit: Any) -> Any:
+    def __lt__(self, limit: Traced) -> Traced:
         return self._is_below(limit)
 
     __le__ = __lt__
 
-    def __gt__(self, limit: Any) -> Any:
+    def __gt__(self, limit: Traced) -> Traced:
         return ~self._is_below(limit)
 
     __ge__ = __gt__
 
-    def _refuse(self, *_: Any, **__: Any) -> Any:
+    def _refuse(self, *_: Traced, **__: Traced) -> Traced:
         raise _refusal("uniform", "it used the number itself and not a comparison with it")
 
     __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __truediv__ = __rtruediv__ = __pow__ = _refuse
@@ -334,8 +345,14 @@ class _Uniform:
 
 
 def _uniform(
-    tape: Tape, key: Any, shape: Any = (), _dtype: Any = None, minval: Any = 0.0, maxval: Any = 1.0, **_: Any
-) -> Any:
+    tape: Tape,
+    key: Traced,
+    shape: Traced = (),
+    _dtype: Traced = None,
+    minval: Traced = 0.0,
+    maxval: Traced = 1.0,
+    **_: object,
+) -> Traced:
     shape = _shape(shape)
     places = np.arange(math.prod(shape)).reshape(shape)
     return _Uniform(partial(_coin, tape, "uniform", key), places, minval, maxval, set())
@@ -344,13 +361,15 @@ def _uniform(
 # Branches -------------------------------------------------------------------------------------------------------------
 
 
-def _both(pred: Any, true_fun: Callable[..., Any], false_fun: Callable[..., Any], *operands: Any, **named: Any) -> Any:
+def _both(
+    pred: Traced, true_fun: Callable[..., Any], false_fun: Callable[..., Any], *operands: Traced, **named: Traced
+) -> Traced:
     """The result of one of two functions that are both traced: the draws of the other one change nothing."""
     operands = operands or ((named["operand"],) if "operand" in named else ())
     return _all_branches(pred, [false_fun, true_fun], *operands)
 
 
-def _all_branches(index: Any, branches: Sequence[Callable[..., Any]], *operands: Any, **_: Any) -> Any:
+def _all_branches(index: Traced, branches: Sequence[Callable[..., Any]], *operands: Traced, **_: object) -> Traced:
     results = [branch(*operands) for branch in branches]
     number = jnp.clip(jnp.asarray(index).astype(jnp.int32), 0, len(branches) - 1)
     answer = results[0]

@@ -18,7 +18,7 @@ from pharos.errors import ParameterError, PharosError, RuleError, UnknownName
 from pharos.importers.chance import placed
 from pharos.importers.fresh_play import FreshPlay
 from pharos.importers.gymnasium import SAMPLED_EPISODE, SAMPLED_STEPS
-from pharos.importers.jax_chance import TracedFunction, refusal_behind
+from pharos.importers.jax_chance import Traced, TracedFunction, refusal_behind
 from pharos.importers.jax_stepping import JaxFunctions
 from pharos.importers.search import END, Arrival, SteppedStates
 from pharos.importers.side_effects import SideEffects
@@ -66,7 +66,7 @@ class StateLayout:
         state: shapes and dtypes of a state. ignore: names of fields.
     """
 
-    def __init__(self, state: Any, ignore: frozenset[str]):
+    def __init__(self, state: Traced, ignore: frozenset[str]):
         leaves, self._tree = jax.tree_util.tree_flatten_with_path(state)
         self.fields = []
         for path, leaf in leaves:
@@ -79,7 +79,7 @@ class StateLayout:
             field.num_bytes for field, ignored in zip(self.fields, self.ignored, strict=True) if not ignored
         )
 
-    def packed(self, states: Any, count: int) -> list[bytes]:
+    def packed(self, states: Traced, count: int) -> list[bytes]:
         """The first `count` of a batch of states."""
         leaves = jax.tree.leaves(states)
         parts = [np.empty((count, 0), np.uint8)]
@@ -89,7 +89,7 @@ class StateLayout:
                 parts.append(array.view(np.uint8).reshape(count, -1))
         return [row.tobytes() for row in np.concatenate(parts, axis=1)]
 
-    def unpacked(self, rows: Sequence[bytes]) -> Any:
+    def unpacked(self, rows: Sequence[bytes]) -> Traced:
         """A batch of states."""
         data = np.frombuffer(b"".join(rows), np.uint8).reshape(len(rows), -1)
         leaves: list[Any] = [None] * len(self.fields)
@@ -119,7 +119,7 @@ class StateLayout:
         }
 
 
-def _name_of(part: Any) -> str:
+def _name_of(part: Traced) -> str:
     """The name of a step on the way to a field: an attribute, a key of a dictionary, a place in a list."""
     return str(next(getattr(part, name) for name in ("name", "key", "idx") if hasattr(part, name)))
 
@@ -130,7 +130,7 @@ class SteppedOutcome(NamedTuple):
     probability: Fraction | float
     reward: float
     row: bytes | None
-    observation: Any
+    observation: Traced
     tape: int
 
 
@@ -200,7 +200,7 @@ class JaxEnvironment:
         self._single = jax.jit(self._step.run)
         self.observer = SpaceRecorder(_space(shown), self.name)
 
-    def _four(self, key: Any, state: Any, action: Any) -> Any:
+    def _four(self, key: Traced, state: Traced, action: Traced) -> Traced:
         answer = self.functions.step(key, state, action)
         if not isinstance(answer, tuple) or len(answer) < 4:
             raise RuleError(
@@ -211,7 +211,7 @@ class JaxEnvironment:
     def _traced(self, what: str, function: Callable[..., Any], arguments: tuple, most: int) -> TracedFunction:
         return self._calling(what, lambda: TracedFunction(what, function, arguments, most))
 
-    def _calling(self, what: str, function: Callable[[], Any]) -> Any:
+    def _calling(self, what: str, function: Callable[[], Any]) -> Traced:
         try:
             return function()
         except Exception as error:
@@ -243,11 +243,11 @@ class JaxEnvironment:
             if weight > 0
         ]
 
-    def _as_states(self, states: Any) -> Any:
+    def _as_states(self, states: Traced) -> Traced:
         """A batch with the dtypes of the states that `step` returns."""
         return jax.tree.map(lambda leaf, form: jnp.asarray(leaf).astype(form.dtype), states, self.state)
 
-    def _started(self, start: Any) -> tuple[bytes, np.ndarray]:
+    def _started(self, start: Traced) -> tuple[bytes, np.ndarray]:
         """(row, observation) of one start."""
         shown, state = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], start)
         return self.layout.packed(self._as_states(state), 1)[0], _flat(shown, 1)[0]
@@ -265,7 +265,7 @@ class JaxEnvironment:
         num_actions, num_tapes = self.num_actions, len(self._step.tapes)
         count = len(rows) * num_actions * num_tapes
 
-        def flat(leaf: Any) -> Any:
+        def flat(leaf: Traced) -> Traced:
             return leaf.reshape(-1, *leaf.shape[3:])
 
         after = self.layout.packed(jax.tree.map(flat, states), count)
@@ -312,7 +312,7 @@ class JaxEnvironment:
         probability: Fraction | float,
         reward: float,
         row: bytes | None,
-        observations: Any,
+        observations: Traced,
         script: tuple[int, ...],
     ) -> Arrival:
         if row is None:
@@ -424,11 +424,11 @@ class JaxEnvironment:
         return play
 
 
-def _form(leaf: Any) -> tuple[tuple[int, ...], str]:
+def _form(leaf: Traced) -> tuple[tuple[int, ...], str]:
     return tuple(leaf.shape), str(leaf.dtype)
 
 
-def _flat(shown: Any, count: int) -> np.ndarray:
+def _flat(shown: Traced, count: int) -> np.ndarray:
     """The first `count` of a batch of observations as one array: a single array as it is, several one after another."""
     leaves = [np.asarray(leaf)[:count] for leaf in jax.tree.leaves(shown)]
     if len(leaves) == 1:
@@ -436,7 +436,7 @@ def _flat(shown: Any, count: int) -> np.ndarray:
     return np.concatenate([leaf.reshape(count, -1).astype(np.float32) for leaf in leaves], axis=1)
 
 
-def _space(shown: Any) -> Any:
+def _space(shown: Traced) -> Traced:
     """A space of Gymnasium for observations of these shapes."""
     from gymnasium.spaces import Box
 
