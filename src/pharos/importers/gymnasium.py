@@ -238,7 +238,7 @@ def _listed(name: str, table: _Numbered) -> list[list[list]]:
         for a in row if isinstance(row, Mapping) else range(len(row)):
             if isinstance(a, bool) or not isinstance(a, int | np.integer) or a < 0:
                 raise FileFormatError(f"{name}: P[{s}] has the action {capped(a)}; expected numbers from 0 on")
-            if not isinstance(entry := _entry(row, a), Iterable):
+            if not isinstance(entry := _entry(row, int(a)), Iterable):
                 raise FileFormatError(f"{name}: has no P[{s}][{a}] with outcomes; expected a list of them")
             states[-1][int(a)] = list(entry)
         if not any(states[-1].values()):
