@@ -177,7 +177,7 @@ def test_a_checkpoint_is_on_the_disk_before_the_older_one_goes(tmp_path, monkeyp
     checkpoint = _results.Checkpoint(tmp_path / "checkpoint", "id")
     for _ in range(2):
         synced.clear()
-        checkpoint.save(Learner(), [], 0.0)
+        checkpoint.save(Learner(), list, 0.0)
         assert tmp_path.stat().st_ino in synced
     swap = ("checkpoint.partial", "checkpoint")
     assert moves == [swap, ("checkpoint", "checkpoint.old"), swap]

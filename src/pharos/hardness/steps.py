@@ -126,15 +126,6 @@ class FiniteHorizonValues:
         """The expectation over start nodes."""
         return float(sum(p * values[node] for node, p in self.starts))
 
-    def lookahead(self, values: np.ndarray) -> np.ndarray:
-        """(T, N, A): Q^{k+1}, from Q^k."""
-        result = np.empty(self.best.shape)
-        result[-1] = self.rewards
-        for t in range(self.steps - 1):
-            self.tell(f"lookahead of step {t} of {self.steps}")
-            result[t] = self.backup(values[t + 1].max(axis=1))
-        return result
-
 
 # Returns of an episode ------------------------------------------------------------------------------------------------
 

@@ -377,7 +377,7 @@ def _start(env: object, inner: object, states: int, is_stepped: bool) -> np.ndar
     says = "it has no initial_state_distrib" if start is None else f"its {name} says otherwise"
     raise FileFormatError(
         f"{name_of(env)}: its resets start in {listed}, and {says}; give initial=, the states that are equally likely "
-        f"or (S,) probabilities"
+        f"(--initial 0,3) or (S,) probabilities"
     )
 
 

@@ -418,11 +418,16 @@ class Checkpoint:
         self.folder, self.id = folder, id
         self._next = -math.inf
 
-    def save(self, learner: Learner, rows: list[Any], seconds: float) -> None:
-        """Write a checkpoint, unless the last is not ten seconds old, or writing would take more than SHARE_OF_TIME."""
+    def save(self, learner: Learner, curves: Callable[[], list[Any]], seconds: float) -> None:
+        """Write a checkpoint, unless the last is not ten seconds old, or writing would take more than SHARE_OF_TIME.
+
+        Args:
+            curves: returns the rows so far, for which it may have to wait.
+        """
         began = time.monotonic()
         if began < self._next:
             return
+        rows = curves()
         partial = self.folder.with_name(f"{self.folder.name}.partial")
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
