@@ -15,8 +15,8 @@ after a line, Spearman's rank correlation, the share of pairs of observations th
 fit, half the width of the 80 % interval and the share of classes left out that it covers; in brackets 95 % intervals
 over classes drawn anew. Classes weigh alike. `orders` prints the pairs of observations by predicted difference.
 `sealed` prints the same of the second sealed test, by block and predictor, and what the interval of before it held.
-`draw` draws predicted against observed regret of the second sealed set. `cost` prints the seconds of a cell and the memory
-that it adds, each in a process of its own that has compiled, by states of a grid, agent and observation.
+`draw` draws predicted against observed regret of the second sealed set. `cost` prints the seconds of a cell and the
+memory that it adds, each in a process of its own that has compiled, by states of a grid, agent and observation.
 """
 
 import argparse
