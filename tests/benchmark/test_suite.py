@@ -62,6 +62,8 @@ def test_another_setting_of_values_is_refused():
     frozen = replace(SEA, digest=GOLDEN, value_optimal=0.99, value_uniform=0.010625)
     with pytest.raises(ParameterError, match=r"^task deep_sea-6"):
         frozen.check(Protocol(gamma=0.9))
+    with pytest.raises(ParameterError, match=r"^task deep_sea-6: gamma is 1 without a horizon, so regret may be infin"):
+        frozen.check(Protocol(horizon="none"))
     with pytest.raises(ParameterError, match=r"^task deep_sea-6: the value of uniform play is"):
         replace(frozen, value_uniform=0.0107).check(Protocol())
 

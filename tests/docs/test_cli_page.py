@@ -23,6 +23,7 @@ LINES = (
     "render frozen_lake/4x4 --out lake.png",
     "explore frozen_lake/4x4 --out lake.html",
     "train frozen_lake/4x4 --steps 500 --out run",
+    "train endless_sea --objective average --steps 200 --out sea",
     "export frozen_lake/4x4 --format gym --out lake.json",
     "benchmark submit run --out entry.safetensors",
     "benchmark verify entry.safetensors",

@@ -280,6 +280,8 @@ def test_what_cannot_be_predicted_is_one_line(monkeypatch):
         pharos.predict("river_swim", steps=500, agent="ppo")
     with pytest.raises(ParameterError, match="no observation to predict for"):
         pharos.predict("river_swim", [])
+    with pytest.raises(ParameterError, match="of episodes of some number of steps; found horizon none"):
+        pharos.predict("river_swim", horizon=None)
     monkeypatch.setattr(prediction, "MOST_STATES", 4)
     with pytest.raises(ParameterError, match="has 5 states; predictions are made for at most 4: choose a smaller"):
         pharos.predict("river_swim", length=5)

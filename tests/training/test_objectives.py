@@ -10,6 +10,7 @@ import pytest
 from test_train import Killed, kill_at
 
 import pharos
+from command_line import answer
 from pharos.errors import DivergenceError, FileFormatError, ParameterError, UnknownName
 from pharos.training import (
     RegretCurve,
@@ -159,7 +160,7 @@ def test_the_curve_is_drawn_by_steps(tmp_path):
 # Total reward ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_total_reward_of_a_walk_is_its_length():
+def test_the_total_reward_of_a_walk_is_its_length(tmp_path):
     task = Task.of("cliff_walking", {"slippery": False}, objective="total")
     assert (task.gamma, task.horizon, task.objective) == (1.0, None, None)
     assert task.reference.optimal == -13
@@ -177,6 +178,25 @@ def test_the_total_reward_of_a_walk_is_its_length():
     assert evaluate_agent(astray, task).value == -13
     ever = evaluate_agent(np.full(task.mdp.num_states, up), task)
     assert (ever.value, ever.exact) == (-math.inf, True)
+    # the same on the command line
+    np.save(tmp_path / "astray.npy", astray)
+    np.save(tmp_path / "ever.npy", np.full(task.mdp.num_states, up))
+    told, never = (
+        answer("evaluate", "cliff_walking", "--policy", tmp_path / f"{name}.npy", "--objective", "total")
+        for name in ("astray", "ever")
+    )
+    assert (told["value_at_start"], told["regret"], told["worst_value_at_start"]) == (-13, 0, None)
+    assert (never["value_at_start"], never["regret"], never["horizon"]) == (None, None, None)
+
+
+def test_a_run_of_total_rewards_is_evaluated_as_it_was_trained(tmp_path):
+    run = answer(
+        "train", "frozen_lake/4x4", "--random", "0.5", "--objective", "total", "--steps", 300, "--out", tmp_path
+    )
+    again = answer("evaluate", "frozen_lake/4x4", "--policy", tmp_path)
+    assert run["conventions"] == {"gamma": 1.0, "horizon": None, "time_limit": 100}
+    assert again["value_at_start"] == pytest.approx(run["final_value"], abs=1e-9)
+    assert again["horizon"] is None
 
 
 def test_regret_of_policies_without_end_is_infinite(tmp_path):

@@ -101,6 +101,11 @@ class BenchmarkTask:
 
     def training_task(self, protocol: Protocol) -> Task:
         """The task as agents are trained on it; nothing is built before it is needed."""
+        if protocol.gamma == 1.0 and protocol.horizon in (None, "none"):
+            raise ParameterError(
+                f"task {self.name}: gamma is 1 without a horizon, so regret may be infinite, and no score a mean of "
+                f"it; give a horizon, or gamma < 1"
+            )
         return Task.of(
             self.environment,
             self.parameters,

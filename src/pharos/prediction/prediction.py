@@ -224,6 +224,8 @@ def predict(
 
     calibration = published(agent)
     training = TrainingOptions(**{name: value for name, value in options.items() if name in TAKEN})
+    if training.horizon in (None, "none"):
+        raise ParameterError("predictions are of episodes of some number of steps; found horizon none; give a number")
     parameters = {name: value for name, value in options.items() if name not in TAKEN}
     env, chance = Task.of(environment, parameters).env, training.chance
     overrides = {**(COMMON[agent] if common else {}), **(training.hyperparameters or {})}

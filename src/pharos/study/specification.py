@@ -295,7 +295,11 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
             except ParameterError as error:
                 yield ("blocks", i, "environments", j), str(error)
         if (specification.option_of(block, "horizon"), specification.option_of(block, "gamma")) == ("none", 1):
-            yield ("blocks", i), "gamma is 1 and horizon is none, so values may be infinite; expected a gamma below 1"
+            yield (
+                ("blocks", i),
+                "gamma is 1 and horizon is none, so values may be infinite, and means over runs; give a horizon, or a "
+                "gamma below 1 (pharos train --objective total measures single runs)",
+            )
         # Agents and their engines
         engine = specification.option_of(block, "engine")
         for agent in engine if isinstance(engine, dict) else ():
