@@ -290,7 +290,7 @@ def test_an_algorithm_can_be_named_by_its_path():
         ({"agent": "dqn", "hyperparameters": {"learning_rat": 1}}, UnknownName, "did you mean 'learning_rate'"),
         ({"agent": "q_learning", "steps": 0}, ParameterError, "steps is 0"),
         ({"agent": "q_learning", "evaluation_interval": -1}, ParameterError, "evaluation_interval is -1"),
-        ({"agent": "q_learning", "horizon": None}, ParameterError, "give a horizon"),
+        ({"agent": "q_learning", "horizon": 0}, ParameterError, "horizon: found 0"),
         ({"agent": "dqn", "tensorboard": True}, ParameterError, "no folder for results"),
     ],
 )

@@ -377,7 +377,7 @@ class Program:
                 self.learner.publish(i, folder)
                 _results.write_curve(folder, curve)
                 run.write("finished", seconds=share, **entries, result=result)
-            rows = [{name: row[name] for name in _results.COLUMNS} for row in curve]
+            rows = [{name: row[name] for name in _results.ALL_COLUMNS if name in row} for row in curve]
             policy = self.learner.policy(i)
             learnt = None if isinstance(policy, Evaluation) else policy
             end = TrainingResult(config, result, rows, learnt, folder, share, notes)
