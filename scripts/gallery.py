@@ -13,7 +13,7 @@ import numpy as np
 
 import pharos
 from pharos import drawing
-from pharos.environments import start_distribution
+from pharos.environments import BUILT_IN, start_distribution
 from pharos.observations import render
 from pharos.system.wording import pluralize
 
@@ -67,6 +67,10 @@ PLAYED = {  # names of instances
     "umbrella_chain": "umbrella_chain/length-10",
     "discounting_chain": "discounting_chain/delays-10",
 }
+for _entry in BUILT_IN:  # a class without an entry above shows its first instance
+    _name = "/".join((_entry.name, *_entry.instance_names[:1]))
+    INSTANCES.setdefault(_entry.name, ((_name, 3),))
+    PLAYED.setdefault(_entry.name, _name)
 SEVERAL = ("taxi", "blackjack", "catch", "memory_chain", "umbrella_chain")  # games, from drawn starts: one is soon over
 FRAMES_PER_SECOND = {  # others: 12
     **{"sliding_tiles": 4, "pocket_cube": 3, "sokoban": 6, "game_2048": 3, "taxi": 4, "blackjack": 2},

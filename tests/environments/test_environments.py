@@ -391,7 +391,8 @@ def test_parameters_survive_json(name):
 def test_every_environment_keeps_the_contract(name):
     report = pharos.check_environment(pharos.make(name), max_states=120)
     assert report.compiled
-    assert report.complete == (name.split("/")[0] in GRIDS or name in SMALL)
+    assert report.complete or not (name.split("/")[0] in GRIDS or name in SMALL)
+    assert not any("another name" in note for note in report.notes)
 
 
 def test_text_forms_are_the_same_as_python_forms():

@@ -369,10 +369,10 @@ def test_a_batch_whose_evaluating_process_dies_is_halved_and_ends(apart, tmp_pat
     evaluators = importlib.import_module("pharos.training.evaluators")
     begin, killed = evaluators.Evaluators.begin, []
 
-    def kill_once(self, learner):
+    def kill_once(self):
         if not killed:
             killed.append(self.workers.kill("0"))
-        begin(self, learner)
+        begin(self)
 
     monkeypatch.setattr(evaluators.Evaluators, "begin", kill_once)
     own = {"learning_starts": 50, "buffer_size": 500}

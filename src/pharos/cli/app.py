@@ -51,7 +51,7 @@ NO_ARRAY = ("array is too big", "Maximum allowed dimension exceeded")
 class _Group(TyperGroup):
     """Runs a command; errors that pharos or the system raise on purpose end as one line, never as a traceback."""
 
-    def main(self, *args: Any, **options: Any) -> Any:
+    def main(self, *args: Any, **options: Any) -> object:
         options["standalone_mode"] = False
         options["prog_name"] = "pharos"
         arguments = args[0] if args else options.pop("args", None)

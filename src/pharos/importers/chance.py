@@ -11,12 +11,13 @@ import itertools
 import math
 import random as python_random
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, MutableSequence, Sequence
 from fractions import Fraction
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn, SupportsFloat
 
 import numpy as np
+import numpy.typing as npt
 
 from pharos.errors import RuleError
 
@@ -185,7 +186,7 @@ def _ranges(
     return edges, weights, np.array([bisect.bisect_right(edges, limit, 1) - 1 for limit in limits], int)
 
 
-def _exact(value: Any) -> Fraction:
+def _exact(value: SupportsFloat) -> Fraction:
     return value if isinstance(value, Fraction) else Fraction(float(value))
 
 
@@ -229,7 +230,7 @@ class RandomNumber:
             raise self._refusal()
         return self._unit.below(tuple(array.ravel().tolist()), self._scale, self._offset).reshape(array.shape)
 
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: object, **_: object) -> Any:
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: object, **_: object) -> object:
         """Answers to NumPy's functions: comparisons, whole parts, sums and products."""
         names = UFUNCS.get(ufunc.__name__) if method == "__call__" else None
         if names is None:
@@ -242,12 +243,12 @@ class RandomNumber:
             raise self._refusal()
         return answer
 
-    def __lt__(self, other: object) -> Any:
+    def __lt__(self, other: object) -> object:
         return self._is_below(other)
 
     __le__ = __lt__
 
-    def __gt__(self, other: Any) -> Any:
+    def __gt__(self, other: npt.ArrayLike) -> object:
         return np.logical_not(self._is_below(other)) if np.ndim(other) else not self._is_below(other)
 
     __ge__ = __gt__
@@ -269,24 +270,24 @@ class RandomNumber:
             return float(offset)
         return RandomNumber(self._unit, self._scale * scale, self._offset * scale + offset)
 
-    def __mul__(self, other: object) -> Any:
+    def __mul__(self, other: object) -> object:
         return self._moved(other, 0)
 
-    def __add__(self, other: object) -> Any:
+    def __add__(self, other: object) -> object:
         return self._moved(1, other)
 
     __rmul__, __radd__ = __mul__, __add__
 
-    def __sub__(self, other: Any) -> Any:
+    def __sub__(self, other: Any) -> object:
         return self._moved(1, -_exact(other) if np.ndim(other) == 0 else other)
 
-    def __rsub__(self, other: object) -> Any:
+    def __rsub__(self, other: object) -> object:
         return self._moved(-1, other)
 
-    def __neg__(self) -> Any:
+    def __neg__(self) -> object:
         return self._moved(-1, 0)
 
-    def __truediv__(self, other: Any) -> Any:
+    def __truediv__(self, other: Any) -> object:
         return self._moved(1 / _exact(other) if np.ndim(other) == 0 else other, 0)
 
     def __floor__(self) -> int:
@@ -321,19 +322,19 @@ class RandomNumber:
             self._unit.branches, "random(), and used the number itself and not a comparison with it", self._unit.line
         )
 
-    def _refuse(self, *_: object, **__: object) -> Any:
+    def _refuse(self, *_: object, **__: object) -> NoReturn:
         raise self._refusal()
 
     __float__ = __index__ = __complex__ = __array__ = __reduce__ = _refuse
     __pow__ = __rpow__ = __mod__ = __rmod__ = __floordiv__ = __rfloordiv__ = __rtruediv__ = __abs__ = _refuse
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         if name.startswith("__"):
             raise AttributeError(name)
         raise self._refusal()
 
 
-def _array_of(items: Sequence[Any]) -> np.ndarray:
+def _array_of(items: Sequence[object]) -> np.ndarray:
     """An array of objects, set one by one, as NumPy would ask each for its numbers."""
     array = np.empty(len(items), object)
     for i, item in enumerate(items):
@@ -360,16 +361,21 @@ class BranchingGenerator:
             raise ValueError("low >= high")
         return self._branches.draw(_evenly(count) if weights is None else weights, are_positive=weights is None)
 
-    def _many(self, size: Any, draw: Callable[[], Any], kind: Any = None) -> np.ndarray:
-        shape = (int(size),) if np.ndim(size) == 0 else tuple(int(n) for n in size)
+    def _many(self, size: npt.ArrayLike, draw: Callable[[], object]) -> np.ndarray:
+        shape = tuple(np.atleast_1d(np.asarray(size, int)).tolist())
         items = [draw() for _ in range(math.prod(shape))]
         if not any(isinstance(item, RandomNumber) for item in items):
-            return np.array(items, kind).reshape(shape)
+            return np.array(items).reshape(shape)
         return _array_of(items).reshape(shape)
 
     def integers(
-        self, low: Any, high: Any = None, size: Any = None, dtype: Any = np.int64, endpoint: bool = False
-    ) -> Any:
+        self,
+        low: Any,
+        high: Any = None,
+        size: npt.ArrayLike | None = None,
+        dtype: npt.DTypeLike = np.int64,
+        endpoint: bool = False,
+    ) -> object:
         """An integer from low on and below high, or up to high; of one argument, from 0 on."""
         low, high = (0, low) if high is None else (low, high)
         if np.ndim(low) or np.ndim(high):
@@ -381,11 +387,11 @@ class BranchingGenerator:
         drawn = int(low) + self._index(int(high) - int(low) + bool(endpoint))
         return drawn if dtype is int else np.dtype(dtype).type(drawn)
 
-    def random(self, size: object = None, *_: object, **__: object) -> Any:
+    def random(self, size: npt.ArrayLike | None = None, *_: object, **__: object) -> object:
         """A number from [0, 1)."""
         return self.uniform(size=size)
 
-    def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
+    def uniform(self, low: Any = 0.0, high: Any = 1.0, size: npt.ArrayLike | None = None) -> object:
         """A number from [low, high)."""
         if np.ndim(low) or np.ndim(high):
             lows, highs = np.broadcast_arrays(low, high)
@@ -397,8 +403,14 @@ class BranchingGenerator:
         return RandomNumber(_Unit(self._branches), scale, offset) if scale else float(low)
 
     def choice(
-        self, a: Any, size: Any = None, replace: bool = True, p: Any = None, axis: int = 0, shuffle: bool = True
-    ) -> Any:
+        self,
+        a: Any,
+        size: npt.ArrayLike | None = None,
+        replace: bool = True,
+        p: object = None,
+        axis: int = 0,
+        shuffle: bool = True,
+    ) -> object:
         """One of several things, or an array of them; equal things are one outcome."""
         items = list(range(int(a))) if np.ndim(a) == 0 and not isinstance(a, list | tuple) else list(a)
         weights = None if p is None else _normalized(p)
@@ -412,7 +424,7 @@ class BranchingGenerator:
         rest = list(items)
         return self._many(size, lambda: rest.pop(self._index(len(rest))))
 
-    def _one_of(self, items: Sequence[Any], weights: Sequence[Fraction] | None) -> Any:
+    def _one_of(self, items: Sequence[Any], weights: Sequence[Fraction] | None) -> object:
         """One of the items; equal numbers and texts are one outcome."""
         if not len(items):
             raise ValueError("a cannot be empty unless no samples are taken")
@@ -424,7 +436,7 @@ class BranchingGenerator:
         drawn = list(merged.values())
         return drawn[self._index(len(drawn), [share for _, share in drawn])][0]
 
-    def shuffle(self, x: Any, axis: int = 0) -> None:
+    def shuffle(self, x: np.ndarray | MutableSequence[Any], axis: int = 0) -> None:
         """Permute a sequence in place."""
         for i in range(len(x) - 1, 0, -1):
             j = self._index(i + 1)
@@ -441,7 +453,7 @@ class BranchingGenerator:
 
     permuted = permutation
 
-    def binomial(self, n: Any, p: Any, size: Any = None) -> Any:
+    def binomial(self, n: int, p: float, size: npt.ArrayLike | None = None) -> object:
         """Number of successes in n trials."""
         if size is not None:
             return self._many(size, lambda: self.binomial(n, p))
@@ -449,7 +461,7 @@ class BranchingGenerator:
         weights = [math.comb(int(n), k) * q**k * (1 - q) ** (int(n) - k) for k in range(int(n) + 1)]
         return np.int64(self._index(len(weights), weights))
 
-    def multinomial(self, n: Any, pvals: Any, size: Any = None) -> Any:
+    def multinomial(self, n: int, pvals: object, size: npt.ArrayLike | None = None) -> object:
         """Counts of each outcome in n trials."""
         if size is not None:
             return self._many(size, lambda: self.multinomial(n, pvals))
@@ -457,25 +469,27 @@ class BranchingGenerator:
         draws = [self._index(len(weights), weights) for _ in range(int(n))]
         return np.bincount(draws, minlength=len(weights))
 
-    def rand(self, *shape: int) -> Any:
+    def rand(self, *shape: int) -> object:
         """Numbers from [0, 1) in an array of this shape."""
         return self.uniform(size=shape or None)
 
-    def random_sample(self, size: object = None) -> Any:
+    def random_sample(self, size: npt.ArrayLike | None = None) -> object:
         """A number from [0, 1)."""
         return self.uniform(size=size)
 
-    def randint(self, low: object, high: object = None, size: object = None, dtype: object = int) -> Any:
+    def randint(
+        self, low: object, high: object = None, size: npt.ArrayLike | None = None, dtype: npt.DTypeLike = int
+    ) -> object:
         """An integer from low on and below high."""
         return self.integers(low, high, size, dtype)
 
     def seed(self, *_: object, **__: object) -> None:
         """Seeding changes nothing: every outcome is drawn."""
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> NoReturn:
         raise RuleError("a generator is no part of a state")
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         if name.startswith("__"):
             raise AttributeError(name)
         raise _continuous(self._branches, f"{name}()")
@@ -484,7 +498,7 @@ class BranchingGenerator:
 class BranchingPythonGenerator(BranchingGenerator):
     """Stands in for `random.Random`, which includes ends and returns Python's numbers."""
 
-    def randint(self, low: Any, high: Any = None, size: Any = None, dtype: Any = int) -> int:
+    def randint(self, low: Any, high: Any = None, size: object = None, dtype: object = int) -> int:
         """An integer from low to high, both included."""
         return int(low) + self._index(int(high) - int(low) + 1)
 
@@ -493,23 +507,25 @@ class BranchingPythonGenerator(BranchingGenerator):
         values = range(low) if high is None else range(low, high, step)
         return values[self._index(len(values))]
 
-    def choice(self, a: Any, *_: Any, **__: Any) -> Any:
+    def choice(self, a: Any, *_: object, **__: object) -> object:
         """One of a sequence."""
         return self._one_of([a[i] for i in range(len(a))], None)
 
-    def choices(self, items: Any, weights: Any = None, *, cum_weights: Any = None, k: int = 1) -> list:
+    def choices(
+        self, items: Iterable[object], weights: object = None, *, cum_weights: Iterable[float] | None = None, k: int = 1
+    ) -> list:
         """A list of k of a sequence, with repetitions."""
         if cum_weights is not None:
             weights = np.diff([0, *cum_weights])
         shares = None if weights is None else _normalized(weights)
         return [self._one_of(list(items), shares) for _ in range(k)]
 
-    def sample(self, items: Any, k: int, **_: Any) -> list:
+    def sample(self, items: Iterable[object], k: int, **_: object) -> list:
         """A list of k of a sequence, without repetitions."""
         rest = list(items)
         return [rest.pop(self._index(len(rest))) for _ in range(k)]
 
-    def uniform(self, low: object = 0.0, high: object = 1.0, size: object = None) -> Any:
+    def uniform(self, low: object = 0.0, high: object = 1.0, size: object = None) -> object:
         """A number from [low, high]."""
         return super().uniform(low, high)
 

@@ -229,36 +229,21 @@ def explored(
         StateSpaceTooLarge: more than max_states. ParameterError: the folder holds another game. FolderLocked: another
             process imports there.
     """
-    player = Player(make)
+    player, name = Player(make), str(identity["game"])
+    search = LayerSearch(player.first, RowCollector((*player.game.screen().shape,), np.uint8))
+    store, steps = None, 0
     with contextlib.ExitStack() as held:
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
             held.enter_context(storage.lock(folder, FolderLocked, "importing"))
-        return _explored(player, make, identity, horizon, max_states, folder, workers, settles, progress)
-
-
-def _explored(
-    player: Player,
-    make: Callable[[], Console],
-    identity: Mapping[str, Any],
-    horizon: int,
-    max_states: int,
-    folder: Path | None,
-    workers: int,
-    settles: bool,
-    progress: Callable[[str], object] | None,
-) -> ConsoleLayers:
-    name = str(identity["game"])
-    search = LayerSearch(player.first, RowCollector((*player.game.screen().shape,), np.uint8))
-    store = None if folder is None else KeptLayers(folder, {**identity, "start": key_of(player.first).hex()})
-    if store is not None:
-        store.restore(search, horizon - settles)
-    if not search.keys:
-        search.add(ConsoleStep(0.0, key_of(player.first), deflated(player.first, player.first), player.game.screen()))
-        search.sizes.append(1)
-        search.shown.append(1)
-    steps = 0
-    with Team(player, make, workers) as team:
+            store = KeptLayers(folder, {**identity, "start": key_of(player.first).hex()})
+            store.restore(search, horizon - settles)
+        if not search.keys:
+            step = ConsoleStep(0.0, key_of(player.first), deflated(player.first, player.first), player.game.screen())
+            search.add(step)
+            search.sizes.append(1)
+            search.shown.append(1)
+        team = held.enter_context(Team(player, make, workers))
         while len(search.rows) < horizon and search.frontier:
             depth = len(search.rows)
             is_last = depth == horizon - 1

@@ -13,7 +13,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from types import FrameType
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -48,7 +48,7 @@ class _Printed:
 class _Sink:
     """A stream that catches what this thread writes; other threads, which may draw a bar, write as before."""
 
-    def __init__(self, stream: Any, printed: _Printed):
+    def __init__(self, stream: TextIO, printed: _Printed):
         self._stream, self._printed, self._thread = stream, printed, threading.get_ident()
 
     def write(self, text: str) -> int:
@@ -105,7 +105,7 @@ class SideEffects:
             warnings.showwarning = self._on_warning
             yield
 
-    def _on_warning(self, message: Warning | str, *_: Any, **__: Any) -> None:
+    def _on_warning(self, message: Warning | str, *_: object, **__: object) -> None:
         text = capped(COLORS.sub("", str(message)), LONGEST_LINE)
         if text in self._warnings or len(self._warnings) < 100:
             self._warnings[text] = self._warnings.get(text, 0) + 1
@@ -159,7 +159,7 @@ def line_that_changes(run: Callable[[], object], state: Callable[[], object]) ->
     """The line of the environment's code that changes a state while it runs, file and number; else ""."""
     before, line, last = state(), "", ""
 
-    def trace(frame: FrameType, *_: object) -> Any:
+    def trace(frame: FrameType, *_: object) -> object:
         nonlocal line, last
         if not line and state() != before:
             line = last
@@ -174,7 +174,7 @@ def line_that_asks(run: Callable[[], object]) -> str:
     """The first line of the environment's code that asks for the time, a file or the system's randomness; else ""."""
     line = ""
 
-    def profile(frame: FrameType, event: str, argument: Any) -> None:
+    def profile(frame: FrameType, event: str, argument: object) -> None:
         nonlocal line
         if not line and event == "c_call" and getattr(argument, "__name__", "") in CLOCKS:
             line = line_of_code(frame)
@@ -183,7 +183,7 @@ def line_that_asks(run: Callable[[], object]) -> str:
     return line
 
 
-def _under(install: Callable[[Any], object], before: Any, function: Any, run: Callable[[], object]) -> None:
+def _under(install: Callable[[Any], object], before: object, function: object, run: Callable[[], object]) -> None:
     install(function)
     try:
         with contextlib.suppress(Exception):

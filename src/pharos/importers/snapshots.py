@@ -15,7 +15,7 @@ import random as python_random
 import sys
 import types
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any, cast
 
 import numpy as np
@@ -80,7 +80,7 @@ def chain_of(env: Stepped) -> list[Stepped]:
     return chain
 
 
-def _blank(kind: type) -> Any:
+def _blank(kind: type) -> object:
     return kind.__new__(kind)  # type: ignore[call-overload]
 
 
@@ -145,7 +145,7 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def _reduced_view(value: np.ndarray) -> Any:
+def _reduced_view(value: np.ndarray) -> object:
     """The parts of a view of another array; NotImplemented for any other array."""
     base = value.base
     while isinstance(base, np.ndarray) and isinstance(base.base, np.ndarray):
@@ -233,7 +233,7 @@ class EnvironmentSnapshots:
                     return f"field {name} of {named(each)} ({type(value).__name__}): "
         return ""
 
-    def _reference(self, value: object) -> Any:
+    def _reference(self, value: object) -> object:
         """Name of an object that is outside a snapshot; None for the others."""
         kind = type(value)
         if kind in PLAIN:
@@ -401,7 +401,7 @@ class _Feeder:
         self.places[id(value)] = (len(self.places), value)
         self._feed_object(value)
 
-    def _is_fed_as_name(self, value: Any) -> bool:
+    def _is_fed_as_name(self, value: object) -> bool:
         """Write what is told apart by its name, such as functions; whether the value was such a thing."""
         kind = type(value)
         if isinstance(value, RandomNumber):
@@ -473,7 +473,7 @@ class _Feeder:
         else:
             self.put(value.tobytes())
 
-    def _feed_set(self, value: Any) -> None:
+    def _feed_set(self, value: Collection[object]) -> None:
         digests = []
         for item in value:
             hasher = hashlib.blake2b(digest_size=16)

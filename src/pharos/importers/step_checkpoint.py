@@ -10,12 +10,12 @@ expanded are stepped to again. Nothing that is read can run code.
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from pharos.errors import FileFormatError, ParameterError, RuleError
-from pharos.importers.search import END, Arrival, BreadthFirst, Steppable, SteppedStates
+from pharos.importers.search import END, Arrival, BreadthFirst, SteppedStates
 from pharos.system import sealed, storage
 
 IDENTITY = "identity.json"
@@ -23,18 +23,6 @@ WHAT = "part of an import"
 SECONDS = 2.0
 """Between two writes, at least."""
 KEY_BYTES = 16
-
-
-class Replayable(Steppable, Protocol):
-    """A source that can step again where it stepped before."""
-
-    def arrive(self, saved: Any, action: int, script: tuple[int, ...]) -> Arrival:
-        """Step from a saved state, or reset (None), with these draws."""
-        ...
-
-    def skip(self, keys: list[bytes]) -> None:
-        """Hand over no saved states of these keys."""
-        ...
 
 
 class StepCheckpoint:

@@ -207,7 +207,7 @@ def _note_names(env: Environment, notes: list[str]) -> None:
         near = difflib.get_close_matches(name, contract, n=1, cutoff=NEAR)
         if meant := OTHER_NAMES.get(name) or (near[0] if near else ""):
             notes.append(f"{name} is not used; did you mean {meant}?")
-    if own and classes().get(env.name, cls).__module__.startswith("pharos."):
+    if not cls.__module__.startswith("pharos.") and classes().get(env.name, cls).__module__.startswith("pharos."):
         notes.append(f"{env.name!r} is the name of a class of pharos as well; choose another name")
 
 

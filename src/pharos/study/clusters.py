@@ -134,7 +134,9 @@ class RayTasks(Workers):
         if self.is_ours:
             self.ray.shutdown()
 
-    def start(self, key: str, function: Any, arguments: Sequence[Any], definitions: Sequence[object] = ()) -> None:
+    def start(
+        self, key: str, function: Callable[..., object], arguments: Sequence[Any], definitions: Sequence[object] = ()
+    ) -> None:
         remote = self.ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_attempt)
         self.tasks[remote.remote(*arguments)] = key
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import agent_called, is_known
+from pharos.agents import Learner, agent_called, is_known
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
 from pharos.policies import PolicyLike
 from pharos.system import compiling
@@ -29,7 +29,7 @@ from pharos.system.wording import in_one_line
 from pharos.training import functions  # noqa: F401  (who trains functions)
 from pharos.training import results as _results
 from pharos.training.curve import Evaluation, joint_values
-from pharos.training.evaluators import Evaluators, evaluates_apart
+from pharos.training.evaluators import Evaluators, NetworkLearner, evaluates_apart
 from pharos.training.prepared import FailedRun, PreparedRun
 from pharos.training.results import Checkpoint, TrainingResult, clear_run, finished_result
 from pharos.training.schedule import lanes
@@ -159,7 +159,7 @@ def _is_foreign(config: RunConfig, runs: Sequence[PreparedRun]) -> bool:
 class Program:
     """Runs under one loop: trained, evaluated, resumed, and brought into their folders; arguments as `train_group`."""
 
-    learner: Any  # a Learner, from when the runs begin; gone where they failed
+    learner: Learner  # from when the runs begin; gone where they failed
     evaluators: Evaluators | None = None  # where policies are evaluated apart
     pending: Counts | None = None  # of the policies that are evaluated apart
 
@@ -201,8 +201,8 @@ class Program:
             return
         logs = first.folder / "tensorboard" if self.tensorboard and first.folder is not None else None
         self.learner = agent_called(self.config.agent).learner(self.runs, first.tasks.device, logs)
-        if hasattr(self.learner, "set_parameters") and evaluates_apart(first.tasks.device, self.runs):
-            self.evaluators = Evaluators(self.runs)
+        if isinstance(self.learner, NetworkLearner) and evaluates_apart(first.tasks.device, self.runs):
+            self.evaluators = Evaluators(self.learner, self.runs)
             self.held.enter_context(self.evaluators.workers)
         checkpoint = self._checkpoint()
         if checkpoint is not None:
@@ -318,7 +318,7 @@ class Program:
         counts = step, np.array(self.learner.episodes), np.array(self.learner.returns)
         if self.evaluators is not None:
             self._await_values()
-            self.evaluators.begin(self.learner)
+            self.evaluators.begin()
             self.pending = counts
             return {}
         policies: list[PolicyLike | Evaluation] = [self.learner.policy(i) for i in range(len(self.runs))]

@@ -10,7 +10,7 @@ import multiprocessing
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -29,6 +29,7 @@ FEWEST = 8
 Parameters = Mapping[str, np.ndarray]
 
 
+@runtime_checkable
 class NetworkLearner(Learner, Protocol):
     """A learner whose policies depend on the parameters of networks alone."""
 
@@ -54,7 +55,8 @@ class Evaluators:
         workers: to be entered and left.
     """
 
-    def __init__(self, runs: Sequence[PreparedRun]):
+    def __init__(self, learner: NetworkLearner, runs: Sequence[PreparedRun]):
+        self.learner = learner
         number = min(len(runs), max(1, usable_workers(None) - 1))
         self.parts = [part.tolist() for part in np.array_split(np.arange(len(runs)), number)]
         self.workers, self.senders = Workers(), []
@@ -66,11 +68,11 @@ class Evaluators:
             receiver.close()
             self.senders.append(sender)
 
-    def begin(self, learner: NetworkLearner) -> None:
+    def begin(self) -> None:
         """Begin to evaluate the present policies; the values of those before have been fetched."""
         for part, sender in zip(self.parts, self.senders, strict=True):
             with contextlib.suppress(BrokenPipeError):  # `values` finds that the process has ended
-                sender.send([learner.parameters(i) for i in part])
+                sender.send([self.learner.parameters(i) for i in part])
 
     def values(self) -> dict[int, Evaluation | PharosError]:
         """Values of the policies by run, or why they have none; waits for them. PharosError: a process has ended."""
@@ -110,4 +112,6 @@ def _evaluate(configs: Sequence[dict[str, Any]], receiver: Connection, send: Cal
 
 
 def _learner(runs: Sequence[PreparedRun]) -> NetworkLearner:
-    return cast(NetworkLearner, agent_called(runs[0].config.agent).learner(runs, "cpu"))
+    learner = agent_called(runs[0].config.agent).learner(runs, "cpu")
+    assert isinstance(learner, NetworkLearner)
+    return learner
