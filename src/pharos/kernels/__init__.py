@@ -10,6 +10,6 @@ compiling.prepare()
 from pharos.kernels import outcomes  # noqa: E402  (it loads Numba)
 
 _shared = """
-    batched bellman end_components gaps graph hash_table hitting horizon kernel_cache linear_algebra many_searches
-    observation_kernels occupancy outcomes partition patches stepping
+    batched bellman elimination end_components gaps graph hash_table hitting horizon kernel_cache linear_algebra
+    many_searches observation_kernels occupancy outcomes partition patches stepping
 """

@@ -60,11 +60,12 @@ def turn(direction, beta, omega, moved, residual):
 
 
 @kernel
-def entries_of_factor(first, columns, limit):
+def entries_of_factor(first, columns, limit, starts=None, rows=None):
     """(N,) entries below the diagonal in each column of the factor of a matrix whose pattern is symmetric.
 
     Row i of the matrix has its entries in columns[first[i] : first[i + 1]]; pivots are taken in order. In place of the
-    counts of all rows those so far are returned as soon as their sum passes the limit.
+    counts of all rows those so far are returned as soon as their sum passes the limit. Unless they are None, rows holds
+    the rows of those of column j from starts[j] on, in order.
 
     Cost: O(entries of the factor) time, 24 bytes a row.
     """
@@ -81,6 +82,8 @@ def entries_of_factor(first, columns, limit):
             while column < row and marks[column] != row:
                 if parent[column] < 0:
                     parent[column] = row
+                if rows is not None:
+                    rows[starts[column] + entries[column]] = row
                 entries[column] += 1
                 total += 1
                 marks[column] = row

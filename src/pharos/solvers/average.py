@@ -34,10 +34,10 @@ from pharos.errors import PrecisionError, UnknownName
 from pharos.kernels import hitting
 from pharos.kernels.hitting import UNIT
 from pharos.mdp import BEST, WORST, PolicyTable, Selection, TabularMDP, end_components, require_mdp, stand_ins
+from pharos.solvers.chains import Chain
 from pharos.solvers.goals import (
     ELIMINATED,
     MARGIN,
-    Chain,
     Choices,
     GoalProblem,
     WrittenOut,
@@ -210,7 +210,7 @@ def _gains(
     alone = np.flatnonzero(size[labels] == 1)
     at = alone[rewards[alone] == most[labels[alone]]][::-1]
     staying[rows[at] // per_node] = rows[at] % per_node
-    gains, error = most.copy(), np.full(total, nodes.error + nodes.mdp.residual.rewards)
+    gains, error = most.copy(), np.full(total, nodes.error.max(initial=0.0) + nodes.mdp.residual.rewards)
     order = np.argsort(labels, kind="stable")
     ends = np.searchsorted(labels[order], np.arange(total + 1))
     for k in np.flatnonzero((least < most) & (size > 1)):
@@ -244,7 +244,7 @@ def _inner(nodes: WrittenOut, rows: np.ndarray) -> Choices:
         rows=np.searchsorted(owner, np.arange(len(members) + 1)),
         owner=owner,
         rewards=nodes.sign * nodes.rewards[rows],
-        error=nodes.error + residual.rewards,
+        error=nodes.error[rows] + residual.rewards,
         origin=rows,
         terms=terms,
         deviation=residual.probabilities,
@@ -326,7 +326,7 @@ class MeanPayoff:
                 return False
             gain, better = result
             if np.array_equal(better, policy):
-                room = self.choices.error + 2 * UNIT * abs(float(gain)) + 2.0**-1074
+                room = float(self.choices.error.max()) + 2 * UNIT * abs(float(gain)) + 2.0**-1074
                 self.lower, self.upper, self.policy = float(gain) - room, float(gain) + room, policy
                 return True
             policy = better
@@ -403,7 +403,7 @@ class Sums:
         self.choices = choices._replace(
             matrix=matrix, rows=np.arange(count + 1), owner=own, rewards=np.zeros(count), origin=own
         )
-        self.chain = Chain(self.choices, own)
+        self.chain = Chain(matrix, float)
 
     def until(self, b: np.ndarray) -> np.ndarray:
         """(M + 1,) x of b (M,), as floats have it; NaN where it cannot be solved for."""
@@ -498,7 +498,8 @@ def _ends(
     if len(amounts) == 1:
         v, error = np.where(live, nodes.sign * amounts[0], 0.0), np.where(live, room, 0.0)
         return v, error, staying
-    problem = GoalProblem.collapsed(nodes, component, inside, stops, np.zeros(len(nodes.rewards)), 0.0, staying)
+    nothing = np.zeros(len(nodes.rewards))
+    problem = GoalProblem.collapsed(nodes, component, inside, stops, nothing, nothing, staying)
     if problem.choices.num_nodes > ELIMINATED:
         v, error, choices = _swept_ends(problem, tolerance)
     else:
@@ -625,5 +626,5 @@ def _bias(mdp: TabularMDP, select: PolicyTable) -> StateBounds:
     bias = _of_states(mdp, select, of_nodes[0], of_nodes[1], mdp.rewards)
     gain = _of_states(mdp, select, of_nodes[2], of_nodes[3])
     lower, upper = bias.lower - gain.upper, bias.upper - gain.lower
-    extra = 2 * UNIT * (np.abs(lower) + np.abs(upper)) + choices.error
+    extra = 2 * UNIT * (np.abs(lower) + np.abs(upper)) + choices.error.max(initial=0.0)
     return StateBounds(lower - extra, upper + extra)

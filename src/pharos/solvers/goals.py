@@ -13,14 +13,17 @@ over policies whose expected sums of positive and of negative rewards are not bo
    is that of the residuals T_a v - v, none of which is negative.
 3. Bounds. For any u with u >= T_a u everywhere and u = 0 at the end, u >= V: along each proper policy of finite value
    u plus what was paid does not rise on average. For any l with l <= T_pi l under a proper policy pi, l <= V of pi.
-   Both hold for v + w and v - w with (1 - P_pi) w = twice what the residuals of v and their rounding come to.
+   Both hold for v + w and v - w, if w is what a policy collects that is paid more than the residuals of v and their
+   rounding: pi for the lower bound, and for the upper one the policy that collects most.
 
 Rows sum to 1, so T_a v(n) - v(n) = r(n, a) + sum_m p(m | n, a) (v(m) - v(n)): in this form no rounding error grows
 with v itself, rows that floats do not sum to 1 are taken as divided by their sum, and a choice that stays with
 probability 1 - 1e-12 loses no digit.
 
-Where actions are as good as each other up to rounding, and to mix them would never end, floats cannot tell a value from
-an infinite one. Then policy iteration is repeated in rational numbers (`rational.py`).
+A policy's equations are solved by elimination without subtraction (`chains.py`), in floats, then in pairs of them: no
+digit is lost where a loop is left once in 10^12 steps, and a bound is proven wherever rounding of one step, times the
+steps, is less than the tolerance. Where that is too much, or where actions are as good as each other, and to mix them
+would never end, policy iteration is repeated in rational numbers (`rational.py`).
 
 Source: Bertsekas and Tsitsiklis (1991), "An analysis of stochastic shortest path problems"; Haddad and Monmege (2018),
 "Interval iteration algorithm for MDPs and IMDPs"; Baier et al. (2018), "Stochastic shortest paths and weight-bounded
@@ -35,7 +38,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pharos.errors import DivergenceError, PrecisionError
-from pharos.kernels import bellman, hitting
+from pharos.kernels import bellman, elimination, hitting
 from pharos.kernels.hitting import UNIT
 from pharos.mdp import (
     PolicyTable,
@@ -46,7 +49,8 @@ from pharos.mdp import (
     nodes_of_outcomes,
     stand_ins,
 )
-from pharos.solvers.policy_iteration import BLOCK, DENSE, fills_little
+from pharos.solvers.chains import Chain, mean_changes
+from pharos.solvers.policy_iteration import BLOCK
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -55,9 +59,17 @@ if TYPE_CHECKING:
 NAMED = 6
 # Improvements of a policy, at most; each changes all nodes that can be.
 MOST_IMPROVEMENTS = 1000
-# Steps of refinement of a linear solve.
-REFINEMENTS = 3
-# Unknowns of the largest system that is eliminated whatever it fills in.
+# Improvements after which sweeps look further ahead, and how many.
+SWEPT, SWEEPS = 50, 100
+# Solutions of the same policy's equations, each with the rounding of the one before.
+SETTLED = 4
+# Tolerances within which values may be for every MDP within the residual of one.
+WIDER = 1e6
+# Units of a number in its last place that may be rounding.
+NOISE = 64
+# More than what sums of numbers too small for a float lose.
+SMALLEST = 2.0**-1000
+# Nodes of the largest MDP that is not swept first.
 ELIMINATED = 20_000
 # Sweeps of paths before their steps are looked at for a cycle.
 LOOK = 8
@@ -71,7 +83,7 @@ class Choices(NamedTuple):
     Attributes:
         matrix: (R, M + 1) CSR of the outcomes that leave the node; node M is the end.
         rows: (M + 1,). owner: (R,) the node of each row.
-        rewards: (R,), to be maximised. error: bound on the error of each.
+        rewards: (R,), to be maximised. error: (R,) bound on the error of each, of one that is 0 exactly none.
         origin: (R,) node of the MDP times its choices, plus the choice; -1: to stop where nothing is paid.
         terms: the most outcomes of a row, and the numbers that a probability was computed from.
         deviation: how far the probabilities of a row may be from its own, in sum; bounds hold for all of them.
@@ -81,7 +93,7 @@ class Choices(NamedTuple):
     rows: np.ndarray
     owner: np.ndarray
     rewards: np.ndarray
-    error: float
+    error: np.ndarray
     origin: np.ndarray
     terms: int
     deviation: float = 0.0
@@ -91,15 +103,13 @@ class Choices(NamedTuple):
         return len(self.rows) - 1
 
     def residuals(self, v: np.ndarray, rewards: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """((R,) T_a v - v, by how much each may be off) of v (M + 1,)."""
-        matrix, rewards = self.matrix, self.rewards if rewards is None else rewards
-        counts = np.diff(matrix.indptr)
-        steps = matrix.data * (v[matrix.indices] - np.repeat(v[self.owner], counts))
-        entries = np.repeat(np.arange(len(counts)), counts)
-        total = rewards + np.bincount(entries, steps, minlength=len(counts))
-        size = np.abs(rewards) + np.bincount(entries, np.abs(steps), minlength=len(counts))
-        slack = (self.terms + 24) * UNIT * size
-        return total, slack + self.deviation * 2 * float(np.abs(v).max(initial=0.0)) if self.deviation else slack
+        """((R,) T_a v - v, by how much each may be off) of v (M + 1,), floats or pairs of them."""
+        rewards = self.rewards if rewards is None else rewards
+        total, size, off = mean_changes(self.matrix, self.owner, v)
+        slack = (self.terms + 24) * UNIT * (np.abs(rewards) + size) + off + SMALLEST
+        if self.deviation:
+            slack += self.deviation * 2 * float(np.abs(v).max(initial=0.0))
+        return rewards + total, slack
 
 
 @dataclass(frozen=True)
@@ -166,7 +176,7 @@ class WrittenOut(NamedTuple):
         mdp: its nodes are states, under sticky actions pairs (state, previously executed action); N in all.
         sign: -1 if rewards are to be minimised, else 1. per_node: C, choices of a node: A, or 1 under a policy.
         matrix: (N C, N + 2) CSR, column N: it is over; column N + 1: it is over without having arrived.
-        rewards: (N C,) means. size: (N C,) means of their absolute values. error: bound on the error of each.
+        rewards: (N C,) means. size: (N C,) means of their absolute values. error: (N C,) bounds.
         live: (N,) bool, nodes of states that are not terminal. arrived: as `GoalProblem.of` takes it.
     """
 
@@ -176,7 +186,7 @@ class WrittenOut(NamedTuple):
     matrix: "csr_matrix"
     rewards: np.ndarray
     size: np.ndarray
-    error: float
+    error: np.ndarray
     live: np.ndarray
     arrived: np.ndarray | None
 
@@ -201,13 +211,13 @@ class WrittenOut(NamedTuple):
         live = ~np.repeat(np.asarray(mdp.terminal), width)
         outcomes = nodes_of_outcomes(mdp.dynamics.matrix(~np.asarray(mdp.terminal)), num_actions, width)
         each_reward = mdp.rewards.ravel()
-        error = mdp.reward_table.rounding
+        error = mdp.reward_table.rounding * np.ones(nodes * per_node)
         if is_policy or not mdp.chance.is_none:
             each = np.repeat(np.arange(nodes), per_node)
             weights = executed_actions(mdp, table, owner[each], previous[each])
             matrix = (weights @ outcomes).tocsr()
             rewards, size = weights @ each_reward, weights @ np.abs(each_reward)
-            error += (num_actions + 8) * UNIT * float(size.max(initial=0.0))
+            error += (num_actions + 8) * UNIT * size
         else:
             matrix, rewards, size = outcomes, each_reward, np.abs(each_reward)
         # what leads to a terminal state, or to the end, is over: column N, or N + 1 if it has not arrived
@@ -277,14 +287,14 @@ class GoalProblem:
         inside: np.ndarray,
         stops: np.ndarray,
         rewards: np.ndarray,
-        error: float,
+        error: np.ndarray,
         staying: np.ndarray | None = None,
     ) -> "GoalProblem":
         """
         component: (N,) the component of each node, from 0 on, each of which becomes one node; -1: none.
         inside: (N C,) bool, the choices that stay in a component.
         stops: what staying in the first components pays for ever, to be maximised.
-        rewards: (N C,) of the choices. error: bound on the error of each.
+        rewards: (N C,) of the choices. error: (N C,) bounds on the error of each.
         staying: (N,) the choices of nodes of components that stay; None: any that is inside.
         """
         from scipy import sparse
@@ -312,7 +322,7 @@ class GoalProblem:
         joined.sum_duplicates()
         joined.eliminate_zeros()
         terms = int(np.diff(joined.indptr).max(initial=0)) + mdp.num_actions + mdp.dynamics.operations
-        choices = _sorted_choices(joined, own, nodes.sign * rewards[keep], keep, stops, error, terms)
+        choices = _sorted_choices(joined, own, nodes.sign * rewards[keep], keep, stops, error[keep], terms)
         return GoalProblem(mdp, nodes.sign, nodes.per_node, choices, node_of, matrix, inside, staying)
 
     # Solving ----------------------------------------------------------------------------------------------------------
@@ -339,6 +349,7 @@ class GoalProblem:
             rows=np.searchsorted(owner, np.arange(len(nodes))),
             owner=owner,
             rewards=choices.rewards[rows],
+            error=choices.error[rows],
             origin=choices.origin[rows],
         )
         v, error = np.full(len(inside), np.inf), np.zeros(len(inside))
@@ -356,7 +367,7 @@ class GoalProblem:
             raise _without_end(self.mdp, ~sure[self.node_of[:-2]])
         v, error, policy, improvements = _values(choices, policy, tolerance, self._infinite, progress)
         if any(self.mdp.residual):
-            error = self._within_residual(choices, v, policy)
+            error = self._within_residual(choices, v, policy, tolerance)
         nodes = self.node_of[:-2]
         return Goals(
             self.sign * np.append(v, 0.0)[nodes],
@@ -365,12 +376,12 @@ class GoalProblem:
             improvements,
         )
 
-    def _within_residual(self, choices: Choices, v: np.ndarray, policy: np.ndarray) -> np.ndarray:
+    def _within_residual(self, choices: Choices, v: np.ndarray, policy: np.ndarray, tolerance: float) -> np.ndarray:
         """(M,) error of v that holds for every MDP within the residual of this one."""
         residual = self.mdp.residual
         wider = choices._replace(error=choices.error + residual.rewards, deviation=residual.probabilities)
         try:
-            values, error, _, _ = _iterated(wider, policy, self._infinite, None)
+            values, error, _, _ = _iterated(wider, policy, self._infinite, None, WIDER * tolerance)
         except Undecided:
             raise PrecisionError(
                 f"{self.mdp}: rows that were off by {residual.probabilities:.2g} and divided by their sums leave no "
@@ -393,6 +404,7 @@ class GoalProblem:
             rows=rows,
             owner=choices.owner[keep],
             rewards=choices.rewards[keep],
+            error=choices.error[keep],
             origin=choices.origin[keep],
         )
 
@@ -443,7 +455,7 @@ def _sorted_choices(
     rewards: np.ndarray,
     origin: np.ndarray,
     stops: np.ndarray,
-    error: float,
+    error: np.ndarray,
     terms: int,
 ) -> Choices:
     """Choices by node, with one more row that stops for each of the first nodes, and is paid what `stops` says."""
@@ -454,11 +466,11 @@ def _sorted_choices(
         first = np.arange(len(stops))
         entries = (np.ones(len(stops)), (first, np.full(len(stops), count)))
         matrix = sparse.vstack([matrix, sparse.csr_matrix(entries, shape=(len(stops), count + 1))], format="csr")
-        owner, rewards = np.append(owner, first), np.append(rewards, stops)
+        owner, rewards, error = np.append(owner, first), np.append(rewards, stops), np.append(error, 0.0 * stops)
         origin = np.append(origin, np.full(len(stops), -1))
     order = np.argsort(owner, kind="stable")
     if (order[1:] < order[:-1]).any():
-        matrix, owner, rewards, origin = matrix[order], owner[order], rewards[order], origin[order]
+        matrix, owner, rewards, origin, error = (each[order] for each in (matrix, owner, rewards, origin, error))
     return Choices(matrix, np.searchsorted(owner, np.arange(count + 1)), owner, rewards, error, origin, terms)
 
 
@@ -513,49 +525,6 @@ class Undecided(Exception):
         self.policy = policy
 
 
-class Chain:
-    """Linear equations (1 - P) x = b of a proper policy (M,), a row for each node."""
-
-    def __init__(self, choices: Choices, policy: np.ndarray):
-        from scipy import sparse
-        from scipy.sparse import linalg
-
-        self.choices, self.policy = choices, policy
-        matrix = choices.matrix[policy]
-        inner = matrix[:, :-1]
-        # 1 minus the probability to stay, as the sum of the others: nothing is subtracted
-        self.leaving = np.asarray(matrix.sum(axis=1)).ravel()
-        system = sparse.diags(self.leaving, format="csr") - inner
-        self._solve: Callable[[np.ndarray], np.ndarray] = lambda right: np.full(len(right), np.nan)
-        count = choices.num_nodes
-        with np.errstate(all="ignore"):
-            try:
-                if count <= DENSE:
-                    inverse = np.linalg.inv(system.toarray())
-                    self._solve = lambda right: inverse @ right
-                elif count <= ELIMINATED or fills_little(system):
-                    self._solve = linalg.splu(system.tocsc()).solve
-            except (np.linalg.LinAlgError, RuntimeError):
-                pass
-
-    def solve(self, right: np.ndarray) -> np.ndarray:
-        """(M + 1,) x, 0 at the end; NaN where the system is singular to the last bit, or too large."""
-        with np.errstate(all="ignore"):
-            x = np.append(self._solve(right), 0.0)
-            rows = self.choices._replace(
-                matrix=self.choices.matrix[self.policy], owner=np.arange(len(right)), rewards=right
-            )
-            least = math.inf
-            for _ in range(REFINEMENTS):
-                left, _ = rows.residuals(x)
-                largest = float(np.abs(left).max(initial=0.0))
-                if not largest < 0.5 * least:
-                    break
-                least = largest
-                x[:-1] += self._solve(left)
-        return x
-
-
 def _values(
     choices: Choices,
     policy: np.ndarray,
@@ -565,66 +534,122 @@ def _values(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """((M,) values, (M,) error of each, (M,) rows, improvements), from a proper policy: by floats, where they can tell
     and are long enough, else by rational numbers."""
-    try:
-        v, error, policy, improvements = _iterated(choices, policy, infinite, progress)
-        if not error.max(initial=0.0) <= tolerance:
-            raise Undecided(policy)
-        return v, error, policy, improvements
-    except Undecided as undecided:
-        from pharos.solvers.rational import rational_values
+    from pharos.solvers.rational import rational_values
 
-        return rational_values(choices, undecided.policy, infinite)
+    for dtype in (float, complex):
+        try:
+            v, error, policy, improvements = _iterated(choices, policy, infinite, progress, tolerance, dtype)
+            if error.max(initial=0.0) <= tolerance:
+                return v, error, policy, improvements
+        except Undecided as undecided:
+            policy = undecided.policy
+    return rational_values(choices, policy, infinite)
 
 
 def _iterated(
-    choices: Choices, policy: np.ndarray, infinite: Infinite, progress: Callable[[int, float], None] | None
+    choices: Choices,
+    policy: np.ndarray,
+    infinite: Infinite,
+    progress: Callable[[int, float], None] | None,
+    tolerance: float,
+    dtype: type = float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """((M,) values, (M,) error of each, (M,) rows, improvements), from a proper policy; `Undecided` if floats cannot
-    tell."""
-    nodes, bonus = np.arange(choices.num_nodes), None
+    """((M,) values, (M,) error of each, (M,) rows, improvements), from a proper policy; `Undecided` if floats, or
+    pairs of them (complex), cannot tell."""
+    nodes = np.arange(choices.num_nodes)
     if not len(nodes):
         return np.zeros(0), np.zeros(0), policy, 0
     for improvements in range(1, MOST_IMPROVEMENTS):
-        chain = Chain(choices, policy)
+        chain = Chain(choices.matrix[policy], dtype)
         v = chain.solve(choices.rewards[policy])
         if not np.isfinite(v).all():
             raise Undecided(policy)
         total, slack = choices.residuals(v)
         slack += choices.error
-        own = np.abs(total[policy]) + slack[policy]
+        # how far v may be from the policy's own values: pairs are right to more than their residuals are computed to
+        own = np.abs(total[policy]) + slack[policy] if dtype is float else NOISE * chain.unit * np.abs(v.real[:-1])
         gain = total - slack
         better = best_rows(choices, gain)
-        if bonus is None and (gain[better] > 2 * own).any():
-            changed = np.where(gain[better] > 2 * own, better, policy)
-            if not _proper(choices.matrix[changed], np.arange(len(nodes) + 1))[0].all():
-                stuck = np.flatnonzero(recurrent_classes(choices.matrix[changed], nodes >= 0)[0] == 0)
-                raise infinite(choices, changed[stuck]) if _pays(choices, changed, stuck) else Undecided(policy)
-            policy = changed
-            continue
-        # the best up to rounding: from now on each step pays a bonus of what its actions may gain
-        near = np.abs(total) <= 8 * (slack + own[choices.owner])
-        room = np.maximum.reduceat(np.where(near, np.abs(total) + slack, 0.0), choices.rows[:-1])
-        room = 2 * np.maximum(room, own) + 2.0**-1000
-        bonus = room if bonus is None else np.where(room > bonus, 2 * room, bonus)
-        w = chain.solve(bonus)
-        if not (np.isfinite(w).all() and (w >= 0).all()):
-            raise Undecided(policy)
-        more, rounding = choices.residuals(w, np.zeros(len(total)))
-        above = total + slack + more + rounding
-        below = (total - slack - more - rounding)[policy]
-        if progress is not None:
-            progress(improvements, float(w.max(initial=0.0)))
-        if (above <= 0).all() and (below >= 0).all():
-            return v[:-1], w[:-1] * MARGIN, policy, improvements
-        better = best_rows(choices, above)
-        changed = np.where(above[better] > 0, better, policy)
-        is_stuck = (
-            np.array_equal(changed, policy) or not _proper(choices.matrix[changed], np.arange(len(nodes) + 1))[0].all()
-        )
-        if is_stuck or improvements > MOST_IMPROVEMENTS // 2:
-            raise Undecided(policy)
-        policy = changed
+        is_better = gain[better] > 2 * own
+        if not is_better.any():
+            error = _errors(choices, policy, chain, total, slack, tolerance) + np.abs(v.imag[:-1])
+            if progress is not None:
+                progress(improvements, float(error.max()))
+            return v.real[:-1], error, policy, improvements
+        changed = np.where(is_better, better, policy)
+        if not _is_proper(choices, changed):
+            stuck = np.flatnonzero(recurrent_classes(choices.matrix[changed], nodes >= 0)[0] == 0)
+            raise infinite(choices, changed[stuck]) if _pays(choices, changed, stuck) else Undecided(policy)
+        policy = _swept(choices, v.real.copy(), changed) if improvements <= SWEPT else changed
     raise Undecided(policy)
+
+
+def _errors(
+    choices: Choices, policy: np.ndarray, chain: Chain, total: np.ndarray, slack: np.ndarray, tolerance: float
+) -> np.ndarray:
+    """(M,) the error of a policy's values with residuals `total` (R,), each within `slack`; `Undecided` if unproven."""
+    nodes = np.arange(choices.num_nodes)
+    own = choices._replace(
+        matrix=choices.matrix[policy], rows=np.arange(len(nodes) + 1), owner=nodes, rewards=choices.rewards[policy]
+    )
+    below = _room(own, nodes, chain, slack[policy] - total[policy], slack[policy], tolerance)
+    above = None if below is None else _room(choices, policy, chain, total + slack, slack, tolerance)
+    if below is None or above is None:
+        raise Undecided(policy)
+    return np.maximum(below, above) * MARGIN
+
+
+def _room(
+    choices: Choices, rows: np.ndarray, chain: Chain, off: np.ndarray, slack: np.ndarray, tolerance: float
+) -> np.ndarray | None:
+    """(M,) w <= tolerance with w(n) >= off + sum_m p(m) w(m) for all choices (R,), rounding included; None if unproven.
+
+    w is what a policy collects that is paid so much, and its slack more, improved from a proper one (M,) whose chain is
+    given. Each row is paid its own rounding, not that of another choice of its node.
+    """
+    least = NOISE * chain.unit * tolerance + SMALLEST  # more than rounding of w takes away
+    extra, zeros, settled = np.zeros(len(off)), np.zeros(len(off)), 0
+    for improvements in range(MOST_IMPROVEMENTS):
+        payment = off + slack + 2 * extra + least
+        w = chain.solve(payment[rows])
+        if not w.real.max() <= tolerance:
+            return None
+        more, rounding = choices.residuals(w, zeros)
+        above = off + more + rounding
+        if (above <= 0).all():
+            return w.real[:-1] + np.abs(w.imag[:-1])
+        # a row that is no better but for the rounding of w is paid that, too
+        better = best_rows(choices, above)
+        changed = np.where((above[better] > 0) & ((payment + more - rounding)[better] > 0), better, rows)
+        extra = np.maximum(extra, rounding)
+        if np.array_equal(changed, rows):
+            settled += 1
+            if settled > SETTLED:
+                return None
+            continue
+        if not _is_proper(choices, changed):
+            return None
+        rows = changed
+        if improvements < SWEPT:
+            rows = _swept(choices._replace(rewards=payment), w.real.copy(), changed)
+        chain = Chain(choices.matrix[rows], chain.dtype)
+    return None
+
+
+def _is_proper(choices: Choices, policy: np.ndarray) -> bool:
+    """Whether a policy (M,) surely ends."""
+    return bool(_proper(choices.matrix[policy], np.arange(len(policy) + 1))[0].all())
+
+
+def _swept(choices: Choices, v: np.ndarray, policy: np.ndarray) -> np.ndarray:
+    """(M,) rows of a policy that is better than a proper one, as sweeps from its values v (M + 1,) have it."""
+    matrix, better = choices.matrix, policy.copy()
+    for sweep in range(SWEEPS):
+        if not elimination.improve(
+            matrix.indptr, matrix.indices, matrix.data, choices.rows, choices.rewards, sweep % 2 == 0, v, better
+        ):
+            break
+    return better if _is_proper(choices, better) else policy
 
 
 def best_rows(choices: Choices, gain: np.ndarray) -> np.ndarray:
@@ -654,7 +679,7 @@ def _pays(choices: Choices, policy: np.ndarray, nodes: np.ndarray) -> bool:
     v[nodes] = h
     total, slack = choices.residuals(v)
     at = policy[nodes]
-    return bool((total[at] - slack[at] - choices.error > 0).all())
+    return bool((total[at] - slack[at] - choices.error[at] > 0).all())
 
 
 # Longest paths --------------------------------------------------------------------------------------------------------

@@ -71,7 +71,7 @@ def _large(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray
     order = csgraph.reverse_cuthill_mckee(system)
     ordered = system[order][:, order]
     if not fills_little(ordered):
-        return _iterated(system, right, x)
+        return iterated(system, right, x)
     # in each row the diagonal outweighs the rest, so pivots are on the diagonal, and the pattern is that of the count
     options = {"SymmetricMode": True}
     factors = linalg.splu(ordered.tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
@@ -81,7 +81,7 @@ def _large(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray
     return solved
 
 
-def _iterated(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray:
+def iterated(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray:
     """The x of system x = right, by BiCGSTAB, repeated on the residual as far as rounding allows; NaN if divergent."""
     residual = right - system @ x
     for call in range(CALLS):
