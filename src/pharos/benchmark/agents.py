@@ -16,7 +16,6 @@ import os
 import random
 import sys
 import time
-import traceback
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,7 +40,7 @@ from pharos.agents import (
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
 from pharos.system.sources import Source, find, is_reference, load, source_of
-from pharos.system.wording import capped, in_one_line
+from pharos.system.wording import capped, in_one_line, line_in
 from pharos.system.workers import Terminated, Workers
 from pharos.training import (
     Curve,
@@ -500,12 +499,6 @@ def failure(label: str, job: Job, end: BaseException | str, file: str | None = N
     text, place = (end, "") if isinstance(end, str) else (in_one_line(end), line_in(end, file))
     printable = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in capped(text, LONGEST))
     return f"{label} on {job.id}: {printable.rstrip(': ')}{place}"
-
-
-def line_in(error: BaseException, file: str | None) -> str:
-    """The last line of a file in the traceback of an error, such as " (FILE, line 12)"; empty if there is none."""
-    frames = [each for each in traceback.extract_tb(error.__traceback__) if file and each.filename == file]
-    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
 
 # Processes ------------------------------------------------------------------------------------------------------------
