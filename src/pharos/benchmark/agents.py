@@ -121,12 +121,14 @@ class RunResult:
         curve: (evaluations,) normalised regret. exact: whether all of it is.
         steps: of the environment, as it counted them, else those of the protocol.
         notes: sentences on what looks like a mistake, by kind.
+        policies: facts on the policies, by `policy_facts` of training/curve.py; empty if they are unknown.
     """
 
     curve: np.ndarray
     exact: bool
     steps: int
     notes: Mapping[str, str] = field(default_factory=dict)
+    policies: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -176,6 +178,7 @@ class Form:
             all(row["exact"] for row in rows_at),
             protocol.steps if counted is None else int(counted),
             {str(kind): str(text) for kind, text in notes.items()} if isinstance(notes, Mapping) else {},
+            record.get("policies") or {},
         )
 
 
@@ -488,8 +491,7 @@ def record_run(
     else:
         (job.folder / POLICY).unlink(missing_ok=True)  # of an earlier attempt
     write_curve(job.folder, end.rows)
-    if notes:
-        record["notes"] = dict(notes)
+    record |= {name: dict(entry) for name, entry in {"notes": notes, "policies": end.policies}.items() if entry}
     write_record(job.folder, {**record, "status": "finished", "result": end.result()})
     return None
 
