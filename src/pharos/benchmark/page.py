@@ -231,11 +231,11 @@ def _core(contents: Contents) -> Element | None:
         f"{distance:.2f} apart on the average task. Sorted by difference, the worst first. {verdict} "
         "One action: the best policy that always plays the same one.",
         _table(heads, rows, numeric=(1, 2, 3, 4)),
-        *([asked] if (asked := _asked(contents)) is not None else []),
+        *([folded] if (folded := _purposes(contents)) is not None else []),
     )
 
 
-def _asked(contents: Contents) -> Element | None:
+def _purposes(contents: Contents) -> Element | None:
     """A folded table of what each core task asks, and what failing it means."""
     tasks = [(task, purpose) for task in contents.suite.core if (purpose := purpose_of(task)) is not None]
     rows: list[list[str | Element]] = [[_task(task), purpose.asks, purpose.failing] for task, purpose in tasks]

@@ -98,7 +98,7 @@ def known_properties() -> dict[str, TaskProperties]:
 
 @dataclass(frozen=True)
 class Purpose:
-    """What a task asks of an agent, and what failing it means, in words."""
+    """Words on a task: what it asks of an agent, and what failing it means."""
 
     asks: str
     failing: str
