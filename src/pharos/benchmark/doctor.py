@@ -1,0 +1,334 @@
+"""Readings of an agent whose worlds are known exactly: whether its values obey the equation that they ought to obey.
+
+Values of actions of a healthy learner are near their own backup, Q(s, a) = r(s, a) + gamma E max Q(s', .), and those of
+states near that of their policy, whatever has been learnt so far. A fault is another equation: without the end of an
+episode, with clipped rewards, with another discount. `residuals` says how far the values are from each, in units of the
+deviation of the backup, and the discount that fits best is part of the answer. All is arithmetic on small arrays.
+
+Source: Sutton and Barto (2018), sections 3.6 and 11.4 (Bellman residuals); the equations of faults are ours.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from pharos.benchmark.examination import Examination, WorldArrays
+
+GAMMAS = (0.0, 0.25, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995)
+RIGHT = "right"
+EQUATIONS = {
+    RIGHT: "reward, and the discounted value of what comes after",
+    "through_ends": "values go on after the end of an episode",
+    "to_next_episode": "values go on into the next episode",
+    "cut_is_end": "the time limit counts as an end",
+    "signs": "rewards are replaced by their signs",
+    "earlier_reward": "each step has the reward of the one before",
+    "itself": "what comes after is the state itself",
+    "mean": "the mean of the next values in place of the largest",
+    "negative": "rewards have the wrong sign",
+}
+"""Equations that values may obey: name -> in words."""
+FLOOR = 0.02  # a residual below it is as good as none
+LEAST = 3  # visits of a pair that counts
+SAME = 1e-6
+
+
+def targets(examination: Examination, gamma: float) -> dict[str, np.ndarray]:
+    """Values by each of EQUATIONS if the next values are the agent's own.
+
+    Args:
+        examination: with `q`, (S, A), or `v`, (S,).
+    Returns:
+        Arrays of the shape of `q`, or of `v`; those equations alone that the world tells from the right one.
+    """
+    world, values = examination.world, answers_of(examination)
+    q = values if values.ndim == 2 else None
+    v = values.max(axis=1) if q is not None else values
+    live = np.where(world.terminal, 0.0, v)
+    visits = np.maximum(examination.visits, 1)
+    moves, rewards = world.transitions, world.rewards
+    ends = moves @ world.terminal
+    cuts = examination.cuts / visits
+    onward = moves @ live
+    first = world.start @ v
+    backups = {
+        RIGHT: rewards + gamma * onward,
+        "through_ends": rewards + gamma * (moves @ v),
+        "to_next_episode": rewards + gamma * ((1 - cuts) * onward + (ends + cuts) * first),
+        "cut_is_end": rewards + gamma * (1 - cuts) * onward,
+        "signs": np.sign(rewards) + gamma * onward,
+        "earlier_reward": earlier_rewards(examination)[:, None] + gamma * onward,
+        "itself": rewards + gamma * live[:, None],
+        "negative": gamma * onward - rewards,
+    }
+    if q is not None:
+        backups["mean"] = rewards + gamma * (moves @ np.where(world.terminal, 0.0, q.mean(axis=1)))
+    differs = {
+        "through_ends": ends.any(),
+        "to_next_episode": ends.any() or cuts.any(),
+        "cut_is_end": cuts.any(),
+        "signs": not np.isin(rewards, (-1, 0, 1)).all(),
+    }
+    backups = {name: values for name, values in backups.items() if differs.get(name, True)}
+    if q is None:
+        return {name: (examination.policy * values).sum(axis=1) for name, values in backups.items()}
+    return backups
+
+
+def earlier_rewards(examination: Examination) -> np.ndarray:
+    """(S,) mean reward of the step that led to each state, over the steps of the run; 0 where episodes begin alone."""
+    world, visits = examination.world, examination.visits
+    flow = visits[:, :, None] * world.transitions
+    arrivals = flow.sum(axis=(0, 1))
+    income = (flow * world.rewards[:, :, None]).sum(axis=(0, 1))
+    return np.divide(income, arrivals, out=np.zeros(len(arrivals)), where=arrivals > 0)
+
+
+def weights_of(examination: Examination, visits: np.ndarray) -> np.ndarray:
+    """Weights of pairs, or of states if it has values of states alone: roots of visits, which sum to 1."""
+    counts = visits if examination.q is not None else visits.sum(axis=1)
+    counts = np.where(counts >= min(LEAST, counts.max()), counts, 0)
+    roots = np.sqrt(counts)
+    return roots / max(roots.sum(), 1e-12)
+
+
+def deviation(values: np.ndarray, weights: np.ndarray) -> float:
+    """Standard deviation under weights."""
+    mean = float((weights * values).sum())
+    return float(np.sqrt((weights * (values - mean) ** 2).sum()))
+
+
+def distance(values: np.ndarray, target: np.ndarray, weights: np.ndarray, least: float) -> float:
+    """Root mean square of `values - target` in units of the deviation of the target, or of `least` if that is larger;
+    at most 100.
+    """
+    error = float(np.sqrt((weights * (values - target) ** 2).sum()))
+    scale = max(deviation(target, weights), least, 1e-12)
+    return min(error / scale, 100.0) if np.isfinite(error) else 100.0
+
+
+def answers_of(examination: Examination) -> np.ndarray:
+    """The values of actions, or of states, huge ones cut."""
+    values = examination.q if examination.q is not None else examination.v
+    assert values is not None
+    return np.nan_to_num(np.clip(values, -1e12, 1e12), nan=1e12)
+
+
+def residuals(examination: Examination, visits: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Distances from each of the equations that the world tells apart, (len(GAMMAS),) by name.
+
+    Args:
+        visits: (S, A), of the pairs that count; None: all of the run.
+    """
+    weights = weights_of(examination, examination.visits if visits is None else visits)
+    values, least = answers_of(examination), least_scale(examination.world)
+    columns: dict[str, list[float]] = {}
+    for gamma in GAMMAS:
+        for name, target in targets(examination, gamma).items():
+            columns.setdefault(name, []).append(distance(values, target, weights, least))
+    return {name: np.array(column) for name, column in columns.items()}
+
+
+def least_scale(world: WorldArrays) -> float:
+    """The least deviation of values that errors are measured in: a twentieth of the largest reward."""
+    return 0.05 * float(np.abs(world.rewards).max())
+
+
+def contrast(examination: Examination, name: str, gamma: float, right_gamma: float) -> float:
+    """log10 of the distance from an equation, less that from the right one, where both differ: negative if the values
+    obey this one. Each with its own discount. NaN: they differ nowhere where it was.
+    """
+    other, right = targets(examination, gamma), targets(examination, right_gamma)[RIGHT]
+    if name not in other:
+        return float("nan")
+    weights, values = weights_of(examination, examination.visits), answers_of(examination)
+    scale = max(deviation(right, weights), least_scale(examination.world))
+    parts = weights * (np.abs(other[name] - other[RIGHT]) > 0.02 * scale)
+    if parts.sum() < 1e-3:
+        return float("nan")
+    parts = parts / parts.sum()
+    errors = [min(float(np.sqrt((parts * (values - each) ** 2).sum())) / scale, 100.0) for each in (other[name], right)]
+    return float(np.log10(errors[0] + FLOOR) - np.log10(errors[1] + FLOOR))
+
+
+def optimal(world: WorldArrays, gamma: float, policy: np.ndarray | None = None, sweeps: int = 2000) -> np.ndarray:
+    """(S, A) values of actions of the optimal policy, or of a policy (S, A); by iteration until nothing changes."""
+    q = np.zeros_like(world.rewards)
+    for _ in range(sweeps):
+        v = q.max(axis=1) if policy is None else (policy * q).sum(axis=1)
+        after = world.rewards + gamma * (world.transitions @ np.where(world.terminal, 0.0, v))
+        if np.abs(after - q).max() < 1e-9 * (1 + np.abs(after).max()):
+            return after
+        q = after
+    return q
+
+
+# Readings -------------------------------------------------------------------------------------------------------------
+
+
+def readings(examinations: Sequence[Examination]) -> dict[str, float]:
+    """Numbers that describe an agent, by name; those that do not apply to it are left out.
+
+    Of an agent with values: `gamma`, the discount that fits them best, as log10 of 1 / (1 - gamma); `consistency`,
+    log10 of the residual; of each other equation the residual less that of the right one, negative if it fits better;
+    `slope`, log10 of the factor with which rewards enter; `size`, log10 of the deviation of the values relative to
+    exact ones; `truth`, their correlation with exact ones, and `truth_unvisited` elsewhere; `bias`, their mean error in
+    deviations; `ends`, values of terminal states in deviations; `deaf`, the share of numbers of observations that
+    change nothing, `deaf_last` of last ones; `wavering`, log10 of the change if asked again; `forgets`, the residual
+    where it was of late less that of all; `own`, whether they are nearer to values of the agent's own policy than to
+    optimal ones; `far`, the error far from the end less that near it.
+    Of all: `overlap` of late behaviour with the policy, and `overlap_shifted` with its actions shifted, less that;
+    `random`, entropy of late behaviour, 1 as uniform; `certain`, probability of the likeliest action; `coverage` of
+    states; `behind`, late regret of behaviour less that of the policy; `equal_seeds`, share of worlds where two seeds
+    did the same; `regret` of each world.
+    """
+    numbers: dict[str, float] = {}
+    with_values = [each for each in examinations if each.q is not None or each.v is not None]
+    if with_values:
+        numbers |= _of_values(with_values)
+    numbers |= _of_behaviour(examinations)
+    return {name: float(value) for name, value in numbers.items() if np.isfinite(value)}
+
+
+def _of_values(examinations: Sequence[Examination]) -> dict[str, float]:
+    tables = [residuals(each) for each in examinations]
+    logs = [{name: np.log10(row + FLOOR) for name, row in table.items()} for table in tables]
+    right = np.mean([table[RIGHT] for table in logs], axis=0)
+    place = int(right.argmin())
+    gamma = GAMMAS[place]
+    numbers = {"gamma": -np.log10(1 - gamma), "consistency": float(right[place])}
+    for name in EQUATIONS:
+        applicable = [table for table in logs if name in table]
+        if name != RIGHT and applicable:
+            own = GAMMAS[int(np.mean([table.get(name, table[RIGHT]) for table in logs], axis=0).argmin())]
+            contrasts = [contrast(each, name, own, gamma) for each in examinations]
+            numbers[name] = float(np.nanmean(contrasts)) if np.isfinite(contrasts).any() else np.nan
+    columns: dict[str, list[float]] = {}
+    for each in examinations:
+        for name, value in _of_one(each, gamma).items():
+            if np.isfinite(value):
+                columns.setdefault(name, []).append(value)
+    return numbers | {name: float(np.mean(column)) for name, column in columns.items()}
+
+
+def _of_one(examination: Examination, gamma: float) -> dict[str, float]:
+    """Readings of the values of one run."""
+    world, values = examination.world, answers_of(examination)
+    weights = weights_of(examination, examination.visits)
+    exact = optimal(world, gamma)
+    own = optimal(world, gamma, examination.policy)
+    if examination.q is None:
+        exact = own = (examination.policy * own).sum(axis=1)
+    is_live = np.broadcast_to((~world.terminal).reshape(-1, *[1] * (values.ndim - 1)), values.shape)
+    is_new = is_live & (weights == 0)
+    scale = max(deviation(exact, weights), 1e-6 + 0.05 * float(np.abs(world.rewards).max()))
+    own_scale = max(deviation(values, weights), 1e-9)
+    error = np.abs(values - exact) / scale
+    numbers = {
+        "size": np.clip(np.log10(own_scale / scale), -3, 3),
+        "truth": correlation(values, exact, weights),
+        "bias": np.clip((weights * (values - exact)).sum() / scale, -5, 5),
+        "deaf": float((examination.reaction[world.vary] < SAME).mean()),
+        "deaf_last": float(examination.reaction[np.flatnonzero(world.vary)[-1]] < SAME),
+        "wavering": np.log10(max(examination.wavering, SAME)),
+    }
+    if is_new.any():
+        numbers["error_unvisited"] = np.clip(np.log10(error[is_new].mean() + FLOOR), -2, 3)
+    if world.terminal.any():
+        after = values[world.terminal].max(axis=1) if values.ndim == 2 else values[world.terminal]
+        numbers["ends"] = np.clip(np.log10(np.abs(after).mean() / own_scale + 1e-3), -3, 3)
+    late = residuals(examination, examination.last)[RIGHT][GAMMAS.index(gamma)]
+    numbers["forgets"] = np.log10(late + FLOOR) - np.log10(residuals(examination)[RIGHT][GAMMAS.index(gamma)] + FLOOR)
+    numbers["slope"] = np.clip(reward_slope(examination, gamma), -3, 3)
+    if examination.q is not None:
+        numbers["own"] = np.log10(
+            (distance(values, own, weights, 1e-6) + FLOOR) / (distance(values, exact, weights, 1e-6) + FLOOR)
+        )
+        numbers["truth_greedy"] = greedy_share(values, exact, weights)
+    steps = steps_to_end(world)
+    is_far = steps > np.median(steps[weights.reshape(len(steps), -1).sum(axis=1) > 0])
+    far = weights * np.broadcast_to(is_far.reshape(-1, *[1] * (values.ndim - 1)), values.shape)
+    if 0 < far.sum() < weights.sum():
+        near = weights - far
+        parts = [(part * error).sum() / part.sum() for part in (far, near)]
+        numbers["far"] = np.clip(np.log10((parts[0] + FLOOR) / (parts[1] + FLOOR)), -2, 2)
+    return {name: float(value) for name, value in numbers.items()}
+
+
+def correlation(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> float:
+    """Correlation under weights; 0 if one of them is constant."""
+    x, y = x - (weights * x).sum(), y - (weights * y).sum()
+    both = float(np.sqrt((weights * x * x).sum() * (weights * y * y).sum()))
+    return float((weights * x * y).sum() / both) if both > 1e-12 else 0.0
+
+
+def greedy_share(q: np.ndarray, exact: np.ndarray, weights: np.ndarray) -> float:
+    """Share of states, by their weights, in which an action of the largest value is optimal."""
+    best = exact >= exact.max(axis=1, keepdims=True) - 1e-6 * (1 + np.abs(exact).max())
+    share = weights.sum(axis=1)
+    return float(share @ best[np.arange(len(q)), q.argmax(axis=1)])
+
+
+def reward_slope(examination: Examination, gamma: float) -> float:
+    """log10 of the factor with which rewards enter values: the slope of values less discounted next values on rewards.
+
+    NaN if rewards do not differ where it was, or the slope is not positive: -3.
+    """
+    values, world = answers_of(examination), examination.world
+    live = np.where(world.terminal, 0.0, values.max(axis=1) if values.ndim == 2 else values)
+    onward, rewards = gamma * (world.transitions @ live), world.rewards
+    if values.ndim == 1:
+        onward, rewards = (examination.policy * onward).sum(axis=1), (examination.policy * rewards).sum(axis=1)
+    weights = weights_of(examination, examination.visits)
+    centred = rewards - (weights * rewards).sum()
+    variance = float((weights * centred**2).sum())
+    if variance < 1e-12:
+        return float("nan")
+    slope = float((weights * centred * (values - onward)).sum()) / variance
+    return float(np.log10(slope)) if slope > 1e-3 else -3.0
+
+
+def steps_to_end(world: WorldArrays) -> np.ndarray:
+    """(S,) least number of steps to a terminal state, or, without one, to the state with the largest reward."""
+    steps = np.where(world.terminal, 0, np.inf)
+    if not world.terminal.any():
+        steps[world.rewards.max(axis=1).argmax()] = 0
+    reachable = (world.transitions > 0).any(axis=1)
+    for _ in range(len(steps)):
+        nearest = np.where(reachable, steps[None, :], np.inf).min(axis=1) + 1
+        steps = np.minimum(steps, nearest)
+    return np.where(np.isfinite(steps), steps, len(steps))
+
+
+def _of_behaviour(examinations: Sequence[Examination]) -> dict[str, float]:
+    columns: dict[str, list[float]] = {}
+    for each in examinations:
+        late, num_actions = each.late, each.policy.shape[1]
+        share = late.sum(axis=1) / max(late.sum(), 1)
+        frequency = late / np.maximum(late.sum(axis=1, keepdims=True), 1)
+        overlaps = [float(share @ np.minimum(frequency, np.roll(each.policy, -k, axis=1)).sum(axis=1)) for k in (0, 1)]
+        surprise = -(frequency * np.log(np.maximum(frequency, 1e-12))).sum(axis=1)
+        numbers = {
+            "overlap": overlaps[0],
+            "overlap_shifted": overlaps[1] - overlaps[0],
+            "random": float(share @ surprise / np.log(num_actions)),
+            "certain": float(share @ each.policy.max(axis=1)),
+            "coverage": float((each.visits.sum(axis=1) > 0).sum() / max((~each.world.terminal).sum(), 1)),
+            "behind": float(np.clip(each.late_regret - each.regret, -2, 2)),
+            f"regret_{each.name}": float(np.clip(each.regret, 0, 1.5)),
+        }
+        for name, value in numbers.items():
+            columns.setdefault(name, []).append(value)
+    numbers = {name: float(np.nanmean(column)) for name, column in columns.items() if not np.isnan(column).all()}
+    pairs = same_runs(examinations)
+    return numbers | ({"equal_seeds": float(np.mean([*pairs.values()]))} if pairs else {})
+
+
+def same_runs(examinations: Sequence[Examination]) -> Mapping[str, bool]:
+    """By world with two seeds or more: whether all did the same, in each state each action as often."""
+    runs: dict[str, list[np.ndarray]] = {}
+    for each in examinations:
+        runs.setdefault(each.name, []).append(each.visits)
+    return {
+        name: all((one == visits[0]).all() for one in visits[1:]) for name, visits in runs.items() if len(visits) > 1
+    }

@@ -1,0 +1,298 @@
+"""Faults that people make in agents, each a switch of a small DQN or PPO: what `pharos diagnose` knows.
+
+    pharos diagnose pharos.benchmark.faults:dqn --set fault=target_never_copied
+    pharos benchmark run --agent pharos.benchmark.faults:ppo --set fault=gamma_half --out results/fault
+
+Both agents are generators of policies in NumPy alone, with two hidden layers; their policies give `q_values` or
+`values`. Without a fault they are healthy. Sources: Mnih et al. (2015); Schulman et al. (2017); Huang et al. (2022),
+The 37 implementation details of proximal policy optimization.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import UnknownName
+
+HEALTHY = "none"
+DQN_FAULTS = {
+    "target_never_copied": "the target network is never copied from the network that learns",
+    "terminal_bootstrapped": "the value of what comes after the end of an episode is added to its last reward",
+    "truncation_as_end": "an episode that the time limit cuts counts as one that has ended",
+    "last_feature_lost": "the last number of each observation never reaches the network",
+    "bytes_not_divided": "pixels from 0 to 255 reach the network undivided",
+    "rewards_clipped": "rewards are replaced by their signs",
+    "replay_too_small": "the replay buffer keeps the last 50 steps",
+    "learning_rate_high": "the learning rate is 100 times too high",
+    "learning_rate_low": "the learning rate is 100 times too low",
+    "epsilon_stuck": "epsilon stays 1 while it learns",
+    "never_explores": "epsilon is 0 from the first step",
+    "action_off_by_one": "the action that is played is the one after the action that was chosen, when it is judged",
+    "seeds_ignored": "every run has the same random numbers",
+    "gamma_half": "the discount is 0.5",
+    "next_is_observation": "the observation is stored as the next observation, too",
+    "rewards_shifted": "each transition is stored with the reward of the one before",
+    "plays_at_random": "one action in five is random when it is judged",
+    "mean_backup": "targets have the mean of the next values in place of the largest",
+}
+PPO_FAULTS = {
+    "advantages_not_normalised": "advantages are used as they are, whatever the size of rewards",
+    "stale_log_probabilities": "old log-probabilities are those of the policy that learns, so that nothing is clipped",
+    "value_without_mask": "advantages and values run on over the ends of episodes",
+    "truncation_as_end": "an episode that the time limit cuts counts as one that has ended",
+    "gamma_half": "the discount is 0.5",
+    "rollout_reshaped": "steps and environments of a rollout are mixed up, so that advantages belong to other steps",
+    "learning_rate_high": "the learning rate is 100 times too high",
+    "entropy_penalised": "the sign of the entropy bonus is wrong",
+    "action_off_by_one": "the action that is played is the one after the action that was chosen, when it is judged",
+}
+FAULTS = {"dqn": DQN_FAULTS, "ppo": PPO_FAULTS}
+"""Faults by agent: name -> what is wrong, in words."""
+
+
+def make(agent: str, fault: str = HEALTHY, **hyperparameters: Any) -> partial[Iterator["Greedy | Stochastic"]]:
+    """The agent "dqn" or "ppo" with a fault, as learn(env, steps, seed), which `benchmark.run` and `diagnose` take.
+
+    Args:
+        fault: a key of `FAULTS[agent]`; "none": a healthy one.
+        hyperparameters: other keywords of `dqn` or `ppo`.
+    Raises:
+        UnknownName: there is no such agent or fault.
+    """
+    if agent not in FAULTS:
+        raise UnknownName("agent with faults", agent, FAULTS)
+    _check(agent, fault)
+    learn: Any = dqn if agent == "dqn" else ppo
+    return partial(learn, fault=fault, **hyperparameters)
+
+
+def _check(agent: str, fault: str) -> None:
+    if fault != HEALTHY and fault not in FAULTS[agent]:
+        raise UnknownName(f"fault of {agent}", fault, [HEALTHY, *FAULTS[agent]])
+
+
+class SmallNetwork:
+    """A network of two hidden layers with ReLU, and Adam. x (N, D) -> (N, outputs), float32."""
+
+    def __init__(self, inputs: int, width: int, outputs: int, rng: np.random.Generator):
+        sizes = (inputs, width, width, outputs)
+        self.parameters = []
+        for fan_in, fan_out in pairwise(sizes):
+            bound = 1 / np.sqrt(fan_in)
+            self.parameters.append(rng.uniform(-bound, bound, (fan_in, fan_out)).astype(np.float32))
+            self.parameters.append(rng.uniform(-bound, bound, fan_out).astype(np.float32))
+        self.moments = [(np.zeros_like(each), np.zeros_like(each)) for each in self.parameters]
+        self.updates = 0
+        self.layers: list[np.ndarray] = []
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        w1, b1, w2, b2, w3, b3 = self.parameters
+        h1 = np.maximum(x @ w1 + b1, 0)
+        h2 = np.maximum(h1 @ w2 + b2, 0)
+        self.layers = [x, h1, h2]
+        return h2 @ w3 + b3
+
+    def update(self, gradient: np.ndarray, rate: float, limit: float = 10.0) -> None:
+        """One step of Adam along the gradient (N, outputs) of the loss by the outputs of the last call."""
+        weights = self.parameters[::2]
+        gradients: list[np.ndarray] = []
+        for weight, layer in zip(weights[::-1], self.layers[::-1], strict=True):
+            gradients = [layer.T @ gradient, gradient.sum(axis=0), *gradients]
+            gradient = (gradient @ weight.T) * (layer > 0)
+        norm = float(np.sqrt(sum((each**2).sum() for each in gradients)))
+        scale = min(1.0, limit / (norm + 1e-6)) if np.isfinite(norm) else 0.0
+        self.updates += 1
+        correction = np.sqrt(1 - 0.999**self.updates) / (1 - 0.9**self.updates)
+        for parameter, (mean, square), each in zip(self.parameters, self.moments, gradients, strict=True):
+            step = each * scale if scale else np.zeros_like(each)
+            mean += 0.1 * (step - mean)
+            square += 0.001 * (step**2 - square)
+            parameter -= np.float32(rate * correction) * mean / (np.sqrt(square) + 1e-8)
+
+    def copy(self) -> "SmallNetwork":
+        """A network with the same weights, for targets and policies."""
+        twin = object.__new__(SmallNetwork)
+        twin.parameters, twin.moments, twin.updates, twin.layers = [w.copy() for w in self.parameters], [], 0, []
+        return twin
+
+
+def encoded(observations: Any, fault: str) -> np.ndarray:
+    """(N, ...) observations as (N, D) float32, bytes divided by 255."""
+    x = np.asarray(observations)
+    is_bytes = x.dtype == np.uint8 and fault != "bytes_not_divided"
+    rows = x.reshape(len(x), -1).astype(np.float32) / np.float32(255 if is_bytes else 1)
+    if fault == "last_feature_lost":
+        rows[:, -1] = 0
+    return rows
+
+
+class Greedy:
+    """Greedy policy of a network of values of actions; `q_values(observations)` is (N, A)."""
+
+    def __init__(self, network: SmallNetwork, fault: str):
+        self.network, self.fault = network.copy(), fault
+
+    def q_values(self, observations: Any) -> np.ndarray:
+        return self.network(encoded(observations, self.fault))
+
+    def __call__(self, observations: Any) -> np.ndarray:
+        q = self.q_values(observations)
+        probabilities = np.eye(q.shape[1])[q.argmax(axis=1)]
+        if self.fault == "plays_at_random":
+            probabilities = 0.8 * probabilities + 0.2 / q.shape[1]
+        return np.roll(probabilities, self.fault == "action_off_by_one", axis=1)
+
+
+def dqn(
+    env: Any,
+    steps: int,
+    seed: int,
+    *,
+    fault: str = HEALTHY,
+    width: int = 32,
+    learning_rate: float = 0.001,
+    gamma: float = 0.95,
+    batch_size: int = 32,
+    target_interval: int = 200,
+    final_epsilon: float = 0.05,
+) -> Iterator[Greedy]:
+    """DQN with a fault of DQN_FAULTS; it yields its greedy policy ten times, and at the end."""
+    _check("dqn", fault)
+    seed = 0 if fault == "seeds_ignored" else seed
+    rng = np.random.default_rng(seed)
+    rate = learning_rate * {"learning_rate_high": 100, "learning_rate_low": 0.01}.get(fault, 1)
+    gamma = 0.5 if fault == "gamma_half" else gamma
+    observation, _ = env.reset(seed=seed)
+    x = encoded(observation[None], fault)[0]
+    size, num_actions = min(steps, 50_000), int(env.action_space.n)
+    if fault == "replay_too_small":
+        size = 50
+    network = SmallNetwork(len(x), width, num_actions, rng)
+    target = network.copy()
+    before, after = np.zeros((2, size, len(x)), np.float32)
+    actions, rewards, goes_on = np.zeros(size, np.int64), np.zeros(size, np.float32), np.zeros(size, np.float32)
+    earlier = 0.0  # reward of the step before
+    for step in range(steps):
+        epsilon = max(final_epsilon, 1 - (1 - final_epsilon) * step / (0.3 * steps))
+        epsilon = {"epsilon_stuck": 1.0, "never_explores": 0.0}.get(fault, epsilon)
+        action = int(rng.integers(num_actions)) if rng.random() < epsilon else int(network(x[None])[0].argmax())
+        observation, reward, terminated, truncated, _ = env.step(action)
+        behind, place = encoded(observation[None], fault)[0], step % size
+        before[place], after[place], actions[place] = x, x if fault == "next_is_observation" else behind, action
+        stored, earlier = (earlier if fault == "rewards_shifted" else reward), float(reward)
+        rewards[place] = np.sign(stored) if fault == "rewards_clipped" else stored
+        ended = (terminated and fault != "terminal_bootstrapped") or (truncated and fault == "truncation_as_end")
+        goes_on[place] = not ended
+        x = behind
+        if terminated or truncated:
+            x = encoded(env.reset(**({"seed": 0} if fault == "seeds_ignored" else {}))[0][None], fault)[0]
+        if step >= 200 and step % 2 == 0:
+            rows = rng.integers(min(step + 1, size), size=batch_size)
+            next_q = target(after[rows])
+            best = next_q.mean(axis=1) if fault == "mean_backup" else next_q.max(axis=1)
+            aims = rewards[rows] + np.float32(gamma) * goes_on[rows] * best
+            q, gradient = network(before[rows]), np.zeros((batch_size, num_actions), np.float32)
+            each = np.arange(batch_size), actions[rows]
+            gradient[each] = np.clip(q[each] - aims, -1, 1) / batch_size
+            network.update(gradient, rate)
+        if step % target_interval == 0 and fault != "target_never_copied":
+            target = network.copy()
+        if (step + 1) % max(1, steps // 10) == 0 or step + 1 == steps:
+            yield Greedy(network, fault)
+
+
+class Stochastic:
+    """Policy of a network of preferences, beside a network of values; `values(observations)` is (N,)."""
+
+    def __init__(self, actor: SmallNetwork, critic: SmallNetwork, fault: str):
+        self.actor, self.critic, self.fault = actor.copy(), critic.copy(), fault
+
+    def values(self, observations: Any) -> np.ndarray:
+        return self.critic(encoded(observations, self.fault))[:, 0]
+
+    def __call__(self, observations: Any) -> np.ndarray:
+        probabilities = action_probabilities(self.actor(encoded(observations, self.fault)).astype(np.float64))
+        return np.roll(probabilities, self.fault == "action_off_by_one", axis=1)
+
+
+def action_probabilities(x: np.ndarray) -> np.ndarray:
+    """Probabilities (N, A) that are proportional to exp(x)."""
+    powers = np.exp(x - x.max(axis=1, keepdims=True))
+    return powers / powers.sum(axis=1, keepdims=True)
+
+
+def ppo(  # noqa: PLR0913  (its hyperparameters)
+    env: Any,
+    steps: int,
+    seed: int,
+    *,
+    fault: str = HEALTHY,
+    width: int = 32,
+    learning_rate: float = 0.001,
+    gamma: float = 0.95,
+    num_envs: int = 4,
+    rollout: int = 32,
+    epochs: int = 10,
+    batch_size: int = 32,
+    entropy: float = 0.01,
+    clip_range: float = 0.2,
+    gae_lambda: float = 0.95,
+) -> Iterator[Stochastic]:
+    """PPO with a fault of PPO_FAULTS; it yields its policy after each rollout."""
+    _check("ppo", fault)
+    rng = np.random.default_rng(seed)
+    rate = learning_rate * (100 if fault == "learning_rate_high" else 1)
+    gamma = 0.5 if fault == "gamma_half" else gamma
+    entropy = -5 * entropy if fault == "entropy_penalised" else entropy
+    envs = [env.copy() for _ in range(num_envs)]
+    x = encoded(np.stack([each.reset()[0] for each in envs]), fault)
+    num_actions, shape = int(env.action_space.n), (rollout, num_envs)
+    actor, critic = SmallNetwork(x.shape[1], width, num_actions, rng), SmallNetwork(x.shape[1], width, 1, rng)
+    before, actions = np.zeros((*shape, x.shape[1]), np.float32), np.zeros(shape, np.int64)
+    old, rewards, v, after, goes_on, is_cut = np.zeros((6, *shape), np.float32)
+    for _ in range(steps // (rollout * num_envs)):
+        for t in range(rollout):
+            probabilities = action_probabilities(actor(x))
+            chances = probabilities.cumsum(axis=1) > rng.random((num_envs, 1))
+            before[t], actions[t], v[t] = x, chances.argmax(axis=1), critic(x)[:, 0]
+            old[t] = np.log(probabilities[np.arange(num_envs), actions[t]] + 1e-8)
+            behind, firsts = [], []
+            for k, each in enumerate(envs):
+                observation, rewards[t, k], terminated, truncated, _ = each.step(int(actions[t, k]))
+                is_end = terminated or (truncated and fault == "truncation_as_end")
+                goes_on[t, k], is_cut[t, k] = not is_end, terminated or truncated
+                behind.append(observation)
+                firsts.append(each.reset()[0] if terminated or truncated else observation)
+            x = encoded(np.stack(firsts), fault)
+            after[t] = critic(x if fault == "value_without_mask" else encoded(np.stack(behind), fault))[:, 0]
+        if fault == "value_without_mask":
+            goes_on[:], is_cut[:] = 1, 0
+        advantages, running = np.zeros(shape, np.float32), np.zeros(num_envs, np.float32)
+        for t in reversed(range(rollout)):
+            error = rewards[t] + gamma * goes_on[t] * after[t] - v[t]
+            advantages[t] = running = error + gamma * gae_lambda * (1 - is_cut[t]) * running
+        returns = (advantages + v).ravel()
+        weights = (advantages.T if fault == "rollout_reshaped" else advantages).ravel()
+        rows_of_all, flat_actions, flat_old = before.reshape(-1, x.shape[1]), actions.ravel(), old.ravel()
+        for _ in range(epochs):
+            for rows in np.array_split(rng.permutation(len(returns)), max(1, len(returns) // batch_size)):
+                weight = weights[rows]
+                if fault != "advantages_not_normalised":
+                    weight = (weight - weight.mean()) / (weight.std() + 1e-8)
+                probabilities = action_probabilities(actor(rows_of_all[rows]))
+                each = np.arange(len(rows)), flat_actions[rows]
+                log = np.log(probabilities + 1e-8)
+                ratio = np.exp(log[each] - (log[each] if fault == "stale_log_probabilities" else flat_old[rows]))
+                is_clipped = ((ratio > 1 + clip_range) & (weight > 0)) | ((ratio < 1 - clip_range) & (weight < 0))
+                pull = -probabilities
+                pull[each] += 1  # gradient of the log-probability by the preferences
+                gradient = -pull * (np.where(is_clipped, 0, ratio) * weight)[:, None] + (
+                    entropy * probabilities * (log - (probabilities * log).sum(axis=1, keepdims=True))
+                )
+                actor.update((gradient / len(rows)).astype(np.float32), rate, 0.5)
+                error = critic(rows_of_all[rows])[:, 0] - returns[rows]
+                critic.update((error / len(rows)).astype(np.float32)[:, None], rate, 0.5)
+        yield Stochastic(actor, critic, fault)
