@@ -1,4 +1,5 @@
-"""Faulty agents in `benchmark run`: honest mistakes, crashes, hangs and leftovers, each by the command line.
+"""Faulty agents in `benchmark run`, `train`, `tune` and studies: honest mistakes, crashes, hangs and leftovers, each by
+the command line.
 
 Each agent is one seed of a task, so that many faulty ones run in one command. What comes out of each is an error in one
 line with agent, task and seed, a note, or a finished run; never a traceback, a run without an end, a fault without a
@@ -12,7 +13,7 @@ from textwrap import indent
 import pytest
 
 from attacks.damage import Tally
-from command_line import process
+from command_line import process, run
 from pharos.benchmark import BenchmarkTask, Protocol, Suite, write_suite
 from pharos.benchmark.suite import digest_of_suite, frozen
 
@@ -218,7 +219,9 @@ def suite():
 
 def written(codes):
     """The file of an agent whose run with seed k has the k-th of these codes."""
-    functions = [f"def run_{k}(env, steps, seed):\n{indent(code, ' ' * 4)}\n" for k, code in enumerate(codes)]
+    functions = [
+        f"def run_{k}(env, steps, seed, *, rate=0.1):\n{indent(code, ' ' * 4)}\n" for k, code in enumerate(codes)
+    ]
     return "\n\n".join(
         [HEAD, *functions, "def learn(env, steps, seed):\n    return globals()[f'run_{seed}'](env, steps, seed)\n"]
     )
@@ -258,6 +261,100 @@ def test_faulty_agents(suite, tmp_path, count, kind):
     tally.check()
     assert tally.total == len(cases) == tally.counts[OUTCOMES[kind]]
     assert done.returncode == (OUTCOMES[kind] == "refused")
+
+
+STUDY = """
+name: faulty
+seeds: 1
+steps: 300
+evaluations: 3
+blocks:
+  - environments: [frozen_lake/4x4]
+    chance: [{{random: 0.1}}]
+    observations: [vector]
+    agents: [{}]
+"""
+OTHER_DOORS = {
+    "errors": [
+        *("returns a policy", "yields None", "one observation", "a short answer", "float actions", "bool actions"),
+        *(
+            "action A",
+            "NaN",
+            "values",
+            "samples actions",
+            "samples a little",
+            "the policy raises",
+            "raises late",
+            "SystemExit",
+        ),
+        *("raises at once", "SystemExit 0", "an exception of its own", "asserts", "the state", "four times the same"),
+    ],
+    "notes": ["never yields", "yields at the end", "never resets", "the same seed", "stops early", "catches all"],
+    "harmless": ["sound", "half precision", "a list", "yields each step", "deep copies", "catches exceptions"],
+}
+"""Kinds of mistakes that people make, given to the other doors of an agent."""
+
+
+def through_train(k, folder):
+    """(exit code, standard error, notes) of one run of the k-th agent."""
+    words = ("--random", 0.1, "--observation", "vector", "--steps", 300, "--interval", 100, "--out", folder / f"{k}")
+    done = run("train", "frozen_lake/4x4", "--agent", f"mine.py:run_{k}", *words, "--json")
+    return done.exit_code, done.stderr, set(json.loads(done.stdout)["notes"]) if not done.exit_code else set()
+
+
+def through_tune(k, folder):
+    """(exit code, standard error, None) of a search of one trial with the k-th agent: it has no notes."""
+    words = ("--trials", 1, "--seeds", 0, "--search", "rate=0.1,0.2", "--steps", 300, "--out", folder / f"{k}")
+    done = run("tune", "frozen_lake/4x4", "--random", 0.1, "--agent", f"mine.py:run_{k}", *words)
+    return done.exit_code, done.stderr, None
+
+
+def through_a_study(count, folder):
+    """The same of all agents in one study, in their order."""
+    (folder / "faulty.yaml").write_text(STUDY.format(", ".join(f'"mine.py:run_{k}"' for k in range(count))))
+    done = process("study", "run", "faulty.yaml", "--out", "out", "--workers", 2, cwd=folder)
+    assert "Traceback" not in done.stderr, done.stderr[-3000:]
+    records = [json.loads(file.read_text()) for file in (folder / "out" / "runs").glob("*/run.json")]
+    by_agent = {record["config"]["agent"]: record for record in records}
+    ends = [by_agent[f"mine.py:run_{k}"] for k in range(count)]
+    return [
+        (int(end["status"] != "finished"), f"pharos: {end.get('error', '')}\n", set(end.get("notes", {})))
+        for end in ends
+    ]
+
+
+@pytest.mark.parametrize("door", ["train", "tune", "study"])
+def test_faulty_agents_through_other_doors(tmp_path, monkeypatch, count, door):
+    """An error in one line with the agent's words, a note, or a finished run, as in the benchmark."""
+    tables = {"errors": ERRORS, "notes": NOTES, "harmless": {name: (code, "") for name, code in HARMLESS.items()}}
+    cases = [(kind, name, *tables[kind][name]) for kind, names in OTHER_DOORS.items() for name in names]
+    (tmp_path / "mine.py").write_text(written([code for _, _, code, _ in cases]))
+    monkeypatch.chdir(tmp_path)
+    if door == "study":
+        ends = through_a_study(len(cases), tmp_path)
+    else:
+        ends = [(through_train if door == "train" else through_tune)(k, tmp_path) for k in range(len(cases))]
+    tally = Tally()
+    for (kind, name, _, words), (code, text, notes) in zip(cases, ends, strict=True):
+        holds = code == 0 and (
+            notes is None or notes <= {"late policy"} if kind == "harmless" else words in (notes or words)
+        )
+        if kind == "errors":
+            holds = code != 0 and text.count("\n") == 1 and text.startswith("pharos: ") and words in text
+        outcome = "unchanged" if notes is None and not code else OUTCOMES[kind]
+        tally.note(name, outcome if holds else "failed", f"exit {code}, {text[-1000:]}, notes {notes}")
+    count(f"{tally.total} faulty agents through {door}: {tally}")
+    tally.check()
+    assert tally.total == len(cases) == sum(map(len, OTHER_DOORS.values()))
+
+
+def test_an_agent_that_goes_on_after_its_budget_ends_with_a_line(tmp_path):
+    """It catches all: nothing but the end of the process stops it."""
+    (tmp_path / "mine.py").write_text(written([NOTES["catches all and goes on"][0]]))
+    words = ("--agent", "mine.py:run_0", "--steps", 300, "--out", "out")
+    done = process("train", "frozen_lake/4x4", *words, cwd=tmp_path)
+    assert done.returncode == 1 and "went on for 1,000 steps after its 300" in done.stderr
+    assert done.stderr.count("\n") == 1 and done.stdout == ""
 
 
 def test_agents_that_cannot_be_loaded(suite, tmp_path, count):

@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+import pharos
 from pharos import benchmark
 from pharos.benchmark import BenchmarkTask, BudgetSpent, Protocol, Suite
 from pharos.benchmark.suite import digest_of_suite, frozen
@@ -187,6 +188,42 @@ def test_uniform_play_and_a_first_policy_before_the_first_step_are_none_of_it():
     assert [curve_of(learn).counted_steps for learn in (nothing, uniform, initial)] == [0, 0, 300]
 
 
+def test_facts_on_policies_are_those_of_plain_counting():
+    """A policy that prefers optimal actions with probability 0.7 is optimal if it is played greedily."""
+    task = SEA.training_task(PROTOCOL)
+    best = pharos.value_iteration(task.mdp).policy
+    best = np.asarray(best[0] if np.ndim(best) > 1 else best)
+
+    def yielding(table):
+        def learn(env, steps, seed):
+            answers = {observation_of(task, state).tobytes(): table[state] for state in range(task.mdp.num_states)}
+            env.reset()
+            env.step(0)
+            yield lambda seen: np.array([answers[each.tobytes()] for each in seen])
+
+        return learn
+
+    noisy = np.full((task.mdp.num_states, 2), 0.3)
+    noisy[np.arange(len(noisy)), best] = 0.7
+    curve = curve_of(yielding(noisy), SEA)
+    states = [state for state in range(task.mdp.num_states) if not task.mdp.terminal[state]]
+    share = max(sum(best[state] == action for state in states) for action in range(2)) / len(states)
+    facts = curve.policies
+    assert (facts["one_action"], facts["deterministic"]) == (pytest.approx(share), False)
+    assert facts["greedy_regret"] == pytest.approx([0.0] * 3, abs=1e-9)
+    assert curve.rows[-1]["normalized_regret"] > 0.1
+
+    certain = curve_of(yielding(np.eye(2)[[0] * task.mdp.num_states]), SEA).policies
+    assert certain == {"one_action": 1.0, "deterministic": True}
+    uniform = curve_of(yielding(np.full_like(noisy, 0.5)), SEA).policies
+    assert uniform == {"one_action": 0.0, "deterministic": False}
+
+
+def observation_of(task, state):
+    """The observation of one state."""
+    return task.observer.observe(task.space.states([state]), np.array([-1]), np.array([0]))[0]
+
+
 def test_counted_steps_stand_in_the_record_of_each_run(tmp_path):
     made = frozen(SEA, PROTOCOL)
     suite = Suite("small", PROTOCOL, (made,), (), "", {})
@@ -204,6 +241,9 @@ def test_counted_steps_stand_in_the_record_of_each_run(tmp_path):
     for seed in range(2):
         record = json.loads((tmp_path / "out" / "runs" / "sea" / f"seed-{seed}" / "run.json").read_text())
         assert record["result"]["counted_steps"] == 12
+        assert record["policies"] == {"one_action": 1.0, "deterministic": True}
+    stored = benchmark.AgentResults.read(tmp_path / "out")
+    assert stored.record["policies"] == {"sea": {"one_action": 1.0, "deterministic": 1.0}}
 
     def cheat(env, steps, seed):
         yield lambda seen: np.full(len(seen), 0)

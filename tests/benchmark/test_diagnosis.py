@@ -13,7 +13,7 @@ from pharos.benchmark.comparison import compare_groups
 from pharos.benchmark.contents import contents_of, residuals
 from pharos.benchmark.diagnosis import fall_everywhere, falls, groups_of, strengths, without_verdict
 from pharos.benchmark.page import page
-from pharos.benchmark.properties import known_properties, properties_of
+from pharos.benchmark.properties import known_properties, properties_of, purpose_of
 from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite
 from pharos.errors import ParameterError
 
@@ -314,3 +314,42 @@ def test_runs_without_a_policy_and_with_one_at_the_end_are_told():
         assert sentence in text_of(page(contents_of(results_of_most, beside=[], suite=SUITE)))
         results_of_few = replace(HEALTHY, curves=HEALTHY.curves | dict.fromkeys(names[:2], curve))
         assert "evaluations are random" not in text_of(page(contents_of(results_of_few, beside=[], suite=SUITE)))
+
+
+def with_policies(curves, policies, agent="agent"):
+    own = results(agent, curves)
+    return replace(own, record={"policies": policies})
+
+
+def test_a_policy_of_one_action_and_noise_in_play_are_told():
+    """Three core tasks with scores 0.5, 0.7 and 0.9; played greedily the first one has 0.8."""
+    curves = {name: np.full((2, 3), regret) for name, regret in zip("abc", (0.5, 0.3, 0.1), strict=True)}
+    facts = {
+        "a": {"one_action": 0.95, "deterministic": 0.0, "greedy_score": 0.8},
+        "b": {"one_action": 0.5, "deterministic": 1.0},
+        "c": {"one_action": 0.4, "deterministic": 1.0},
+    }
+    html = page(contents_of(with_policies(curves, facts), beside=(), suite=SUITE))
+    words = " ".join(text_of(html).split())
+    assert "on 1 of 3 core tasks the final policy prefers the same action nearly everywhere (a)" in words
+    assert "Deterministic on 2 of 3 core tasks" in words
+    assert "score 0.80 instead of 0.70 on 3 core tasks: of 0.30 below optimal, 0.10 is noise in play" in words
+    for record in (
+        {},
+        {"a": 3},
+        {"a": {"one_action": "much", "deterministic": 1}},
+        [1],
+    ):  # earlier files, and forged ones
+        assert "What the policies are like" not in page(
+            contents_of(with_policies(curves, record), beside=(), suite=SUITE)
+        )
+
+
+def test_each_task_of_the_suite_says_what_it_asks_and_what_failing_means():
+    suite = benchmark.load_suite("v1")
+    purposes = {task.name: purpose_of(task) for task in suite.tasks}
+    assert all(each.asks and each.failing for each in purposes.values())
+    assert "key" in purposes["mini_grid-door_key-6-0-hash"].asks
+    assert "rooms" in purposes["mini_grid-multi-room-n2-s4-vector-sticky-0.25"].asks
+    assert purpose_of(BenchmarkTask("own", "mine.py:World")) is None
+    assert len({*purposes.values()}) == 17  # no row of the table is unused

@@ -222,7 +222,8 @@ def test_an_error_in_a_function_is_that_of_its_run(mine):
     configs = [RunConfig.of_task(task, "broken.py:learn", steps=20, seed=seed) for seed in range(3)]
     ends = train_configs(configs, [Path(f"{seed}") for seed in range(3)])
     assert all(isinstance(end, FailedRun) for end in ends)
-    assert ends[2].error == "IndexError: list index out of range" == read_record("2")["error"]
+    words = "agent broken.py:learn raised IndexError: list index out of range (broken.py, line 3)"
+    assert ends[2].error == words == read_record("2")["error"]
 
 
 def test_a_function_of_this_process_has_a_name_here_alone(tmp_path):

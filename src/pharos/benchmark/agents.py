@@ -16,7 +16,6 @@ import os
 import random
 import sys
 import time
-import traceback
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,7 +40,7 @@ from pharos.agents import (
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
 from pharos.system.sources import Source, find, is_reference, load, source_of
-from pharos.system.wording import capped, in_one_line
+from pharos.system.wording import capped, in_one_line, line_in
 from pharos.system.workers import Terminated, Workers
 from pharos.training import (
     Curve,
@@ -122,12 +121,14 @@ class RunResult:
         curve: (evaluations,) normalised regret. exact: whether all of it is.
         steps: of the environment, as it counted them, else those of the protocol.
         notes: sentences on what looks like a mistake, by kind.
+        policies: facts on the policies, by `policy_facts` of training/curve.py; empty if they are unknown.
     """
 
     curve: np.ndarray
     exact: bool
     steps: int
     notes: Mapping[str, str] = field(default_factory=dict)
+    policies: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,7 @@ class Form:
             all(row["exact"] for row in rows_at),
             protocol.steps if counted is None else int(counted),
             {str(kind): str(text) for kind, text in notes.items()} if isinstance(notes, Mapping) else {},
+            record.get("policies") or {},
         )
 
 
@@ -489,8 +491,7 @@ def record_run(
     else:
         (job.folder / POLICY).unlink(missing_ok=True)  # of an earlier attempt
     write_curve(job.folder, end.rows)
-    if notes:
-        record["notes"] = dict(notes)
+    record |= {name: dict(entry) for name, entry in {"notes": notes, "policies": end.policies}.items() if entry}
     write_record(job.folder, {**record, "status": "finished", "result": end.result()})
     return None
 
@@ -500,12 +501,6 @@ def failure(label: str, job: Job, end: BaseException | str, file: str | None = N
     text, place = (end, "") if isinstance(end, str) else (in_one_line(end), line_in(end, file))
     printable = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in capped(text, LONGEST))
     return f"{label} on {job.id}: {printable.rstrip(': ')}{place}"
-
-
-def line_in(error: BaseException, file: str | None) -> str:
-    """The last line of a file in the traceback of an error, such as " (FILE, line 12)"; empty if there is none."""
-    frames = [each for each in traceback.extract_tb(error.__traceback__) if file and each.filename == file]
-    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
 
 # Processes ------------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from pharos.benchmark.charts import frontier_text
-from pharos.benchmark.comparison import BETTER, NEGLIGIBLE, UNDECIDED, WORSE, Comparison, Difference
+from pharos.benchmark.comparison import BETTER, LEAST, NEGLIGIBLE, UNDECIDED, WORSE, Comparison, Difference
 from pharos.benchmark.contents import PREDICTORS, Contents, ScoredAgent, kind_of, listed, number, residuals, signed
 from pharos.benchmark.properties import known_properties
 from pharos.benchmark.results import AgentResults, baselines
@@ -19,6 +19,8 @@ from pharos.system.wording import pluralize
 
 SHIPPED = {"dqn": ("dqn",), "ppo": ("ppo",), "table": ("q_learning",), "both": ("dqn", "ppo")}
 OWN = 0.1  # by which the regret of a residual is above that of the shipped agent of the kind
+ONE_ACTION = 0.9  # share of states in which a policy prefers the same action, to be told so
+SHOWN = 5  # names of tasks in a sentence
 VERDICTS = (WORSE, BETTER, NEGLIGIBLE, UNDECIDED)
 
 
@@ -201,6 +203,59 @@ def random_play(results: AgentResults) -> list[str]:
         "earlier": at_end,
     }
     return [f"In {count:,} of {pluralize(runs, 'run')} {text}." for text, count in texts.items() if 2 * count > runs]
+
+
+def policies_of(results: AgentResults) -> dict[str, Mapping[str, float]]:
+    """Facts on the policies by task, of tasks with curves: `one_action`, `deterministic`, and maybe `greedy_score`.
+
+    Results that were made before there were such facts, and agents of pharos and classes, have none.
+    """
+    stored = results.record.get("policies")
+    entries = stored.items() if isinstance(stored, Mapping) else ()
+    return {
+        name: facts
+        for name, facts in entries
+        if name in results.curves
+        and isinstance(facts, Mapping)
+        and all(isinstance(facts.get(each), int | float) for each in ("one_action", "deterministic"))
+        and isinstance(facts.get("greedy_score", 0.0), int | float)
+    }
+
+
+def policy_sentences(contents: Contents) -> list[str]:
+    """Sentences on the final policies on core tasks: one action nearly everywhere, chance, and noise in play."""
+    names = {task.name for task in contents.suite.core}
+    facts = {name: each for name, each in policies_of(contents.agent.results).items() if name in names}
+    if not facts:
+        return []
+    count, sentences = pluralize(len(facts), "core task"), []
+    fixed = [name for name, each in facts.items() if each["one_action"] >= ONE_ACTION]
+    if fixed:
+        shown = f"{', '.join(fixed[:SHOWN])}{f' and {len(fixed) - SHOWN} more' if len(fixed) > SHOWN else ''}"
+        sentences.append(
+            f"One action in {100 * ONE_ACTION:.0f} % of states and more: on {len(fixed)} of {count} the final policy "
+            f"prefers the same action nearly everywhere ({shown}). If the observation does not reach the policy, or "
+            f'the step size is too large, this is what comes out; the column "one action" of core tasks says what '
+            f"that scores."
+        )
+    certain = [name for name, each in facts.items() if each["deterministic"] == 1]
+    sentences.append(f"Deterministic on {len(certain)} of {count} at the end, in all runs.")
+    greedy = [name for name, each in facts.items() if "greedy_score" in each]
+    if greedy:
+        runs = run_scores(contents.agent.results)
+        own = sum(float(runs[name].mean()) for name in facts) / len(facts)
+        best = sum(facts[name].get("greedy_score", float(runs[name].mean())) for name in facts) / len(facts)
+        noise = (
+            f"of {1 - own:.2f} below optimal, {best - own:.2f} is noise in play"
+            if best - own >= LEAST
+            else "noise in play costs nothing"
+            if best - own > -LEAST
+            else f"it plays {own - best:.2f} better with its chance"
+        )
+        sentences.append(
+            f"Played greedily, the same snapshots score {best:.2f} instead of {own:.2f} on {count}: {noise}."
+        )
+    return sentences
 
 
 def seeds_sentence(agents: Sequence[ScoredAgent]) -> list[str]:

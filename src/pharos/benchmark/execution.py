@@ -9,7 +9,7 @@ DIR/results.safetensors    all curves of what was asked for, when the runs have 
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib import metadata
@@ -205,6 +205,7 @@ def collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any],
     exact: dict[str, bool] = {}
     missing: dict[str, str] = {}
     notes: dict[str, dict[str, str]] = {}
+    facts: dict[str, list[Mapping[str, Any]]] = {}
     seeds, steps = tuple(dict.fromkeys(job.seed for job in jobs)), 0
     for job in jobs:
         task, which = job.task.name, job.id
@@ -218,11 +219,14 @@ def collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any],
             notes.setdefault(kind, {})[which] = text
         curves.setdefault(task, []).append(result.curve)
         exact[task] = exact.get(task, True) and result.exact
+        facts.setdefault(task, []).append(result.policies)
     whole = {task: np.stack(each) for task, each in curves.items() if len(each) == len(seeds)}
     if (text := equal_seeds(whole)) and form.learns:
         notes["equal seeds"] = {f"{len(whole)} tasks": text}
     full_record = {**record, "exact": {task: exact[task] for task in whole}, "steps_used": steps}
-    full_record |= {name: value for name, value in {"failed": missing, "notes": notes}.items() if value}
+    policies = {task: mean_facts(facts[task], whole[task]) for task in whole if all(facts[task])}
+    optional = {"failed": missing, "notes": notes, "policies": policies}
+    full_record |= {name: value for name, value in optional.items() if value}
     results = AgentResults(str(record["agent"]), suite.name, suite.digest, seeds, whole, full_record)
     outcome = Outcome(results, folder, missing, suite, steps, notes)
     if not whole:
@@ -232,6 +236,21 @@ def collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any],
     if outcome.scores.has_core:
         storage.replace_json(folder / SCORE, {"agent": results.agent, "suite": suite.name, **asdict(outcome.scores)})
     return outcome
+
+
+def mean_facts(facts: Sequence[Mapping[str, Any]], curves: np.ndarray) -> dict[str, float]:
+    """Means over the runs of a task: `one_action`, `deterministic` (a share of runs), and `greedy_score`.
+
+    The last is the score if the policies of all evaluations are played greedily; it is left out if none is stochastic.
+
+    Args:
+        curves: (runs, evaluations) normalised regret of what was played.
+    """
+    means = {name: float(np.mean([each[name] for each in facts])) for name in ("one_action", "deterministic")}
+    if any("greedy_regret" in each for each in facts):
+        regrets = [np.mean(each.get("greedy_regret", curve)) for each, curve in zip(facts, curves, strict=True)]
+        means["greedy_score"] = float(np.mean(1.0 - np.clip(regrets, 0.0, 1.0)))
+    return means
 
 
 def equal_seeds(curves: Mapping[str, np.ndarray]) -> str:

@@ -54,6 +54,8 @@ from pharos.benchmark.diagnosis import (
     is_own,
     lowest_rungs,
     nearest,
+    policies_of,
+    policy_sentences,
     predictor_sentence,
     random_play,
     seeds_sentence,
@@ -63,7 +65,7 @@ from pharos.benchmark.diagnosis import (
     worst_groups,
 )
 from pharos.benchmark.latex import latex_of
-from pharos.benchmark.properties import known_properties
+from pharos.benchmark.properties import known_properties, purpose_of
 from pharos.benchmark.suite import BenchmarkTask, Ladder, Suite
 from pharos.plots import agent_name
 from pharos.system import storage
@@ -229,6 +231,44 @@ def _core(contents: Contents) -> Element | None:
         f"{distance:.2f} apart on the average task. Sorted by difference, the worst first. {verdict} "
         "One action: the best policy that always plays the same one.",
         _table(heads, rows, numeric=(1, 2, 3, 4)),
+        *([folded] if (folded := _purposes(contents)) is not None else []),
+    )
+
+
+def _purposes(contents: Contents) -> Element | None:
+    """A folded table of what each core task asks, and what failing it means."""
+    tasks = [(task, purpose) for task in contents.suite.core if (purpose := purpose_of(task)) is not None]
+    rows: list[list[str | Element]] = [[_task(task), purpose.asks, purpose.failing] for task, purpose in tasks]
+    if not rows:
+        return None
+    table = element("div", _table(["task", "asks to", "failing means, most often"], rows), class_="words")
+    return element("details", element("summary", "What each task asks, and what failing it means"), table)
+
+
+def _policies(contents: Contents) -> Element | None:
+    sentences = policy_sentences(contents)
+    if not sentences:
+        return None
+    scores, facts = contents.agent.score.tasks, policies_of(contents.agent.results)
+    rows: list[list[str | Element]] = []
+    for task in contents.suite.core:
+        if (own := facts.get(task.name)) is not None:
+            greedy = f"{own['greedy_score']:.2f}" if "greedy_score" in own else "the same"
+            cells = (
+                f"{scores[task.name].value:.2f}",
+                greedy,
+                *(f"{100 * own[each]:.0f} %" for each in ("one_action", "deterministic")),
+            )
+            rows.append([_task(task), *cells])
+    rows.sort(key=lambda row: -float(str(row[3]).removesuffix(" %")))
+    heads = ["task", "score", "played greedily", "one action in", "runs that end deterministic"]
+    table = element("details", element("summary", "Task by task"), _table(heads, rows, numeric=(1, 2, 3, 4)))
+    return _section(
+        "What the policies are like",
+        "Of all states of a task that are not terminal, reached or not. Played greedily: the most probable action of "
+        "each snapshot, evaluated exactly.",
+        _list(sentences),
+        table,
     )
 
 
@@ -381,6 +421,7 @@ SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
     _learning,
     _ladders,
     _words,
+    _policies,
     _core,
     _groups,
     _plane,
@@ -389,7 +430,7 @@ SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
 )
 
 
-ON_PAGE = ("exact", "division", "steps_used", "failed", "notes")
+ON_PAGE = ("exact", "division", "steps_used", "failed", "notes", "policies")
 """Entries of the record that the page says in words."""
 
 

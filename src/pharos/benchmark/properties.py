@@ -18,6 +18,7 @@ from pharos.mdp import rewards_of_outcomes
 from pharos.policies import evaluate_policy
 
 FILE = Path(__file__).parent / "data" / "task_properties.csv"
+PURPOSES = FILE.with_name("task_purposes.csv")
 SHORT, LONG = 32, 400  # steps
 
 
@@ -93,3 +94,25 @@ def known_properties() -> dict[str, TaskProperties]:
             for row in csv.DictReader(lines)
         ]
     return {each.digest: each for each in rows}
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """Words on a task: what it asks of an agent, and what failing it means."""
+
+    asks: str
+    failing: str
+
+
+@cache
+def _purposes() -> dict[str, Purpose]:
+    with open(PURPOSES, encoding="utf-8", newline="") as lines:
+        return {row["environment"]: Purpose(row["asks"], row["failing"]) for row in csv.DictReader(lines)}
+
+
+def purpose_of(task: BenchmarkTask) -> Purpose | None:
+    """Purpose of a task by its class of environments, and kind of MiniGrid; None for other classes."""
+    name, _, instance = task.environment.partition("/")
+    kind = str(task.parameters.get("kind", instance))
+    keys = [key for key in _purposes() if key.split()[0] == name and kind.startswith(key.partition(" ")[2])]
+    return _purposes()[keys[0]] if keys else None

@@ -1,6 +1,8 @@
 """Texts of counts, names and errors in messages and tables; and the templates of pages."""
 
+import traceback
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pharos.errors import MissingExtra, PharosError
@@ -32,6 +34,12 @@ def in_one_line(error: BaseException) -> str:
     except Exception:  # of a class of the user's own
         text = "an error that cannot be printed"
     return text if isinstance(error, PharosError) else f"{type(error).__name__}: {text}"
+
+
+def line_in(error: BaseException, file: str | None) -> str:
+    """The last line of a file in the traceback of an error, such as " (mine.py, line 12)"; empty if there is none."""
+    frames = [each for each in traceback.extract_tb(error.__traceback__) if file and each.filename == file]
+    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
 
 def latex_text(text: str) -> str:

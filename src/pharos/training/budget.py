@@ -37,7 +37,7 @@ from pharos.interaction import GymEnv
 from pharos.mdp import uniform_choice
 from pharos.policies import PolicyAnswers, PolicyLike, RecurrentPolicy, SB3Model, deep_policy
 from pharos.system.wording import in_one_line
-from pharos.training.curve import Curve, Evaluation, evaluate_agent
+from pharos.training.curve import Curve, Evaluation, evaluate_agent, policy_facts
 from pharos.training.task import Task
 
 BLOCK = 4096  # observations that a policy is asked about at once
@@ -368,12 +368,17 @@ class PolicyRecorder:
         """
         curve = Curve(self.task, counted_steps=self.budget.steps)
         values: dict[int, Evaluation] = {}  # by the identity of the policy
+        tables: list[np.ndarray | None] = []
         to_come = ((point, *self._ended_at(point), self.in_force) for point in self._points)
         for point, episodes, returns, policy in [*self._passed, *to_come]:
             if id(policy) not in values:
                 values[id(policy)] = policy if isinstance(policy, Evaluation) else evaluate_agent(policy, self.task)
             curve.add(point, episodes, returns, policy, values[id(policy)])
+            tables.append(policy if isinstance(policy, np.ndarray) else None)
         self.check_steps(curve)
+        if self.count:
+            regrets = [row["normalized_regret"] for row in curve.rows]
+            curve.policies = policy_facts(self.task, tables[1:], regrets[1:])
         return curve
 
     def check_steps(self, curve: Curve) -> None:

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 
 BLOCK = 4096  # observations that policies are asked about at once
+CERTAIN, TIE = 0.999, 1e-9  # probability of a certain choice; difference of equal ones
 
 
 def evaluate_agent(
@@ -175,12 +176,14 @@ class Curve:
     Attributes:
         table: the policy of the last row, where it is a table.
         counted_steps: of the environment, where it counts them itself (`pharos.benchmark`).
+        policies: facts on the policies, see `policy_facts`; empty if nobody asked for them.
     """
 
     task: Task
     rows: list[dict[str, Any]] = field(default_factory=list)
     table: np.ndarray | None = None
     counted_steps: int | None = None
+    policies: dict[str, Any] = field(default_factory=dict)
     _evaluation: Evaluation | None = field(default=None, init=False, repr=False)  # of the table
 
     def add(
@@ -272,6 +275,43 @@ class Curve:
             "normalized_average_regret": sum(total) / 2 / steps / scale if steps else math.nan,
             **{f"{name}_gain_at_start": each._asdict() for name, each in gains.items()},
         }
+
+
+def policy_facts(task: Task, tables: Sequence[np.ndarray | None], regrets: Sequence[float]) -> dict[str, Any]:
+    """Facts on the policies of a run, at its evaluations.
+
+    Args:
+        tables: policy of each evaluation, (S, A) probabilities; None if it is no table.
+        regrets: normalised, of each as it is played.
+    Returns:
+        Empty if a policy is no table, else `one_action`: share of states in which the last policy prefers the same
+        action; `deterministic`: whether its choice is certain in all of them, terminal ones left out; and if some
+        policy is stochastic `greedy_regret`: normalised regret at each evaluation if the preferred action, the first
+        among equals, is always played. Uniform play prefers none, and stays as it is.
+    Cost: an evaluation of each stochastic table.
+    """
+    if not tables or any(table is None or table.ndim != 2 for table in tables):
+        return {}
+    goes_on = ~np.asarray(task.mdp.terminal, bool)
+    values: dict[int, float] = {}  # by the identity of the policy
+    is_stochastic = False
+    for table, own in zip(tables, regrets, strict=True):
+        assert table is not None
+        if id(table) in values:
+            continue
+        played, values[id(table)] = table[goes_on], own
+        if (played.max(axis=1) < CERTAIN).any() and not (np.ptp(played, axis=1) < TIE).all():
+            is_stochastic = True
+            value = evaluate_agent(table.argmax(axis=1), task).value
+            values[id(table)] = float(regret(value, task.reference, normalized_by="uniform"))
+    assert tables[-1] is not None
+    last = tables[-1][goes_on]
+    preferred = last.argmax(axis=1)[np.ptp(last, axis=1) >= TIE]  # uniform play prefers nothing
+    facts = {
+        "one_action": float(np.bincount(preferred, minlength=1).max() / len(last)),
+        "deterministic": bool((last.max(axis=1) >= CERTAIN).all()),
+    }
+    return facts | ({"greedy_regret": [values[id(table)] for table in tables]} if is_stochastic else {})
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,21 +5,27 @@ seed alone.
 """
 
 import math
+import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from pharos.agents import COMPILED, GENERATOR, generator_of, register_form
-from pharos.errors import ParameterError
+from pharos.errors import ParameterError, PharosError
 from pharos.policies import PolicyLike
 from pharos.solvers import GainInterval
-from pharos.training.budget import PolicyRecorder, generate, uniform_policy
+from pharos.system.wording import capped, in_one_line, line_in
+from pharos.system.workers import Terminated
+from pharos.training.budget import IGNORED, PolicyRecorder, generate, uniform_policy
 from pharos.training.curve import Evaluation, evaluate_agent
 from pharos.training.jax_agents import compiled_curves
 from pharos.training.results import write_policy
+
+LONGEST = 500  # letters of an agent's error
 
 
 class GeneratorLearner(PolicyRecorder):
@@ -30,6 +36,7 @@ class GeneratorLearner(PolicyRecorder):
         config = run.config
         super().__init__(run.task, steps=config.steps, interval=config.evaluation_interval, seed=config.seed)
         self.run, self.function = run, learn
+        self.budget.give_up = self._give_up
 
     @property
     def episodes(self) -> np.ndarray:
@@ -44,14 +51,37 @@ class GeneratorLearner(PolicyRecorder):
 
         Raises:
             ParameterError: it is no generator; or it has a second policy, or ends with another one than uniform play,
-                when no step was counted; or yields very many policies without a step while it has some; or whatever its
-                code raises.
+                when no step was counted; or yields very many policies without a step while it has some.
+            PharosError: its code raises something, SystemExit included.
         """
         self.at_point = at_point
-        generate(partial(generator_of(self.function), **self.run.hyperparameters), self, self.run.config.seed)
+        try:
+            generate(partial(generator_of(self.function), **self.run.hyperparameters), self, self.run.config.seed)
+        except (PharosError, MemoryError, KeyboardInterrupt, Terminated):
+            raise
+        except BaseException as error:
+            if not (line := line_in(error, self._file)):  # of pharos, such as a full disk
+                raise
+            text = capped(in_one_line(error).rstrip(": "), LONGEST)
+            raise PharosError(f"agent {self.run.config.agent} raised {text}{line}") from error
         self.run.curve.counted_steps = self.budget.steps
         self.pass_points(math.inf)
         self.check_steps(self.run.curve)
+
+    @property
+    def _file(self) -> str | None:
+        """The file with the code of the function."""
+        source = self.run.config.sources.get("agent")
+        return source.file if source else getattr(getattr(self.function, "__code__", None), "co_filename", None)
+
+    def _give_up(self) -> NoReturn:
+        """End this process: what catches BudgetSpent around `step`, and goes on, cannot be ended otherwise."""
+        sys.stderr.write(
+            f"pharos: agent {self.run.config.agent} went on for {IGNORED:,} steps after its {self.budget.limit:,}; "
+            f"expected its loop to end: catch no BudgetSpent (`except:`, `except BaseException`) around step\n"
+        )
+        sys.stderr.flush()
+        os._exit(1)
 
     def policy(self, i: int) -> PolicyLike | Evaluation:
         return self.in_force
