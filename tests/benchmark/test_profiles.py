@@ -10,6 +10,7 @@ from pharos.benchmark import diagnose, faults
 from pharos.benchmark.examination import NAMES
 from pharos.benchmark.faults import FAULTS, HEALTHY
 from pharos.benchmark.profiles import (
+    HEALTHY_ONES,
     SYMPTOMS,
     Profile,
     accuracy,
@@ -49,6 +50,7 @@ def test_likeness_is_the_ratio_of_gaussian_densities_where_readings_are_independ
     x = np.array([0.3, -0.2, 0.5, 0.1])
     shares = likeness({f"x{k}": value for k, value in enumerate(x)}, known)
     densities = {fault: np.exp(-0.5 * ((x - mean) ** 2).sum()) for fault, mean in means.items()}
+    densities[HEALTHY] *= HEALTHY_ONES
     total = sum(densities.values())
     for fault, density in densities.items():
         assert shares[fault] == pytest.approx(density / total, abs=0.03)

@@ -40,11 +40,11 @@ DQN_FAULTS = {
 }
 PPO_FAULTS = {
     "advantages_not_normalised": "advantages are used as they are, whatever the size of rewards",
-    "stale_log_probabilities": "old log-probabilities are those of the policy that learns, so that nothing is clipped",
+    "stale_log_probabilities": "old log-probabilities are those of the policy that learns: nothing is clipped",
     "value_without_mask": "advantages and values run on over the ends of episodes",
     "truncation_as_end": "an episode that the time limit cuts counts as one that has ended",
     "gamma_half": "the discount is 0.5",
-    "rollout_reshaped": "steps and environments of a rollout are mixed up, so that advantages belong to other steps",
+    "rollout_reshaped": "steps and environments of a rollout are mixed up: advantages are those of other steps",
     "learning_rate_high": "the learning rate is 100 times too high",
     "entropy_penalised": "the sign of the entropy bonus is wrong",
     "action_off_by_one": "the action that is played is the one after the action that was chosen, when it is judged",

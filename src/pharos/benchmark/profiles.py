@@ -26,7 +26,8 @@ DECIMALS = 3
 LARGEST = 4.0  # deviations within a fault that a reading counts as being away
 OWN = 0.5  # weight of the deviations alone in the covariance within a fault
 INDEPENDENT = 8  # readings that count as independent evidence
-CREDIBLE = 0.5  # likeness from which a fault is said
+CREDIBLE = 0.6  # likeness from which a fault is said
+HEALTHY_ONES = 3.0  # times as many agents that are healthy as agents with any one fault, before anything is seen
 BROKEN = 0.5  # mean regret of an agent of which no check and no fault says what is wrong
 
 
@@ -143,7 +144,7 @@ SYMPTOMS = (
     Symptom(
         "cut_share",
         True,
-        0.1,
+        0.25,
         0.45,
         "values stop at the time limit: they are {value} of the way to those for which a truncated episode has ended",
         "bootstrap where truncated: only terminated ends a return",
@@ -153,8 +154,8 @@ SYMPTOMS = (
     Symptom(
         "signs",
         False,
-        0.1,
-        -0.1,
+        0.3,
+        -0.8,
         "values are those of the signs of rewards: errors are {value} smaller",
         "look for clipped rewards (a wrapper of Atari), or divide by the largest instead",
         ("rewards_clipped",),
@@ -174,7 +175,7 @@ SYMPTOMS = (
         "itself",
         False,
         0.1,
-        -0.1,
+        -0.3,
         "what comes after a state is the state itself: errors are {value} smaller",
         "look for an observation that is overwritten before it is stored; copy the array",
         ("next_is_observation",),
@@ -184,7 +185,7 @@ SYMPTOMS = (
         "mean",
         False,
         0.1,
-        -0.1,
+        -0.2,
         "values are those of random play from the next step on: errors are {value} smaller",
         "take the maximum over the axis of actions, not the mean",
         ("mean_backup",),
@@ -213,12 +214,22 @@ SYMPTOMS = (
     Symptom(
         "forgets",
         False,
-        0.1,
-        -0.2,
+        0.2,
+        -0.3,
         "values are right where it was of late, and {value} further off elsewhere",
         "use a larger replay buffer, or more minibatches between two policies",
         ("replay_too_small",),
         _factor,
+    ),
+    Symptom(
+        "slope",
+        False,
+        0.3,
+        -1.0,
+        "rewards enter its values with the factor {value} in place of 1",
+        "look at rewards that are stored, scaled or clipped on their way into the loss, and at the learning rate",
+        ("rewards_shifted", "learning_rate_low"),
+        _share,
     ),
     Symptom(
         "consistency",
@@ -344,6 +355,7 @@ def likeness(numbers: Mapping[str, float], library: Sequence[Profile]) -> dict[s
         z = np.clip((x - rows[own].mean(axis=0)) / deviations, -LARGEST, LARGEST)
         scores.append(-0.5 * float(z @ np.linalg.solve(covariance, z)) * own.sum() / (own.sum() + 1))
     powers = np.exp((np.array(scores) - max(scores)) * min(1.0, INDEPENDENT / len(names)))
+    powers *= [HEALTHY_ONES if fault == HEALTHY else 1.0 for fault in faults]
     ranked = sorted(zip(faults, powers / powers.sum(), strict=True), key=lambda each: -each[1])
     return {fault: float(share) for fault, share in ranked}
 
@@ -353,14 +365,20 @@ class Accuracy:
     """Shares of agents for which the likeness was right, of those that were left out of the library.
 
     Attributes:
-        agents: how many. first: share whose fault was the likeliest; three: among the three likeliest.
-        healthy: share of healthy ones for whom no check was against it, and "none" was the likeliest.
+        agents: how many. first: share of those with a fault whose fault was the likeliest; three: among three.
+        healthy: share of healthy ones without a symptom and without a fault that is likely.
     """
 
     agents: int
     first: float
     three: float
     healthy: float
+
+
+def suspect(shares: Mapping[str, float]) -> str | None:
+    """The fault that is likely enough to be said, if there is one."""
+    fault, share = next(iter(shares.items()))
+    return fault if fault != HEALTHY and share > CREDIBLE else None
 
 
 @cache
@@ -372,9 +390,10 @@ def accuracy(kind: str) -> Accuracy:
         rest = library[:place] + library[place + 1 :]
         if each.fault not in {other.fault for other in rest}:
             continue
-        order = [*likeness(each.readings, rest)]
+        shares = likeness(each.readings, rest)
+        order = [*shares]
         if each.fault == HEALTHY:
-            healthy.append(order[0] == HEALTHY and not failed(each.readings, rest))
+            healthy.append(not failed(each.readings, rest) and suspect(shares) is None)
         else:
             ranks.append(order.index(each.fault))
     places = np.array(ranks)
@@ -448,7 +467,7 @@ class Diagnosis:
     def is_healthy(self) -> bool:
         """Whether no check has found anything, and no fault is likely."""
         score = sum(self.scores.values()) / len(self.scores)
-        return not self.findings and next(iter(self.likeness)) == HEALTHY and score > BROKEN
+        return not self.findings and suspect(self.likeness) is None and score > BROKEN
 
     @property
     def how_often(self) -> str:
@@ -540,12 +559,11 @@ def diagnosis_of(examinations: Sequence[Examination], label: str) -> Diagnosis:
 
 
 def _verdict(findings: Sequence[Finding], shares: Mapping[str, float], kind: str, score: float) -> str:
-    fault, share = next(iter(shares.items()))
-    like = f"it is most like an agent in which {meanings(kind).get(fault)} ({share:.2f})"
+    fault = suspect(shares)
+    like = f"it is most like an agent in which {meanings(kind)[fault]} ({shares[fault]:.2f})" if fault else ""
     if findings:
-        more = f"; {like}" if fault != HEALTHY and share > CREDIBLE else ""
-        return f"Something is wrong: {findings[0].wrong}{more}."
-    if fault != HEALTHY and share > CREDIBLE:
+        return f"Something is wrong: {findings[0].wrong}{'; ' * bool(like)}{like}."
+    if fault:
         return f"No single number is unlike those of healthy agents, but {like}."
     if score < BROKEN:
         return f"It learns little (mean score {score:.2f}), and is like none of the known faults."
