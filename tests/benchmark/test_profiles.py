@@ -87,7 +87,7 @@ def test_the_table_has_every_fault_and_tells_most_of_them_apart():
     for kind, words in FAULTS.items():
         assert {each.fault for each in table if each.kind == kind} == {HEALTHY, *words}
         right = accuracy(kind)
-        assert not right.agents or (right.first > 1.5 / len(words) and right.three > 4.5 / len(words))
+        assert right.agents > 20 and right.first > 0.6 and right.three > 0.75 and right.healthy > 0.75
     assert {kind_of(each.readings) == each.kind for each in table} == {True}
     assert {name for each in SYMPTOMS for name in each.faults} <= meanings("").keys()
     assert all(f"regret_{name}" in each.readings for each in table for name in NAMES)
