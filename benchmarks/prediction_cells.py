@@ -2,17 +2,21 @@
 
     python benchmarks/prediction_cells.py compute --out cells.csv [--block NAME ...]
     python benchmarks/prediction_cells.py judge [--cells cells.csv] [--resamples 1000]
+    python benchmarks/prediction_cells.py orders [--cells cells.csv]
+    python benchmarks/prediction_cells.py sealed [--cells cells.csv] [--resamples 1000]
     python benchmarks/prediction_cells.py draw [--cells cells.csv] [--picture docs/images/sealed.png]
     python benchmarks/prediction_cells.py cost
 
 `compute` reads the packed runs of docs/studies (twelve development classes: hardness-dev; fourteen sealed ones:
-sealed-1) and computes the primary predictor of each cell, `sampled_regret` of a DQN; that of a PPO is in the files of
-predictions. A row that is there already is not computed again. `judge` prints how well predictions agree with runs, by
-set and agent: number of cells, R2 of classes left out after a line, Spearman's rank correlation, the share of pairs of
-observations that are ordered rightly, R2 without a fit, half the width of the 80 % interval and the share of classes
-left out that it covers; in brackets 95 % intervals over classes drawn anew. Classes weigh alike. `draw` draws predicted
-against observed regret of the sealed classes. `cost` prints the seconds of a cell and the memory that it adds, each in
-a process of its own that has compiled, by states of a grid, agent and observation.
+sealed-1; fourteen others: sealed-2, blocks a to c) and computes the primary predictor of each cell, `sampled_regret` of
+a DQN; those of a PPO and of sealed-2 are in the files of predictions. A row that is there already is not computed
+again. `judge` prints how well predictions agree with runs, by set and agent: number of cells, R2 of classes left out
+after a line, Spearman's rank correlation, the share of pairs of observations that are ordered rightly, R2 without a
+fit, half the width of the 80 % interval and the share of classes left out that it covers; in brackets 95 % intervals
+over classes drawn anew. Classes weigh alike. `orders` prints the pairs of observations by predicted difference.
+`sealed` prints the same of the second sealed test, by block and predictor, and what the interval of before it held.
+`draw` draws predicted against observed regret of the second sealed set. `cost` prints the seconds of a cell and the
+memory that it adds, each in a process of its own that has compiled, by states of a grid, agent and observation.
 """
 
 import argparse
@@ -29,8 +33,8 @@ import pandas as pd
 from pharos import study
 from pharos.agents import primary_predictors
 from pharos.prediction import Published
+from pharos.prediction.calibration import BINS, FILE, NUMBERS
 from pharos.prediction.learners import primary_regret
-from pharos.prediction.prediction import FILE
 from pharos.statistics import spearman
 from pharos.study.cross_validation import held_out
 from pharos.study.tables import CELL
@@ -41,6 +45,7 @@ DEV = STUDIES / "hardness-dev"
 # name -> (specification, packed runs, predictions that hold the primary predictor of a PPO)
 BLOCKS = {
     "sealed-1": (STUDIES / "sealed-1" / "report.yaml", None, None),
+    "sealed-2": (STUDIES / "sealed-2" / "report.yaml", None, None),
     "dev-main": (DEV / "main-dqn.yaml", DEV / "main-dqn-runs.parquet", None),
     "dev-random": (DEV / "random-dqn.yaml", DEV / "random-dqn-runs.parquet", None),
     "dev-long": (DEV / "long-dqn.yaml", DEV / "long-dqn-runs.parquet", None),
@@ -51,19 +56,22 @@ BLOCKS = {
         DEV / "long-random-ppo.yaml", DEV / "long-random-ppo-runs.parquet", DEV / "long-random-ppo-predictions.parquet",
     ),
 }  # fmt: skip
-COLUMNS = ("study", *CELL, "steps", "states", "predicted", "observed", "seeds")
+COLUMNS = ("study", *CELL, "steps", "states", "spread", "predicted", "observed", "seeds")
 
 
 def observed_of(block, specification, runs):
-    """CELL -> (mean greedy regret, seeds) of the runs that are finished."""
-    if runs is None:  # of the sealed set, whose table of cells is kept
-        cells = pd.read_csv(STUDIES / "sealed-1" / "cells.csv")
+    """CELL -> (mean greedy regret, seeds, V* - U) of the runs that are finished."""
+    if runs is None:  # of a sealed set, whose table of cells is kept
+        cells = pd.read_csv(STUDIES / block / "cells.csv")
+        if block == "sealed-2":  # plain, with the common hyperparameters: its primary test
+            cells = cells[cells["part"].str[0].isin(["a", "b", "c"])]
     else:
         with tempfile.TemporaryDirectory() as folder:
             study.unpack(runs, Path(folder) / "runs", into=specification)
             table = study.table(specification, Path(folder) / "runs")
             cells = study.outcomes(table, study.curves(specification, Path(folder) / "runs"))
-            cells = cells.merge(table.groupby(CELL).size().rename("seeds").reset_index(), on=CELL)
+            table["spread"] = table["value_optimal"] - table["value_uniform"]
+            cells = cells.merge(table.groupby(CELL).agg(seeds=("id", "size"), spread=("spread", "mean")), on=CELL)
     return {
         tuple(row[name] for name in CELL): row for row in cells.to_dict("records") if row["greedy"] == row["greedy"]
     }
@@ -75,7 +83,7 @@ def compute(out, blocks):
         with out.open(newline="") as file:
             done = {tuple(row[name] for name in ("study", *CELL)) for row in csv.DictReader(file)}
     with out.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         if not done:
             writer.writeheader()
         for block in blocks:
@@ -95,6 +103,7 @@ def compute(out, blocks):
                 value, states = regret_of(run, cells[key], told.get(key))
                 if value == value:
                     row = {"steps": run.config["steps"], "states": int(states), "predicted": round(value, 6)}
+                    row |= {"spread": float(f"{cells[key]['spread']:.6g}")}
                     row |= {"observed": round(cells[key]["greedy"], 6), "seeds": int(cells[key]["seeds"])}
                     writer.writerow({"study": block, **cell, **row})
                     file.flush()
@@ -112,16 +121,55 @@ def regret_of(run, cell, told):
 
 def judge(file, resamples):
     frame = pd.read_csv(file)
-    sealed = frame["study"] == "sealed-1"
+    one, two = (frame["study"] == name for name in ("sealed-1", "sealed-2"))
     for agent in primary_predictors():
         for name, chosen in (
-            ("twelve of development", ~sealed),
-            ("fourteen sealed", sealed),
-            ("all 26", sealed | True),
+            ("twelve of development", ~one & ~two),
+            ("the first fourteen sealed", one),
+            ("the second fourteen sealed", two),
+            ("all 40", one | ~one),
         ):
             cells = frame[(frame["agent"] == agent) & chosen]
             if len(cells):
                 print(f"| {name} | {agent.upper()} | {len(cells)} | {said_of(cells, resamples)} |")
+
+
+def orders(file):
+    """Pairs of observations by predicted difference: all, those of the said sign, those that differ and are right."""
+    frame = pd.read_csv(file)
+    for agent in primary_predictors():
+        known = of(frame[frame["agent"] == agent])
+        counts = [known.ordered(low) for low in BINS]
+        for words, values in (
+            ("pairs", [each.pairs for each in counts]),
+            ("less regret, however little", [each.right for each in counts]),
+            ("less by more than 0.05", [f"{each.clear_right} of {each.clear_pairs}" for each in counts]),
+        ):
+            print(f"| {agent.upper()} | {words} | {' | '.join(map(str, values))} |")
+
+
+PREDICTORS = {
+    "dqn": ("sampled_regret", "kernel_regret", "sampled_descent", "sampled_adam", "sampled_tabular"),
+    "ppo": ("clipped_regret_evaluated", "policy_regret_evaluated", "kernel_regret", "clipped_tabular_regret"),
+}
+
+
+def sealed(file, resamples):
+    """The second sealed test: blocks a to c by predictor, then d and e, then what the interval of before held."""
+    frame, before = pd.read_csv(STUDIES / "sealed-2" / "cells.csv"), pd.read_csv(file)
+    for agent, predictors in PREDICTORS.items():
+        mine = frame[frame["agent"].str.split().str[0] == agent]
+        width = of(before[(before["agent"] == agent) & (before["study"] != "sealed-2")]).half_width()
+        for blocks, names in (("abc", predictors), ("d", predictors[:1]), ("e", predictors[:1])):
+            part = mine[mine["part"].str[0].isin([*blocks])]
+            for name in names:
+                cells = part.rename(columns={name: "predicted", "greedy": "observed", "num_states": "states"})
+                cells = cells.assign(study="sealed-2", steps=30_000)
+                inside = (cells["predicted"] - cells["observed"]).abs() <= width
+                held = inside.groupby(cells["environment"]).mean().mean()
+                title = f"{', '.join(blocks)} | {agent.upper()} | `{name}` | {len(cells)}"
+                r_squared, rho, pairs, unfitted, *_ = said_of(cells, resamples).split(" | ")
+                print(f"| {title} | {r_squared} | {rho} | {pairs} | {unfitted} | {held:.2f} of ± {width:.2f} |")
 
 
 def said_of(cells, resamples):
@@ -131,7 +179,7 @@ def said_of(cells, resamples):
     drawn = [np.bincount(rng.choice(number, number), minlength=number) for _ in range(resamples)]
     values = statistics(known, np.array([np.ones(number, int), *drawn]))
     r_squared, rho, unfitted, pairs = (
-        f"{each[0]:.2f} ({low:.2f} to {high:.2f})"
+        "{:.2f} ({:.2f} to {:.2f})".format(*(round(end, 2) + 0.0 for end in (each[0], low, high)))
         for each in values for low, high in [np.nanquantile(each[1:], [0.025, 0.975])]
     )  # fmt: skip
     width = f"± {known.half_width():.2f} | {known.coverage():.2f}"
@@ -139,7 +187,7 @@ def said_of(cells, resamples):
 
 
 def draw(file, picture):
-    """Predicted against observed on the sealed classes, a panel for each agent."""
+    """Predicted against observed on the second sealed set, a panel for each agent."""
     from pharos.plots import save
     from pharos.plots.style import COLORS, GRID, panels, styled
 
@@ -148,7 +196,7 @@ def draw(file, picture):
         frame = pd.read_csv(file)
         drawn, axes = panels(2, 3.4, 3.3)
         for axis, agent in zip(axes, primary_predictors(), strict=True):
-            cells = frame[(frame["agent"] == agent) & (frame["study"] == "sealed-1")]
+            cells = frame[(frame["agent"] == agent) & (frame["study"] == "sealed-2")]
             axis.plot([0, 1.8], [0, 1.8], color=GRID, zorder=0)
             for number, (name, some) in enumerate(cells.groupby(cells["observation"].str.split("[(,]").str[0])):
                 label = name.replace("_", " ")
@@ -199,7 +247,7 @@ def cost():
 
 def of(cells):
     mdps = cells["study"] + " " + cells["instance"] + " " + cells["chance"]
-    numbers = (cells[name].to_numpy(float) for name in ("predicted", "observed", "states", "steps"))
+    numbers = (cells[name].to_numpy(float) for name in NUMBERS)
     return Published(cells["environment"].to_numpy(str), mdps.to_numpy(str), *numbers)
 
 
@@ -226,7 +274,7 @@ def statistics(known, counts):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("task", choices=("compute", "judge", "draw", "cost"))
+    parser.add_argument("task", choices=("compute", "judge", "orders", "sealed", "draw", "cost"))
     parser.add_argument("--out", type=Path, default=FILE)
     parser.add_argument("--cells", type=Path, default=FILE)
     parser.add_argument("--block", action="append", choices=[*BLOCKS])
@@ -237,6 +285,10 @@ def main():
         compute(arguments.out, arguments.block or [*BLOCKS])
     elif arguments.task == "judge":
         judge(arguments.cells, arguments.resamples)
+    elif arguments.task == "orders":
+        orders(arguments.cells)
+    elif arguments.task == "sealed":
+        sealed(arguments.cells, arguments.resamples)
     elif arguments.task == "cost":
         cost()
     else:

@@ -18,8 +18,8 @@ import pyarrow.parquet as pq
 from scipy import stats
 
 from pharos import study
+from pharos.prediction.calibration import FILE, NUMBERS, Published
 from pharos.prediction.pairs import Pairs
-from pharos.prediction.prediction import FILE
 from pharos.statistics import holm, r_squared, spearman
 from pharos.study.blocks import Run
 from pharos.study.cross_validation import class_predictions, resampled_classes
@@ -31,13 +31,14 @@ ROOT = Path(__file__).parents[1]
 STUDIES = ROOT / "docs" / "studies"
 IMAGES = ROOT / "docs" / "images"
 SEALED = STUDIES / "sealed-1"
+SECOND = STUDIES / "sealed-2"
+WORST_GREEDY = 1.5  # of the idealised learner: what a policy counts at most
 SMALL = ("simple_grid", "frozen_lake")
 STUDY_NAMES = {"A": "classes", "B": "paper"}  # in the text, and of `runs`
 RESAMPLES = 1000
 NAMES = {"simple_grid": "grids", "frozen_lake": "lakes", "freeway": "Freeway", "breakout": "Breakout", "all": "all"}
 SAME_HARD = "DQN and PPO find the same hard"
 OBSERVED, LEARNER = "the harder observation of DQN", "the learner with more regret"
-NUMBERS = ["zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"]
 PRIMARY = {"dqn": "kernel_regret", "ppo": "clipped_regret_evaluated"}
 ROWS = (  # of the table of findings: in words, the finding and its class as in `study.findings`
     ("images harder: grids", OBSERVED, "simple_grid"),
@@ -210,6 +211,26 @@ def sealed():
     return study.outcomes(done, pd.concat(points)), predictions, done
 
 
+@cache
+def second(cut=np.inf):
+    """(cells, predictions, runs) of the second sealed test, blocks a to c; regret of an evaluation is at most `cut`."""
+    rows, points, parts = [], [], []
+    for entry in pq.read_table(SECOND / "curves.parquet").to_pylist():
+        if entry["part"][0] in "abc":
+            value, best, uniform = np.array(entry.pop("value")), entry["value_optimal"], entry["value_uniform"]
+            regret = np.minimum((best - value) / (best - uniform), cut)
+            points.append(pd.DataFrame({"step": entry.pop("step"), "normalized_regret": regret}).assign(id=entry["id"]))
+            rows.append(entry)
+    for name in sorted(file for part in "abc" for file in SECOND.glob(f"predictions-{part}-*.parquet")):
+        table, about = study.read_predictions(name)
+        parts.append(table.assign(date=about["date"]))
+    done, predictions = pd.DataFrame(rows), pd.concat(parts, ignore_index=True)
+    return study.outcomes(done, pd.concat(points)), predictions, done
+
+
+TESTS = {"first": sealed, "second": second}
+
+
 def identity(config):
     parts = (config["parameters"], config["observation_options"])
     return (
@@ -222,11 +243,11 @@ def identity(config):
 
 
 @cache
-def judged():
+def judged(test="first"):
     """(agent, predictor) -> its row of `study.validation`, for greedy regret."""
-    cells, predictions, _ = sealed()
+    cells, predictions, _ = TESTS[test]()
     names = ["kernel_regret", "sampled_regret", "tabular_regret", "clipped_regret_evaluated", "policy_tabular_regret"]
-    measures = pd.read_csv(SEALED / "hardness.csv")
+    measures = pd.read_csv((SEALED if test == "first" else SECOND) / "hardness.csv")
     table = study.validation(predictions, cells, predictors=names, measures=measures, permutations=0)
     table = table[table["outcome"] == "greedy"]
     return {(row["agent"], row["predictor"]): row for row in table.to_dict("records")}
@@ -234,32 +255,33 @@ def judged():
 
 def sealed_table():
     rows = []
-    for agent, predictor, words in (
-        ("ppo", "clipped_regret_evaluated", "`clipped_regret_evaluated`"),
-        ("dqn", "kernel_regret", "`kernel_regret`"),
-        ("dqn", "sampled_regret", "`sampled_regret`, after the test"),
-        ("ppo", "policy_tabular_regret", "learner on a table"),
-        ("dqn", "tabular_regret", "learner on a table"),
-        ("ppo", "tabular measures", "tabular measures"),
-        ("dqn", "tabular measures", "tabular measures"),
+    for test, agent, predictor, words in (
+        ("first", "ppo", "clipped_regret_evaluated", "`clipped_regret_evaluated`"),
+        ("first", "dqn", "kernel_regret", "`kernel_regret`"),
+        ("first", "ppo", "policy_tabular_regret", "learner on a table"),
+        ("first", "dqn", "tabular_regret", "learner on a table"),
+        ("first", "ppo", "tabular measures", "tabular measures"),
+        ("first", "dqn", "tabular measures", "tabular measures"),
+        ("second", "ppo", "clipped_regret_evaluated", "`clipped_regret_evaluated`"),
+        ("second", "dqn", "sampled_regret", "`sampled_regret`"),
     ):
-        row = judged()[agent, predictor]
+        row = judged(test)[agent, predictor]
         said = [interval(*(row[name + end] for end in ("", "_lower", "_upper"))) for name in ("r_squared", "rho")]
         without_line = "–"
-        if predictor in (both := joined(agent)):
+        if predictor in (both := joined(agent, test)):
             left = variance_share(both["greedy"] - both[predictor], both)
             without_line = interval(1 - left[0], 1 - left[2], 1 - left[1])
         share = "0.50"  # of what is the same for all observations of an MDP
         if row["agreement_lower"] == row["agreement_lower"]:
             share = interval(*(row["agreement" + end] for end in ("", "_lower", "_upper")))
-        rows.append([agent.upper(), words, *said, share, without_line])
-    head = ["agent", "predictor", "R², class left out", "rank correlation", "pairs in order", "R², no line"]
+        rows.append([test, agent.upper(), words, *said, share, without_line])
+    head = ["test", "agent", "predictor", "R², class left out", "rank correlation", "pairs in order", "R², no line"]
     return markdown(head, rows)
 
 
-def joined(agent):
-    """Cells of the sealed test with their predictions."""
-    cells, predictions, _ = sealed()
+def joined(agent, test="first", **options):
+    """Cells of a sealed test with their predictions."""
+    cells, predictions, _ = TESTS[test](**options)
     return predictions[predictions["agent"] == agent].merge(cells, on=CELL)
 
 
@@ -292,10 +314,10 @@ def left_out_r_squared(cells, predictor):
     return r_squared(regret, regret - prediction, classes)
 
 
-def misses(agent, predictor):
-    """Class -> mean of observed less predicted regret, each class predicted by a line through the others."""
-    regret, prediction, _ = left_out(joined(agent), predictor)
-    return pd.Series(regret - prediction).groupby(joined(agent)["environment"]).mean().sort_values()
+def misses(predictor):
+    """Class of the second test -> mean of observed less predicted regret of DQN."""
+    cells = joined("dqn", "second")
+    return (cells["greedy"] - cells[predictor]).groupby(cells["environment"]).mean().sort_values()
 
 
 def without_one_class(agent):
@@ -308,7 +330,7 @@ def without_one_class(agent):
 def facts():
     """Phrases of the text that hold numbers, each as the text has it."""
     of_study = (facts_of_findings, facts_of_the_sealed_test)
-    of_development = (facts_of_misses, facts_of_the_new_block, facts_of_large_instances)
+    of_development = (facts_of_the_second_test, facts_of_the_new_block)
     return [phrase for part in (*of_study, *of_development) for phrase in part()]
 
 
@@ -429,14 +451,30 @@ def facts_of_the_sealed_test():
     return said
 
 
-def facts_of_misses():
-    before, after = (misses("dqn", predictor).abs().sort_index() for predictor in ("kernel_regret", "sampled_regret"))
-    is_large = before > 0.1
-    if (after >= before)[is_large].any():
-        raise ValueError("a miss above 0.1 has grown")
-    stay, grown = (after[is_large] > 0.1).sum(), (after > before)[~is_large].sum()
-    shrunk, grown, others = (NUMBERS[number] for number in (is_large.sum(), grown, (~is_large).sum()))
-    return [f"shrinks the {shrunk} above 0.1 ({NUMBERS[stay]} stay above) and enlarges {grown} of the {others} others"]
+def facts_of_the_second_test():
+    _, predictions, done = second()
+    dates = done.merge(predictions, on=CELL)
+    if len(dates) != len(done) or (dates["written"] < dates["date"]).any():
+        raise ValueError("a run was finished before its prediction was written")
+    states = pd.read_csv(SECOND / "hardness.csv")["num_states"]
+    published = pd.read_csv(FILE)
+    held = []
+    for agent, predictor in (("ppo", "clipped_regret_evaluated"), ("dqn", "sampled_regret")):
+        rows = published[(published["agent"] == agent) & (published["study"] != "sealed-2")]
+        mdps = np.arange(len(rows)).astype(str)
+        before = Published(rows["environment"].to_numpy(str), mdps, *(rows[name].to_numpy() for name in NUMBERS))
+        both = joined(agent, "second")
+        inside = (both["greedy"] - both[predictor]).abs() <= before.half_width()
+        held.append(number(inside.groupby(both["environment"]).mean().mean()))
+    cut = joined("dqn", "second", cut=WORST_GREEDY)
+    mean, rank = misses("sampled_regret"), spearman(left_out(cut, "sampled_regret")[1], cut["greedy"].to_numpy())
+    hardest, easiest = (f"{name} by {number(abs(mean[name]))}" for name in (mean.index[-1], mean.index[0]))
+    return [
+        f"{len(states)} instances of {states.min()} to {states.max()} states, {len(done)} runs",
+        f"80 % intervals held {held[0]} of PPO's cells and {held[1]} of DQN's",
+        f"Cut alike, the rank correlation is {number(rank)}",
+        f"too little for {hardest}, too much for {easiest}",
+    ]
 
 
 def facts_of_the_new_block():
@@ -464,7 +502,10 @@ def large(agent):
     return predictions.merge(study.outcomes(done, points), on=CELL)
 
 
-ON_A_TABLE = {"dqn": "sampled_tabular", "ppo": "clipped_tabular_regret"}  # the same learners without a kernel
+OF_LARGE = (  # primary, and the same learners without a kernel
+    *(("dqn", "sampled_regret"), ("ppo", "clipped_regret_evaluated")),
+    *(("dqn", "sampled_tabular"), ("ppo", "clipped_tabular_regret")),
+)
 
 
 def judged_large(agent, predictor):
@@ -475,20 +516,6 @@ def judged_large(agent, predictor):
     pairs = Pairs.of(regret, instances)
     in_order = pairs.right(predicted).sum()
     return r_squared(regret, regret - predicted, classes), spearman(predicted, regret), in_order, len(pairs.first)
-
-
-def facts_of_large_instances():
-    states = large("dqn")["num_states"]
-    said = [f"{states.nunique()} instances of {states.min():,.0f} to {states.max():,.0f} states"]
-    dqn, ppo = judged_large("dqn", "sampled_regret"), judged_large("ppo", "clipped_regret_evaluated")
-    for words, (fit, rank, *_) in (("`sampled_regret`", dqn), ("PPO", ppo)):
-        said.append(f"{number(fit)} and {number(rank)} for {words}")
-    (right, of), (right_ppo, of_ppo) = dqn[2:], ppo[2:]
-    mdps = (large("ppo").groupby("instance")["greedy"].agg(np.ptp) > 0.05).sum()
-    if right > 0.75 * of or mdps != 1:
-        raise ValueError("DQN's pairs are enough, or PPO's are of several MDPs")
-    said.append(f"{right:g} of {of} pairs (too few) and {right_ppo:g} of {of_ppo} (one MDP's) are in order")
-    return said
 
 
 # Figures -------------------------------------------------------------------------------------------------------------
@@ -573,44 +600,50 @@ def observations_figure():
     return drawn
 
 
+PREDICTED = {"first": PRIMARY, "second": PRIMARY | {"dqn": "sampled_regret"}}
+
+
 def sealed_figure():
-    """Regret that was predicted before the runs, against observed regret, on classes that nobody had used."""
+    """Regret that was predicted before the runs, against observed regret: a row of panels for each sealed test."""
     from matplotlib.figure import Figure
 
-    drawn = Figure(figsize=(3.4, 2.2), layout="constrained")
-    axes = drawn.subplots(1, 2, sharey=True)
-    for axis, (agent, predictor) in zip(axes, PRIMARY.items(), strict=True):
-        both = joined(agent)
-        axis.plot([0, 1.7], [0, 1.7], color="#999999", linewidth=0.9, zorder=0)
-        for name, some in both.groupby(both["observation"].map(kind)):
-            color, mark = LOOKS[name]
-            axis.scatter(
-                some[predictor], some["greedy"], 10, color, marker=mark, label=LABELS.get(name, name), linewidth=0
-            )
-        axis.set(xlim=(0, 1.7), ylim=(0, 1.7), xlabel="predicted regret", title=agent.upper(), aspect="equal")
-        axis.set(xticks=[0, 0.5, 1, 1.5], yticks=[0, 0.5, 1, 1.5])
-    axes[0].set_ylabel("observed regret")
-    axes[0].legend(loc="upper left", handletextpad=0, borderpad=0, labelspacing=0.2, fontsize=7)
+    drawn = Figure(figsize=(3.4, 3.9), layout="constrained")
+    axes = drawn.subplots(2, 2, sharex=True, sharey=True)
+    for row, (test, predictors) in zip(axes, PREDICTED.items(), strict=True):
+        for axis, (agent, predictor) in zip(row, predictors.items(), strict=True):
+            both = joined(agent, test)
+            axis.plot([0, 1.7], [0, 1.7], color="#999999", linewidth=0.9, zorder=0)
+            for name, some in both.groupby(both["observation"].map(kind)):
+                color, mark = LOOKS[name]
+                axis.scatter(
+                    some[predictor], some["greedy"], 10, color, marker=mark, label=LABELS.get(name, name), linewidth=0
+                )
+            axis.set(xlim=(0, 1.7), ylim=(0, 1.7), title=f"{agent.upper()}, {test} test", aspect="equal")
+            axis.set(xticks=[0, 0.5, 1, 1.5], yticks=[0, 0.5, 1, 1.5])
+        row[0].set_ylabel("observed regret")
+    for axis in axes[1]:
+        axis.set_xlabel("predicted regret")
+    axes[0, 0].legend(loc="upper left", handletextpad=0, borderpad=0, labelspacing=0.2, fontsize=7)
     return drawn
 
 
 def misses_figure():
-    """Mean miss of each class that was left out, by the predictor named before and by the one proposed after."""
+    """Mean miss in each class of the second test, by the predictor that was named for it and by the one before."""
     from matplotlib.figure import Figure
 
     drawn = Figure(figsize=(3.4, 2.9), layout="constrained")
     axis = drawn.subplots()
-    before, after = misses("dqn", "kernel_regret"), misses("dqn", "sampled_regret")
-    for place, name in enumerate(before.index):
-        axis.plot([before[name], after[name]], [place, place], color="#999999", linewidth=0.9, zorder=1)
-    places = np.arange(len(before))
+    primary, former = misses("sampled_regret"), misses("kernel_regret")
+    for place, name in enumerate(primary.index):
+        axis.plot([primary[name], former[name]], [place, place], color="#999999", linewidth=0.9, zorder=1)
+    places = np.arange(len(primary))
     for values, fill, mark, label in (
-        (before, "#23262d", "D", "kernel_regret (named before)"),
-        (after[before.index], "#ffffff", "D", "sampled_regret (proposed after)"),
+        (primary, "#23262d", "D", "sampled_regret"),
+        (former[primary.index], "#ffffff", "D", "kernel_regret"),
     ):
         axis.scatter(values, places, 18, fill, marker=mark, edgecolors="#23262d", label=label, zorder=2)
     axis.axvline(0, color="#23262d", linewidth=0.9)
-    axis.set(yticks=places, yticklabels=[name.replace("_", " ") for name in before.index])
+    axis.set(yticks=places, yticklabels=[name.replace("_", " ") for name in primary.index])
     axis.set(xlabel="observed minus predicted regret of DQN")
     drawn.legend(loc="outside lower center", handletextpad=0.2)
     return drawn
@@ -632,9 +665,10 @@ def main():
     for agent, predictor in PRIMARY.items():
         told = ", ".join(f"{name} {value:.2f}" for name, value in without_one_class(agent).items())
         print(f"\nR² of {agent.upper()} by {predictor}, without one class: {told}")
-    for agent, predictor in ON_A_TABLE.items():
-        fit, rank, *_ = judged_large(agent, predictor)
-        print(f"\n{agent.upper()} on the six large instances by {predictor}: R² {number(fit)}, rank {number(rank)}")
+    for agent, predictor in OF_LARGE:
+        fit, rank, right, of = judged_large(agent, predictor)
+        said = f"R² {number(fit)}, rank {number(rank)}, {right:g} of {of} pairs in order"
+        print(f"\n{agent.upper()} on the six large instances by {predictor}: {said}")
 
 
 if __name__ == "__main__":

@@ -35,6 +35,18 @@ for name, derandomize in (("fixed", True), ("explore", False)):
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 
 
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def packed_runs():
+    """Folder of packed studies whose runs are there: a source distribution leaves 26 MB of them out."""
+    studies = ROOT / "docs" / "studies"
+    if (ROOT / "PKG-INFO").exists() and not (studies / "paper" / "runs.parquet").exists():
+        pytest.skip("the packed runs of docs/studies are in the repository, and not in a source distribution")
+    return studies
+
+
 @pytest.fixture(scope="session")
 def quantecon():
     """The package quantecon, imported by one process at a time.

@@ -12,7 +12,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP, paid_outcomes, require_all_actions, require_mdp
+from pharos.mdp import TabularMDP, paid_outcomes, require_mdp
 from pharos.system import distinct_rows, mdp_files, storage
 
 __all__ = ["bridge", "drn", "gym_p"]
@@ -132,13 +132,17 @@ def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     `screen_mapping` (S,).
 
     Raises:
-        ParameterError: the MDP has chance or several start states, which the form cannot say; or the name does not end
-            in .npz.
+        ParameterError: the MDP has chance, several start states, or actions that are not available in some states,
+            which the form cannot say; or the name does not end in .npz.
     """
     path = Path(path)
     if path.suffix != ".npz":
         raise ParameterError(f"{path}: expected a name that ends in .npz")
-    require_all_actions(mdp, f"{path}: BRIDGE's files")
+    if mdp.available is not None:
+        raise ParameterError(
+            f"{path}: BRIDGE's files have a next state for each action in each state, and some of {mdp} are not "
+            f"available in some states; expected an MDP in which all are (drn and gym write these)"
+        )
     if not mdp.is_deterministic or len(mdp.start_states) != 1:
         raise ParameterError(f"{mdp}: BRIDGE's files hold deterministic MDPs with one start state; expected such a one")
     table = np.array(mdp.dynamics.deterministic_table(), np.int64)

@@ -43,12 +43,12 @@ def regret_scale(optimal: ArrayLike, reference: ArrayLike, error_bound: float = 
         error_bound: of each of the two.
     Returns:
         A float or an array, in return. NaN where it is not above max(1e-12, 2 `error_bound`): there the reference
-        policy is itself optimal, as far as the values can tell, and regret has no scale.
+        policy is itself optimal, as far as the values can tell, and regret has no scale. NaN where it is infinite, too.
     Source: 1 - regret / scale is the normalised score of Mnih et al. (2015), with the exact optimum in the place of a
         human. The threshold is ours.
     """
     scale = np.asarray(np.asarray(optimal, np.float64) - np.asarray(reference, np.float64))
-    scale = np.where(scale > max(SMALLEST_SCALE, 2 * error_bound), scale, np.nan)
+    scale = np.where((scale > max(SMALLEST_SCALE, 2 * error_bound)) & (scale < np.inf), scale, np.nan)
     return scale if scale.ndim else float(scale)
 
 
@@ -143,4 +143,5 @@ def cumulative_expected_regret(episodes: ArrayLike, expected: ArrayLike) -> np.n
     if (between < 0).any():
         k = int(np.argmax(between < 0)) + 1
         raise ParameterError(f"episodes fall from {count[k - 1]:g} to {count[k]:g} at evaluation {k}; expected a count")
-    return np.concatenate([[0.0], np.cumsum(between * lost[:-1])])
+    losses = np.multiply(between, lost[:-1], out=np.zeros(len(between)), where=between > 0)  # of total rewards: inf
+    return np.concatenate([[0.0], np.cumsum(losses)])

@@ -523,7 +523,10 @@ def test_count_and_show_tell_where_no_policy_beats_uniform_play(tmp_path, monkey
     spec = {"name": "own", "steps": 100, "seeds": 1, "blocks": [{**block, "chance": ["plain", {"random": 0.1}]}]}
     (tmp_path / "own.yaml").write_text(json.dumps(spec))
     before = process("study", "show", "own.yaml", cwd=tmp_path).stdout
-    assert "of the world, of the world and random 0.1  q_learning" in before and "plain, random 0.1 " in before
+    assert (
+        "plain (and of the world), random 0.1 (and of the world)  q_learning" in before
+        and "plain, random 0.1 " in before
+    )
     assert "no scale" not in before  # nothing is solved in order to show a grid
     assert process("study", "run", "own.yaml", "--workers", 1, cwd=tmp_path).returncode == 0
     after = process("study", "show", "own.yaml", cwd=tmp_path).stdout.splitlines()

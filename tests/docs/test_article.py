@@ -19,7 +19,7 @@ def script(name, monkeypatch):
 
 
 @pytest.mark.long
-def test_the_tables_are_those_of_the_packed_runs(monkeypatch):
+def test_the_tables_are_those_of_the_packed_runs(monkeypatch, packed_runs):
     article = script("article", monkeypatch)
     tables = {name: table() for name, table in article.TABLES.items()}
     assert tables.keys() == {"findings", "encodings", "sealed"}
@@ -29,14 +29,14 @@ def test_the_tables_are_those_of_the_packed_runs(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_numbers_of_the_text_are_those_of_the_packed_runs(monkeypatch):
+def test_the_numbers_of_the_text_are_those_of_the_packed_runs(monkeypatch, packed_runs):
     words = " ".join(PAGE.split())
     for phrase in script("article", monkeypatch).facts():
         assert phrase in words
 
 
 @pytest.mark.slow
-def test_the_sealed_cells_are_the_kept_ones(monkeypatch):
+def test_the_sealed_cells_are_the_kept_ones(monkeypatch, packed_runs):
     """The regret of each cell, computed from curves, is that of cells.csv; the measures are those of the kept table."""
     import pandas as pd
 
@@ -50,7 +50,7 @@ def test_the_sealed_cells_are_the_kept_ones(monkeypatch):
 
 
 @pytest.mark.slow
-def test_findings_of_the_runs_are_the_kept_ones(monkeypatch):
+def test_findings_of_the_runs_are_the_kept_ones(monkeypatch, packed_runs):
     import pandas as pd
 
     article = script("article", monkeypatch)
@@ -62,7 +62,7 @@ def test_findings_of_the_runs_are_the_kept_ones(monkeypatch):
 
 
 @pytest.mark.slow
-def test_shares_of_variance(monkeypatch):
+def test_shares_of_variance(monkeypatch, packed_runs):
     """What differs between MDPs has the rest of the variance,."""
     article = script("article", monkeypatch)
     for agent in ("dqn", "ppo"):

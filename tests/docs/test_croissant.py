@@ -19,7 +19,7 @@ def script(monkeypatch):
     return importlib.import_module("croissant")
 
 
-def test_metadata_are_those_of_the_files(script, capsys):
+def test_metadata_are_those_of_the_files(script, capsys, packed_runs):
     assert script.main(["--check"]) == 0, capsys.readouterr().out
     document = json.loads((STUDIES / "croissant.json").read_text())
     records = {record["field"][0]["source"]["fileObject"]["@id"]: record for record in document["recordSet"]}
@@ -35,7 +35,7 @@ def test_metadata_are_those_of_the_files(script, capsys):
             assert field.get("repeated", False) == str(schema.field(name).type).startswith("list<")
 
 
-def test_changed_studies_need_new_metadata(script, tmp_path, monkeypatch, capsys):
+def test_changed_studies_need_new_metadata(script, tmp_path, monkeypatch, capsys, packed_runs):
     (tmp_path / "docs" / "studies" / "one_hot").mkdir(parents=True)
     studies = tmp_path / "docs" / "studies"
     for name in ("CITATION.cff", "docs/agents.md", "docs/studies/one_hot/runs.parquet"):
@@ -51,7 +51,7 @@ def test_changed_studies_need_new_metadata(script, tmp_path, monkeypatch, capsys
     assert "run python scripts/croissant.py" in capsys.readouterr().out
 
 
-def test_the_format_accepts_the_metadata():
+def test_the_format_accepts_the_metadata(packed_runs):
     mlcroissant = pytest.importorskip("mlcroissant")
     dataset = mlcroissant.Dataset(STUDIES / "croissant.json")
     assert not dataset.metadata.ctx.issues.errors

@@ -15,6 +15,7 @@ BUILT_IN = [name for name, measure in hardness.measures().items() if measure.ver
 
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_every_measure_has_definition_source_cost_and_witness(name):
+    assert name in ENTRIES, f"docs/hardness-measures.md has no entry `### {name}`: write one like those around it"
     entry = ENTRIES[name]
     for part in ("**Source.**", "**Witness.**"):
         assert part in entry

@@ -105,11 +105,13 @@ def test_workflows_and_recipes_name_no_package_index():
         assert not re.search(r"pypi\.org|pythonhosted|download\.pytorch|--(extra-)?index-url", file.read_text()), file
 
 
-def test_the_source_distribution_leaves_nothing_out():
+def test_the_source_distribution_leaves_nothing_out_but_packed_runs():
     tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
     if tracked.returncode:
         pytest.skip("not a checkout")
-    manifest = (ROOT / "MANIFEST.in").read_text().split()
+    text = (ROOT / "MANIFEST.in").read_text()
+    manifest = text.split()
+    assert re.findall("^recursive-exclude (.*)$", text, re.M) == ["docs/studies *runs.parquet curves.parquet"]
     always = {"MANIFEST.in", "README.md", "LICENSE", "pyproject.toml", "setup.py", "src"}
     top = {line.split("/")[0] for line in tracked.stdout.splitlines()}
     assert not top - set(manifest) - always

@@ -56,7 +56,8 @@ def test_links_of_pages_lead_somewhere(page):
         if "://" in path or path.startswith("mailto:"):
             continue
         target = page.parent / path if path else page
-        assert target.exists(), link
+        is_left_out = (ROOT / "PKG-INFO").exists() and path.endswith("runs.parquet")  # of a source distribution
+        assert target.exists() or is_left_out, link
         if anchor and target.suffix == ".md":
             assert anchor in anchors_of(target.read_text()), link
 

@@ -1,6 +1,7 @@
 """docs/how-it-works.md, "Where a change goes": a toy of each kind, added to a copy of the package by its lines."""
 
 import ast
+import re
 import shutil
 import subprocess
 import sys
@@ -13,7 +14,8 @@ import pharos
 from pharos.agents import agents
 
 SOURCE = Path(pharos.__file__).parent
-PAGE = (Path(__file__).parents[2] / "docs" / "how-it-works.md").read_text()
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "how-it-works.md").read_text()
 
 WORLD = '''
 from dataclasses import dataclass
@@ -99,11 +101,59 @@ class AlwaysRightAgent(TableBasedAgent):
 
 ALWAYS_RIGHT = AlwaysRightAgent(name="always_right", title="Always right")
 '''
+RING = '''
+import numpy as np
+
+from pharos.mdp.dynamics import Dynamics
+from pharos.mdp.table import Table
+
+
+class Ring(Dynamics):
+    """States in a ring: action a goes steps[a] states on, wherever it is executed."""
+
+    operations, mass, is_deterministic, has_ends = 0, 1.0, True, False
+
+    def __init__(self, num_states, steps):
+        self.num_states, self.num_actions, self.steps = num_states, len(steps), np.array(steps)
+
+    def deterministic_table(self):
+        return ((np.arange(self.num_states)[:, None] + self.steps) % self.num_states).astype(np.int32)
+
+    @property
+    def table(self):
+        return Table(self.deterministic_table())
+
+    @property
+    def for_kernels(self):
+        return self.table.for_kernels
+
+    def expected(self, x, states=slice(None)):
+        return self.table.expected(x, states)
+
+    def entries(self, states, actions):
+        return self.table.entries(states, actions)
+
+    def sample(self, states, actions, rng):
+        return (states + self.steps[actions]) % self.num_states
+
+    def _restricted_to(self, states):
+        return self.table.restricted_to(states)
+
+    def merged(self, classes, representatives):
+        return self.table.merged(classes, representatives)
+
+    def arrays(self):
+        return self.table.arrays()
+
+    def part(self, start, stop):
+        return self.table.part(start, stop)
+'''
 FILES = {
     "environments/worlds/corridor.py": WORLD,
     "hardness/num_pairs.py": MEASURE,
     "observations/halves.py": OBSERVATION,
     "agents/always_right.py": AGENT,
+    "mdp/ring.py": RING,
 }
 # File -> (a line of it, which new lines follow; empty: at the end), new lines
 LINES = {
@@ -118,6 +168,8 @@ register("num_pairs", lambda problem: num_pairs(problem.mdp), definition="S time
     "agents/registry.py": ("", "from pharos.agents.always_right import ALWAYS_RIGHT\nregister(ALWAYS_RIGHT)"),
 }
 USE = """
+from dataclasses import replace
+
 import numpy as np
 import pharos
 from pharos import environments, hardness
@@ -134,6 +186,13 @@ assert [row["value"] for row in one.curve] == [0.0, 0.0, 1.0, 1.0, 1.0], one.cur
 assert one.config["agent"] == "always_right" and one.config["observation"] == "index"
 alone = pharos.train("always_right", "corridor", steps=100, out="alone")
 assert alone.result["final_value"] == 1.0 and load_agent("alone")[1].tolist() == [1] * 5
+
+from pharos.mdp.ring import Ring
+
+ring = Ring(6, (1, -1))
+table = pharos.TabularMDP.from_arrays(ring.deterministic_table(), np.eye(6)[:, :2], gamma=0.9)
+one, other = (pharos.value_iteration(mdp) for mdp in (table, replace(table, dynamics=ring)))
+assert (one.v == other.v).all() and one.v.max() > 1.0, (one.v, other.v)
 print("used")
 """
 
@@ -151,6 +210,14 @@ def test_one_of_each_kind_is_added_by_the_lines_of_the_page(tmp_path):
     command = [sys.executable, "-c", USE]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "used", done.stderr
+
+
+def test_the_page_names_a_command_that_tests_each_kind():
+    table = PAGE.partition("| what is new |")[2].partition("\n\n")[0].splitlines()[2:]
+    assert len(table) == len(FILES)
+    for row in table:
+        (tests,) = re.findall(r"`pytest (tests/[\w/.]+)", row.rsplit("|", 2)[1])
+        assert (ROOT / tests).exists(), row
 
 
 def add(file, before, line):

@@ -4,6 +4,7 @@ import contextlib
 import http.client
 import json
 import socket
+from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -13,11 +14,12 @@ import pharos
 from command_line import run
 from naive import mdp as naive_mdp
 from patience import PATIENCE, wait_for
+from pharos.environments import Environment, make
 from pharos.errors import ParameterError, UnknownName
 from pharos.explorer import Exploration, Explorer, Learnt, exploration_of, page, write
 from pharos.explorer.exploration import Pictures
 from pharos.explorer.launch import MOST_CONNECTIONS
-from pharos.explorer.pages import contents, heat_map, quantities, quantity
+from pharos.explorer.pages import contents, heat_map, quantities, quantity, smaller_instance
 from pharos.explorer.states import NumberedStates, axes_of
 from pharos.mdp import TabularMDP
 from refusals import failing
@@ -218,6 +220,43 @@ def test_a_space_that_does_not_fit_into_a_page_is_refused_in_one_line(monkeypatc
     with pytest.raises(ParameterError, match="has 16 states; a page of its own holds at most 15: choose a smaller"):
         write(lake, tmp_path / "lake.html")
     assert not list(tmp_path.iterdir())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Square(Environment):
+    """A square in which one walks right or down, for ever."""
+
+    side: int = 9
+    name = "square"
+    actions = ("right", "down")
+
+    def variables(self):
+        return {"row": range(self.side), "column": range(self.side)}
+
+    def initial_state(self):
+        return (0, 0)
+
+    def transition(self, state, action, out):
+        out[action] = (state[action] + 1) % self.side
+
+    def reward(self, state, action, next_state):
+        return 0.0
+
+
+@pytest.mark.parametrize(
+    ("env", "most", "words"),
+    [
+        (make("frozen_lake", size=12, seed=1), 70, "frozen_lake/8x8 has 64"),
+        (make("frozen_lake/8x8"), 20, "frozen_lake/4x4 has 16"),
+        (make("frozen_lake/8x8"), 9, ""),
+        (Square(), 80, "side=8 has 64"),
+        (Square(), 24, "side=4 has 16"),
+        (Square(side=1), 0, ""),
+    ],
+    ids=str,
+)
+def test_what_is_too_large_for_a_page_names_a_smaller_instance_if_there_is_one(env, most, words):
+    assert smaller_instance(env, most) == words
 
 
 def test_an_environment_without_a_drawing_is_shown_without_one(lake):

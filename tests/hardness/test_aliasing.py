@@ -5,11 +5,14 @@ import itertools
 import numpy as np
 import pytest
 from gymnasium import spaces
+from hypothesis import strategies as st
 
 import pharos
 from command_line import answer, usage_error
 from pharos.errors import ParameterError
 from pharos.observations import aliasing, memoryless_loss, observation_classes, observe
+from refusals import refusal
+from strategies import examples
 
 pytestmark = pytest.mark.long  # with each class compiled
 
@@ -82,6 +85,35 @@ def test_the_loss_is_that_of_the_best_of_all_policies(seed):
     assert loss.lower - 2e-9 <= expected <= loss.upper + 2e-9
     hurried = memoryless_loss(mdp, classes, budget=0)
     assert hurried.lower - 2e-9 <= expected <= hurried.upper + 2e-9
+
+
+@examples(40, st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5]))
+def test_the_loss_within_sets_is_that_of_the_best_policy_that_takes_what_is_available(seed, random):
+    rng = np.random.default_rng(seed)
+    sets = rng.random((6, 3)) < 0.7
+    sets[np.arange(6), rng.integers(3, size=6)] = True
+    classes = np.array([0, 0, 0, 1, 1, 2])[rng.permutation(6)]
+    R = np.where(sets, np.round(rng.normal(size=(6, 3)), 1), -np.inf)
+    table = rng.integers(6, size=(6, 3))
+    mdp = pharos.random_actions(pharos.TabularMDP.from_arrays(table, R, gamma=0.9), random)
+    common = [[a for a in range(3) if sets[classes == c, a].all()] for c in range(3)]
+    if not all(common):
+        assert "no action is available in all of them" in refusal(ParameterError, memoryless_loss, mdp, classes)
+        return
+
+    def value(choose):
+        """V by sweeps of plain Python; choose: (state, {action: q}) -> the action."""
+        v = [0.0] * 6
+        for _ in range(400):
+            q = [{a: R[s, a] + 0.9 * v[table[s, a]] for a in range(3) if sets[s, a]} for s in range(6)]
+            v = [random * sum(q[s].values()) / len(q[s]) + (1 - random) * q[s][choose(s, q[s])] for s in range(6)]
+        return v[0]
+
+    best = value(lambda _, q: max(q, key=q.get))
+    loss = best - max(value(lambda s, _, p=policy: p[classes[s]]) for policy in itertools.product(*common))
+    result = memoryless_loss(mdp, classes)
+    assert result.exact
+    assert result.lower - 1e-6 <= loss <= result.upper + 1e-6
 
 
 def test_two_rooms_that_look_alike_cost_half_of_the_prizes():

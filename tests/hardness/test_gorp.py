@@ -84,6 +84,29 @@ def test_no_proven_method_is_below_the_probability_of_failure(mdp, steps, k, m, 
     assert search.failure(m, k) >= failure_probability(mdp, steps, k, m) - 1e-9
 
 
+def within_sets(mdp, seed, steps=None):
+    """The MDP in which some actions are not available, with one start."""
+    rng = np.random.default_rng(seed)
+    sets = rng.random(mdp.next_states.shape) < 0.5
+    sets[np.arange(len(sets)), rng.integers(mdp.num_actions, size=len(sets))] = True
+    options = {"terminal": np.asarray(mdp.terminal), "gamma": 1.0, "horizon": steps, "available": sets}
+    return TabularMDP.from_arrays(mdp.next_states, mdp.rewards, **options).with_initial(int(mdp.start_states[0]))
+
+
+@examples(
+    60,
+    deterministic_mdps(max_states=4, max_actions=3),
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 3),
+    st.integers(1, 2),
+    st.sampled_from(PROVEN),
+)
+def test_within_sets_no_proven_method_is_below_the_probability_of_failure(mdp, seed, steps, k, method):
+    mdp = within_sets(mdp, seed)
+    search = GorpSearch(mdp, steps, (method,))
+    assert search.failure(1, k) >= failure_probability(mdp, steps, k, 1) - 1e-9
+
+
 @st.composite
 def paying_once(draw):
     """Deterministic MDPs whose returns are 0 or 1: an episode ends when it is paid."""
@@ -104,6 +127,30 @@ def test_the_exact_method_is_the_probability_of_failure(mdp, steps, k, m):
     search = GorpSearch(mdp, steps, ("exact",))
     if search.two_valued:
         assert search.failure(m, k) == pytest.approx(failure_probability(mdp, steps, k, m), abs=1e-9)
+
+
+@pytest.mark.slow
+@examples(60, paying_once(), st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 2), st.integers(1, 3))
+def test_within_sets_the_exact_method_is_the_probability_of_failure(mdp, seed, steps, k, m):
+    assume(mdp.num_actions**k <= 4)
+    mdp = within_sets(mdp, seed, 4)
+    search = GorpSearch(mdp, steps, ("exact",))
+    if search.two_valued:
+        assert search.failure(m, k) == pytest.approx(failure_probability(mdp, steps, k, m), abs=1e-9)
+
+
+def test_within_sets_gorp_fails_as_often_as_the_exact_probability_says():
+    table, sets = [[2, 1, 0], [-1, -1, 1], [2, -1, 2]], [[True, True, False], [True, False, True], [True, True, True]]
+    rewards = [[0, 0, 0], [1, 0, 0], [0, 0, 0]]
+    mdp = TabularMDP.from_arrays(table, np.array(rewards, float), gamma=1.0, horizon=2, available=np.array(sets))
+    runs = hardness.run_gorp(mdp, m=2, runs=2000, seed=3)
+    expected = 1 - failure_probability(mdp, 2, 1, 2)
+    assert expected == 0.75  # both samples after action 1 miss the reward with probability 1/4
+    assert runs.success_rate == pytest.approx(expected, abs=3.3 * math.sqrt(expected * (1 - expected) / 2000))
+    assert (runs.actions[:, 0] < 2).all()
+    bound = hardness.gorp_bound(mdp, methods=PROVEN)
+    assert bound.value == 1 + math.log(bound.ms[0]) / math.log(3)
+    assert hardness.effective_horizon(mdp, horizon=2, tight=1).tight == hardness.gorp_bound(mdp).value
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The stationary effective horizon: against its definition on explicit matrices, and against the time-indexed one."""
 
+import importlib
 import math
 
 import numpy as np
@@ -12,7 +13,7 @@ from naive.mdp import absorbing, optimal_values, values_of
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.mdp import TabularMDP
-from strategies import examples, small_mdps
+from strategies import deterministic_mdps, examples, small_mdps
 
 TIE, SLACK = 1e-6, 1e-8
 
@@ -120,3 +121,13 @@ def test_it_is_part_of_a_report_when_asked_for_and_says_what_is_not_defined():
         hardness.stationary_effective_horizon(pharos.build(pharos.make("frozen_lake/4x4")).mdp(gamma=1.0))
     with pytest.raises(ParameterError, match="steps is 0"):
         hardness.stationary_effective_horizon(mdp, steps=0)
+
+
+@pytest.mark.slow
+@examples(40, deterministic_mdps(max_states=6, max_actions=3))
+def test_values_that_are_not_written_out_are_the_same(mdp):
+    module = importlib.import_module("pharos.hardness.effective_horizon")
+    expected = hardness.stationary_effective_horizon(mdp.with_gamma(0.9))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "WRITTEN_OUT", 0)
+        assert hardness.stationary_effective_horizon(mdp.with_gamma(0.9)) == expected

@@ -3,9 +3,11 @@
 import math
 from dataclasses import replace
 from fractions import Fraction
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.sparse.linalg
 from hypothesis import strategies as st
 
 import pharos
@@ -13,7 +15,7 @@ from naive import hitting as naive_hitting
 from patience import PATIENCE
 from pharos import hardness
 from pharos.errors import UndefinedMeasure
-from pharos.hardness.hitting_times import HittingBounds, HittingTimes, multiplications
+from pharos.hardness.hitting_times import HittingBounds, HittingTimes, factors_of, multiplications
 from pharos.hardness.interval import Budget, BudgetClock
 from pharos.hardness.stochastic_diameter import HubBounds, _Diameter
 from pharos.kernels import hitting
@@ -502,3 +504,20 @@ def test_a_target_without_an_upper_bound_so_far_is_not_ruled_out():
 
 def test_where_no_upper_bound_is_known_there_is_none_of_times_of_0():
     assert HittingBounds(0.5, math.inf, 0.0).upper == math.inf
+
+
+def test_an_improper_policy_is_told_before_the_linear_algebra_prints_messages_about_it(monkeypatch, capfd):
+    """Two nodes stay where they are: 1 - P is singular, for which SuperLU complains on the terminal."""
+    rng = np.random.default_rng(0)
+    matrix = scipy.sparse.random(60, 61, 0.08, "csr", rng=rng).tolil()
+    matrix[:, 60] = 0.1
+    for stays in (10, 40):
+        matrix[stays, :], matrix[stays, stays] = 0.0, 1.0
+    matrix = scipy.sparse.csr_matrix(matrix)
+    matrix = scipy.sparse.csr_matrix(scipy.sparse.diags(1 / np.asarray(matrix.sum(axis=1)).ravel()) @ matrix)
+    choices = SimpleNamespace(matrix=matrix, num_actions=1, is_restart=np.zeros(61, np.bool_))
+    policy, inner = np.zeros(61, np.int64), np.arange(60)
+    assert factors_of(choices, policy, np.setdiff1d(inner, (10, 40))) is not None
+    monkeypatch.setattr(scipy.sparse.linalg, "splu", None)  # is not called
+    assert factors_of(choices, policy, inner) is None
+    assert capfd.readouterr() == ("", "")

@@ -41,6 +41,23 @@ class Slips(Walk):
         return 0 if self.np_random.random() < 0.25 else 2 * action - 1
 
 
+class Pictures(Walk):
+    """Draws a white point where it stands."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+    render_mode = "rgb_array"
+
+    def render(self):
+        picture = np.zeros((1, 5, 3), np.uint8)
+        picture[0, self.cell] = 255
+        return picture
+
+
+def pictured():
+    """Shows pictures alone, by a function that the wrapper makes and that holds the wrapper."""
+    return gymnasium.wrappers.AddRenderObservation(Pictures())
+
+
 class WithEzPickle(Walk, EzPickle):
     def __init__(self, start=1):
         EzPickle.__init__(self, start)

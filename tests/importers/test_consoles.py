@@ -1,5 +1,6 @@
 """Atari and Procgen as tables: BRIDGE's published tables, fresh episodes of the games, and the search by layers."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -19,7 +20,7 @@ from pharos import exporters, hardness, importers
 from pharos.errors import FolderLocked, MissingExtra, ParameterError, StateSpaceTooLarge, UnknownName
 from pharos.importers import consoles, layers
 from pharos.system import storage
-from refusals import refusal
+from refusals import failing, refusal
 from toy_console import ToyConsole, naive_layers
 
 BRIDGE = Path(__file__).parents[1] / "data" / "bridge"
@@ -72,6 +73,25 @@ def test_a_search_that_was_interrupted_goes_on_from_its_last_layer(broken_at, mo
     assert parts(resumed) == parts(explored(6))
     sizes = explored(6).sizes
     assert resumed.num_steps == 3 * sum(sizes[broken_at:])
+
+
+def test_a_disk_that_is_full_leaves_the_layers_that_were_finished(monkeypatch, tmp_path):
+    fsync, room = os.fsync, 9
+
+    def write(descriptor):
+        nonlocal room
+        room -= 1
+        if room < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(descriptor)
+
+    with monkeypatch.context() as disk, pytest.raises(OSError, match="No space left"):
+        disk.setattr(os, "fsync", write)
+        explored(6, tmp_path)
+    stored = len(list(tmp_path.glob("layer-*.npz")))
+    resumed, whole = explored(6, tmp_path), explored(6)
+    assert parts(resumed) == parts(whole)
+    assert 1 < stored < 5 and resumed.num_steps <= whole.num_steps - 3 * sum(whole.sizes[: stored - 1])
 
 
 def test_layers_of_a_longer_horizon_serve_a_shorter_one(tmp_path):
@@ -255,6 +275,9 @@ def test_a_rom_that_is_not_there_and_a_package_that_is_not_are_one_line(monkeypa
     assert "pharos-rl[atari]" in refusal(MissingExtra, importers.atari, "pong")
     monkeypatch.setitem(sys.modules, "procgen", None)
     assert "pip install --no-deps procgen-mirror==0.10.7" in refusal(ParameterError, importers.procgen, "maze")
+    parts_missing = SimpleNamespace(ProcgenGym3Env=failing(ModuleNotFoundError("No module named 'pycparser'")))
+    monkeypatch.setitem(sys.modules, "procgen", parts_missing)
+    assert "(No module named 'pycparser')" in refusal(ParameterError, importers.procgen, "maze")
 
 
 @pytest.mark.parametrize(

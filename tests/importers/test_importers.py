@@ -530,6 +530,10 @@ def test_toy_text_keeps_the_names_of_its_documentation(tmp_path):
     for s in (0, 123, 499):
         assert [int(column[s]) for column in names.variables.values()] == [int(value) for value in taxi.decode(s)]
     assert importers.gymnasium({0: {0: [(1.0, 0, 0.0, True)]}}).names is None
+    words = ("import", "gymnasium", "FrozenLake-v1", "--no-check", "--out", tmp_path / "lake", "--initial")
+    assert "--initial is 'a'" in run(*words, "a").stderr
+    assert run(*words, "4,6").exit_code == 0
+    assert importers.load(tmp_path / "lake").start_states.tolist() == [4, 6]
     done = run("import", "gymnasium", "CliffWalking-v1", "--out", tmp_path / "cliff", "--no-check")
     assert done.exit_code == 0
     assert pharos.make(str(tmp_path / "cliff")).actions == ("up", "right", "down", "left")

@@ -115,6 +115,40 @@ def test_returns_of_uniform_walks_have_the_mean_that_is_solved_for(jax, name):
     assert abs(returns.mean() - uniform_value(mdp).value_at_start) < error
 
 
+@pytest.mark.slow
+def test_steps_within_sets_are_those_of_the_mdp(jax):
+    """Each state and action as often as the chain of uniform choices says, under sticky and random actions."""
+    world = np.random.default_rng(5)
+    table, sets = world.integers(4, size=(4, 3)), np.array([[0, 1, 1], [1, 0, 0], [1, 1, 1], [1, 0, 1]], bool)
+    plain = pharos.TabularMDP.from_arrays(table, world.normal(size=(4, 3)), gamma=1.0, available=sets)
+    mdp = pharos.random_actions(pharos.sticky_actions(plain, 0.4), 0.3)
+    env = pharos.to_gymnax(mdp, np.eye(4, dtype=np.float32), time_limit=6)
+    index, executed, reward, _, truncated, after, _, action, _ = walks(jax, env, 40_000, 6)
+    assert sets[index, executed].all()
+    assert (after[~truncated] == table[index, executed][~truncated]).all()
+    np.testing.assert_allclose(reward, np.asarray(mdp.rewards)[index, executed], rtol=1e-6)
+    # what is executed, by plain Python, of a choice that acts as the first available action if it is not available
+    for step in (0, 3):
+        counts, expected = {}, {}
+        rows = zip(
+            index[step], executed[step - 1] if step else [None] * 40_000, action[step], executed[step], strict=True
+        )
+        for s, b, choice, a in rows:
+            key = int(s), (None if b is None or not sets[s, b] else int(b)), int(choice)
+            counts.setdefault(key, np.zeros(3))[a] += 1
+        for (s, b, choice), sampled in counts.items():
+            chosen = choice if sets[s, choice] else int(sets[s].argmax())
+            expected = 0.3 * sets[s] / sets[s].sum() + 0.7 * (np.arange(3) == chosen)
+            if b is not None:
+                expected = 0.6 * expected + 0.4 * (np.arange(3) == b)
+            deviation = np.sqrt(expected * (1 - expected) / sampled.sum())
+            assert (np.abs(sampled / sampled.sum() - expected) <= 5 * deviation + 1e-9).all()
+    _, state = env.reset(jax.random.PRNGKey(0), env.default_params)
+    assert env.action_mask(state).tolist() == sets[int(state.index)].tolist()
+    info = env.step(jax.random.PRNGKey(0), state, 1, env.default_params)[-1]
+    assert info["action_mask"].tolist() == sets[table[int(state.index), int(info["executed"])]].tolist()
+
+
 def test_what_says_too_little_is_refused(jax, space):
     chain = pharos.TabularMDP.from_arrays(np.array([[0, 1], [0, 1]]), np.zeros((2, 2)), gamma=0.9)
     assert "give a time_limit" in refusal(ParameterError, pharos.to_gymnax, chain)

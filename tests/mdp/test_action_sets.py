@@ -255,13 +255,6 @@ def test_a_policy_that_takes_an_action_that_is_not_available_is_refused():
         assert message == "the policy takes action 1 in state 0, where it is not available; expected one of 0"
 
 
-def test_measures_that_are_not_of_sets_say_so():
-    mdp = TabularMDP.from_arrays([[1, 0], [0, 1]], [[1.0, -np.inf], [0.0, 0.0]])
-    report = hardness.report(mdp, "tight_effective_horizon,sum_of_reciprocal_gaps", horizon=3)
-    assert "every action is available everywhere" in report["tight_effective_horizon"].undefined
-    assert report["sum_of_reciprocal_gaps"].value == 0.0 or report["sum_of_reciprocal_gaps"].exact
-
-
 @examples(40, worlds(), st.sampled_from([0.0, 0.25, 1.0]))
 def test_total_rewards_choose_what_is_available(world, random):
     """Worlds that end by each action with probability 0.1: the total is that of a long horizon."""

@@ -6,12 +6,14 @@ from fractions import Fraction
 import gymnasium
 import numpy as np
 import pytest
+from hypothesis import assume
 from hypothesis import strategies as st
 from scipy import sparse
+from test_action_sets import of_chance, worlds
 
 import pharos
 from naive import exact as naive_exact
-from pharos import hardness, importers
+from pharos import exporters, hardness, importers
 from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from refusals import refusal
@@ -284,15 +286,22 @@ STAYS = [(1.0, 0, 0.0, False)]
     [
         (
             {0: {0: STAYS}, 1: {}},
-            "P[1] has no actions; expected the same actions in each state: a term",
+            "P[1] has no actions; expected one at least: a terminal state has [(1.0, 1, 0.0, True)]",
         ),
         (
             {0: {0: STAYS}, 1: {0: []}},
-            "P[1][0] has no outcomes; expected the same actions in each state: a term",
+            "P[1] has no actions; expected one at least: a terminal state has [(1.0, 1, 0.0, True)]",
         ),
-        ({0: {0: STAYS, 1: STAYS}, 1: {0: STAYS}}, "P[1] has 1 actions, P[0] 2"),
+        ({0: {0: [(0.0, 0, 0.0, False)]}}, "P[0][0] has no outcomes"),
+        ([[STAYS, STAYS], [STAYS]], "P[1] is a list of 1 actions, and there are 2; expected a list of all, or a dict"),
+        ({0: {0: STAYS, 2: STAYS}}, "has no state with the action 1; expected actions 0 to 2"),
+        ({0: {0: STAYS, 1: []}}, "has no state with the action 1; expected actions 0 to 1"),
+        ({0: {0: STAYS, 10**9: STAYS}}, "has no state with the action 1; expected"),
+        ({0: {"left": STAYS}}, "P[0] has the action left; expected numbers from 0 on"),
+        ({0: {-1: STAYS, 0: STAYS}}, "P[0] has the action -1; expected numbers from 0 on"),
+        ({0: {0: 3}}, "has no P[0][0] with outcomes; expected a list of them"),
         ({1: {0: STAYS}, 2: {0: STAYS}}, "has no P[0] with actions; expected states 0 to 1"),
-        ({0: {1: STAYS}}, "has no P[0][0] with outcomes; expected actions 0 to 0"),
+        ({0: {1: STAYS}}, "has no state with the action 0; expected actions 0 to 1"),
         (
             {0: {0: [(1.0, 0, 0.0)]}},
             "P[0][0] has (1.0, 0, 0.0); expected (probability, next state, ",
@@ -303,6 +312,63 @@ STAYS = [(1.0, 0, 0.0, False)]
 def test_a_malformed_table_is_refused_by_the_row_that_is_wrong(table, message):
     said = refusal(FileFormatError, importers.gymnasium, table)
     assert message in said and len(said) < 200
+
+
+@examples(60, worlds(), st.sampled_from([0.0, 0.3]), st.booleans())
+def test_what_is_exported_comes_back_with_its_sets(world, random, is_written_as_empty):
+    mdp = of_chance(world, 0.0, random)
+    assume(mdp.available.any(axis=0).all())  # else the table does not say how many actions there are
+    table = exporters.gym_p(mdp)
+    if is_written_as_empty:
+        table = {s: {a: row.get(a, []) for a in range(mdp.num_actions)} for s, row in table.items()}
+    again = importers.gymnasium(table, gamma=mdp.gamma, initial=mdp.initial)
+    np.testing.assert_array_equal(again.available, mdp.available)
+    for solve in (pharos.value_iteration, pharos.solvers.worst_value, pharos.solvers.uniform_value):
+        one, other = solve(mdp), solve(again)
+        assert np.abs(one.v - other.v).max() <= one.error_bound + other.error_bound
+    twice = importers.gymnasium(exporters.gym_p(again), gamma=mdp.gamma, initial=mdp.initial)
+    np.testing.assert_allclose(twice.rewards, again.rewards, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(twice.available, again.available)
+    assert abs(twice.dynamics.matrix() - again.dynamics.matrix()).max() <= 1e-15
+
+
+def test_rewards_and_outcomes_of_a_table_leave_out_what_is_not_available():
+    table = {0: {0: [(0.5, 0, 1.0, False), (0.5, 1, 2.0, False)]}, 1: {0: STAYS, 1: [(1.0, 1, 3.0, True)]}}
+    asked = []
+
+    def rewards(state, action, next_state, reward):
+        asked.append((state, action))
+        return 2 * reward
+
+    mdp = importers.gymnasium(table, rewards=rewards)
+    assert set(asked) == {(0, 0), (1, 0), (1, 1)}
+    assert mdp.available.tolist() == [[True, False], [True, True]]
+    assert mdp.rewards.tolist() == [[3.0, 3.0], [0.0, 6.0]]
+    outcomes = importers.gymnasium_outcomes(table)
+    assert np.diff(outcomes.offsets).tolist() == [2, 2, 1, 1]  # that of an action which is not there is a copy
+
+
+class Corridor(gymnasium.Env):
+    """Two cells, in the first of which there is no way back; what is not available would lead astray."""
+
+    observation_space, action_space = gymnasium.spaces.Discrete(2), gymnasium.spaces.Discrete(2)
+    P = {0: {0: [(1.0, 1, 0.0, False)]}, 1: {0: [(1.0, 1, 1.0, True)], 1: [(1.0, 0, 0.0, False)]}}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.cell = 0
+        return 0, {}
+
+    def step(self, action):
+        assert action in self.P[self.cell]
+        ((_, self.cell, reward, ended),) = self.P[self.cell][action]
+        return self.cell, reward, ended, False, {}
+
+
+def test_an_environment_is_stepped_by_available_actions_alone():
+    mdp = importers.gymnasium(Corridor(), gamma=0.9)
+    assert mdp.available.tolist() == [[True, False], [True, True]]
+    assert pharos.value_iteration(mdp).v.tolist() == pytest.approx([0.9, 1.0])
 
 
 def test_a_message_never_quotes_a_whole_table():

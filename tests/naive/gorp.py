@@ -40,28 +40,29 @@ def returns_of_paths(mdp, policy, steps):
 def failure_probability(mdp, steps, k, m):
     """Probability that GORP, with k and m, takes an action that is not optimal: all outcomes of all samples, round by
     round."""
-    uniform = np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions)
 
     def ended(state):
         return state < 0 or mdp.terminal[state]
+
+    def actions(state):
+        everything = range(mdp.num_actions)
+        return [b for b in everything if ended(state) or mdp.available is None or mdp.available[state, b]]
 
     def completions(state, left):
         """{return: probability} of random play."""
         if left <= 0 or ended(state):
             return {0.0: 1.0}
         found = {}
-        for b in range(mdp.num_actions):
+        for b in actions(state):
             for value, p in completions(int(mdp.next_states[state, b]), left - 1).items():
                 key = round(value + mdp.rewards[state, b], 6)
-                found[key] = found.get(key, 0.0) + p * uniform[state, b]
+                found[key] = found.get(key, 0.0) + p / len(actions(state))
         return found
 
     def best(state, left):
         if left <= 0 or ended(state):
             return 0.0
-        return max(
-            mdp.rewards[state, b] + best(int(mdp.next_states[state, b]), left - 1) for b in range(mdp.num_actions)
-        )
+        return max(mdp.rewards[state, b] + best(int(mdp.next_states[state, b]), left - 1) for b in actions(state))
 
     def sums(distribution):
         total = {0.0: 1.0}
@@ -77,12 +78,15 @@ def failure_probability(mdp, steps, k, m):
         """(A,) the probability that each action is taken."""
         each = []
         for sequence in itertools.product(range(mdp.num_actions), repeat=k):
-            at, paid = state, 0.0
+            at, paid, possible = state, 0.0, True
             for i, b in enumerate(sequence):
                 if i >= left or ended(at):
                     break
+                possible &= b in actions(at)
                 paid += mdp.rewards[at, b]
                 at = int(mdp.next_states[at, b])
+            if not possible:
+                continue
             tail = completions(at, left - k)
             each.append((sequence[0], sums({round(paid + x, 6): p for x, p in tail.items()})))
         result = np.zeros(mdp.num_actions)
@@ -96,7 +100,7 @@ def failure_probability(mdp, steps, k, m):
             return 0.0
         taken = first_actions(state, left)
         total = 0.0
-        for b in range(mdp.num_actions):
+        for b in actions(state):
             following = int(mdp.next_states[state, b])
             good = mdp.rewards[state, b] + best(following, left - 1) >= best(state, left) - 1e-4
             total += taken[b] * (fails(following, left - 1) if good else 1.0)

@@ -251,8 +251,9 @@ def test_what_is_no_policy_is_refused(agent, message):
     assert message in refusal(ParameterError, evaluate_agent, agent, Task.of("frozen_lake/4x4"))
 
 
-def test_a_task_needs_a_horizon_or_a_discount():
-    assert "give a horizon" in refusal(ParameterError, Task.of, "frozen_lake/4x4", horizon=None)
+def test_a_task_without_a_horizon_has_total_rewards_or_a_discount():
+    assert Task.of("frozen_lake/4x4", horizon=None).conventions == {"gamma": 1.0, "horizon": None, "time_limit": 100}
+    assert Task.of("frozen_lake/4x4", horizon=None).reference.optimal == 1.0
     assert Task.of("frozen_lake/4x4").horizon == 100
 
 

@@ -15,6 +15,7 @@ from pharos.agents import primary_predictors
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.observations import representation
 from pharos.prediction import Published, prediction, published
+from pharos.prediction.calibration import COMMON, OrderCounts
 from pharos.prediction.prediction import PairOrder
 
 CHOICES = Path(__file__).parents[2] / "docs" / "studies" / "choices"
@@ -26,7 +27,7 @@ OPTIONS = {"steps": 1000, "hyperparameters": SHORT}
 def cells(predicted, observed, classes, mdps=None):
     predicted, observed = np.array(predicted, float), np.array(observed, float)
     mdps = np.array([str(n) for n in range(len(predicted))] if mdps is None else mdps)
-    return Published(np.array(classes), mdps, predicted, observed, np.ones(len(predicted)), np.ones(len(predicted)))
+    return Published(np.array(classes), mdps, predicted, observed, *np.ones((3, len(predicted))))
 
 
 def naive_half_width(known, level, but=None):
@@ -67,23 +68,73 @@ def test_a_class_that_is_drawn_as_the_others_is_covered():
     assert 0.79 <= np.mean(covered) <= 0.86  # 400 classes: a standard error of 0.015
 
 
-def test_orders_are_counted_among_clear_pairs_of_one_mdp():
-    known = cells([0.1, 0.25, 0.9, 0.1, 0.24], [0.1, 0.3, 0.05, 0.1, 0.12], list("aaabb"), list("xxxyy"))
-    assert known.ordered(0.15) == (1, 1)  # 0.1 and 0.25; those of y are observed to be alike
-    assert known.ordered(-0.15) == (1, 1)
-    assert known.ordered(0.7) == (0, 1)  # 0.25 and 0.9; 0.1 and 0.9 are observed to be alike
-    assert known.ordered(0.01) == (0, 0)
+def test_orders_are_counted_among_all_pairs_of_one_mdp_ties_included():
+    known = cells([0.1, 0.25, 0.9, 0.1, 0.24], [0.1, 0.3, 0.05, 0.1, 0.1], list("aaabb"), list("xxxyy"))
+    both = OrderCounts(pairs=2, right=1, clear_pairs=1, clear_right=1)  # 0.1 and 0.25 differ by 0.2; those of y tie
+    assert known.ordered(0.15) == known.ordered(-0.15) == both
+    far = OrderCounts(pairs=2, right=0, clear_pairs=1, clear_right=0)  # 0.25 and 0.9, 0.1 and 0.9: by 0.25 and 0.05
+    assert known.ordered(0.7) == far
+    assert known.ordered(0.01) == OrderCounts(pairs=0, right=0, clear_pairs=0, clear_right=0)
+
+
+@pytest.mark.parametrize("agent", primary_predictors())
+def test_counts_are_those_of_plain_loops_over_pairs(agent):
+    known = published(agent)
+    counts = dict.fromkeys(("pairs", "right", "clear_pairs", "clear_right"), 0)
+    for mdp in sorted(set(known.mdps)):
+        rows = list(zip(known.predicted[known.mdps == mdp], known.observed[known.mdps == mdp], strict=True))
+        for (x, y), (other_x, other_y) in itertools.combinations(rows, 2):
+            if 0.1 <= abs(x - other_x) < 0.2:
+                is_right, is_clear = (
+                    (x > other_x and y > other_y) or (x < other_x and y < other_y),
+                    abs(y - other_y) > 0.05,
+                )
+                counts["pairs"] += 1
+                counts["right"] += is_right
+                counts["clear_pairs"] += is_clear
+                counts["clear_right"] += is_right and is_clear
+    assert known.ordered(0.15) == OrderCounts(**counts) and counts["pairs"] > 60
 
 
 @pytest.mark.parametrize("agent", primary_predictors())
 def test_published_cells_are_of_many_classes_and_sets(agent):
     known = published(agent)
-    assert len(set(known.classes)) == 26
-    assert len(known.predicted) >= 350
-    assert np.isfinite([known.predicted, known.observed, known.states, known.steps]).all()
+    assert len(set(known.classes)) == 40
+    assert len(known.predicted) >= 450
+    assert np.isfinite([known.predicted, known.observed, known.states, known.steps, known.spreads]).all()
     assert 0.74 <= known.coverage() <= 0.88
-    right, pairs = known.ordered(1.0)
-    assert right / pairs > 0.9  # what the words rest on
+    counts = known.ordered(1.0)
+    assert counts.right / counts.pairs > 0.9  # what the words rest on
+
+
+def test_the_common_hyperparameters_are_those_of_the_presets():
+    yaml = pytest.importorskip("yaml")
+    for name in ("hardness-dev", "hardness-sealed"):
+        text = (Path(pharos.study.__file__).parent / "presets" / f"{name}.yaml").read_text(encoding="utf-8")
+        sets = yaml.safe_load(text)["hyperparameters"]
+        assert {agent: sets[f"common_{agent}"] for agent in ("dqn", "ppo")} == COMMON
+
+
+@pytest.mark.slow
+def test_the_published_hyperparameters_are_a_choice_and_others_are_named(tmp_path):
+    world = {"length": 5, "agent": "ppo", "steps": 2048}
+    own, common = (pharos.predict("river_swim", **world, common=common) for common in (False, True))
+    assert any("gamma" in line and "--hyperparameters common" in line for line in own.warnings)
+    assert not any("--hyperparameters" in line for line in common.warnings)
+    assert {name: common.hyperparameters[name] for name in COMMON["ppo"]} == COMMON["ppo"]
+    words = ["predict", "river_swim", "length=5", "--agent", "ppo", "--steps", "2048", "--hyperparameters"]
+    said = run(*words, "common", "--json")
+    assert json.loads(said.stdout)["cells"][0]["value"] == pytest.approx(common.cells[0].value)
+    assert "mine.yaml" in (other := run(*words, "mine.yaml").output) and "common" in other
+
+
+def test_a_unit_outside_of_what_was_tested_is_named():
+    known = published("dqn")
+    low, high = known.spreads.min(), known.spreads.max()
+    none = pharos.mdp.ChanceSetting()
+    for spread, is_outside in ((low, False), (high, False), (low / 2, True), (high * 2, True)):
+        lines = list(prediction._warnings(known, 100, 30_000, spread, none))
+        assert len(lines) == is_outside and all("is V* less the value of uniform play" in line for line in lines)
 
 
 def test_agents_without_published_runs_are_refused():
@@ -119,6 +170,7 @@ def test_a_dqn_is_predicted_by_the_sampled_learner_with_its_schedule():
     assert answer.predictor == "sampled_regret" and answer.states == 5
     assert any("sticky" in warning for warning in answer.warnings)
     assert any("1,000 steps" in warning for warning in answer.warnings)
+    assert any("learning_starts, batch_size" in warning for warning in answer.warnings)
 
 
 @pytest.mark.slow
@@ -176,14 +228,30 @@ def test_networks_of_ones_own_are_predicted():
     assert len(own.cells) == 2 and own.cells[0].network == "mlp8" != own.cells[1].network
 
 
-def test_orders_are_told_in_words():
-    assert str(PairOrder("vector", "hash", 0.3, 19, 20)) == "vector is easier than hash: right in 19 of 20 such pairs"
-    assert (
-        str(PairOrder("vector", "hash", 0.02, 9, 10))
-        == "vector or hash: too close to call (right in 9 of 10 such pairs)"
-    )
-    assert "too close" in str(PairOrder("vector", "hash", 0.3, 5, 10))
-    assert "too close" in str(PairOrder("vector", "hash", 0.3, 0, 0))
+@pytest.mark.parametrize(
+    ("difference", "counts", "words"),
+    [
+        (0.3, (20, 19, 17, 17), "vector is easier than hash: so in 19 of 20 such pairs, by more than 0.05 in 17"),
+        (
+            *(0.02, (40, 32, 10, 9)),
+            "vector is easier than hash if their regrets differ by more than 0.05: so in 9 of 10 that did; 30 of 40 "
+            "such pairs do not",
+        ),
+        (
+            *(0.3, (10, 6, 8, 5)),
+            "vector or hash: too close to call; 2 of 10 such pairs do not differ by more than 0.05, and vector was "
+            "easier in 5 of 8 that did",
+        ),
+    ],
+)
+def test_orders_are_told_in_words(difference, counts, words):
+    names = ("pairs", "right", "clear_pairs", "clear_right")
+    assert str(PairOrder("vector", "hash", difference, OrderCounts(**dict(zip(names, counts, strict=True))))) == words
+
+
+def test_nothing_is_called_without_pairs():
+    order = PairOrder("vector", "hash", 0.3, OrderCounts(pairs=0, right=0, clear_pairs=0, clear_right=0))
+    assert not order.is_called and "too close to call" in str(order)
 
 
 @pytest.mark.slow
@@ -201,7 +269,8 @@ def test_the_order_of_networks_is_not_called():
             )
             if abs(seen) > 0.05:
                 right.append(said * seen > 0)
-    assert (sum(right), len(right)) == prediction.NETWORKS_IN_ORDER
+    counts = prediction.NETWORKS_IN_ORDER
+    assert (sum(right), len(right)) == (counts.right, counts.pairs) == (counts.clear_right, counts.clear_pairs)
 
 
 def test_what_cannot_be_predicted_is_one_line(monkeypatch):

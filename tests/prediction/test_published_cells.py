@@ -25,7 +25,7 @@ def published(classes=5):
     mdps = np.array([f"{name} {i % 2}" for i, name in enumerate(names)])
     x = rng.random(len(names))
     y = x + rng.normal(0, 0.3, len(names)) + np.unique(names, return_inverse=True)[1] / classes
-    return Published(names, mdps, x, y, np.ones(len(names)), np.ones(len(names)))
+    return Published(names, mdps, x, y, *np.ones((3, len(names))))
 
 
 def plainly(known, count):
@@ -67,23 +67,49 @@ def test_statistics_of_a_sample_of_classes_are_those_of_plain_loops(cells, count
 def test_a_class_that_is_drawn_twice_is_not_predicted_from_its_copy(cells):
     """Points (0, 0) and (1, 1), four times each, and (2, 0): lines through the others say 2, 0 and 2."""
     names, x, y = np.repeat(["a", "b", "c"], 2), np.repeat([0.0, 1.0, 2.0], 2), np.repeat([0.0, 1.0, 0.0], 2)
-    known = Published(names, names, x, y, np.ones(6), np.ones(6))
+    known = Published(names, names, x, y, *np.ones((3, 6)))
     r_squared, _, _, pairs = cells.statistics(known, np.array([[4, 4, 1]]))
     assert r_squared == pytest.approx([1 - (4 * 4 + 4 * 1 + 1 * 4) / (20 / 9)])
     assert np.isnan(pairs).all()  # no regrets of an MDP differ
 
 
+def lines_of(capsys, task, *arguments):
+    task(*arguments)
+    return capsys.readouterr().out.splitlines()
+
+
 @pytest.mark.slow
 def test_the_pages_have_the_numbers_of_the_cells(cells, capsys):
-    cells.judge(cells.FILE, 1000)
-    lines = capsys.readouterr().out.splitlines()
-    evidence, page = ((DOCS / name).read_text(encoding="utf-8") for name in ("evidence/sealed-1.md", "prediction.md"))
-    assert len(lines) == 6
+    pages = ("evidence/sealed-2.md", "evidence/sealed-1.md", "prediction.md")
+    evidence, first, page = ((DOCS / name).read_text(encoding="utf-8") for name in pages)
+    lines = lines_of(capsys, cells.judge, cells.FILE, 1000)
+    assert len(lines) == 8
     for line in lines:
         assert line in evidence
         name, agent, count, r_squared, rho, pairs, _, width, coverage = line.strip("| ").split(" | ")
-        if name == "all 26":
+        if name == "all 40":
             assert f"| {agent} | {count} | {r_squared} | {rho} | {pairs} | {width} | {coverage} |" in page
+        if (name, agent) == ("the first fourteen sealed", "DQN"):
+            assert f"| DQN | `sampled_regret`, named before the second | {r_squared}, known by then |" in page
+    for line in lines_of(capsys, cells.orders, cells.FILE):
+        assert line in page
+    tested = lines_of(capsys, cells.sealed, cells.FILE, 1000)
+    assert len(tested) == 13
+    r_squared = {}
+    for line in tested:
+        assert line in evidence
+        blocks, _, predictor, _, said, *_ = line.strip("| ").split(" | ")
+        if blocks == "a, b, c":
+            r_squared.setdefault(predictor, said)
+    for predictor, end in (
+        ("clipped_regret_evaluated", ": held"),
+        ("kernel_regret", ""),
+        ("sampled_regret", ": failed"),
+    ):
+        (row,) = (line for line in page.splitlines() if f"`{predictor}`, named" in line)
+        assert row.endswith(f"| {r_squared[f'`{predictor}`']}{end} |")
+        if predictor != "sampled_regret":  # the first test, with samples of classes of its own
+            assert row.split(" | ")[2].split(":")[0] in first
 
 
 def test_classes_of_one_size_weigh_alike_if_their_cells_do():

@@ -15,7 +15,7 @@ from edits import edited_json
 from pharos import study
 from pharos.study import worker as _worker
 from pharos.study.execution import claim
-from pharos.study.figures import same_steps
+from pharos.study.figures import representations, same_steps
 from pharos.study.report import files, number
 from pharos.study.report.page import table
 from pharos.system.wording import latex_text
@@ -340,3 +340,17 @@ def test_columns_that_say_nothing_are_left_out_of_a_table():
     shown = table(rows)
     assert [column.title for column in shown.columns] == ["model", "left out", "R2"]
     assert shown.rows == [["single", "", "0.500"], ["class", "diameter", "0.000"]]
+
+
+def test_kinds_of_chance_are_in_the_legend_if_there_are_several():
+    """A legend with one entry for all points says nothing."""
+    rows = [
+        {"environment": "frozen_lake", "instance": "a", "chance": chance, "agent": "dqn", "observation": observation}
+        for chance in ("plain", "random 0.1")
+        for observation in ("vector", "simple_image")
+    ]
+    cells = pd.DataFrame(rows).assign(normalized_regret=[0.2, 0.3, 0.4, 0.5])
+    expected = {1: ["frozen lake"], 2: ["frozen lake", "no added noise", "random"]}
+    for count, words in expected.items():
+        (axis,) = representations(cells[: 2 * count]).axes
+        assert [text.get_text() for text in axis.get_legend().get_texts()] == words

@@ -333,3 +333,59 @@ def test_knobs_of_chance_and_pay_are_those_of_the_run_alone():
     np.testing.assert_equal(together[1].result, alone.result)  # nan, where no episode has ended, equals nan
     optimal = Task.of("simple_grid/4x4-plain", sticky=0.1, lazy=0.2).optimal
     assert alone.result["value_optimal"] == optimal.value_at_start
+
+
+@pytest.fixture
+def apart(monkeypatch):
+    """Policies of every batch are evaluated by two processes."""
+    monkeypatch.setattr("pharos.training.batch.evaluates_apart", lambda *_: True)
+    monkeypatch.setattr("pharos.training.evaluators.usable_workers", lambda _: 3)
+    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("agent, chance", [("dqn", {}), ("ppo", {"sticky": 0.25})])
+def test_policies_that_other_processes_evaluate_leave_the_same_bytes(agent, chance, tmp_path, request):
+    own = {"learning_starts": 50, "buffer_size": 500} if agent == "dqn" else {"n_steps": 64}
+    options = {"agent": agent, "steps": 200, "evaluation_interval": 50, "hyperparameters": own, "engine": "batched"}
+    whole = many(tmp_path / "whole", **options, **chance)
+    request.getfixturevalue("apart")
+    done = []
+    parts = many(tmp_path / "parts", progress=lambda now: done.append((now.done, len(now.rows))), **options, **chance)
+    assert done[:4] == [(150 * i, 3) for i in range(1, 5)]
+    assert [end.result for end in parts] == [end.result for end in whole]
+    with pytest.raises(Killed):
+        many(tmp_path / "killed", progress=kill_at(3 * 150), **options, **chance)
+    assert any((tmp_path / "killed" / "checkpoints").glob("*/checkpoint"))
+    many(tmp_path / "killed", **options, **chance)
+    for seed in range(3):
+        folders = [tmp_path / name / f"seed-{seed}" for name in ("whole", "parts", "killed")]
+        expected, *others = [(bytes_of(folder), read_record(folder)["result"]) for folder in folders]
+        assert others == [expected] * 2
+
+
+@pytest.mark.long
+def test_a_batch_whose_evaluating_process_dies_is_halved_and_ends(apart, tmp_path, monkeypatch):
+    evaluators = importlib.import_module("pharos.training.evaluators")
+    begin, killed = evaluators.Evaluators.begin, []
+
+    def kill_once(self, learner):
+        if not killed:
+            killed.append(self.workers.kill("0"))
+        begin(self, learner)
+
+    monkeypatch.setattr(evaluators.Evaluators, "begin", kill_once)
+    own = {"learning_starts": 50, "buffer_size": 500}
+    with pytest.warns(UserWarning, match="evaluates ended with exit code -9"):
+        ends = many(steps=100, evaluation_interval=50, hyperparameters=own, engine="batched")
+    assert not any(isinstance(end, FailedRun) for end in ends)
+
+
+def test_policies_are_evaluated_apart_where_a_gpu_learns_many_runs_of_importable_code():
+    from pharos.training.evaluators import FEWEST, evaluates_apart
+
+    class Run:
+        config = config()
+
+    assert evaluates_apart("cuda", [Run()] * FEWEST)
+    assert not evaluates_apart("cpu", [Run()] * FEWEST) and not evaluates_apart("cuda", [Run()] * (FEWEST - 1))

@@ -199,7 +199,8 @@ def test_the_configuration_in_a_record_is_plain_json(tmp_path):
 def test_the_page_about_agents_defines_every_column_and_every_key():
     page = (Path(__file__).parents[2] / "docs" / "agents.md").read_text()
     result = train("q_learning", "simple_grid/4x4-plain", steps=10).result
-    assert [name for name in (*_results.COLUMNS, *result) if f"`{name}`" not in page] == []
+    result |= train("q_learning", "endless_sea", size=3, steps=10, objective="average").result
+    assert [name for name in (*_results.ALL_COLUMNS, *result) if f"`{name}`" not in page] == []
 
 
 # Damage --------------------------------------------------------------------------------------------------------------

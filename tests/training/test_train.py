@@ -177,7 +177,7 @@ def test_a_checkpoint_is_on_the_disk_before_the_older_one_goes(tmp_path, monkeyp
     checkpoint = _results.Checkpoint(tmp_path / "checkpoint", "id")
     for _ in range(2):
         synced.clear()
-        checkpoint.save(Learner(), [], 0.0)
+        checkpoint.save(Learner(), list, 0.0)
         assert tmp_path.stat().st_ino in synced
     swap = ("checkpoint.partial", "checkpoint")
     assert moves == [swap, ("checkpoint", "checkpoint.old"), swap]
@@ -290,7 +290,7 @@ def test_an_algorithm_can_be_named_by_its_path():
         ({"agent": "dqn", "hyperparameters": {"learning_rat": 1}}, UnknownName, "did you mean 'learning_rate'"),
         ({"agent": "q_learning", "steps": 0}, ParameterError, "steps is 0"),
         ({"agent": "q_learning", "evaluation_interval": -1}, ParameterError, "evaluation_interval is -1"),
-        ({"agent": "q_learning", "horizon": None}, ParameterError, "give a horizon"),
+        ({"agent": "q_learning", "horizon": 0}, ParameterError, "horizon: found 0"),
         ({"agent": "dqn", "tensorboard": True}, ParameterError, "no folder for results"),
     ],
 )

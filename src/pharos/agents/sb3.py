@@ -403,12 +403,20 @@ class Networks(ArrayLearner):
     def restore(self, state: dict[str, np.ndarray]) -> None:
         self.batch.restore(state)
 
+    def parameters(self, i: int) -> dict[str, np.ndarray]:
+        """The network of run i, under the names of Stable-Baselines3."""
+        return self.batch.parameters(i)
+
+    def set_parameters(self, i: int, parameters: Mapping[str, np.ndarray]) -> None:
+        """Replace the network of run i."""
+        self.batch.set_parameters(i, parameters)
+
     def publish(self, i: int, folder: Path) -> None:
         """Write the network, as `Deep` reads it, with the names of parameters in the policy of Stable-Baselines3."""
         import torch
 
         place = new_agent(folder)
-        parameters = self.batch.parameters(i).items()
+        parameters = self.parameters(i).items()
         policy = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters}
         torch.save({"policy": policy}, place / "parameters.pt")
         counters = {"num_timesteps": int(self.batch.steps), "episodes": int(self.episodes[i])}

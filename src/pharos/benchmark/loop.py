@@ -192,7 +192,7 @@ class LoopRun:
         agent: label of what learns.
         out: folder of the run; None: nothing is written.
         options: of `TrainingOptions`: observation, observation_options, sticky, random and the like, gamma, horizon,
-            evaluation_interval, hyperparameters; and those of the environment.
+            objective, evaluation_interval, hyperparameters; and those of the environment.
     Attributes:
         env: the environment, which counts the steps of all of its copies (`env.copy`); use it, or your own.
         task: environment, observation and setting of values, a `training.Task`.
@@ -222,6 +222,7 @@ class LoopRun:
             observation_options=dict(training.observation_options or {}),
             gamma=training.gamma,
             horizon=training.horizon,
+            objective=training.objective,
         )
         self.config = RunConfig.of_task(
             self.task,

@@ -229,7 +229,7 @@ def _verify_entry(
         normalized_regret=normalized,
         value_optimal=reference.optimal,
         value_uniform=reference.uniform,
-        **vars(evaluation),
+        **{name: value for name, value in vars(evaluation).items() if name != "gain"},
     )
 
 

@@ -337,13 +337,13 @@ def evaluate(
     if objective == "average":
         return averaged(goal, mdp, policy, decisions, tolerance, chance, source)
     with progress_line("evaluating"):
-        values = {name: _worth(solution_of(mdp, name, None, tolerance)) for name in POLICIES}
+        values = {name: _worth_of_named(mdp, name, tolerance) for name in POLICIES}
         if decisions is None:
             worth = values[policy]
         elif _sees_frames(goal, decisions):
             worth = _worth_over_histories(goal, mdp, decisions, chance)
         else:
-            worth = _worth(solution_of(mdp, policy, decisions, tolerance))
+            worth = _worth_of_given(goal, mdp, decisions, chance, tolerance)
     is_network = decisions is not None and "observation" in decisions.observer_options
     rounding = ", for the probabilities that its network computes in 32 bits" if is_network else ""
     best, uniform, worst = (values[name].value for name in POLICIES)
@@ -442,6 +442,37 @@ class Worth:
 
 def _worth(solution: "Solution") -> Worth:
     return Worth(solution.value_at_start, solution.error_bound, solution.seconds)
+
+
+def _worth_of_named(mdp: "TabularMDP", name: str, tolerance: float) -> Worth:
+    """Worth of one of POLICIES; all but the best may go on for ever, where the total reward has no limit."""
+    from pharos.policies import endless_value
+
+    began = time.perf_counter()
+    try:
+        return _worth(solution_of(mdp, name, None, tolerance))
+    except DivergenceError:
+        if name == "optimal":
+            raise
+        value = -math.inf if name == "worst" else endless_value(mdp, name)
+        return Worth(value, 0.0, time.perf_counter() - began)
+
+
+def _worth_of_given(
+    goal: Target, mdp: "TabularMDP", decisions: Given, chance: "ChanceSetting", tolerance: float
+) -> Worth:
+    """Worth of a policy of one's own, by its values from all states if they are finite, else from the start alone."""
+    from pharos.policies import NumberObserver, policy_value
+
+    try:
+        return _worth(solution_of(mdp, "", decisions, tolerance))
+    except DivergenceError:
+        if "observation" in decisions.observer_options:
+            return _worth_over_histories(goal, mdp, decisions, chance)
+    began, observer = time.perf_counter(), NumberObserver.of(mdp.num_states)
+    limits = (-math.inf, math.inf)
+    value = policy_value(decisions.policy, mdp, lambda: observer, lambda: limits, max_states=mdp.num_states)
+    return Worth(value.value, value.error_bound, time.perf_counter() - began)
 
 
 def _estimated(worth: Worth) -> str:

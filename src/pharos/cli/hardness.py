@@ -21,7 +21,7 @@ from pharos.cli.answers import (
     told_if_slow,
 )
 from pharos.cli.options import Building, Chance, Count, Discount, Seconds, Target, file_ending, parse_parameters
-from pharos.errors import ParameterError
+from pharos.errors import ParameterError, UnknownName
 from pharos.system import compiling
 from pharos.system.wording import pluralize
 from pharos.training import TrainingOptions
@@ -251,6 +251,7 @@ def predict(
     observation: Annotated[list[str] | None, "NAME[,OPTION=VALUE...]"] = None,
     network: list[str] | None = None,
     training: Annotated[TrainingOptions, PREDICTED_OPTIONS] = PREDICTED,
+    preset: Annotated[str | None, typer.Option("--hyperparameters", metavar="common")] = None,
     horizon: Count | None = None,
     landmarks: Annotated[int | None, typer.Option(min=0)] = None,
     plot: Annotated[Path | None, file_ending(".png", ".pdf", ".svg")] = None,
@@ -263,6 +264,7 @@ def predict(
             when not given.
         agent: dqn or ppo.
         steps: Steps that it would learn from.
+        preset: Those of the published cells, for which the interval is calibrated; --set goes before them.
         horizon: Steps of an episode; the environment's time limit when not given.
         landmarks: Approximate the kernel by so many; 0: never; beyond 2,048 if not given.
         plot: Draw the bars into a PNG, PDF or SVG.
@@ -270,12 +272,15 @@ def predict(
     env = target.found_environment()
     from pharos.prediction import predict as foretell
 
+    if preset not in (None, "common"):
+        raise UnknownName("set of hyperparameters", str(preset), ("common",))
     with progress_line("predicting") as tell:
         prediction = foretell(
             env,
             [_observation(text) for text in observation or ["vector"]],
             networks=network or None,
             landmarks=landmarks,
+            common=preset is not None,
             progress=tell,
             **{name: getattr(training, name) for name in ("agent", "steps", "hyperparameters", "chance")},
             horizon=horizon or "limit",

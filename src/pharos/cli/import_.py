@@ -76,6 +76,7 @@ def gymnasium(
     option: Mapping[str, Any],
     gamma: Discount = 0.99,
     horizon: Episode = None,
+    initial: Annotated[str | None, "STATE,..."] = None,
     check: bool = True,
 ) -> Answer:
     """Import the table P of an environment of Gymnasium; training takes its time limit.
@@ -84,6 +85,7 @@ def gymnasium(
         name: Such as Taxi-v4: an environment with a table P.
         option: Of the environment, such as is_slippery=false.
         gamma: Discount of the MDP.
+        initial: The start, or several that are equally likely; what the environment says when not given.
         check: Compare sampled steps with the table.
     """
     import gymnasium as package
@@ -95,11 +97,21 @@ def gymnasium(
     except Exception as error:  # whatever an environment does with options that are none of its own
         message = " ".join(str(error).split())
         raise ParameterError(f"{name}: Gymnasium cannot make it: {message or type(error).__name__}") from None
-    mdp = importers.gymnasium(env, gamma=gamma, horizon=horizon, check=check)
+    starts = None if initial is None else _start_states(initial)
+    mdp = importers.gymnasium(env, gamma=gamma, horizon=horizon, check=check, initial=starts)
     words = " ".join((name, *(f"{key}={written(value)}" for key, value in option.items())))
     limit, outcomes = env.spec.max_episode_steps if env.spec else None, importers.gymnasium_outcomes(env)
     importers.save(mdp, out, source=f"Gymnasium: {words}", time_limit=limit, outcomes=outcomes)
     return _answer(words, mdp, out)
+
+
+def _start_states(text: str) -> int | list[int]:
+    """States from 3, or 0,3,5; ParameterError if it is no such thing."""
+    try:
+        states = [int(part) for part in text.split(",")]
+    except ValueError:
+        raise ParameterError(f"--initial is {text!r}; expected numbers of states such as 0,3,5") from None
+    return states[0] if len(states) == 1 else states
 
 
 @app.command("env")
@@ -120,10 +132,10 @@ def env(
     workers: Count = 1,
     check: bool = True,
 ) -> Answer:
-    """Import any environment of Gymnasium by stepping it from every state; the same command resumes.
+    """Import any environment of Gymnasium or JAX by stepping it from every state; the same command resumes.
 
     Args:
-        target: gymnasium:ID, module:factory or file.py:factory; wrappers count.
+        target: gymnasium:ID, gymnax:ID, pgx:ID, module:factory, file.py:factory, or jax:file.py:factory.
         option: Of the environment or the factory, such as is_slippery=false.
         seed: Of one reset; else all starts are imported.
         key: module:function or file.py:function (environment) -> equal for equal states; pairs are checked.

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -43,6 +43,7 @@ def train(
     gamma: Discount | None = None,
     horizon: Count | None = None,
     endless: Annotated[bool, typer.Option("--no-horizon")] = False,
+    objective: Literal["total", "average"] | None = None,
     tensorboard: bool = False,
 ) -> Answer:
     """Train an agent and measure the exact regret of its policy on the way.
@@ -57,6 +58,7 @@ def train(
         gamma: Discount of values and returns; 1 when not given, with a horizon.
         horizon: Steps of an episode; the environment's time limit when not given.
         endless: Discounted values without a horizon, at --gamma (0.99).
+        objective: total: gamma 1 and no horizon; average: measure the reward of a step in the long run, too.
         tensorboard: Write TensorBoard logs into --out.
     """
     env = target.found_environment()
@@ -71,8 +73,9 @@ def train(
     training = replace(
         training,
         hyperparameters=hyperparameters,
-        gamma=gamma if gamma is not None else 0.99 if endless else 1.0,
+        gamma=gamma if gamma is not None else 0.99 if endless and objective != "total" else 1.0,
         horizon=None if endless else horizon or "limit",
+        objective=objective,
     )
     title = f"{agent} on {target.title}"
     if seeds is not None:
@@ -197,6 +200,7 @@ def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, ob
     shown = "-" if regret is None or math.isnan(regret) else f"{regret:.4g}  (0: optimal, 1: uniform)"
     shown = UNIFORM_IS_OPTIMAL if _is_uniform_optimal(result) else shown
     return [
+        *_facts_of_averages(result),
         ("final value", f"{result['final_value']:.6g}  (optimal {best:.6g}, uniform {uniform:.6g})"),
         ("final regret", f"{result['final_regret']:.6g}"),
         ("cumulative regret", f"{learnt:.6g} of the learnt policies, {played:.6g} as played"),
@@ -206,6 +210,25 @@ def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, ob
         ("chance", chance),
         ("seconds", f"{run.seconds:.1f} ({steps / run.seconds:,.0f} steps/s, evaluation included)"),
         *compiling_fact(),
+    ]
+
+
+def _facts_of_averages(result: Mapping[str, Any]) -> list[tuple[str, object]]:
+    """Average reward and regret a step in the long run, if the run measures them."""
+    if "gain_at_start" not in result:
+        return []
+    from pharos.solvers import GainInterval
+
+    names = ("gain_at_start", "optimal_gain_at_start", "uniform_gain_at_start", "average_regret")
+    own, best, uniform, lost = (GainInterval(**result[name]) for name in names)
+    relative = result["normalized_average_regret"]
+    shown = (
+        "-" if relative is None or math.isnan(relative) else f"{relative:.4g} over the run  (0: optimal, 1: uniform)"
+    )
+    return [
+        ("final average reward", f"{own}  (optimal {best}, uniform {uniform})"),
+        ("final average regret", f"{lost} a step"),
+        ("normalised average regret", shown),
     ]
 
 

@@ -352,7 +352,7 @@ def exploration_of(
     title = title or (_title(env) if env is not None else "")
     mdp_with_chance = chance.of(mdp.with_gamma(GAMMA if gamma is None else gamma))
     if in_one_page:
-        check_size(mdp_with_chance, title or str(mdp))
+        check_size(mdp_with_chance, title or str(mdp), env)
     return Exploration(
         mdp_with_chance,
         env=env,

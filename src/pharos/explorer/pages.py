@@ -5,23 +5,27 @@ through in blocks, so that no more than some megabytes are needed beside it.
 """
 
 import base64
+import contextlib
 import hashlib
 import html
 import json
 import os
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from functools import cache
+from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pharos.errors import ParameterError, UnknownName
+from pharos.environments import Environment, make
+from pharos.errors import ParameterError, PharosError, UnknownName
 from pharos.explorer.exploration import Exploration, number
 from pharos.explorer.states import OPTIMAL, Axis, axes_of
 from pharos.mdp import TabularMDP
+from pharos.state_space import build
 from pharos.system import storage
 
 BLOCK = 1 << 18  # states that are looked at in one go
@@ -180,6 +184,7 @@ def _first_axes(axes: Mapping[str, Axis]) -> list[str]:
 
 MOST_POSITIONS = 10_000  # states, under sticky actions times previous ones, that a page of its own holds
 MOST_BYTES = 64 << 20  # of such a page
+TRIES = 6  # named instances that are built to find one that fits
 SCRIPTS = ("source.js", "drawing.js", "maps.js", "panels.js", "main.js")
 DIGITS = 12  # significant ones of a number in a page of its own
 
@@ -233,7 +238,7 @@ def contents(world: Exploration) -> dict[str, Any]:
         ParameterError: there are more than MOST_POSITIONS.
     """
     mdp = world.mdp
-    check_size(mdp, world.title)
+    check_size(mdp, world.title, world.env)
     states = np.arange(mdp.num_states)
     before: list[int | None] = [None, *range(mdp.policy_width - 1)]
     positions = {
@@ -246,15 +251,48 @@ def contents(world: Exploration) -> dict[str, Any]:
     return _shortened({"about": world.about(), "positions": positions, "fields": fields, "wrong": wrong})
 
 
-def check_size(mdp: TabularMDP, title: str) -> None:
-    """ParameterError where a page of its own does not hold all positions of an MDP."""
+def check_size(mdp: TabularMDP, title: str, env: Environment | None = None) -> None:
+    """ParameterError if a page of its own does not hold all positions of an MDP; it names a smaller one of `env`."""
     width = mdp.policy_width
     if mdp.num_states * width > MOST_POSITIONS:
+        smaller = smaller_instance(env, MOST_POSITIONS // width) if env is not None else ""
         raise ParameterError(
             f"{title}: has {mdp.num_states * width:,} "
             f"{'pairs of a state and a previous action' if width > 1 else 'states'}; a page of its own holds at most "
-            f"{MOST_POSITIONS:,}: choose a smaller instance, or leave out --out (out= in Python) for a local server"
+            f"{MOST_POSITIONS:,}: choose a smaller instance{smaller and f' ({smaller})'}, or leave out --out (out= in "
+            "Python) for a local server"
         )
+
+
+def smaller_instance(env: Environment, most: int) -> str:
+    """Instance of the same class with at most `most` states, in words: `frozen_lake/8x8 has 64`; empty without one.
+
+    The largest of the first TRIES named instances; else the same environment with one whole-number parameter as much
+    smaller as needed, by bisection. Cost: builds of at most `most` states.
+    """
+    named = [f"{env.name}/{name}" for name in type(env).instances][:TRIES]
+    sizes = {name: size for name in named if (size := _num_states(partial(make, name), most))}
+    if sizes:
+        name = max(sizes, key=sizes.__getitem__)
+        return f"{name} has {sizes[name]:,}"
+    for name, value in env.parameters.items():
+        text, low, high = "", 0, value if type(value) is int else 0
+        while high - low > 1:
+            middle = (low + high) // 2
+            if size := _num_states(partial(type(env), **{**env.parameters, name: middle}), most):
+                text, low = f"{name}={middle} has {size:,}", middle
+            else:
+                high = middle
+        if text:
+            return text
+    return ""
+
+
+def _num_states(make_env: Callable[[], Environment], most: int) -> int:
+    """Number of states of an environment; 0 if there is none with these parameters, or it has more than `most`."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(PharosError, ValueError):
+        return build(make_env(), Path(folder) / "states", max_states=most, progress=False).num_states
+    return 0
 
 
 def write(world: Exploration, path: str | os.PathLike) -> Path:

@@ -17,9 +17,10 @@ pharos's own variant of Laidlaw, Russell and Dragan's (2023) measure; `effective
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import itemgetter
 from typing import Any, Protocol
 
 import numpy as np
@@ -73,6 +74,7 @@ class LookAhead:
 
 COMPILED = 2**26  # bytes of the table of all steps from which on it is not written out
 GREEDY_RETURNS = 5
+WRITTEN_OUT = 2**18  # action values, of nodes that each lead to one; of more a compiled kernel is worth loading
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ def effective_horizon(
     mdp = mdp_within(mdp, steps)
     compiled = applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > COMPILED
     tell = progress or str
-    parts = parts_of(LargeHorizon(mdp, steps, TIE, tell) if compiled else SmallHorizon(mdp, steps, tell))
+    parts = parts_of(LargeHorizon(mdp, steps, TIE, tell) if compiled else NodeHorizon.of_steps(mdp, steps, tell))
     bound = gorp_bound(mdp, horizon=steps, max_k=tight, progress=progress).value if tight else None
     conventions = {
         "horizon": steps,
@@ -147,8 +149,9 @@ def effective_horizon(
     return EffectiveHorizon(**parts, tight=bound, conventions=conventions)
 
 
-def parts_of(values: "SmallHorizon | LargeHorizon") -> dict[str, Any]:
+def parts_of(values: "NodeHorizon | LargeHorizon") -> dict[str, Any]:
     """Fields of an `EffectiveHorizon`, but for `tight` and `conventions`."""
+    assert values.steps is not None
     ahead, greedy = look_ahead(values, values.steps, values.most_actions, values.greedy_return, values.tell)
     returns = dict(zip(("optimal_return", "random_return", "worst_return"), values.returns, strict=True))
     return {**vars(ahead), **returns, "greedy_returns": greedy, "num_states": values.num_visitable}
@@ -206,64 +209,158 @@ def look_ahead(
     return LookAhead(best, k_min, window, ks, ms, gaps, variances), greedy
 
 
-class SmallHorizon(FiniteHorizonValues):
-    """Lookahead values of MDPs whose action values of all steps are written out.
+class NodeHorizon:
+    """Lookahead values on nodes, states or pairs with the previous action: of each of T steps, or the same at all.
 
     Attributes:
-        values: (T, N, A) Q^k. variance: (T, N, A) var^k.
+        choices: the MDP written out. rewards: (N, A) of choosing an action.
+        values: Q^k of each step. spread: (N,) max over a of var^k, of each step. optimal: (N, A) bool, of each step.
+        slack: values within it are equal.
+        returns, num_visitable: of episodes of T steps, see `EffectiveHorizon`.
     """
 
-    def __init__(self, mdp: TabularMDP, steps: int, tell: Callable[[str], object] = str):
-        super().__init__(mdp, steps, tell)
-        self.values, self.variance = self.explored, (self.explored - self.worst) * (self.best - self.worst)
-        values = (self.best.max(axis=2)[0], self.explored_value[0], self.worst.min(axis=2)[0])
-        self.returns = tuple(map(self.at_start, values))
+    values: list["_ActionValues"]
+    returns: tuple[float, ...]
+    num_visitable: int
+    most_actions: int
+
+    def __init__(self, choices: ExpandedMDP, rewards: np.ndarray, gamma: float = 1.0, steps: int | None = None):
+        self.choices, self.rewards, self.gamma, self.steps = choices, rewards, gamma, steps
+        self.num_nodes, self.starts = len(rewards), np.array(sorted(node for node, _ in choices.starts))
+        self.is_large = choices.table is not None and choices.table.size > WRITTEN_OUT
+        self.tell: Callable[[str], object] = str
+
+    @staticmethod
+    def of_steps(mdp: TabularMDP, steps: int, tell: Callable[[str], object] = str) -> "NodeHorizon":
+        """Values of T steps, all of which are written out."""
+        tree = FiniteHorizonValues(mdp, steps, tell)
+        nodes = NodeHorizon(tree.choices, tree.rewards, steps=steps)
+        nodes.tell, nodes.most_actions, nodes.num_visitable = tell, tree.most_actions, tree.num_visitable
+        values = (tree.best.max(axis=2)[0], tree.explored_value[0], tree.worst.min(axis=2)[0])
+        nodes.returns = tuple(map(tree.at_start, values))
+        nodes.values = [_ActionValues(nodes, value) for value in nodes._after(tree.explored_value)]
+        nodes.compare(zip(tree.best, tree.worst, tree.explored, strict=True), TIE)
+        return nodes
+
+    def compare(self, values: Iterable[Sequence[np.ndarray]], tie: float, slack: float = 0.0) -> None:
+        """Begin with var^1; actions within `tie` of the best are optimal.
+
+        values: action values (N, A) of the best, worst and uniform play at each step.
+        """
+        self.slack, self.optimal, self.spread = slack, [], []
+        for b, w, e in values:
+            self.optimal.append(b >= b.max(axis=1, keepdims=True) - tie)
+            self.spread.append(((e - w) * (b - w)).max(axis=1))
+
+    def _after(self, rows: Iterable[np.ndarray]) -> list[np.ndarray]:
+        """Rows (N,) that come after each step, of those of each step: zeros after the last of T steps."""
+        return list(rows) if self.steps is None else [*rows, np.zeros(self.num_nodes)][1:]
 
     def samples(self, log: float) -> tuple[int, float, float] | None:
-        worst: tuple[int, float, float] | None = None
-        is_reached = self.first
-        for t in range(self.steps):
-            nodes = np.flatnonzero(is_reached)
-            best = self.values[t, nodes].max(axis=1)
-            second = np.where(self.optimal[t, nodes], -math.inf, self.values[t, nodes]).max(axis=1)
-            if (best == second).any():
-                return None
-            samples, gap, spread = most_samples(best - second, self.variance[t, nodes].max(axis=1), log)
-            if worst is None or samples > worst[0]:
-                worst = (samples, gap, spread)
-            better = np.zeros((self.num_nodes, self.num_actions), np.bool_)
-            better[nodes] = self.values[t, nodes] > second[:, None]
-            is_reached = self.successors(is_reached, better)
-        return worst
+        gaps = np.empty((len(self.values), self.num_nodes))
+
+        def better(t: int, nodes: np.ndarray) -> np.ndarray | None:
+            q, optimal = self.values[t].at(nodes), self.optimal[t][nodes]
+            second = np.where(optimal, -math.inf, q).max(axis=1)
+            gaps[t, nodes] = gap = q.max(axis=1) - second
+            return None if (gap <= self.slack).any() else optimal & (q > second[:, None] - self.slack)
+
+        layers = self.met(better)
+        if layers is None:
+            return None
+        each = (most_samples(gaps[t, nodes], self.spread[t][nodes], log) for t, nodes in enumerate(layers))
+        return max(each, key=itemgetter(0))
 
     def is_greedy_optimal(self) -> bool:
-        is_reached = self.first
-        for t in range(self.steps):
-            greedy = self.values[t] == self.values[t].max(axis=1, keepdims=True)
-            if (greedy & ~self.optimal[t])[is_reached].any():
-                return False
-            is_reached = self.successors(is_reached, greedy)
-        return True
+        def greedy(t: int, nodes: np.ndarray) -> np.ndarray | None:
+            q = self.values[t].at(nodes)
+            is_greedy = q >= q.max(axis=1, keepdims=True) - self.slack
+            return None if (is_greedy & ~self.optimal[t][nodes]).any() else is_greedy
+
+        return self.met(greedy) is not None
+
+    def met(self, actions: Callable[[int, np.ndarray], np.ndarray | None]) -> list[np.ndarray] | None:
+        """The nodes that are met at each of T steps by some actions, or at any step; None where `actions` is None.
+
+        actions: from a step and nodes (n,) to (n, A) bool, the actions that are chosen there.
+        """
+        layers: list[np.ndarray] = []
+        is_met, nodes = np.zeros(self.num_nodes, np.bool_), self.starts
+        while nodes.size and len(layers) != self.steps:
+            allowed = actions(0 if self.steps is None else len(layers), nodes)
+            if allowed is None:
+                return None
+            layers.append(nodes)
+            is_next = np.zeros(self.num_nodes, np.bool_)
+            is_next[self.choices.successors(nodes, allowed)] = True
+            if self.steps is None:
+                is_met[nodes] = True
+                is_next &= ~is_met
+            nodes = np.flatnonzero(is_next)
+        return [np.flatnonzero(is_met)] if self.steps is None else layers
 
     def advance(self, spread: bool = True) -> None:
-        self.values = self.lookahead(self.values)
+        best = []
+        for t, values in enumerate(self.values):
+            self.tell(f"lookahead of step {t} of {self.steps}")
+            best.append(values.best)
+        self.values = [_ActionValues(self, value) for value in self._after(best)]
         if spread:
-            after = np.zeros_like(self.variance)
-            for t in range(self.steps - 1):
-                after[t] = self.choices.largest(self.variance[t + 1].max(axis=1))
-            self.variance = after
+            self.spread = self._after([self.gamma**2 * self._largest_after(each) for each in self.spread])
+
+    def _largest_after(self, values: np.ndarray) -> np.ndarray:
+        """(N,): the largest of values (N,) over the nodes that some action may lead to, at least 0 if it is sure to."""
+        if not self.is_large:
+            largest = np.asarray(self.choices.largest(values).max(axis=1))
+            return largest if self.choices.table is None else np.maximum(largest, 0.0)
+        from pharos.kernels import horizon
+
+        result = np.empty(self.num_nodes)
+        horizon.largest(self.choices.table, values, result)
+        return result
 
     def restart_from_rewards(self) -> None:
-        self.values = np.broadcast_to(self.rewards, self.explored.shape)
+        self.values = [_ActionValues(self, np.zeros(self.num_nodes))] * len(self.values)
 
     def greedy_return(self) -> float:
         """J_k: the return of the policy greedy in Q^k, its ties broken as badly as possible."""
-        value = np.zeros(self.num_nodes)
-        for t in range(self.steps - 1, -1, -1):
-            greedy = self.values[t] == self.values[t].max(axis=1, keepdims=True)
-            q = self.backup(value) if t < self.steps - 1 else self.rewards
-            value = np.where(greedy, q, math.inf).min(axis=1)
-        return self.at_start(value)
+        value, everywhere = np.zeros(self.num_nodes), np.s_[:]
+        for values in reversed(self.values):
+            q = values.at(everywhere)
+            returns = _ActionValues(self, value).at(everywhere)
+            value = np.where(q == q.max(axis=1, keepdims=True), returns, math.inf).min(axis=1)
+        return float(sum(p * value[node] for node, p in self.choices.starts))
+
+
+class _ActionValues:
+    """Action values r + gamma E value(next) of nodes; on demand where there are many and each leads to one node."""
+
+    def __init__(self, nodes: NodeHorizon, value: np.ndarray):
+        self.nodes, self.value = nodes, value
+        self.table: np.ndarray | None = None
+        if not nodes.is_large:
+            self.table = nodes.choices.expected(value)
+            self.table *= nodes.gamma
+            self.table += nodes.rewards
+
+    def at(self, index: np.ndarray | slice) -> np.ndarray:
+        """(n, A): the action values of some nodes."""
+        if self.table is not None:
+            return self.table[index]
+        nodes = self.nodes
+        assert nodes.choices.table is not None
+        return nodes.rewards[index] + nodes.gamma * self.value[nodes.choices.table[index]]
+
+    @cached_property
+    def best(self) -> np.ndarray:
+        """(N,): the largest action value of each node."""
+        if self.table is not None:
+            return np.asarray(self.table.max(axis=1))
+        from pharos.kernels import horizon
+
+        result, nodes = np.empty(len(self.value)), self.nodes
+        horizon.lookahead(nodes.choices.table, nodes.rewards, nodes.gamma, self.value, result)
+        return result
 
 
 def most_samples(gap: np.ndarray, variance: np.ndarray, log: float) -> tuple[int, float, float]:
@@ -454,9 +551,9 @@ def stationary_effective_horizon(
         )
     limit = mdp.horizon or math.ceil(1 / (1 - mdp.gamma)) if steps is None else whole_number(steps, "steps", STEPS)
     endless = mdp if mdp.horizon is None else mdp.with_horizon(None)
-    tell = progress or (lambda line: None)
-    nodes = _Nodes(endless, solution, tolerance, tell)
-    floor = 2 * nodes.error
+    tell = progress or str
+    nodes, values, error = _nodes_of(endless, solution, tolerance, tell)
+    floor = 2 * error
     tie = max(1e-9, 1.25 * floor) if tie_tolerance is None else float(tie_tolerance)
     if not tie > floor:
         raise PrecisionError(
@@ -464,7 +561,7 @@ def stationary_effective_horizon(
             "it, or solve with a smaller tolerance"
         )
     slack = max(1e-12, 2 * floor)
-    nodes.compare(tie, slack)
+    nodes.compare([values], tie, slack)
     ahead, _ = look_ahead(nodes, limit, most_actions(mdp), tell=tell)
     conventions = {
         "gamma": mdp.gamma,
@@ -477,127 +574,25 @@ def stationary_effective_horizon(
     return StationaryHorizon(**vars(ahead), conventions=conventions)
 
 
-class _ActionValues:
-    """Action values r + gamma E value(next) of nodes; computed on demand where each action leads to one node."""
+def _nodes_of(
+    mdp: TabularMDP, solution: Solution | None, tolerance: float, tell: Callable[[str], object]
+) -> tuple[NodeHorizon, list[np.ndarray], float]:
+    """(Lookahead values without time, action values (N, A) of the best, worst and uniform play, their error)."""
+    choices = _states_and_the_end(mdp) if mdp.is_deterministic else ExpandedMDP.of(mdp, restart=False).reachable()
+    nodes = NodeHorizon(choices, choices.rewards(mdp), mdp.gamma)
 
-    def __init__(self, nodes: "_Nodes", value: np.ndarray):
-        self.nodes, self.value, self.table = nodes, value, np.empty(0)
-        if nodes.table is None:
-            self.table = nodes.rewards + nodes.gamma * nodes.choices.expected(value)
+    def solution_of(solve: Callable[..., Solution], whose: str) -> Solution:
+        tell(f"values of {whose} play")
+        return solved(
+            solve, mdp, tolerance, progress=lambda sweeps, _: tell(f"sweep {sweeps} of the values of {whose} play")
+        )
 
-    @cached_property
-    def best(self) -> np.ndarray:
-        """(N,): the largest action value of each node."""
-        from pharos.kernels import horizon
-
-        if self.nodes.table is None:
-            return np.asarray(self.table.max(axis=1))
-        result = np.empty(len(self.value))
-        horizon.lookahead(self.nodes.table, self.nodes.rewards, self.nodes.gamma, self.value, result)
-        return result
-
-    def at(self, nodes: np.ndarray) -> np.ndarray:
-        """(n, A): the action values of some nodes."""
-        if self.nodes.table is None:
-            return self.table[nodes]
-        return self.nodes.rewards[nodes] + self.nodes.gamma * self.value[self.nodes.table[nodes]]
-
-
-class _Nodes:
-    """Lookahead values without time, on nodes that can be reached: states, or pairs with the previous action.
-
-    Attributes:
-        rewards, best, worst, explored: (N, A) of choosing an action. error: the largest error of any of them.
-        choices: the MDP written out. table: (N, A), the only node that an action leads to; None where some lead to
-            several.
-    """
-
-    def __init__(self, mdp: TabularMDP, solution: Solution | None, tolerance: float, tell: Callable[[str], None]):
-        self.gamma, self.num_actions = mdp.gamma, mdp.num_actions
-        choices = _states_and_the_end(mdp) if mdp.is_deterministic else ExpandedMDP.of(mdp, restart=False).reachable()
-        self.choices, self.table, self.num_nodes = choices, choices.table, len(choices.underlying)
-        self.starts = np.array(sorted(node for node, _ in choices.starts))
-        self.rewards = choices.rewards(mdp)
-
-        def solution_of(solve: Callable[..., Solution], whose: str) -> Solution:
-            tell(f"values of {whose} play")
-            return solved(
-                solve, mdp, tolerance, progress=lambda sweeps, _: tell(f"sweep {sweeps} of the values of {whose} play")
-            )
-
-        best = solution_of(value_iteration, "optimal") if solution is None else optimal_solution(mdp, solution)
-        worst, explored = solution_of(worst_value, "the worst"), solution_of(uniform_value, "uniform")
-        self.error = mdp.gamma * max(best.error_bound, worst.error_bound, explored.error_bound)
-        self.error += mdp.reward_table.rounding
-        everywhere = np.arange(self.num_nodes)
-        values = [_ActionValues(self, _on_nodes(each, choices, mdp)) for each in (best, worst, explored)]
-        self.best, self.worst, self.explored = (each.at(everywhere) for each in values)
-        self.values = values[-1]
-
-    def compare(self, tie: float, slack: float) -> None:
-        """Begin with Q^1 of uniform play; actions within `tie` of the best are optimal, values within `slack` equal."""
-        self.slack, self.optimal = slack, self.best >= self.best.max(axis=1, keepdims=True) - tie
-        self.spread = ((self.explored - self.worst) * (self.best - self.worst)).max(axis=1)
-
-    def samples(self, log: float) -> tuple[int, float, float] | None:
-        def second(n: np.ndarray, q: np.ndarray) -> np.ndarray:
-            return np.asarray(np.where(self.optimal[n], -math.inf, q).max(axis=1))
-
-        def better(n: np.ndarray) -> np.ndarray | None:
-            q = self.values.at(n)
-            others = second(n, q)
-            if (q.max(axis=1) - others <= self.slack).any():
-                return None
-            return self.optimal[n] & (q > others[:, None] - self.slack)
-
-        nodes = self.closure(better)
-        if nodes is None:
-            return None
-        q = self.values.at(nodes)
-        return most_samples(q.max(axis=1) - second(nodes, q), self.spread[nodes], log)
-
-    def is_greedy_optimal(self) -> bool:
-        def greedy(n: np.ndarray) -> np.ndarray | None:
-            q = self.values.at(n)
-            is_greedy = q >= q.max(axis=1, keepdims=True) - self.slack
-            return None if (is_greedy & ~self.optimal[n]).any() else is_greedy
-
-        return self.closure(greedy) is not None
-
-    def advance(self, spread: bool = True) -> None:
-        self.values = _ActionValues(self, self.values.best)
-        if spread:
-            self.spread = self.gamma**2 * self.successor_max(self.spread)
-
-    def restart_from_rewards(self) -> None:
-        self.values = _ActionValues(self, np.zeros(self.num_nodes))
-
-    def successor_max(self, values: np.ndarray) -> np.ndarray:
-        """(N,): the largest of values (N,) >= 0 over the nodes that some action may lead to."""
-        from pharos.kernels import horizon
-
-        if self.table is None:
-            return np.asarray(self.choices.largest(values).max(axis=1))
-        result = np.empty(self.num_nodes)
-        horizon.largest(self.table, values, result)
-        return result
-
-    def closure(self, actions: Callable[[np.ndarray], np.ndarray | None]) -> np.ndarray | None:
-        """The nodes that can be reached from the start by some actions; None where `actions` returns None.
-
-        actions: from nodes (n,) to (n, A) bool, the actions that are taken there.
-        """
-        is_reached = np.zeros(self.num_nodes, np.bool_)
-        is_reached[self.starts] = True
-        nodes = self.starts
-        while nodes.size:
-            allowed = actions(nodes)
-            if allowed is None:
-                return None
-            next_nodes = self.choices.successors(nodes, allowed)
-            nodes = np.unique(next_nodes[~is_reached[next_nodes]])
-            is_reached[nodes] = True
-        return np.flatnonzero(is_reached)
+    best = solution_of(value_iteration, "optimal") if solution is None else optimal_solution(mdp, solution)
+    solutions = best, solution_of(worst_value, "the worst"), solution_of(uniform_value, "uniform")
+    values = [_ActionValues(nodes, _on_nodes(each, choices, mdp)) for each in solutions]
+    nodes.values = values[2:]
+    error = mdp.gamma * max(each.error_bound for each in solutions) + mdp.reward_table.rounding
+    return nodes, [each.at(np.s_[:]) for each in values], error
 
 
 def _states_and_the_end(mdp: TabularMDP) -> ExpandedMDP:

@@ -17,7 +17,7 @@ import numpy as np
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.interval import fields_of
 from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
-from pharos.mdp import TabularMDP, require_mdp, whole_number
+from pharos.mdp import TabularMDP, drawn_actions, require_mdp, whole_number
 from pharos.system.wording import pluralize
 
 METHODS = ("binomial", "bernstein", "exact")
@@ -71,6 +71,8 @@ def gorp_bound(
 
     [low, high] encloses the probability that a sequence has the best mean of m samples. Of all methods the smallest F
     counts, node by node. The maximum is a fractional knapsack: the largest f first. m is found by bisection, to 1 %.
+    Where some actions are not available, the sequences are those that can be executed, random play takes what is
+    available, and A is the largest number of available actions in a state.
 
     Args:
         horizon: T; None: that of the MDP.
@@ -101,7 +103,7 @@ def gorp_bound(
     _needs_one_outcome("gorp_bound", mdp)
     search = GorpSearch(mdp, steps, names, progress or str)
     ms, failures = (list(each) for each in zip(*map(search.samples, ks), strict=True))
-    log_actions = math.log(mdp.num_actions) if mdp.num_actions > 1 else math.inf
+    log_actions = math.log(search.tree.most_actions) if search.tree.most_actions > 1 else math.inf
     values = [math.inf if m is None else k + math.log(m) / log_actions for k, m in zip(ks, ms, strict=True)]
     return GorpBound(
         min(values),
@@ -156,6 +158,8 @@ def run_gorp(
 ) -> GorpRuns:
     """Run GORP: find a sequence of T actions, one a round, by m random completions of each sequence of k actions.
 
+    Only sequences that can be executed are tried, if some actions are not available in some states.
+
     Ties between means go to the first sequence, in the order of its actions.
 
     Args:
@@ -185,8 +189,10 @@ def run_gorp(
     for run, generator in enumerate(np.random.default_rng(seed).spawn(int(runs))):
         node = start
         for t in range(steps):
-            total = _completions(tree, node, t, sequences, int(m), generator)
-            best = sequences[int(total.reshape(len(sequences), int(m)).mean(axis=1).argmax()), 0]
+            possible = _possible(tree, np.array([node]), t, sequences)
+            tried = sequences if possible is None else sequences[possible[0]]
+            total = _completions(tree, node, t, tried, int(m), generator)
+            best = tried[int(total.reshape(len(tried), int(m)).mean(axis=1).argmax()), 0]
             actions[run, t] = best
             returns[run] += tree.rewards[node, best]
             node = tree.table[node, best]
@@ -204,6 +210,8 @@ def _completions(
     for i in range(tree.steps - t):
         if i < sequences.shape[1]:
             actions = np.repeat(sequences[:, i], m)
+        elif tree.sets is not None:
+            actions = drawn_actions(tree.sets[nodes], generator)
         else:
             actions = generator.integers(tree.num_actions, size=len(nodes))
         total += tree.rewards[nodes, actions]
@@ -211,9 +219,20 @@ def _completions(
     return total
 
 
+def _possible(tree: FiniteHorizonValues, nodes: np.ndarray, t: int, sequences: np.ndarray) -> np.ndarray | None:
+    """(n, L) bool: the sequences of actions (L, k) that can be executed from nodes (n,) at step t; None: all can."""
+    if tree.sets is None:
+        return None
+    assert tree.table is not None
+    at = np.repeat(nodes[:, None], len(sequences), axis=1)
+    possible = np.ones(at.shape, np.bool_)
+    for i in range(min(sequences.shape[1], tree.steps - t)):
+        possible &= tree.sets[at, sequences[:, i]]
+        at = tree.table[at, sequences[:, i]]
+    return possible
+
+
 def _needs_one_outcome(name: str, mdp: TabularMDP) -> None:
-    if mdp.available is not None:
-        raise UndefinedMeasure(f"{name} is defined for MDPs in which every action is available everywhere: {mdp}")
     if not mdp.is_deterministic:
         raise UndefinedMeasure(f"{name} is defined for deterministic MDPs: {mdp} has chance; take the MDP without it")
 
@@ -266,11 +285,28 @@ class GorpSearch:
 
     def _worst_case(self, nodes: np.ndarray, t: int, f: np.ndarray, m: int, k: int) -> np.ndarray:
         """(n,): F_t of nodes, the smallest over all methods."""
-        mean, best, worst = self._returns(nodes, t, k)
-        each = np.repeat(f, mean.shape[1] // f.shape[1], axis=1)
+        returns = self._returns(nodes, t, k)
+        each = np.repeat(f, returns[0].shape[1] // f.shape[1], axis=1)
+        possible = _possible(self.tree, nodes, t, sequences_of(self.tree.num_actions, k))
+        if possible is None:
+            return self._bounded(*returns, each, m, k)
+        # Nodes with the same sequences at once
+        result = np.empty(len(nodes))
+        patterns, group = np.unique(possible, axis=0, return_inverse=True)
+        for i, columns in enumerate(patterns):
+            rows = np.flatnonzero(group.reshape(-1) == i)
+            part = np.ix_(rows, np.flatnonzero(columns))
+            mean, best, worst = (x[part] for x in returns)
+            result[rows] = self._bounded(mean, best, worst, each[part], m, k)
+        return result
+
+    def _bounded(
+        self, mean: np.ndarray, best: np.ndarray, worst: np.ndarray, each: np.ndarray, m: int, k: int
+    ) -> np.ndarray:
+        """(n,): the same by mean, largest and smallest return, and f of the first action, of each sequence (n, L)."""
         is_counted = self.two_valued and m <= MOST_BINOMIAL
         applies = {"binomial": is_counted and k == 1, "exact": is_counted, "bernstein": mean.shape[1] <= MOST_SEQUENCES}
-        least, result = f.min(axis=1), f.max(axis=1)
+        least, result = each.min(axis=1), each.max(axis=1)
         for name in sorted(name for name in self.methods if applies[name]):  # bernstein may spare the others
             todo = result - least > 1e-9
             if not todo.any():

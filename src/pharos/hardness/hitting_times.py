@@ -458,6 +458,8 @@ def factors_of(choices: ExpandedMDP, policy: np.ndarray, inner: np.ndarray) -> F
     row, column = np.repeat(np.arange(first.size), np.diff(rows.indptr)), place[rows.indices]
     data = np.where(row == column, 0.0, rows.data)
     leaving = np.bincount(row, data, first.size)
+    if not _all_leave(row[data > 0], column[data > 0], first.size):
+        return None  # singular, for which the linear algebra prints messages of its own
     inside = column < first.size
     matrix = scipy.sparse.coo_matrix((data[inside], (row[inside], column[inside])), shape=(first.size, first.size))
     try:
@@ -466,6 +468,14 @@ def factors_of(choices: ExpandedMDP, policy: np.ndarray, inner: np.ndarray) -> F
         )
     except RuntimeError:  # singular
         return None
+
+
+def _all_leave(nodes: np.ndarray, successors: np.ndarray, number: int) -> bool:
+    """Whether from each node `number`, which stands for all outside, is reached over edges from nodes to successors."""
+    from scipy.sparse import csgraph
+
+    backward = scipy.sparse.csr_matrix((np.ones(len(nodes)), (successors, nodes)), shape=(number + 1, number + 1))
+    return len(csgraph.breadth_first_order(backward, number, return_predecessors=False)) == number + 1
 
 
 def _numbered_once(is_restart: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,6 @@ from pharos.mdp import (
     mean_of_actions,
     most_actions,
     require_mdp,
-    uniform_choice,
     whole_number,
 )
 from pharos.solvers import TablePolicy
@@ -58,6 +57,7 @@ class FiniteHorizonValues:
         choices: the MDP written out; rewards (N, A); table (N, A) where each choice has one outcome, else None.
         best, worst, explored: (T, N, A) action values; explored_value (T, N), clipped to [worst, best].
         optimal: (T, N, A) bool.
+        sets: (N, A) bool, the available actions; None: all are everywhere. All are where an episode is over.
         first: (N,) bool, the start nodes. num_visitable: states (pairs under sticky actions) that can be visited.
     """
 
@@ -76,9 +76,10 @@ class FiniteHorizonValues:
         self.most_actions = most_actions(mdp)
         self.num_nodes, self.starts, self.table = len(choices.underlying), choices.starts, choices.table
         self.rewards = choices.rewards(mdp)
-        sets = (
-            None if mdp.available is None else uniform_choice(mdp)[np.minimum(choices.underlying, mdp.num_states - 1)]
-        )
+        self.sets, shares = None, None
+        if mdp.available is not None:
+            self.sets = np.append(mdp.available, np.ones((1, mdp.num_actions), np.bool_), axis=0)[choices.underlying]
+            shares = self.sets / self.sets.sum(axis=1, keepdims=True)
         shape = (steps, self.num_nodes, self.num_actions)
         self.best, self.worst, self.explored = (np.empty(shape) for _ in range(3))
         self.explored_value = np.empty(shape[:2])
@@ -89,7 +90,7 @@ class FiniteHorizonValues:
                 self.best[t] = self.backup(self.best[t + 1].max(axis=1))
                 self.worst[t] = self.backup(self.worst[t + 1].min(axis=1))
                 self.explored[t] = self.backup(self.explored_value[t + 1])
-            mean = mean_of_actions(self.explored[t]) if sets is None else (self.explored[t] * sets).sum(axis=1)
+            mean = mean_of_actions(self.explored[t]) if shares is None else (self.explored[t] * shares).sum(axis=1)
             self.explored_value[t] = mean.clip(self.worst[t].min(axis=1), self.best[t].max(axis=1))
         self.optimal = self.best >= self.best.max(axis=2, keepdims=True) - TIE
         self.first = np.zeros(self.num_nodes, np.bool_)
@@ -124,15 +125,6 @@ class FiniteHorizonValues:
     def at_start(self, values: np.ndarray) -> float:
         """The expectation over start nodes."""
         return float(sum(p * values[node] for node, p in self.starts))
-
-    def lookahead(self, values: np.ndarray) -> np.ndarray:
-        """(T, N, A): Q^{k+1}, from Q^k."""
-        result = np.empty(self.best.shape)
-        result[-1] = self.rewards
-        for t in range(self.steps - 1):
-            self.tell(f"lookahead of step {t} of {self.steps}")
-            result[t] = self.backup(values[t + 1].max(axis=1))
-        return result
 
 
 # Returns of an episode ------------------------------------------------------------------------------------------------

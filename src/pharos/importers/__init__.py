@@ -15,6 +15,7 @@ from pharos.importers.gymnasium import (
     minigrid_grids,
     minigrid_recording,
 )
+from pharos.importers.jax_stepping import JaxFunctions, jax_stepping
 from pharos.importers.models import Question, storm, storm_import, storm_recording
 from pharos.importers.one_player import OnePlayer
 from pharos.importers.search import SteppedStates
@@ -22,6 +23,7 @@ from pharos.importers.step_target import StepTarget
 from pharos.importers.stepping import StepRecording, stepping
 
 __all__ = [
+    "JaxFunctions",
     "OnePlayer",
     "Question",
     "Recording",
@@ -31,6 +33,7 @@ __all__ = [
     "environment",
     "gymnasium",
     "gymnasium_outcomes",
+    "jax_stepping",
     "load",
     "matrices",
     "minigrid",

@@ -24,7 +24,7 @@ MOST_DRAWS = 200
 """Draws with several outcomes in one step; more are taken for a rejection that never ends."""
 MOST_OUTCOMES = 3_000
 """Ways in which the draws of one step may come out."""
-HIDDEN = ("pharos/importers/", "/numpy/", "<frozen", "<string>", "/random.py", "/functools.py")
+HIDDEN = ("pharos/importers/", "/numpy/", "site-packages/jax/", "<frozen", "<string>", "/random.py", "/functools.py")
 """Parts of the paths of files that are no code of an environment."""
 
 ONE = Fraction(1)

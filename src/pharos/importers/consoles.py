@@ -133,8 +133,8 @@ def procgen(  # noqa: PLR0913  (an option each)
         all_actions: all 15 actions, in place of the 9 to 13 that BRIDGE takes.
         horizon, noops, raw, max_states, workers, folder, progress: as for `atari`; noops are steps of Procgen.
     Raises:
-        MissingExtra: Procgen is not installed. UnknownName: no such game or mode.
-        StateSpaceTooLarge, ParameterError: as for `atari`.
+        UnknownName: no such game or mode. StateSpaceTooLarge: as for `atari`.
+        ParameterError: Procgen is not installed, and the message says how it is; or as for `atari`.
     Cost: about 1,500 steps of Procgen a second and process.
     Source: BRIDGE (Laidlaw, Russell and Dragan 2023), whose maze_easy_l0_30_fs1 is met state by state.
     """
@@ -357,7 +357,9 @@ COMBINATIONS = (
     *("d", "a", "w", "s", "q", "e"),
 )
 NOTHING = COMBINATIONS.index("none")
-PROCGEN_PARTS = "procgen-mirror==0.10.7 gym==0.26.2 gym-notices gym3==0.3.3 imageio moderngl glfw glcontext cffi"
+PROCGEN_PARTS = (
+    "procgen-mirror==0.10.7 gym==0.26.2 gym-notices gym3==0.3.3 imageio moderngl glfw glcontext cffi pycparser"
+)
 
 
 def _procgen() -> Any:
@@ -366,11 +368,15 @@ def _procgen() -> Any:
         try:
             import procgen as package
         except ImportError as error:
-            raise ParameterError(
-                f"Procgen needs procgen-mirror ({error}); it works with NumPy 2, which its metadata excludes: "
-                f"pip install --no-deps {PROCGEN_PARTS}"
-            ) from None
+            raise _incomplete(error) from None
     return package
+
+
+def _incomplete(error: ImportError) -> ParameterError:
+    return ParameterError(
+        f"Procgen needs procgen-mirror ({error}); it works with NumPy 2, which its metadata excludes: "
+        f"pip install --no-deps {PROCGEN_PARTS}"
+    )
 
 
 @dataclass
@@ -390,9 +396,12 @@ class ProcgenGame:
 
     def __post_init__(self) -> None:
         place = {"start_level": self.level, "num_levels": 1} if self.mode != "exploration" else {}
-        self.env = _procgen().ProcgenGym3Env(
-            num=1, env_name=self.name, distribution_mode=self.mode, rand_seed=0, num_threads=0, **place
-        )
+        try:
+            self.env = _procgen().ProcgenGym3Env(
+                num=1, env_name=self.name, distribution_mode=self.mode, rand_seed=0, num_threads=0, **place
+            )
+        except ImportError as error:  # of what it loads when it begins
+            raise _incomplete(error) from None
         self.actions: tuple[str, ...] = COMBINATIONS[: self.num_actions]
         self._begin = self.save()
 

@@ -2,7 +2,7 @@
 
 import random as python_random
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -12,18 +12,19 @@ from pharos.importers.search import END, SteppedStates
 from pharos.importers.snapshots import chain_of
 from pharos.importers.wrappers import Stepped, reset
 
-if TYPE_CHECKING:
-    from pharos.importers.stepped_environment import SteppedEnvironment
-
 
 class FreshPlay:
     """A new environment with its own generators, played and compared with the states that stepping found.
 
     Args:
         horizon: of the exploration, whose last states were not made.
+    Attributes:
+        tolerance: of rewards, relative where they exceed 1.
     """
 
-    def __init__(self, source: "SteppedEnvironment", states: SteppedStates, horizon: int | None):
+    tolerance = 0.0
+
+    def __init__(self, source: Any, states: SteppedStates, horizon: int | None):
         self.source, self.states, self.horizon = source, states, horizon
         self.rng = np.random.default_rng(0)
         self.tries = Counter[tuple[int, int]]()
@@ -39,7 +40,7 @@ class FreshPlay:
                 env, state = self._start(env, episode)
                 left -= self._episode(env, state)
                 episode += 1
-        self._check_frequencies()
+        self.check_frequencies()
 
     def _made(self) -> Stepped:
         """A new environment; RuleError if its tables are others."""
@@ -68,7 +69,11 @@ class FreshPlay:
             number = self.states.numbers.get(self.source.key_of(env))
             if number is not None and number in self.states.starts:
                 return env, number
-        raise RuleError(
+        raise self.unknown_start()
+
+    def unknown_start(self) -> RuleError:
+        """An error: an episode began in a state that is no start."""
+        return RuleError(
             f"{self.source.name}: a reset of a new environment leads to a state that stepping did not find among its "
             f"starts: the factory makes different environments, or chance comes from outside"
         )
@@ -83,19 +88,21 @@ class FreshPlay:
             self.tries[state, action] += 1
             _, payment, ended = self.source.step(env, self.source.actions[action])
             next_state = END if ended else self.states.numbers.get(self.source.key_of(env))
-            self._check_outcome(state, action, next_state, payment)
+            self.check_outcome(state, action, next_state, payment)
             if next_state is None or next_state == END:
                 return step + 1
             state = next_state
         return SAMPLED_EPISODE
 
-    def _check_outcome(self, state: int, action: int, next_state: int | None, payment: float) -> None:
+    def check_outcome(self, state: int, action: int, next_state: int | None, payment: float) -> None:
+        """RuleError if a step has no such outcome."""
         row = state * self.states.num_actions + action
         start, stop = self.states.offsets[row], self.states.offsets[row + 1]
         is_last = self.horizon is not None and self.states.depths[state] + 1 >= self.horizon
         to = END if next_state is None and is_last else next_state
         for outcome in range(start, stop):
-            if self.states.next_states[outcome] == to and self.states.rewards[outcome] == payment:
+            away = abs(self.states.rewards[outcome] - payment)
+            if self.states.next_states[outcome] == to and away <= self.tolerance * max(1.0, abs(payment)):
                 self.samples.setdefault(row, Counter())[outcome - start] += 1
                 return
         raise RuleError(
@@ -108,7 +115,8 @@ class FreshPlay:
             return "the key, or what is ignored, leaves out something that matters"
         return "its chance comes from elsewhere (time, files, threads, C++), or a copy shares what a step changes"
 
-    def _check_frequencies(self) -> None:
+    def check_frequencies(self) -> None:
+        """RuleError if outcomes came far more or less often than they should."""
         for row, counts in self.samples.items():
             start, stop = self.states.offsets[row], self.states.offsets[row + 1]
             shares = np.array(self.states.probabilities[start:stop])

@@ -59,9 +59,10 @@ def gymnasium(
     """Return the MDP of an environment with a `P` table, such as FrozenLake, Taxi or CliffWalking.
 
     Args:
-        env: a Gymnasium environment, or a table P[s][a] = [(probability, next state, reward, terminated), ...].
-            Wrappers must change nothing of the MDP: time limits, recorders and wrappers of observations pass; any other
-            is stepped beside the environment below it, in every outcome of the table, and refused if they differ.
+        env: a Gymnasium environment, or a table P[s][a] = [(probability, next state, reward, terminated), ...]. An
+            action that the dictionary of a state leaves out, or whose list is empty, is not available there. Wrappers
+            must change nothing of the MDP: time limits, recorders and wrappers of observations pass; any other is
+            stepped beside the environment below it, in every outcome of the table, and refused if they differ.
         gamma, horizon: of the MDP; Gymnasium's time limit is not taken over.
         check: whether an environment is stepped SAMPLED_STEPS times, as a copy where it can be copied, and compared
             with its table: some have chance that is not in it, such as Taxi with `fickle_passenger=True`. Outcomes that
@@ -77,25 +78,27 @@ def gymnasium(
         The probabilities of a row that sum to 1 within 1e-6 are divided by their sum, which error bounds of values
         count (`TabularMDP.residual`).
     Raises:
-        FileFormatError: there is no table, states or actions are missing, probabilities do not sum to 1, the
-            environment does what its table does not say, or its resets start elsewhere.
+        FileFormatError: there is no table, states are missing, a state has no action or an action no state, lists of
+            actions have different lengths, probabilities do not sum to 1, the environment does what its table does not
+            say, or its resets start elsewhere.
         ParameterError: a wrapper changes the MDP, which is named with the way that works; or rewards do not fit.
     """
     inner, rows = _rows(env)
     states = len(rows)
     is_stepped = check and hasattr(inner, "step") and hasattr(inner, "reset")
-    next_states, means, ends, probabilities, residual = _table(env, _with_rewards(env, rows, rewards))
+    sets = np.array([[bool(row) for row in options] for options in rows])
+    next_states, means, ends, probabilities, residual = _table(env, _filled(_with_rewards(env, rows, rewards)))
     _check_wrappers(env, rows, SAMPLED_STEPS if check else 0)
     if is_stepped:
         _compare_with_steps(env, inner, rows)
     if initial is None:
         start = _start(env, inner, states, is_stepped)
         initial = int(start.argmax()) if start.max() == 1 else start / start.sum()
+    setting: dict[str, Any] = {"gamma": gamma, "initial": initial, "horizon": horizon, "available": sets}
     if probabilities is None:
-        mdp = TabularMDP.from_arrays(next_states, means.array, gamma=gamma, initial=initial, horizon=horizon)
+        mdp = TabularMDP.from_arrays(next_states, means.array, **setting)
     else:
-        setting: dict[str, Any] = {"gamma": gamma, "initial": initial, "horizon": horizon, "ends": ends}
-        mdp = TabularMDP.from_matrices(probabilities, means.array, **setting)
+        mdp = TabularMDP.from_matrices(probabilities, means.array, ends=ends, **setting)
     return replace(mdp, residual=residual, reward_table=means, names=_names_of(inner, *means.shape))
 
 
@@ -139,7 +142,7 @@ def gymnasium_outcomes(env: object, *, rewards: OutcomeRewards | None = None) ->
     _, rows = _rows(env)
     _check_rows(env, rows)
     _check_wrappers(env, rows, 0)
-    rows = _with_rewards(env, rows, rewards)
+    rows = _filled(_with_rewards(env, rows, rewards))
     entries = [
         [(-1 if ended else int(next_state), p, float(reward)) for p, next_state, reward, ended in row if p > 0]
         for state in rows
@@ -192,7 +195,7 @@ def _wrong_sum(env: object, actions: int, row: int, total: float) -> FileFormatE
     return FileFormatError(f"{name_of(env)}: the probabilities of P[{s}][{a}] sum to {total:.9g}; expected 1")
 
 
-_TERMINAL = "expected the same actions in each state: a terminal one has [(1.0, {}, 0.0, True)] for each"
+_TERMINAL = "expected one at least: a terminal state has [(1.0, {}, 0.0, True)] for each action"
 
 
 def name_of(env: object) -> str:
@@ -219,25 +222,46 @@ class _Numbered(Protocol):
 
 
 def _listed(name: str, table: _Numbered) -> list[list[list]]:
-    """rows[s][a] of a table; FileFormatError names the first row that is missing."""
-    rows: list[list[list]] = []
+    """rows[s][a] of a table, [] for an action that is not available; FileFormatError names the first row that is wrong.
+
+    A dictionary says by its keys which actions a state has; of a list that is shorter than others nobody knows.
+    """
+    states: list[dict[int, list]] = []
+    lengths: dict[int, int] = {}  # of lists, by state
     for s in range(len(table)):
-        row, actions = _entry(table, s), len(rows[0]) if rows else None
+        row = _entry(table, s)
         if not isinstance(row, _Numbered):
             raise FileFormatError(f"{name}: has no P[{s}] with actions; expected states 0 to {len(table) - 1}")
-        if not len(row):
+        if not isinstance(row, Mapping):
+            lengths[s] = len(row)
+        states.append({})
+        for a in row if isinstance(row, Mapping) else range(len(row)):
+            if isinstance(a, bool) or not isinstance(a, int | np.integer) or a < 0:
+                raise FileFormatError(f"{name}: P[{s}] has the action {capped(a)}; expected numbers from 0 on")
+            if not isinstance(entry := _entry(row, int(a)), Iterable):
+                raise FileFormatError(f"{name}: has no P[{s}][{a}] with outcomes; expected a list of them")
+            states[-1][int(a)] = list(entry)
+        if not any(states[-1].values()):
             raise FileFormatError(f"{name}: P[{s}] has no actions; {_TERMINAL.format(s)}")
-        if len(row) != (actions or len(row)):
-            raise FileFormatError(f"{name}: P[{s}] has {len(row)} actions, P[0] {actions}; {_TERMINAL.format(s)}")
-        rows.append([])
-        for a in range(len(row)):
-            entry = _entry(row, a)
-            if not isinstance(entry, Iterable):
-                raise FileFormatError(f"{name}: has no P[{s}][{a}] with outcomes; expected actions 0 to {len(row) - 1}")
-            rows[-1].append(list(entry))
-    if not rows:
+    if not states:
         raise FileFormatError(f"{name}: its table P has no states")
-    return rows
+    everywhere = {a for actions in states for a, row in actions.items() if row}
+    count = 1 + max(max(actions) for actions in states)
+    for s, length in lengths.items():
+        if length != count:
+            raise FileFormatError(
+                f"{name}: P[{s}] is a list of {length} actions, and there are {count}; expected a list of all, or a "
+                f"dictionary of those that are available"
+            )
+    if len(everywhere) < count:
+        a = next(a for a in itertools.count() if a not in everywhere)
+        raise FileFormatError(f"{name}: has no state with the action {a}; expected actions 0 to {count - 1}")
+    return [[actions.get(a, []) for a in range(count)] for actions in states]
+
+
+def _filled(rows: list[list[list]]) -> list[list[list]]:
+    """Rows in which an action that is not available has the outcomes of the first one that is."""
+    return [[row or next(filter(None, options)) for row in options] for options in rows]
 
 
 def _entry(table: _Numbered, number: int) -> object:
@@ -280,7 +304,8 @@ def _check_rows(env: object, rows: list[list[list]]) -> None:
     """FileFormatError if an outcome is none."""
     for s, options in enumerate(rows):
         for a, row in enumerate(options):
-            _checked(env, s, a, row, len(rows))
+            if row:
+                _checked(env, s, a, row, len(rows))
 
 
 def _with_rewards(env: object, rows: list[list[list]], rewards: OutcomeRewards | None) -> list[list[list]]:
@@ -352,7 +377,7 @@ def _start(env: object, inner: object, states: int, is_stepped: bool) -> np.ndar
     says = "it has no initial_state_distrib" if start is None else f"its {name} says otherwise"
     raise FileFormatError(
         f"{name_of(env)}: its resets start in {listed}, and {says}; give initial=, the states that are equally likely "
-        f"or (S,) probabilities"
+        f"(--initial 0,3) or (S,) probabilities"
     )
 
 
@@ -385,12 +410,13 @@ def _probability_of(counts: np.ndarray, probabilities: np.ndarray) -> float:
 def _compare_with_steps(env: object, inner: object, rows: list[list[list]]) -> None:
     """Step the environment; raise FileFormatError if a transition is not in its table.
 
-    Each state's actions are tried in turn, so that few steps try many of them.
+    Each state's available actions are tried in turn, so that few steps try many of them.
     """
     stepped = _copy(inner)
     probabilities = [[_probabilities(options) for options in row] for row in rows]
     samples: dict[tuple[int, int], Counter] = {}
-    tries = np.zeros((len(rows), len(rows[0])), np.int64)
+    never = np.iinfo(np.int64).max
+    tries = np.array([[0 if row else never for row in options] for options in rows])
     rng = np.random.default_rng(0)
     state = None
     first_state, first_action = first_number(inner, "observation"), first_number(inner, "action")

@@ -97,10 +97,47 @@ def _without_pickle_methods(value: object) -> bool:
     return "_ezpickle_args" in getattr(value, "__dict__", ())
 
 
+class _Template:
+    """A function that is made again with copies of what it holds, such as the environment that a lambda renders."""
+
+    def __init__(self, function: types.FunctionType):
+        self.function = function
+
+
+def _function(template: _Template) -> types.FunctionType:
+    like = template.function
+    cells = tuple(types.CellType() for _ in like.__closure__ or ())
+    made = types.FunctionType(like.__code__, like.__globals__, like.__name__, like.__defaults__, cells)
+    made.__kwdefaults__, made.__qualname__, made.__module__ = like.__kwdefaults__, like.__qualname__, like.__module__
+    return made
+
+
+def _fill_cells(function: types.FunctionType, contents: list[Any]) -> None:
+    for cell, value in zip(function.__closure__ or (), contents, strict=True):
+        cell.cell_contents = value
+
+
+def _holds_environment(value: object) -> bool:
+    """Whether a function was made within an environment that it holds."""
+    if not isinstance(value, types.FunctionType):
+        return False
+    contents = map(_contents, value.__closure__ or ())
+    return any(hasattr(each, "step") and hasattr(each, "reset") and not isinstance(each, type) for each in contents)
+
+
 class _Pickler(pickle.Pickler):
-    """A pickler that keeps the fields of EzPickle's heirs, and arrays that are views as views."""
+    """A pickler that keeps the fields of EzPickle's heirs, arrays that are views, and functions within environments.
+
+    Attributes:
+        template: function -> its stand-in outside of the snapshot.
+    """
+
+    template: Callable[[types.FunctionType], _Template] = _Template
 
     def reducer_override(self, value: Any) -> Any:
+        if _holds_environment(value):
+            contents = [_contents(cell) for cell in value.__closure__]
+            return _function, (self.template(value),), contents, None, None, _fill_cells
         if isinstance(value, np.ndarray) and type(value) is np.ndarray:
             return _reduced_view(value)
         if _without_pickle_methods(value):
@@ -143,6 +180,7 @@ class EnvironmentSnapshots:
         self._places: dict[tuple[int, str], int] = {}
         self._adopted: list[Any] = []
         self._numbers: dict[int, int] = {}
+        self._templates: dict[types.CodeType, _Template] = {}
 
     @contextlib.contextmanager
     def drawing_from(self, branches: DrawTree) -> Iterator[None]:
@@ -159,8 +197,7 @@ class EnvironmentSnapshots:
     def save(self, value: object) -> bytes:
         """A snapshot of an environment, or of a part of it."""
         stored = io.BytesIO()
-        pickler = _Pickler(stored, protocol=5)
-        pickler.persistent_id = self._reference  # type: ignore[method-assign]
+        pickler = self._pickler(stored)
         try:
             pickler.dump(value)
         except RuleError:
@@ -168,6 +205,15 @@ class EnvironmentSnapshots:
         except (pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError) as error:
             raise RuleError(f"keeps what cannot be copied: {self._culprit(value)}{capped(error)}") from None
         return stored.getvalue()
+
+    def _pickler(self, stored: io.BytesIO) -> _Pickler:
+        pickler = _Pickler(stored, protocol=5)
+        pickler.persistent_id, pickler.template = self._reference, self._template  # type: ignore[method-assign]
+        return pickler
+
+    def _template(self, function: types.FunctionType) -> _Template:
+        """Stand-in for the functions of one line of code."""
+        return self._templates.setdefault(function.__code__, _Template(function))
 
     def restore(self, snapshot: bytes) -> Any:
         """A copy of what `save` was given."""
@@ -181,10 +227,8 @@ class EnvironmentSnapshots:
             for name, value in sorted(getattr(each, "__dict__", {}).items()):
                 if name == "env":
                     continue
-                pickler = _Pickler(io.BytesIO(), protocol=5)
-                pickler.persistent_id = self._reference  # type: ignore[method-assign]
                 try:
-                    pickler.dump(value)
+                    self._pickler(io.BytesIO()).dump(value)
                 except Exception:
                     return f"field {name} of {named(each)} ({type(value).__name__}): "
         return ""
@@ -197,7 +241,7 @@ class EnvironmentSnapshots:
         number = self._numbers.get(id(value))
         if number is not None:
             return number
-        if not _is_outside(kind):
+        if not _is_outside(kind) or _holds_environment(value):
             return None
         if isinstance(value, types.ModuleType):
             return ("module", value.__name__)
@@ -496,7 +540,7 @@ def _fields_of(value: object) -> dict[str, Any]:
 
 def _holds_no_state(kind: type) -> bool:
     """Whether objects of a class are no state, or are generators."""
-    functions = (types.ModuleType, types.FunctionType, type)
+    functions = (types.ModuleType, types.FunctionType, type, _Template)
     if issubclass(kind, (*functions, BranchingGenerator, *GENERATORS)):
         return True
     if kind.__module__.split(".")[0] in OUTSIDE:

@@ -13,15 +13,17 @@ import numpy as np
 
 from pharos.errors import FolderLocked, ParameterError, RuleError
 from pharos.importers.folder import BUILDING, check_free, save
+from pharos.importers.jax_stepping import GymnaxEnvironment, PgxEnvironment, jax_source
 from pharos.importers.search import SteppedStates
 from pharos.importers.step_checkpoint import SECONDS, StepCheckpoint
+from pharos.importers.stepped_environment import SteppedEnvironment
 from pharos.importers.stepping import SteppingOptions, SteppingRun, StepRecording
 from pharos.importers.wrappers import Stepped
 from pharos.mdp import TabularMDP
 from pharos.system import sources, storage
 from pharos.system.wording import in_one_line
 
-PREFIX = "gymnasium:"
+JAX = "jax:"
 ENTRY_POINTS = "gymnasium.envs"
 FORMAT = 1
 """Of the files of an unfinished import; raised when states get other keys."""
@@ -84,6 +86,15 @@ class GymnasiumEnvironment:
             raise ParameterError(f"{self.name}: Gymnasium cannot make it: {reason}") from None
 
 
+MAKERS: dict[str, Callable[[str, Mapping[str, Any]], Any]] = {
+    "gymnasium:": GymnasiumEnvironment,
+    "gymnax:": GymnaxEnvironment,
+    "pgx:": PgxEnvironment,
+}
+"""Libraries whose environments are made by an id."""
+JAX_MAKERS = ("gymnax:", "pgx:")
+
+
 def _load_entry_points() -> None:
     """Let packages register their environments that announce them by an entry point, as older Gymnasium did itself."""
     from gymnasium.envs import registration
@@ -103,7 +114,8 @@ class StepTarget:
     """An environment named on the command line, with what is named beside it.
 
     Args:
-        target: gymnasium:ID, module:factory or file.py:factory.
+        target: gymnasium:ID, gymnax:ID, pgx:ID, module:factory or file.py:factory; jax: before these where the
+            factory returns `JaxFunctions`.
         options: of the environment or the factory.
         key, reward: names of functions, see `stepping`. weights: "1,0.5", of a vector of rewards.
     Attributes:
@@ -124,12 +136,20 @@ class StepTarget:
         options = dict(options or {})
         self.words = " ".join([target, *(f"{name}={value}" for name, value in options.items())])
         here = str(Path.cwd())
-        if target.startswith(PREFIX):
-            self.factory: GymnasiumEnvironment | NamedCode = GymnasiumEnvironment(target.removeprefix(PREFIX), options)
-        elif sources.is_reference(target):
-            self.factory = NamedCode(target, here, options)
+        maker = next((prefix for prefix in MAKERS if target.startswith(prefix)), None)
+        reference = target.removeprefix(JAX)
+        self.source_of: Callable[..., Any] = (
+            jax_source if maker in JAX_MAKERS or reference != target else SteppedEnvironment
+        )
+        self.factory: Any
+        if maker is not None:
+            self.factory = MAKERS[maker](target.removeprefix(maker), options)
+        elif sources.is_reference(reference):
+            self.factory = NamedCode(reference, here, options)
         else:
-            raise ParameterError(f"{target!r}: expected gymnasium:ID, module:factory or file.py:factory")
+            raise ParameterError(
+                f"{target!r}: expected gymnasium:ID, gymnax:ID, pgx:ID, module:factory or file.py:factory"
+            )
         if reward is not None and weights:
             raise ParameterError("a reward and weights; expected one of them")
         self.key, self.reward = (None if name is None else NamedCode(name, here) for name in (key, reward))
@@ -166,7 +186,7 @@ class StepTarget:
         building = folder / BUILDING
         building.mkdir(parents=True, exist_ok=True)
         checkpoint = StepCheckpoint(building, self._identity(stepping_options, options.get("horizon")), seconds)
-        run = SteppingRun(self.factory, stepping_options, checkpoint=checkpoint, **options)
+        run = SteppingRun(self.factory, stepping_options, checkpoint=checkpoint, source_of=self.source_of, **options)
         try:
             with storage.lock(building, FolderLocked, "importing"):
                 mdp, recording = run.finish(gamma, progress)
@@ -184,8 +204,7 @@ class StepTarget:
 
     def _identity(self, options: SteppingOptions, horizon: int | None) -> dict[str, Any]:
         """Names, options and versions that decide about the states and their numbers."""
-        import gymnasium
-
+        packages = ["gymnasium", *["jax", "gymnax", "pgx"] * (self.source_of is jax_source)]
         codes = {"factory": self.factory, "key": self.key, "reward": self.reward}
         return {
             "format": FORMAT,
@@ -197,8 +216,15 @@ class StepTarget:
             "reward": self.reward.name if self.reward else list(self.weights),
             "max_outcomes": options.max_outcomes,
             "horizon": horizon,
-            "versions": [platform.python_version(), np.__version__, gymnasium.__version__],
+            "versions": [platform.python_version(), np.__version__, *map(_version, packages)],
         }
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
 
 
 def _numbers(text: str) -> tuple[float, ...]:

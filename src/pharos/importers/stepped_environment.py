@@ -17,16 +17,18 @@ import numpy as np
 from pharos.errors import ParameterError, PharosError, RuleError, UnknownName
 from pharos.importers import side_effects
 from pharos.importers.chance import MOST_OUTCOMES, DrawError, DrawTree, line_of_code, placed
-from pharos.importers.search import Arrival
+from pharos.importers.fresh_play import FreshPlay
+from pharos.importers.search import Arrival, Expansions, ExpansionsHere, SteppedStates
 from pharos.importers.side_effects import SideEffects
 from pharos.importers.snapshots import EnvironmentSnapshots, bare, chain_of, digest_of, field_names, integers_of
 from pharos.importers.step_spaces import SpaceRecorder, listed_actions_of
+from pharos.importers.step_workers import ExpansionsElsewhere
 from pharos.importers.wrappers import Stepped, reset
 from pharos.system.wording import capped
 
 CHECKED_COPIES = 50
-CHECKED_PAIRS = 200
-"""Pairs of different states with one key that are compared: the first 100, and then each tenth."""
+CHECKED_PAIRS = 1_000
+"""Pairs of different states with one key that are compared: the first half, and then each tenth."""
 WALK_STEPS = 20
 """Steps of a walk from each such pair, as long as nothing is drawn."""
 REPEATED = 100
@@ -51,7 +53,7 @@ class SteppingOptions:
         reward: (reward of the environment) -> number, or weights of a vector of rewards.
         actions: in place of those of a discrete action space.
         max_outcomes: in which the draws of one step may come out.
-        copied: fields that are never shared between copies, though they seem constant.
+        copied: fields that are never shared between copies, though they seem constant, nor left out as counters.
     """
 
     seed: int | None = None
@@ -64,7 +66,7 @@ class SteppingOptions:
 
 
 class ConstantChanged(Exception):
-    """A table that all copies shared was changed by a step."""
+    """A table that all copies shared was changed by a step, or a counter that was left out matters."""
 
 
 class SteppedEnvironment:
@@ -148,6 +150,22 @@ class SteppedEnvironment:
         """Hand over no saved states of these keys, which others have."""
         self._sent.update(keys)
 
+    def integers(self, saved: bytes) -> dict[str, int]:
+        """Whole numbers that a state holds, by the names of their fields."""
+        return integers_of(self.snapshots.restore(saved), self.options.ignore)
+
+    def expansions(self, workers: int) -> Expansions:
+        """States that are expanded in this process, or by others."""
+        return ExpansionsHere(self) if workers == 1 else ExpansionsElsewhere(self, workers)
+
+    def compare(self, states: SteppedStates, horizon: int | None) -> None:
+        """RuleError if a new environment, with its own generators, does what the states say to be impossible."""
+        FreshPlay(self, states, horizon).compare()
+
+    def check_rest(self) -> None:
+        """Checks when all states were expanded."""
+        self.check_constants()
+
     def check_constants(self) -> None:
         """Raise ConstantChanged if a table that copies share was changed."""
         name = self.snapshots.changed_constant(self._env)
@@ -190,24 +208,11 @@ class SteppedEnvironment:
             raise RuleError(f"{self.name}: {what} returned {capped(answer)}; expected (observation, reward, ...)")
         observation, payment, ended, *rest = answer
         truncated = len(rest) > 1 and bool(rest[0]) and not self.options.ignore
-        return observation, self._calling(what, lambda: self._paid(payment)), bool(ended) or truncated
-
-    def _paid(self, payment: Any) -> float:
-        """The reward as a number."""
-        own = self.options.reward
-        if callable(own):
-            payment = own(payment)
-        elif own is not None:
-            payment = float(np.dot(np.asarray(payment, float), np.asarray(own, float)))
-        if np.ndim(payment) and np.size(payment) != 1:
-            raise ParameterError(
-                f"{self.name}: pays a vector of {np.size(payment)} rewards; give weights, such as "
-                f"reward=({', '.join(['1.0'] * np.size(payment))}) (--weights 1,...), or a function of it"
-            )
-        number = float(np.asarray(payment).item() if np.ndim(payment) else payment)
-        if not np.isfinite(number):
-            raise RuleError(f"{self.name}: pays {number}; expected a finite number")
-        return number
+        return (
+            observation,
+            self._calling(what, lambda: payment_of(payment, self.options.reward, self.name)),
+            bool(ended) or truncated,
+        )
 
     def _calling(self, what: str, function: Callable[[], Any]) -> Any:
         """Answer of a function of the environment; its errors become one line that names the line of its code."""
@@ -223,7 +228,7 @@ class SteppedEnvironment:
             raise
         except (Exception, SystemExit) as error:
             self.draws.check()
-            reason = placed(f"{type(error).__name__}: {capped(' '.join(str(error).split()))}", _line_of(error))
+            reason = placed(f"{type(error).__name__}: {capped(' '.join(str(error).split()))}", line_of_error(error))
             raise RuleError(f"{self.name}: {what} raised {reason}") from error
 
     def _reset_runs(self, visit: Visit) -> None:
@@ -367,7 +372,7 @@ class SteppedEnvironment:
             for number, action in enumerate(self.actions):
                 one, other = (Counter(self._shares(saved, action)) for saved in (first, second))
                 if one != other:
-                    raise self._refused_merge(f"action {number}", _difference(one, other))
+                    raise self._refused_merge(f"action {number}", difference(one, other))
             rng = python_random.Random(self._num_pairs)
             for _ in range(8 if self._num_pairs <= 5 else 1):
                 self._compare_walk(first, second, [rng.randrange(self.num_actions) for _ in range(WALK_STEPS)])
@@ -385,7 +390,7 @@ class SteppedEnvironment:
                     return
             if steps[0] != steps[1]:
                 names = ", ".join(map(str, actions[:count]))
-                raise self._refused_merge(f"actions {names}", _difference(steps[0], steps[1]))
+                raise self._refused_merge(f"actions {names}", difference(steps[0], steps[1]))
             if ended:
                 return
 
@@ -404,11 +409,28 @@ class SteppedEnvironment:
         return shares
 
 
+def payment_of(payment: Any, own: Payment | None, name: str) -> float:
+    """A reward as a number; `own` is a function of it, or weights of a vector; `name` is for messages."""
+    if callable(own):
+        payment = own(payment)
+    elif own is not None:
+        payment = float(np.dot(np.asarray(payment, float), np.asarray(own, float)))
+    if np.ndim(payment) and np.size(payment) != 1:
+        raise ParameterError(
+            f"{name}: pays a vector of {np.size(payment)} rewards; give weights, such as "
+            f"reward=({', '.join(['1.0'] * np.size(payment))}) (--weights 1,...), or a function of it"
+        )
+    number = float(np.asarray(payment).item() if np.ndim(payment) else payment)
+    if not np.isfinite(number):
+        raise RuleError(f"{name}: pays {number}; expected a finite number")
+    return number
+
+
 def _signature(arrival: Arrival) -> tuple:
     return arrival.probability, arrival.key, arrival.reward
 
 
-def _difference(one: Counter, other: Counter) -> str:
+def difference(one: Counter, other: Counter) -> str:
     """Words on two distributions over (key, reward) that differ."""
     rewards = [sorted({payment for _, payment in each}) for each in (one, other)]
     if rewards[0] != rewards[1]:
@@ -420,7 +442,7 @@ def _difference(one: Counter, other: Counter) -> str:
     return "they lead to different states, or with different probabilities"
 
 
-def _line_of(error: BaseException) -> str:
+def line_of_error(error: BaseException) -> str:
     """The line of the environment's code that raised an error."""
     trace, line = error.__traceback__, ""
     while trace is not None:
@@ -444,7 +466,7 @@ class ClockSearch:
         fields: names -> value at depth 0, those that did so far.
     """
 
-    source: SteppedEnvironment
+    source: Any
     fields: dict[str, int] | None = None
     num_depths: int = 0
     _looks: Counter = field(default_factory=Counter)
@@ -455,7 +477,7 @@ class ClockSearch:
             return
         self._looks[depth] += 1
         self.num_depths = len(self._looks)
-        values = integers_of(self.source.snapshots.restore(saved), self.source.options.ignore)
+        values = self.source.integers(saved)
         if self.fields is None:
             self.fields = {name: value - depth for name, value in values.items()}
         self.fields = {name: at for name, at in self.fields.items() if values.get(name) == at + depth}

@@ -14,10 +14,8 @@ import numpy as np
 from pharos.importers import side_effects
 from pharos.importers.chance import MOST_OUTCOMES
 from pharos.importers.folder import ImportedOutcomes
-from pharos.importers.fresh_play import FreshPlay
-from pharos.importers.search import BreadthFirst, Expansions, ExpansionsHere, SteppedStates, mdp_of
+from pharos.importers.search import BreadthFirst, SteppedStates, mdp_of
 from pharos.importers.step_checkpoint import StepCheckpoint
-from pharos.importers.step_workers import ExpansionsElsewhere
 from pharos.importers.stepped_environment import (
     ClockSearch,
     ConstantChanged,
@@ -128,6 +126,7 @@ class SteppingRun:
         factory, options: of `stepping`. horizon, max_states, check: as there.
         checkpoint: keeps what is finished in a folder; None: nothing is kept.
         workers: processes that expand states; 1: this one does.
+        source_of: makes the source of states of a factory.
     """
 
     factory: Factory
@@ -137,6 +136,7 @@ class SteppingRun:
     check: bool = True
     checkpoint: StepCheckpoint | None = None
     workers: int = 1
+    source_of: Callable[[Any, SteppingOptions], Any] = SteppedEnvironment
 
     def __post_init__(self) -> None:
         if self.horizon is not None:
@@ -149,7 +149,7 @@ class SteppingRun:
     ) -> tuple[TabularMDP, StepRecording]:
         """The MDP and the recording."""
         with side_effects.undone():
-            source = SteppedEnvironment(self.factory, self.options)
+            source = self.source_of(self.factory, self.options)
             try:
                 states, clocks = self._states(source, progress)
             except ConstantChanged as change:
@@ -158,7 +158,7 @@ class SteppingRun:
                 copied = self.options.copied | {str(change)}
                 return replace(self, options=replace(self.options, copied=copied)).finish(gamma, progress)
             if self.check:
-                FreshPlay(source, states, self.horizon).compare()
+                source.compare(states, self.horizon)
         gamma = gamma if gamma is not None else 0.99 if self.horizon is None else 1.0
         mdp, outcomes = mdp_of(states, gamma=gamma, horizon=self.horizon)
         observations, observed = source.observer.stacked(states.observations)
@@ -167,8 +167,8 @@ class SteppingRun:
         return mdp, StepRecording(observations, observed, outcomes, source.action_names, limit, depths, notes)
 
     def _states(
-        self, source: "SteppedEnvironment", progress: Callable[[SteppedStates, float, bool], None] | None
-    ) -> tuple[SteppedStates, "ClockSearch"]:
+        self, source: Any, progress: Callable[[SteppedStates, float, bool], None] | None
+    ) -> tuple[SteppedStates, ClockSearch]:
         clocks = ClockSearch(source)
         search = BreadthFirst(
             source,
@@ -182,15 +182,14 @@ class SteppingRun:
         if self.checkpoint is not None:
             search.checkpoint = self.checkpoint.save
         states, frontier = (self.checkpoint.resume if self.checkpoint else BreadthFirst.begin)(search)
-        pool: Expansions
-        pool = ExpansionsHere(source) if self.workers == 1 else ExpansionsElsewhere(source, self.workers)
+        pool = source.expansions(self.workers)
         try:
             search.run(states, frontier, pool)
         finally:
             pool.close()
             if self.checkpoint is not None:
                 self.checkpoint.write(states)
-        source.check_constants()
+        source.check_rest()
         return states, clocks
 
 

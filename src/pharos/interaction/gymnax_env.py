@@ -45,6 +45,7 @@ class EnvParams:
         observations: (S + 1, ...) what is seen of each state.
         chance: (4,) float32: probabilities that the chosen, the previous, a uniform action is executed; and that the
             chosen one is on the first step.
+        available: (S + 1, A) bool, the actions that exist in each state; all at the end.
     """
 
     max_steps_in_episode: int
@@ -56,6 +57,7 @@ class EnvParams:
     start_cumulative: jax.Array
     observations: jax.Array
     chance: jax.Array
+    available: jax.Array
 
 
 class GymnaxEnv(environment.Environment):
@@ -81,7 +83,10 @@ class GymnaxEnv(environment.Environment):
         reward_noise: float = 0.0,
     ):
         super().__init__()
-        self._reward_noise = reward_noise
+        self._reward_noise, self._has_sets = reward_noise, mdp.available is not None
+        everything = np.ones((mdp.num_states + 1, mdp.num_actions), np.bool_)
+        if mdp.available is not None:
+            everything[:-1] = mdp.available
         self._name, self._num_actions, self._num_states = name, mdp.num_actions, mdp.num_states
         self._space = spaces.Box(low, high, observations.shape[1:], observations.dtype)
         nothing = np.zeros_like(observations[:1])
@@ -100,6 +105,7 @@ class GymnaxEnv(environment.Environment):
             start_cumulative=jnp.asarray(cumulative, jnp.float32),
             observations=jnp.asarray(np.concatenate([observations, nothing])),
             chance=jnp.asarray([*mdp.chance.triple, mdp.chance.first_chosen], jnp.float32),
+            available=jnp.asarray(everything),
         )
 
     def joined_ends(self) -> "JoinedEnds":
@@ -128,10 +134,18 @@ class GymnaxEnv(environment.Environment):
         key_which, key_uniform, key_outcome = jax.random.split(key, 3)
         p_action, p_previous, _, p_first_action = params.chance
         u = jax.random.uniform(key_which)
-        uniform = jax.random.randint(key_uniform, (), 0, self._num_actions)
+        is_first = state.previous == self._num_actions
+        if self._has_sets:
+            mask = params.available[state.index]
+            action = jnp.where(mask[action], action, jnp.argmax(mask))
+            rank = jax.random.randint(key_uniform, (), 0, mask.sum())
+            uniform = jnp.argmax(jnp.cumsum(mask) > rank)
+            is_first |= ~mask[jnp.minimum(state.previous, self._num_actions - 1)]
+        else:
+            uniform = jax.random.randint(key_uniform, (), 0, self._num_actions)
         later = jnp.where(u < p_action, action, jnp.where(u < p_action + p_previous, state.previous, uniform))
         first = jnp.where(u < p_first_action, action, uniform)
-        executed = jnp.where(state.previous == self._num_actions, first, later).astype(jnp.int32)
+        executed = jnp.where(is_first, first, later).astype(jnp.int32)
         outcome = _drawn(params.cumulative[state.index, executed], jax.random.uniform(key_outcome))
         next_index = params.successors[state.index, executed, outcome]
         reward = params.rewards[state.index, executed]
@@ -140,6 +154,8 @@ class GymnaxEnv(environment.Environment):
         after = EnvState(time=state.time + 1, index=next_index, previous=executed)
         is_over = params.ends[next_index]
         info = {"discount": jnp.where(is_over, 0.0, 1.0), "executed": executed}
+        if self._has_sets:
+            info["action_mask"] = params.available[next_index]
         return self.get_obs(after, params), after, reward, is_over, info
 
     def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, EnvState]:
@@ -153,6 +169,10 @@ class GymnaxEnv(environment.Environment):
     def get_obs(self, state: EnvState, params: EnvParams | None = None, key: jax.Array | None = None) -> jax.Array:
         """Observation of a state."""
         return (self._params if params is None else params).observations[state.index]
+
+    def action_mask(self, state: EnvState, params: EnvParams | None = None) -> jax.Array:
+        """(A,) bool, the actions that are available in a state, also in the first one of an episode."""
+        return (self._params if params is None else params).available[state.index]
 
     def is_terminated(self, state: EnvState, params: EnvParams) -> jax.Array:
         """Whether a terminal state was reached."""

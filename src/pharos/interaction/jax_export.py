@@ -7,7 +7,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import MissingExtra, ParameterError
-from pharos.mdp import TabularMDP, require_all_actions
+from pharos.mdp import TabularMDP
 from pharos.observations import observe
 from pharos.state_space import StateSpace
 
@@ -30,7 +30,9 @@ def to_gymnax(
     `step`.
 
     Its tables are in `env.default_params`. What is executed and what follows is drawn as the MDP says: sticky, random
-    and lazy actions, chance of the rules. The mean reward of what is executed is paid.
+    and lazy actions, chance of the rules. The mean reward of what is executed is paid. Where some actions are not
+    available in some states, a choice of one acts as the first available action, as in `GymEnv`;
+    `env.action_mask(state)` and `info["action_mask"]` say which are.
 
     Args:
         source: a built space; or an MDP, with its chance.
@@ -52,7 +54,6 @@ def to_gymnax(
     mdp = source.mdp(gamma=1.0) if isinstance(source, StateSpace) else source
     if not isinstance(mdp, TabularMDP):
         raise ParameterError(f"to_gymnax: found {source!r}; expected a StateSpace or a TabularMDP")
-    require_all_actions(mdp, "to_gymnax")
     space = mdp.space
     env = None if space is None else space.environment
     limit = time_limit or mdp.horizon or (env.max_episode_steps if env is not None else None)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
         drawn_actions,
         filled,
         most_actions,
-        require_all_actions,
         stand_ins,
         uniform_choice,
         with_sets,

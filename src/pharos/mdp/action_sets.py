@@ -110,13 +110,3 @@ def check_choices(probabilities: np.ndarray, sets: np.ndarray | None, states: It
             f"the policy takes action {action} in state {numbers[row]}, where it is not available; expected one of "
             f"{', '.join(map(str, np.flatnonzero(sets[row])))}"
         )
-
-
-def require_all_actions(mdp: "TabularMDP", whose: str) -> None:
-    """ParameterError where some action is not available in some state: `whose` answer would be wrong there."""
-    if mdp.available is not None:
-        states = int((~mdp.available.all(axis=1)).sum())
-        raise ParameterError(
-            f"{whose}: in {states} of {mdp.num_states} states some actions are not available; expected an MDP in which "
-            f"every action is"
-        )

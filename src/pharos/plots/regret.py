@@ -4,6 +4,7 @@ Curves: what the learnt policy loses, and what was lost on the way. Predicted re
 """
 
 import json
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,9 +26,10 @@ from pharos.plots.style import (
     styled,
     thousands,
 )
+from pharos.regret import regret_scale
 from pharos.statistics import bootstrap_interval
 from pharos.system.wording import in_words
-from pharos.training import read_curve, read_record
+from pharos.training import GAIN_TOLERANCE, read_curve, read_record
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,6 +40,9 @@ if TYPE_CHECKING:
 
 # The class of imported MDPs, which has no parameters but its folder
 IMPORTED = "imported"
+# Columns that are drawn: normalised and not, of the policy so far; and summed
+EPISODE_COLUMNS = ("normalized_regret", "expected_regret", "cumulative_realised_regret")
+AVERAGE_COLUMNS = ("normalized_average_regret", "average_regret", "cumulative_average_regret")
 # Two labels up to this long stand beside each other
 WIDE = 60
 
@@ -55,6 +60,8 @@ def regret(
     Left, the normalised expected regret of the policy learnt so far: 0 is optimal, 1 is playing at random (in units of
     return where playing at random is optimal in one of the tasks). Right, the cumulative realised regret of all
     episodes played, exploration included; a dotted line is what playing at random would have cost in as many episodes.
+    If all runs measure the average reward of a step in the long run, both are of the average regret of the policies
+    learnt: left a step, right summed over the steps.
 
     Args:
         folders: of finished runs, on any number of tasks.
@@ -67,24 +74,26 @@ def regret(
         raise ParameterError("no runs to draw; give at least one folder of a finished run")
     groups = _groups(folders)
     left, right = axes if axes is not None else panels(2, 4.6, 3.5)[1]
-    relative = not any(np.isnan(curve["normalized_regret"]).any() for runs in groups.values() for _, curve in runs)
-    column = "normalized_regret" if relative else "expected_regret"
+    curves = [curve for runs in groups.values() for _, curve in runs]
+    average = all("average_regret" in curve for curve in curves)
+    normalized, column, summed = AVERAGE_COLUMNS if average else EPISODE_COLUMNS
+    relative = not any(np.isnan(curve[normalized]).any() for curve in curves)
+    column = normalized if relative else column
     for number, (label, runs) in enumerate(groups.items()):
         color = COLORS[number % len(COLORS)]
-        steps, normalized = _aligned(runs, column)
-        _line(left, steps, normalized, color, label, confidence, resamples)
-        steps, realised = _aligned(runs, "cumulative_realised_regret")
-        _line(right, steps, realised, color, label, confidence, resamples)
-        spread = np.array(
-            [[record["result"]["value_optimal"] - record["result"]["value_uniform"]] for record, _ in runs]
-        )
-        random = (_aligned(runs, "episodes")[1] * spread).mean(axis=0)
+        _line(left, *_aligned(runs, column), color, label, confidence, resamples)
+        steps, losses = _aligned(runs, summed)
+        _line(right, steps, losses, color, label, confidence, resamples)
+        spread = np.array([[_spread(record["result"], average)] for record, _ in runs])
+        random = ((steps if average else _aligned(runs, "episodes")[1]) * spread).mean(axis=0)
         right.plot(steps, random, ":", color=color, linewidth=1.2)
     if relative:
         left.axhline(1, color=INK, linewidth=0.8, linestyle=":")
-    left.set(title="policy learnt so far", xlabel="steps", ylabel=in_words(column))
+    is_infinite = any(np.isinf(curve[column]).any() for curve in curves)  # a total reward of a policy without end
+    title_left = "policy learnt so far" + " (gaps: infinite)" * is_infinite
+    left.set(title=title_left, xlabel="steps", ylabel=in_words(column), xlim=right.get_xlim())
     left.set_ylim(bottom=min(0.0, left.get_ylim()[0]))
-    right.set(title="all episodes played", xlabel="steps", ylabel="cumulative realised regret")
+    right.set(title="all steps" if average else "all episodes played", xlabel="steps", ylabel=in_words(summed))
     for axis in (left, right):
         axis.xaxis.set_major_formatter(thousands)
     right.yaxis.set_major_formatter(thousands)
@@ -102,9 +111,27 @@ def _groups(folders: Sequence[str | os.PathLike]) -> dict[str, list[tuple[dict[s
     for folder in folders:
         record = read_record(folder)
         key = json.dumps({**record["config"], "seed": None}, sort_keys=True)
-        groups.setdefault(key, []).append((record, read_curve(folder)))
+        groups.setdefault(key, []).append((record, _with_averages(read_curve(folder), record["result"])))
     configs = [runs[0][0]["config"] for runs in groups.values()]
     return dict(zip(_labels(configs), groups.values(), strict=True))
+
+
+def _spread(result: dict[str, Any], average: bool) -> float:
+    """Regret of playing at random, of an episode or of a step in the long run; NaN where it is infinite."""
+    if average:
+        return (sum(result["optimal_gain_at_start"].values()) - sum(result["uniform_gain_at_start"].values())) / 2
+    uniform = result["value_uniform"]
+    return math.nan if uniform is None else result["value_optimal"] - uniform
+
+
+def _with_averages(curve: Any, result: dict[str, Any]) -> Any:
+    """A curve with the middle of its average regret, the same normalised, and summed over steps, if it has them."""
+    if "average_regret_lower" not in curve:
+        return curve
+    lost = (curve["average_regret_lower"] + curve["average_regret_upper"]) / 2
+    total = np.concatenate([[0.0], np.cumsum(np.diff(curve["step"]) * lost.to_numpy()[:-1])])
+    columns = (lost / regret_scale(_spread(result, True), 0.0, GAIN_TOLERANCE), lost, total)
+    return curve.assign(**dict(zip(AVERAGE_COLUMNS, columns, strict=True)))
 
 
 def _labels(configs: list[dict[str, Any]]) -> list[str]:

@@ -4,6 +4,7 @@ from pharos.policies.losses import state_losses
 from pharos.policies.models import DeepPolicy, SB3Model, deep_policy
 from pharos.policies.policy import (
     MasksLike,
+    NumberObserver,
     Observer,
     Policy,
     PolicyAnswers,
@@ -21,9 +22,11 @@ from pharos.policies.value import (
     Evaluation,
     ReachedSolution,
     average_regret,
+    endless_value,
     evaluate_policy,
     is_small_table,
     is_walk,
+    policy_gain,
     policy_value,
     table_values,
     walk_values,

@@ -11,6 +11,7 @@ policies that see the last k frames, or remember, are queried in the histories t
 
 import hashlib
 import math
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypedDict, Unpack
@@ -18,7 +19,7 @@ from typing import Any, NamedTuple, TypedDict, Unpack
 import numpy as np
 
 from pharos import solvers
-from pharos.errors import ParameterError
+from pharos.errors import DivergenceError, ParameterError
 from pharos.kernels.stepping import execute_choices
 from pharos.mdp import PolicyTable, Rewards, Table, TabularMDP, drawn_actions, require_mdp
 from pharos.policies.models import SB3Model, check_observation, deep_policy
@@ -286,6 +287,7 @@ class Evaluation:
             an interval that holds the value with a probability of at least 99 % (empirical Bernstein bound).
         states: number of states (or pairs of state and previous action) in which the policy was asked.
         episodes: simulated episodes behind an estimate; 0 where the value is exact.
+        gain: average reward a step in the long run, within proven bounds; None where nobody asked for it.
     """
 
     value: float
@@ -293,6 +295,7 @@ class Evaluation:
     error_bound: float
     states: int
     episodes: int = 0
+    gain: solvers.GainInterval | None = None
 
 
 def policy_value(
@@ -310,33 +313,65 @@ def policy_value(
 ) -> Evaluation:
     """Return the value of a policy from the start: exact where it reaches few states, else estimated with a bound.
 
+    A total reward (gamma 1, no horizon) is -inf if the policy may go on for ever and pays on average; NaN if it goes on
+    for ever and pays nothing on average, though something each time, so that its sum has no limit.
+
     Args:
         observer: gives what the policy sees; called for policies over observations alone.
         return_range: gives the lowest and the highest return of an episode; called where the value is estimated.
         deterministic, masks, max_states, episodes, seed: as for `training.evaluate_agent`.
         reach: (rows at most, steps) -> the rows that every policy of positive probabilities reaches, where more than
             one policy is evaluated: such policies are queried in all of them at once. Changes no value.
+    Raises:
+        ParameterError: it reaches more than `max_states`, and the total reward of an episode has no limits.
     """
     if isinstance(policy, TabularAgent):
         policy = policy.policy_table()
-    answers: QueriedPolicy
-    if isinstance(policy, np.ndarray):
-        if masks is not None:
-            raise ParameterError("masks given for a policy that is a table; expected a model trained under masks")
-        table = policy.argmax(axis=-1) if deterministic and policy.dtype.kind == "f" else policy
-        if mdp.num_states <= max_states:
-            solution = solvers.evaluate_policy(mdp, table)
-            return Evaluation(solution.value_at_start, True, solution.error_bound, mdp.num_states)
-        answers = TableAnswers(table, mdp)
-    else:
-        answers = answers_of(policy, mdp, observer(), deterministic=deterministic, masks=masks)
+    is_total = mdp.gamma == 1.0 and mdp.horizon is None
+    if isinstance(policy, np.ndarray) and masks is None and mdp.num_states <= max_states and not is_total:
+        solution = solvers.evaluate_policy(mdp, _table_of(policy, deterministic))
+        return Evaluation(solution.value_at_start, True, solution.error_bound, mdp.num_states)
+    answers = _answers(policy, mdp, observer, deterministic=deterministic, masks=masks)
     steps, error = steps_that_matter(mdp)
     is_whole = None if reach is None else answers.query_all(lambda: reach(max_states, steps))
     if answers.reach(max_states, steps) if is_whole is None else is_whole:
-        solution = solvers.evaluate_policy(*answers.reached_mdp())
+        part = answers.reached_mdp()
+        try:
+            solution = solvers.evaluate_policy(*part)
+        except DivergenceError:
+            return Evaluation(endless_value(*part), True, 0.0, len(answers.rows))
         return Evaluation(solution.value_at_start, True, solution.error_bound + error, len(answers.rows))
+    if is_total:
+        raise ParameterError(
+            f"the policy reaches more than {max_states:,} states, and a total reward is not estimated from episodes, "
+            f"whose returns have no limits; give a horizon, or gamma < 1"
+        )
     value, width = estimate(answers, return_range(), episodes, np.random.default_rng(seed))
     return Evaluation(value, False, width, len(answers.rows), episodes)
+
+
+def endless_value(mdp: TabularMDP, policy: np.ndarray | str) -> float:
+    """The total reward of a policy that goes on for ever where something is paid, in an MDP whose optimum is finite.
+
+    Returns:
+        -inf if it pays on average; else NaN, as the sums of positive and of negative rewards are both infinite.
+    """
+    return -math.inf if solvers.average_reward(mdp, policy).gain_at_start.upper < 0 else math.nan
+
+
+def _table_of(policy: np.ndarray, deterministic: bool) -> np.ndarray:
+    return np.asarray(policy.argmax(axis=-1)) if deterministic and policy.dtype.kind == "f" else policy
+
+
+def _answers(
+    policy: PolicyLike, mdp: TabularMDP, observer: Callable[[], Observer], **options: Unpack[AnswerOptions]
+) -> QueriedPolicy:
+    """Answers of a table, or of a policy that sees observations."""
+    if not isinstance(policy, np.ndarray):
+        return answers_of(policy, mdp, observer(), **options)
+    if options.get("masks") is not None:
+        raise ParameterError("masks given for a policy that is a table; expected a model trained under masks")
+    return TableAnswers(_table_of(policy, options.get("deterministic", False)), mdp)
 
 
 class ObserverOptions(TypedDict, total=False):
@@ -417,6 +452,13 @@ class AverageRegret(NamedTuple):
     gain: solvers.GainInterval
     optimal: solvers.GainInterval
 
+    @staticmethod
+    def of(gain: solvers.GainInterval, optimal: solvers.GainInterval) -> "AverageRegret":
+        """The regret of a policy by its gain and the optimal one."""
+        room = 2.0**-52 * max(abs(each) for each in (*optimal, *gain))
+        lower, upper = optimal.lower - gain.upper - room, optimal.upper - gain.lower + room
+        return AverageRegret(solvers.GainInterval(max(lower, 0.0), max(upper, 0.0)), gain, optimal)
+
 
 @require_mdp
 def average_regret(
@@ -454,14 +496,36 @@ def average_regret(
             "deterministic": observer_options.get("deterministic", False),
             "masks": observer_options.get("masks"),
         }
-        answers = answers_of(policy, mdp, observer, **limits)
-        answers.reach()
-        own = solvers.average_reward(*answers.reached_mdp(), tolerance=tolerance).gain_at_start
+        gain = policy_gain(policy, mdp, lambda: observer, tolerance=tolerance, **limits)
+        assert gain is not None  # without a limit of states
+        own = gain
     else:
         own = solvers.average_reward(mdp, policy, tolerance=tolerance).gain_at_start
-    room = 2.0**-52 * max(abs(each) for each in (*best, *own))
-    lost = solvers.GainInterval(max(best.lower - own.upper - room, 0.0), max(best.upper - own.lower + room, 0.0))
-    return AverageRegret(lost, own, best)
+    return AverageRegret.of(own, best)
+
+
+def policy_gain(
+    policy: PolicyLike,
+    mdp: TabularMDP,
+    observer: Callable[[], Observer],
+    *,
+    max_states: int | None = None,
+    tolerance: float = 1e-6,
+    **options: Unpack[AnswerOptions],
+) -> solvers.GainInterval | None:
+    """The average reward a step of a policy in the long run, from the start; None if it reaches more than `max_states`.
+
+    Args:
+        observer: gives what the policy sees; called for policies over observations alone.
+        tolerance: the gain is within this of the middle of its bounds.
+        options: `deterministic` and `masks`, as for `training.evaluate_agent`.
+    """
+    if isinstance(policy, TabularAgent):
+        policy = policy.policy_table()
+    answers = _answers(policy, mdp, observer, **options)
+    if not answers.reach(max_states):
+        return None
+    return solvers.average_reward(*answers.reached_mdp(), tolerance=tolerance).gain_at_start
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -566,6 +630,8 @@ def steps_that_matter(mdp: TabularMDP) -> tuple[int, float]:
     """
     if mdp.horizon is not None:
         return mdp.horizon, 0.0
+    if mdp.gamma == 1.0:
+        return sys.maxsize, 0.0
     largest = 2 * max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest)) / (1 - mdp.gamma)
     if largest <= TAIL or mdp.gamma == 0.0:
         return 1, largest * mdp.gamma
@@ -633,8 +699,8 @@ def _copies(mdp: TabularMDP, number: int) -> TabularMDP:
 
 
 def is_walk(mdp: TabularMDP) -> bool:
-    """Whether a deterministic policy always visits the same states: one start, no chance."""
-    is_chosen = mdp.chance.triple[0] == 1.0 and not mdp.laziness
+    """Whether a deterministic policy always visits the same states, so many as matter: one start, no chance."""
+    is_chosen = mdp.chance.triple[0] == 1.0 and not mdp.laziness and (mdp.horizon is not None or mdp.gamma < 1.0)
     return is_chosen and len(mdp.start_states) == 1 and mdp.dynamics.deterministic_table() is not None
 
 

@@ -1,16 +1,8 @@
-"""Predicted regret of an agent behind an observation, before anything is trained: value, interval, order.
+"""Predicted regret of an agent behind an observation, before anything is trained: value, interval, order."""
 
-Published cells, predicted and then run: how wide an interval has to be, and which differences were ordered rightly.
-
-data/cells.csv has a row for each cell of the published runs, with what today's primary predictor says of it;
-benchmarks/prediction_cells.py makes it, and prints how well the predictions agree with the runs.
-"""
-
-import csv
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,106 +10,21 @@ import numpy as np
 from pharos.agents import agent_called, primary_predictors
 from pharos.environments import Environment
 from pharos.errors import ParameterError
+from pharos.prediction.calibration import COMMON, LEVEL, OrderCounts, Published, published
 from pharos.prediction.learners import PrimaryRegret, primary_regret
-from pharos.prediction.pairs import Pairs
 from pharos.system.storage import plain
 
 if TYPE_CHECKING:
     from pharos.training import ChanceSetting
 
 
-FILE = Path(__file__).parent / "data" / "cells.csv"
-BINS = (0.0, 0.05, 0.1, 0.2, 0.4)
-"""Lower ends of the predicted differences that are counted together."""
-LEVEL = 0.8
 TAKEN = {"chance", "sticky", "random", "lazy", "reward_noise", "horizon", "hyperparameters"}  # of TrainingOptions
-
-
-@dataclass(frozen=True, eq=False)
-class Published:
-    """Published cells of one agent: the regret that was predicted, and that of the runs.
-
-    Attributes:
-        classes: (N,) names of the classes of environments, which weigh alike.
-        mdps: (N,) study, instance and chance of each.
-        predicted, observed: (N,) normalised regret of the learnt policies, 0 optimal and 1 uniform play; observed is
-            the mean over evaluations and seeds.
-        states: (N,) numbers of states. steps: (N,) of training.
-    """
-
-    classes: np.ndarray
-    mdps: np.ndarray
-    predicted: np.ndarray
-    observed: np.ndarray
-    states: np.ndarray
-    steps: np.ndarray
-
-    def half_width(self, level: float = LEVEL, but: str | None = None) -> float:
-        """Half of an interval about a prediction that held this share of the cells, each class weighing the same.
-
-        Conformal: the quantile at level (C + 1) / C of the errors |observed - predicted| of C classes, so that a class
-        that is the next one of the same kind is covered with this probability on average.
-
-        Args:
-            but: a class that is left out.
-        Source: Lei et al. (2018), split conformal prediction; Dunn, Wasserman and Ramdas (2023) for groups.
-        """
-        use = self.classes != but
-        errors, classes = np.abs(self.observed - self.predicted)[use], self.classes[use]
-        names, number, counts = np.unique(classes, return_inverse=True, return_counts=True)
-        order = np.argsort(errors, kind="stable")
-        cumulative = np.cumsum((1 / (counts[number] * len(names)))[order])
-        aim = min(1.0, level * (len(names) + 1) / len(names))
-        place = min(int(np.searchsorted(cumulative, aim - 1e-12)), len(errors) - 1)
-        return float(errors[order][place])
-
-    def coverage(self, level: float = LEVEL) -> float:
-        """The share of cells within the interval of the other classes, a mean over classes that are left out."""
-        errors = np.abs(self.observed - self.predicted)
-        names = np.unique(self.classes)
-        return float(np.mean([np.mean(errors[self.classes == name] <= self.half_width(level, name)) for name in names]))
-
-    def ordered(self, difference: float) -> tuple[int, int]:
-        """(ordered rightly, in all) of the pairs of observations of one MDP whose predictions differ about as much.
-
-        Pairs whose regrets differ by less than that of `Pairs` do not count.
-        """
-        number = np.searchsorted(BINS, abs(difference), side="right")
-        pairs = self.pairs
-        apart = np.abs(self.predicted[pairs.first] - self.predicted[pairs.second])
-        same_bin = np.searchsorted(BINS, apart, side="right") == number
-        return int((pairs.right(self.predicted)[same_bin] == 1).sum()), int(same_bin.sum())
-
-    @property
-    def pairs(self) -> Pairs:
-        """Pairs of observations of one MDP whose regrets differ, see `Pairs`."""
-        return Pairs.of(self.observed, self.mdps)
-
-
-@cache
-def published(agent: str) -> Published:
-    """Return the published cells of an agent.
-
-    Raises:
-        ParameterError: there are none.
-    """
-    if agent not in primary_predictors():
-        raise ParameterError(
-            f"agent {agent!r}: no published runs to calibrate on; expected one of {', '.join(primary_predictors())}"
-        )
-    with FILE.open(newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row["agent"] == agent]
-    mdps = [" ".join((row["study"], row["instance"], row["chance"])) for row in rows]
-    numbers = (np.array([float(row[name]) for row in rows]) for name in ("predicted", "observed", "states", "steps"))
-    return Published(np.array([row["environment"] for row in rows]), np.array(mdps), *numbers)
-
-
-NETWORKS_IN_ORDER = (3, 16)
-"""(ordered rightly, in all) of the pairs of a DQN's networks, three widths and depths behind each of ten observations,
-whose regrets differ: benchmarks/prediction_choices.py. What a wider network gains its kernel does not see.
+NETWORKS_IN_ORDER = OrderCounts(pairs=16, right=3, clear_pairs=16, clear_right=3)
+"""Pairs of a DQN's networks, three widths and depths behind each of ten observations, whose regrets differ:
+benchmarks/prediction_choices.py. What a wider network gains its kernel does not see.
 """
 LEAST_RIGHT = 0.75
-"""Share of published pairs of an order below which it is too close to call."""
+"""Share of published pairs below which an order is not called."""
 MOST_STATES = 100_000
 """States beyond which a prediction is refused: its walks evaluate a policy of all states 31 times each."""
 
@@ -161,36 +68,53 @@ class PairOrder:
 
     Attributes:
         easier, harder: labels. difference: of the predicted regrets.
-        right, pairs: of the published pairs whose predictions differ about as much; of networks, of all their pairs.
+        counts: of the published pairs whose predictions differ about as much; of networks, of all their pairs.
         of_networks: whether the cells differ in their networks.
     """
 
     easier: str
     harder: str
     difference: float
-    right: int
-    pairs: int
+    counts: OrderCounts
     of_networks: bool = False
 
     @property
     def is_called(self) -> bool:
-        """Whether published pairs of that difference were ordered rightly often enough."""
-        return self.pairs > 0 and self.difference >= 0.05 and self.right / self.pairs >= LEAST_RIGHT
+        """Whether the easier one had less regret often enough, in all published pairs of that difference."""
+        return self.difference >= 0.05 and self.counts.right >= LEAST_RIGHT * max(self.counts.pairs, 1)
+
+    @property
+    def is_called_if_clear(self) -> bool:
+        """Whether it had less regret often enough in those pairs whose regrets differ by more than 0.05."""
+        return self.counts.clear_right >= LEAST_RIGHT * max(self.counts.clear_pairs, 1)
 
     def __str__(self) -> str:
-        share = f"right in {self.right} of {self.pairs} such pairs"
-        if self.is_called:
-            return f"{self.easier} is easier than {self.harder}: {share}"
+        counts, (easier, harder) = self.counts, (self.easier, self.harder)
         if self.of_networks:
             return (
-                f"{self.easier} or {self.harder}: not to be called, as predictions do not order networks (right in "
-                f"{self.right} of {self.pairs} pairs)"
+                f"{easier} or {harder}: not to be called, as predictions do not order networks (right in "
+                f"{counts.clear_right} of {counts.clear_pairs} pairs)"
             )
-        return f"{self.easier} or {self.harder}: too close to call ({share})"
+        if self.is_called:
+            return (
+                f"{easier} is easier than {harder}: so in {counts.right} of {counts.pairs} such pairs, by more than "
+                f"0.05 in {counts.clear_right}"
+            )
+        ties = f"{counts.pairs - counts.clear_pairs} of {counts.pairs} such pairs do not"
+        if self.is_called_if_clear:
+            return (
+                f"{easier} is easier than {harder} if their regrets differ by more than 0.05: so in "
+                f"{counts.clear_right} of {counts.clear_pairs} that did; {ties}"
+            )
+        return (
+            f"{easier} or {harder}: too close to call; {ties} differ by more than 0.05, and {easier} was easier in "
+            f"{counts.clear_right} of {counts.clear_pairs} that did"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The attributes, whether the order is called, and its text, JSON-able."""
-        return {**vars(self), "called": self.is_called, "text": str(self)}
+        entry = {name: value for name, value in vars(self).items() if name != "counts"}
+        return {**entry, **vars(self.counts), "called": self.is_called, "text": str(self)}
 
 
 @dataclass(frozen=True)
@@ -230,7 +154,7 @@ class Prediction:
             difference, (easier, harder) = cell.value - easiest.value, self._names(easiest, cell)
             of_networks = easiest.network != cell.network and easiest.observation == cell.observation
             counts = NETWORKS_IN_ORDER if of_networks else calibration.ordered(difference)
-            orders.append(PairOrder(easier, harder, difference, *counts, of_networks))
+            orders.append(PairOrder(easier, harder, difference, counts, of_networks))
         return orders
 
     def _names(self, first: PredictedRegret, second: PredictedRegret) -> tuple[str, str]:
@@ -264,6 +188,7 @@ def predict(
     networks: "str | Callable[..., Any] | Iterable[Any] | None" = None,
     steps: int = 30_000,
     landmarks: int | None = None,
+    common: bool = False,
     progress: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Prediction:
@@ -282,6 +207,7 @@ def predict(
             returns a torch.nn.Module; several: each with each observation. None: the agent's own.
         steps: of training.
         landmarks: as for `representation`.
+        common: with the hyperparameters of the published cells, in the place of those of the class.
         progress: called with what is being done.
         options: sticky, random, lazy, reward_noise, horizon and hyperparameters, as for `pharos.train`; and parameters
             of the environment.
@@ -300,7 +226,8 @@ def predict(
     training = TrainingOptions(**{name: value for name, value in options.items() if name in TAKEN})
     parameters = {name: value for name, value in options.items() if name not in TAKEN}
     env, chance = Task.of(environment, parameters).env, training.chance
-    width, cells, states, overrides = calibration.half_width(), [], 0, dict(training.hyperparameters or {})
+    overrides = {**(COMMON[agent] if common else {}), **(training.hyperparameters or {})}
+    width, cells, states, spread = calibration.half_width(), [], 0, math.nan
     # A cell for each observation and network
     for name, view in _observations(observations):
         task = Task.of(env, chance=chance, observation=name, observation_options=view, horizon=training.horizon)
@@ -315,11 +242,12 @@ def predict(
             regret = primary_regret(config, task, network, landmarks)
             low, high = max(0.0, regret.value - width), regret.value + width
             cells.append(PredictedRegret(observation=title, low=low, high=high, **vars(regret)))
+        spread = task.reference.spread() if math.isnan(spread) else spread
     if not cells:
         raise ParameterError("no observation to predict for; give at least one, such as 'vector'")
     return Prediction(
         environment=str(env),
-        chance=str(chance) if chance else "of the world" if env.has_chance else "plain",
+        chance=str(chance),
         agent=agent,
         steps=steps,
         states=states,
@@ -329,7 +257,7 @@ def predict(
         coverage=calibration.coverage(),
         published_cells=len(calibration.predicted),
         published_classes=len(set(calibration.classes)),
-        warnings=tuple(_warnings(calibration, states, steps, chance)),
+        warnings=(*_warnings(calibration, states, steps, spread, chance), *_other_hyperparameters(agent, settings)),
         hyperparameters=settings,
     )
 
@@ -404,15 +332,29 @@ def _check_steps(config: Mapping[str, Any]) -> None:
         )
 
 
-def _warnings(calibration: Published, states: int, steps: int, chance: "ChanceSetting") -> Iterable[str]:
+def _warnings(calibration: Published, states: int, steps: int, spread: float, chance: "ChanceSetting") -> Iterable[str]:
     """Warnings that the instance lies outside of the published cells."""
-    for what, number, tested in (("states", states, calibration.states), ("steps", steps, calibration.steps)):
-        low, high = int(tested.min()), int(tested.max())
+    for what, number, tested in (
+        ("states", states, calibration.states),
+        ("steps", steps, calibration.steps),
+        ("is V* less the value of uniform play", spread, calibration.spreads),
+    ):
+        low, high = float(tested.min()), float(tested.max())
         if not low <= number <= high:
-            tested_ones = f"only {low:,} {what} were tested" if low == high else f"tested were {low:,} to {high:,}"
-            yield f"{number:,} {what}: {tested_ones}, so the interval is not calibrated here"
+            words = f"only {low:,.6g} was tested" if low == high else f"tested were {low:,.6g} to {high:,.6g}"
+            yield f"{number:,.6g} {what}: {words}, so the interval is not calibrated here"
     untested = [name for name in ("sticky", "lazy", "reward_noise") if getattr(chance, name)]
     if chance.random > 0.1:
         untested.append("random above 0.1")
     if untested:
         yield f"{', '.join(untested)}: not among the tested cells, so the interval is not calibrated here"
+
+
+def _other_hyperparameters(agent: str, settings: Mapping[str, Any]) -> Iterable[str]:
+    """A line if hyperparameters are not those of the published cells."""
+    other = [name for name, value in COMMON[agent].items() if settings.get(name) != value]
+    if other:
+        yield (
+            f"{', '.join(other)}: not as in the published cells, for which the interval is calibrated; "
+            "--hyperparameters common (in Python: common=True) predicts an agent with theirs"
+        )

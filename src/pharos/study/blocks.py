@@ -96,10 +96,8 @@ class Run:
 
     @property
     def chance_in_words(self) -> str:
-        """The kind of chance in words: also "of the world", where the rules have chance."""
-        if not self.configuration.task(trust=True).env.has_chance:
-            return self.chance
-        return f"of the world and {self.chance}" if self.configuration.chance else "of the world"
+        """The kind of chance as cells name it, and "(and of the world)" if the rules have chance."""
+        return self.chance + " (and of the world)" * self.configuration.task(trust=True).env.has_chance
 
     @property
     def kind(self) -> tuple[str, str, str, str]:

@@ -268,14 +268,15 @@ def _against(
     if not {*both} <= {*wide.columns} or not len(wide := wide[list(both)].dropna().reset_index()):
         return None
     names, chances = list(dict.fromkeys(wide["environment"])), wide["chance"].str.split().str[0]
-    figure, (axis,) = panels(1, 4.6, 4.0)
+    figure, (axis,) = panels(1, 4.2, 3.7)
     for (environment, chance), part in wide.groupby(["environment", chances]):
         color, marker = class_color(environment, names), CHANCE_MARKERS.get(chance, "D")
         axis.scatter(part[both[0]], part[both[1]], s=32, color=color, marker=marker, alpha=0.85, lw=0)
     for name in names:
         axis.scatter([], [], color=class_color(name, names), label=in_words(name))
-    for chance in dict.fromkeys(chances):
-        axis.scatter([], [], color=DIAGONAL, marker=CHANCE_MARKERS.get(chance, "D"), label=chance)
+    for chance in dict.fromkeys(chances) if chances.nunique() > 1 else ():
+        words = "no added noise" if chance == "plain" else in_words(chance)
+        axis.scatter([], [], color=DIAGONAL, marker=CHANCE_MARKERS.get(chance, "D"), label=words)
     axis.set(xlabel=words[0], ylabel=words[1])
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure

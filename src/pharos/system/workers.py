@@ -228,7 +228,7 @@ def without_main(*definitions: object) -> Iterator[None]:
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         sys.exit(NO_GUARD)
-    if any(getattr(getattr(each, "func", each), "__module__", None) == "__main__" for each in definitions):
+    if is_in_main(*definitions):
         yield
         return
     main = vars(sys.modules["__main__"])
@@ -239,6 +239,11 @@ def without_main(*definitions: object) -> Iterator[None]:
         yield
     finally:
         main.update(hidden)
+
+
+def is_in_main(*definitions: object) -> bool:
+    """Whether one of the classes and functions stands in the user's script."""
+    return any(getattr(getattr(each, "func", each), "__module__", None) == "__main__" for each in definitions)
 
 
 def check_guard(exit_code: int | None) -> None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
         generated_curve,
         uniform_policy,
     )
-    from pharos.training.curve import Curve, Evaluation, RegretCurve, evaluate_agent
+    from pharos.training.curve import GAIN_TOLERANCE, Curve, Evaluation, RegretCurve, evaluate_agent
     from pharos.training.execution import (
         ATTEMPTS,
         Execution,

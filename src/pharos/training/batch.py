@@ -17,7 +17,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pharos.agents import Learner, agent_called, is_known
+import numpy as np
+
+from pharos.agents import agent_called, is_known
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
 from pharos.policies import PolicyLike
 from pharos.system import compiling
@@ -27,11 +29,15 @@ from pharos.system.wording import in_one_line
 from pharos.training import functions  # noqa: F401  (who trains functions)
 from pharos.training import results as _results
 from pharos.training.curve import Evaluation, joint_values
+from pharos.training.evaluators import Evaluators, evaluates_apart
 from pharos.training.prepared import FailedRun, PreparedRun
 from pharos.training.results import Checkpoint, TrainingResult, clear_run, finished_result
 from pharos.training.schedule import lanes
 from pharos.training.task import RunConfig
 
+Values = dict[int, Evaluation | PharosError]
+Counts = tuple[int, np.ndarray, np.ndarray]
+"""Steps of each run, and finished episodes and their returns by run."""
 Tell = Callable[[tuple[Any, ...]], object]
 """tell(("rows", steps so far of the runs that are trained now, {place: row})), tell(("end", place, result)), or
 tell(("halve", places, why they cannot be trained together))."""
@@ -153,7 +159,9 @@ def _is_foreign(config: RunConfig, runs: Sequence[PreparedRun]) -> bool:
 class Program:
     """Runs under one loop: trained, evaluated, resumed, and brought into their folders; arguments as `train_group`."""
 
-    learner: Learner  # from when the runs begin; gone where they failed
+    learner: Any  # a Learner, from when the runs begin; gone where they failed
+    evaluators: Evaluators | None = None  # where policies are evaluated apart
+    pending: Counts | None = None  # of the policies that are evaluated apart
 
     def __init__(
         self, runs: list[PreparedRun], checkpoints: Path | None, tell: Tell, *, raises: bool, tensorboard: bool
@@ -193,6 +201,9 @@ class Program:
             return
         logs = first.folder / "tensorboard" if self.tensorboard and first.folder is not None else None
         self.learner = agent_called(self.config.agent).learner(self.runs, first.tasks.device, logs)
+        if hasattr(self.learner, "set_parameters") and evaluates_apart(first.tasks.device, self.runs):
+            self.evaluators = Evaluators(self.runs)
+            self.held.enter_context(self.evaluators.workers)
         checkpoint = self._checkpoint()
         if checkpoint is not None:
             entries, spent = checkpoint.restore(self.learner) or ([], 0.0)
@@ -266,48 +277,80 @@ class Program:
     def _learn(self, checkpoint: Checkpoint | None, began: float) -> None:
         """Train from the last row of the curves on, with an evaluation at each point."""
         steps, interval = self.config.steps, self.config.evaluation_interval
-        count = sum(run.place is not None for run in self.runs)
         if not any(run.curve.rows for run in self.runs):
             self._evaluate(0)
         # Steps of the evaluations to come, after those of a checkpoint
-        start = max(run.curve.rows[-1]["step"] for run in self.runs if run.curve.rows)
+        start = max((run.curve.rows[-1]["step"] for run in self.runs if run.curve.rows), default=0)
         points = [point for point in [*range(interval, steps, interval), steps] if point > start]
 
         def save(step: int) -> None:
             if checkpoint is None or step == steps:
                 return
-            curves: list[Any] = [
-                {"rows": run.curve.rows, "error": run.error and in_one_line(run.error)} for run in self.runs
-            ]
-            entries = curves[0]["rows"] if self.is_alone else curves
-            checkpoint.save(self.learner, entries, time.perf_counter() - began)
+            checkpoint.save(self.learner, self._curves, time.perf_counter() - began)
 
         def at_point(step: int) -> Mapping[str, Any] | None:
             rows = self._evaluate(step)
             if not self.is_alone:
                 save(step)
-            places = {place: row for i, row in rows.items() if (place := self.runs[i].place) is not None}
-            self.tell(("rows", step * count, places))
+            if self.evaluators is None:
+                self._tell(step, rows)
             if self.is_alone:
                 save(step)
             return rows.get(0)
 
         if points:
             self.learner.learn(points, at_point)
+        self._await_values()
+
+    def _curves(self) -> list[Any]:
+        """The curves so far, as a checkpoint has them."""
+        self._await_values()
+        if self.is_alone:
+            return self.runs[0].curve.rows
+        return [{"rows": run.curve.rows, "error": run.error and in_one_line(run.error)} for run in self.runs]
+
+    def _tell(self, step: int, rows: Mapping[int, Mapping[str, Any]]) -> None:
+        places = {place: row for i, row in rows.items() if (place := self.runs[i].place) is not None}
+        self.tell(("rows", step * sum(run.place is not None for run in self.runs), places))
 
     def _evaluate(self, step: int) -> dict[int, dict[str, Any]]:
-        """Evaluate the policies: a row for each run that has not failed, by its place in the group."""
-        rows: dict[int, dict[str, Any]] = {}
+        """Evaluate the policies, or let them be evaluated: rows by place in the group, as far as they are there."""
+        counts = step, np.array(self.learner.episodes), np.array(self.learner.returns)
+        if self.evaluators is not None:
+            self._await_values()
+            self.evaluators.begin(self.learner)
+            self.pending = counts
+            return {}
         policies: list[PolicyLike | Evaluation] = [self.learner.policy(i) for i in range(len(self.runs))]
-        values = {i: policy for i, policy in enumerate(policies) if isinstance(policy, Evaluation)}
+        values: Values = {i: policy for i, policy in enumerate(policies) if isinstance(policy, Evaluation)}
         if not self.is_alone and not values:
-            values = joint_values(self.learner, self.runs)
-        episodes, returns = self.learner.episodes, self.learner.returns
+            values |= joint_values(self.learner, self.runs)
+        return self._add(counts, values, policies)
+
+    def _await_values(self) -> None:
+        """Add the rows of the policies that are being evaluated apart, and tell them."""
+        if self.evaluators is None or self.pending is None:
+            return
+        counts, self.pending = self.pending, None
+        rows = self._add(counts, self.evaluators.values())
+        if counts[0]:
+            self._tell(counts[0], rows)
+
+    def _add(
+        self, counts: Counts, values: Values, policies: Sequence[PolicyLike | Evaluation] = ()
+    ) -> dict[int, dict[str, Any]]:
+        """Add a row to the curve of each run that has not failed; return them by its place in the group."""
+        rows: dict[int, dict[str, Any]] = {}
+        step, episodes, returns = counts
         for i, run in enumerate(self.runs):
             if run.error is not None:
                 continue
             try:
-                rows[i] = run.curve.add(step, int(episodes[i]), float(returns[i]), policies[i], values.get(i))
+                value = values.get(i)
+                if isinstance(value, PharosError):
+                    raise value
+                policy = policies[i] if policies else None
+                rows[i] = run.curve.add(step, int(episodes[i]), float(returns[i]), policy, value)
             except Exception as error:
                 run.fail(error)
         if all(run.error is not None for run in self.runs):
@@ -334,7 +377,7 @@ class Program:
                 self.learner.publish(i, folder)
                 _results.write_curve(folder, curve)
                 run.write("finished", seconds=share, **entries, result=result)
-            rows = [{name: row[name] for name in _results.COLUMNS} for row in curve]
+            rows = [{name: row[name] for name in _results.ALL_COLUMNS if name in row} for row in curve]
             policy = self.learner.policy(i)
             learnt = None if isinstance(policy, Evaluation) else policy
             end = TrainingResult(config, result, rows, learnt, folder, share, notes)

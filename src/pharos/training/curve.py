@@ -7,7 +7,7 @@ import math
 import os
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,17 +15,20 @@ import numpy as np
 from pharos.agents import Learner, agent_called
 from pharos.errors import PharosError
 from pharos.policies import (
+    AverageRegret,
     Evaluation,
     MasksLike,
     PolicyAnswers,
     PolicyLike,
     is_small_table,
     is_walk,
+    policy_gain,
     policy_value,
     table_values,
     walk_values,
 )
-from pharos.regret import ReferenceValues, cumulative_expected_regret, regret
+from pharos.regret import ReferenceValues, cumulative_expected_regret, regret, regret_scale
+from pharos.solvers import GainInterval
 from pharos.training import results as _results
 from pharos.training.task import Task
 
@@ -64,6 +67,9 @@ def evaluate_agent(
         again: whether more policies of the task will be evaluated: what they share is remembered. Changes no value.
             Policies of vectors under chance are then asked in blocks about all states that any policy reaches, where
             these are few enough, else about those that they reach, step by step.
+    Returns:
+        Its `Evaluation`; with the `gain` if the objective of the task is the average reward: if the policy reaches more
+        than `max_states`, between those of the worst and the best policy.
     Raises:
         ParameterError: the agent is none of these, its answers are no probabilities, or it was trained on other
             observations, behind a VecNormalize that is not with it, or under masks that are not given.
@@ -71,32 +77,36 @@ def evaluate_agent(
     Source: exact policy evaluation, Puterman (1994), section 6.1; reached states: a closed class of an MDP has the same
         values alone; Maurer and Pontil (2009), theorem 4.
     """
-    return policy_value(
+    limits: dict[str, Any] = {"deterministic": deterministic, "masks": masks, "max_states": max_states}
+    value = policy_value(
         agent,
         task.mdp,
         lambda: task.observer,
         lambda: task.return_range,
-        deterministic=deterministic,
-        masks=masks,
-        max_states=max_states,
         episodes=episodes,
         seed=seed,
         reach=task.reach if again else None,
+        **limits,
     )
+    if task.objective != "average":
+        return value
+    gain = policy_gain(agent, task.mdp, lambda: task.observer, **limits)
+    return replace(value, gain=gain or GainInterval(task.gains["worst"].lower, task.gains["optimal"].upper))
 
 
 def joint_values(batch: Learner, runs: "Sequence[PreparedRun]") -> dict[int, Evaluation]:
     """Values of policies by place in the batch, where computing them at once costs less; others are left out.
 
     These are policies of DQN where nothing is random, and of runs that share a task of few states and see one frame.
+    Where gains are measured, too, each policy is evaluated alone.
     """
-    walks: list[int] = []
-    if hasattr(batch, "best_actions"):
-        walks = [i for i, each in enumerate(runs) if each.error is None and _walks(each)]
+    joint = [i for i, each in enumerate(runs) if each.error is None and each.task.objective != "average"]
+    walks = [i for i in joint if _walks(runs[i])] if hasattr(batch, "best_actions") else []
     values = _values_of_walks(batch, runs, walks)
     tasks = defaultdict(list)
-    for i, run in enumerate(runs):
-        if run.error is None and i not in values and is_small_table(run.task.mdp) and _frames(run) == 1:
+    for i in joint:
+        run = runs[i]
+        if i not in values and is_small_table(run.task.mdp) and _frames(run) == 1:
             tasks[id(run.task)].append(i)
     for places in tasks.values():
         if len(places) > 1:
@@ -154,6 +164,10 @@ def _values_of_tables(batch: Learner, task: Task, places: Sequence[int]) -> dict
 # Curves ---------------------------------------------------------------------------------------------------------------
 
 
+GAIN, AVERAGE_REGRET = tuple(_results.AVERAGE_COLUMNS)[:2], tuple(_results.AVERAGE_COLUMNS)[2:]
+GAIN_TOLERANCE = 1e-6  # half the width of a gain's interval, at most
+
+
 @dataclass
 class Curve:
     """Learning curve of a run: a row for each evaluation so far, with the regret of the episodes between them.
@@ -196,7 +210,9 @@ class Curve:
             "value": evaluation.value,
             "expected_regret": regret(evaluation.value, reference),
             "cumulative_expected_regret": (
-                last["cumulative_expected_regret"] + finished * last["expected_regret"] if last else 0.0
+                last["cumulative_expected_regret"] + (finished * last["expected_regret"] if finished else 0.0)
+                if last
+                else 0.0
             ),
             "normalized_regret": regret(evaluation.value, reference, normalized_by="uniform"),
             "mean_return": mean,
@@ -206,6 +222,9 @@ class Curve:
             "error_bound": evaluation.error_bound,
             "returns": returns,
         }
+        if evaluation.gain is not None:
+            lost = AverageRegret.of(evaluation.gain, self.task.gains["optimal"]).regret
+            row |= dict(zip(_results.AVERAGE_COLUMNS, (*evaluation.gain, *lost), strict=True))
         self.rows.append(row)
         self.table = agent if isinstance(agent, np.ndarray) else None
         self._evaluation = evaluation if isinstance(agent, np.ndarray) else None
@@ -231,7 +250,27 @@ class Curve:
             "episodes": last["episodes"],
             "exact": all(row["exact"] for row in self.rows),
             "conventions": self.task.conventions,
+            **self._average_result(),
             **counted,
+        }
+
+    def _average_result(self) -> dict[str, Any]:
+        """Average reward and regret a step in the long run, if the run measures them."""
+        if self.task.objective != "average":
+            return {}
+        gains = self.task.gains
+        gain, lost = ([self.rows[-1][name] for name in names] for names in (GAIN, AVERAGE_REGRET))
+        # Between two evaluations every step counts with the policy of the earlier one
+        lengths = np.diff([row["step"] for row in self.rows])
+        total = [float(lengths @ [row[name] for row in self.rows[:-1]]) for name in AVERAGE_REGRET]
+        steps = self.rows[-1]["step"]
+        scale = regret_scale(sum(gains["optimal"]) / 2, sum(gains["uniform"]) / 2, GAIN_TOLERANCE)
+        return {
+            "gain_at_start": GainInterval(*gain)._asdict(),
+            "average_regret": GainInterval(*lost)._asdict(),
+            "cumulative_average_regret": GainInterval(*total)._asdict(),
+            "normalized_average_regret": sum(total) / 2 / steps / scale if steps else math.nan,
+            **{f"{name}_gain_at_start": each._asdict() for name, each in gains.items()},
         }
 
 

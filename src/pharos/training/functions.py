@@ -5,7 +5,7 @@ seed alone.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 from pharos.agents import COMPILED, GENERATOR, generator_of, register_form
 from pharos.errors import ParameterError
 from pharos.policies import PolicyLike
+from pharos.solvers import GainInterval
 from pharos.training.budget import PolicyRecorder, generate, uniform_policy
 from pharos.training.curve import Evaluation, evaluate_agent
 from pharos.training.jax_agents import compiled_curves
@@ -86,7 +87,7 @@ class CompiledLearner:
         )
         for row, point in enumerate(points, start=1):
             rows = [curve.rows[row] for curve in curves]
-            self.values = [Evaluation(each["value"], each["exact"], each["error_bound"], 0) for each in rows]
+            self.values = [_evaluation(row) for row in rows]
             at_point(point)
 
     def policy(self, i: int) -> Evaluation:
@@ -94,6 +95,12 @@ class CompiledLearner:
 
     def publish(self, i: int, folder: Path) -> None:
         """Write nothing: what was learnt has a form of its own."""
+
+
+def _evaluation(row: Mapping[str, Any]) -> Evaluation:
+    """The value, and the gain if it was measured, in a row of a curve."""
+    gain = GainInterval(row["gain_lower"], row["gain_upper"]) if "gain_lower" in row else None
+    return Evaluation(row["value"], row["exact"], row["error_bound"], 0, gain=gain)
 
 
 register_form(GENERATOR, GeneratorLearner)

@@ -20,6 +20,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.interaction import to_gymnax
+from pharos.mdp import uniform_choice
 from pharos.policies import PolicyAnswers
 from pharos.training.curve import Curve, evaluate_agent
 from pharos.training.task import Task
@@ -83,7 +84,7 @@ def compiled_curves(
     ask = jax.jit(jax.vmap(functions[-1], (0, None)))
     everything, answers = env.default_params.observations[:-1], PolicyAnswers(functions[-1], task.mdp, task.observer)
     places = [point * number // evaluations - 1 for point in range(evaluations + 1)]
-    uniform, curves = np.full((count, env.num_actions), 1 / env.num_actions), []
+    uniform, curves = uniform_choice(task.mdp), []
     for i in range(len(seeds)):
         tables = np.asarray(ask(jax.tree.map(lambda leaf, i=i: leaf[i], snapshots), everything))
         policies = {place: answers.checked(tables[place], count) for place in sorted(set(places) - {-1})}

@@ -13,13 +13,17 @@ ENGINES = ("sb3", "batched")
 """Engines that train networks: Stable-Baselines3, one run in a process; or many runs as one program."""
 
 
+OBJECTIVES = ("total", "average")
+"""Objectives beside values with a discount or a horizon: total reward, and the average reward of a step."""
+
+
 @dataclass(frozen=True)
 class Horizon:
     """The number of steps of an episode in values and returns: a number, the environment's time limit, or none.
 
     Attributes:
         value: a number of steps; "limit": the time limit of the environment; "none": discounted values without a
-            horizon.
+            horizon, or total rewards with gamma 1.
     """
 
     value: int | str = "limit"
@@ -68,6 +72,8 @@ class TrainingOptions:
         steps: steps to learn from.
         gamma: discount of values and returns. The agent's own discount is a hyperparameter.
         horizon: steps of an episode in values and returns, as `Horizon.of` reads it.
+        objective: total: values and regret of the total reward, gamma 1 without a horizon; average: the curve also has
+            the average reward of a step in the long run, and its regret.
         evaluation_interval: steps between evaluations; a hundredth when not given.
         engine: sb3 (Stable-Baselines3), or batched: many seeds as one program. The latter is pharos' own DQN and PPO.
     """
@@ -80,6 +86,7 @@ class TrainingOptions:
     steps: int = parameter(50_000, low=1)
     gamma: float = parameter(1.0, low=0, high=1)
     horizon: int | str | None = "limit"
+    objective: str | None = None
     evaluation_interval: int | None = parameter(None, kind=int, low=1)
     engine: str = "sb3"
 

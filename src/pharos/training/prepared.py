@@ -19,7 +19,10 @@ from pharos.training.task import RunConfig, Task, TaskValues
 
 T = TypeVar("T")
 # Entries of a configuration that decide about the task
-TASK = ("environment", "parameters", "chance", "observation", "observation_options", "gamma", "horizon", "sources")
+TASK = (
+    *("environment", "parameters", "chance", "observation", "observation_options", "gamma", "horizon", "objective"),
+    "sources",
+)
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,9 @@ COLUMNS = {
     "error_bound": "float64",
 }
 """Columns of curve.csv, a row for each evaluation. docs/agents.md defines them."""
+AVERAGE_COLUMNS = dict.fromkeys(("gain_lower", "gain_upper", "average_regret_lower", "average_regret_upper"), "float64")
+"""Further columns of runs that measure the average reward a step in the long run."""
+ALL_COLUMNS = COLUMNS | AVERAGE_COLUMNS
 _TYPES: dict[str, Callable[[Any], Any]] = {"int64": int, "float64": float, "bool": bool}
 _TRUTHS = {"True": True, "False": False}
 
@@ -95,8 +98,9 @@ def write_curve(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """
     lines = io.StringIO(newline="")
     writer = csv.writer(lines, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows([repr(_TYPES[dtype](row[name])) for name, dtype in COLUMNS.items()] for row in rows)
+    columns = {name: dtype for name, dtype in ALL_COLUMNS.items() if name in COLUMNS or (rows and name in rows[0])}
+    writer.writerow(columns)
+    writer.writerows([repr(_TYPES[dtype](row[name])) for name, dtype in columns.items()] for row in rows)
     storage.replace_file(folder / CURVE, lines.getvalue())
     (folder / EARLIER_CURVE).unlink(missing_ok=True)
 
@@ -207,7 +211,7 @@ def _read_text(path: Path) -> dict[str, np.ndarray]:
             raise ValueError("its last line has no end")
         head, *rows = csv.reader(io.StringIO(text), strict=True)
         return {
-            name: np.array([read[COLUMNS[name]](text) for text in column], COLUMNS[name])
+            name: np.array([read[ALL_COLUMNS[name]](text) for text in column], ALL_COLUMNS[name])
             for name, column in zip(head, zip(*rows, strict=True) if rows else [()] * len(head), strict=True)
         }
     except FileNotFoundError:
@@ -414,11 +418,16 @@ class Checkpoint:
         self.folder, self.id = folder, id
         self._next = -math.inf
 
-    def save(self, learner: Learner, rows: list[Any], seconds: float) -> None:
-        """Write a checkpoint, unless the last is not ten seconds old, or writing would take more than SHARE_OF_TIME."""
+    def save(self, learner: Learner, curves: Callable[[], list[Any]], seconds: float) -> None:
+        """Write a checkpoint, unless the last is not ten seconds old, or writing would take more than SHARE_OF_TIME.
+
+        Args:
+            curves: returns the rows so far, for which it may have to wait.
+        """
         began = time.monotonic()
         if began < self._next:
             return
+        rows = curves()
         partial = self.folder.with_name(f"{self.folder.name}.partial")
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)

@@ -53,7 +53,8 @@ def train(
         tensorboard: write TensorBoard's logs into `out`/tensorboard (algorithms of Stable-Baselines3).
         progress: called after each evaluation with steps done, steps in all, and the row of the curve.
         options: of `TrainingOptions`: steps, observation, observation_options, sticky, random, lazy, reward_noise,
-            reward_delay, gamma, horizon, evaluation_interval, hyperparameters, engine; and those of the environment.
+            reward_delay, gamma, horizon, objective, evaluation_interval, hyperparameters, engine; and those of the
+            environment.
     Raises:
         ParameterError: an option is wrong, or `out` holds another run. UnknownName: no such name; the nearest is
             suggested.
@@ -185,6 +186,7 @@ def _runs(
         observation_options=dict(training.observation_options or {}),
         gamma=training.gamma,
         horizon=training.horizon,
+        objective=training.objective,
     )
     if isinstance(table, str | os.PathLike):
         hyperparameters = hyperparameters_of(agent, task.env.name, str(task.observation), table=Path(table))

@@ -18,20 +18,20 @@ import numpy as np
 
 from pharos.agents import agent_called, agent_source, is_known
 from pharos.environments import Environment, as_tuples, class_called, class_of, make, source_of
-from pharos.errors import FileFormatError, ParameterError, UnknownName
+from pharos.errors import DivergenceError, FileFormatError, ParameterError, UnknownName
 from pharos.mdp import (
     ChanceSetting,
     TabularMDP,
     mdp_within,
 )
 from pharos.observations import OwnObservation, observation_of, registered
-from pharos.policies import Observer, ReachableRows, reachable_rows
+from pharos.policies import Observer, ReachableRows, endless_value, reachable_rows
 from pharos.regret import ReferenceValues
-from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
+from pharos.solvers import GainInterval, Solution, average_reward, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
 from pharos.system.records import flat, read
 from pharos.system.sources import Source, is_reference, resolve, untrusted_code
-from pharos.training.options import ENGINES, Horizon, TrainingOptions
+from pharos.training.options import ENGINES, OBJECTIVES, Horizon, TrainingOptions
 
 TAIL = 1e-9  # part of a discounted return that is not looked at
 
@@ -66,7 +66,8 @@ class Task:
 
     Value and return are always in the same setting: undiscounted returns (gamma = 1) of episodes of at most `horizon`
     steps, the time limit of the environment, unless told otherwise. With `horizon=None` values are discounted without a
-    limit, while the episodes that an agent sees still end at the environment's time limit.
+    limit, or total rewards with gamma 1, while the episodes that an agent sees still end at the environment's time
+    limit.
 
     Attributes:
         env: the environment.
@@ -77,6 +78,8 @@ class Task:
         gamma: discount of values and returns.
         horizon: number of steps of an episode in values and returns, as `Horizon.of` reads it; "default": the
             environment's time limit.
+        objective: "average": policies are also measured by what a step earns in the long run; "total" stands for
+            gamma 1 without a horizon, and None for values alone.
         values: at the start, where they are known already; None: solved for when they are needed.
     """
 
@@ -87,6 +90,7 @@ class Task:
     previous_action: bool = False
     gamma: float = 1.0
     horizon: Horizon | int | str | None = "default"
+    objective: str | None = None
     values: TaskValues | None = None
 
     def __post_init__(self) -> None:
@@ -99,11 +103,18 @@ class Task:
             )
         if not isinstance(self.env, Environment):
             raise ParameterError(f"env is {self.env!r}; expected an Environment, or its name")
-        object.__setattr__(self, "horizon", Horizon.of(self.horizon).steps(self.env))
-        if self.horizon is None and self.gamma >= 1:
-            raise ParameterError(
-                "gamma is 1 without a horizon, so a value may be infinite; give a horizon, or gamma < 1"
-            )
+        if self.objective not in (None, *OBJECTIVES):
+            raise UnknownName("objective", self.objective, OBJECTIVES)
+        horizon = Horizon.of(self.horizon)
+        if self.objective == "total":
+            if self.gamma != 1.0 or isinstance(horizon.value, int):
+                raise ParameterError(
+                    f"the objective total has gamma 1 and no horizon; found gamma {self.gamma:g}, horizon "
+                    f"{horizon.value}"
+                )
+            horizon = Horizon("none")
+            object.__setattr__(self, "objective", None)
+        object.__setattr__(self, "horizon", horizon.steps(self.env))
 
     @staticmethod
     def of(environment: Environment | str, parameters: Mapping[str, Any] | None = None, **options: Any) -> "Task":
@@ -116,7 +127,7 @@ class Task:
 
     @property
     def horizon_steps(self) -> int | None:
-        """Steps of an episode in values and returns; None for discounted values without a horizon."""
+        """Steps of an episode in values and returns; None for discounted values or total rewards without a horizon."""
         return self.horizon  # type: ignore[return-value]  # __post_init__ has resolved it
 
     @property
@@ -201,10 +212,22 @@ class Task:
     @cached_property
     def _solved_reference(self) -> ReferenceValues:
         mdp = self._episodes(self.mdp)
-        solutions = [solve(mdp) for solve in (value_iteration, uniform_value, worst_value)]
-        error = max(solution.error_bound for solution in solutions)
-        optimal, uniform, worst = (float(solution.value_at_start) for solution in solutions)
+        best = value_iteration(mdp)
+        values, error = [float(best.value_at_start)], best.error_bound
+        for solve in (uniform_value, worst_value):
+            try:
+                solution = solve(mdp)
+                values.append(float(solution.value_at_start))
+                error = max(error, solution.error_bound)
+            except DivergenceError:  # of total rewards: the policy may go on for ever where something is paid
+                values.append(-math.inf if solve is worst_value else endless_value(mdp, "uniform"))
+        optimal, uniform, worst = values
         return ReferenceValues(optimal, uniform, worst, error)
+
+    @cached_property
+    def gains(self) -> dict[str, GainInterval]:
+        """Average rewards a step in the long run, from the start, of the optimal, the uniform and the worst policy."""
+        return {name: average_reward(self.mdp, name).gain_at_start for name in ("optimal", "uniform", "worst")}
 
     @property
     def return_range(self) -> tuple[float, float]:
@@ -213,6 +236,8 @@ class Task:
 
     @cached_property
     def _solved_return_range(self) -> tuple[float, float]:
+        if self.horizon is None and self.gamma == 1.0:
+            return -math.inf, math.inf
         plain = self._episodes(self._mdp_without_chance)
         if not plain.dynamics.is_deterministic:
             return _range_of_returns(plain)
@@ -258,7 +283,7 @@ CELL = ["environment", "instance", "chance", "agent", "observation"]  # columns 
 # In the order of run.json
 KEYS = (
     *("environment", "parameters", "chance", "observation", "observation_options", "agent", "hyperparameters", "steps"),
-    *("seed", "gamma", "horizon", "evaluation_interval", "engine", "sources"),
+    *("seed", "gamma", "horizon", "objective", "evaluation_interval", "engine", "sources"),
 )
 
 
@@ -271,7 +296,10 @@ class RunConfig(TrainingOptions):
         environment: name of the class of environments.
         parameters: all parameters of the environment, JSON-able.
         seed: of everything random.
-        horizon: number of steps of an episode in values and returns; None: discounted values without a horizon.
+        horizon: number of steps of an episode in values and returns; None: discounted values without a horizon, or
+            total rewards where gamma is 1.
+        objective: "average", of runs that also measure what a step earns in the long run; else None, and not in `id`
+            and `to_dict`.
         evaluation_interval: steps between evaluations of the policy.
         hyperparameters: of the agent, which go before its defaults.
         engine: what trains networks, one of ENGINES. Tables are the same with each, so theirs is always "sb3"; `id` and
@@ -291,6 +319,8 @@ class RunConfig(TrainingOptions):
     def __post_init__(self) -> None:
         if self.engine not in ENGINES:
             raise UnknownName("engine", self.engine, ENGINES)
+        if self.objective not in (None, "average"):
+            raise ParameterError(f"the objective of a run is {self.objective!r}; expected average, or none")
         object.__setattr__(self, "engine", agent_called(self.agent).engine(self.engine))
         for name in ("steps", "evaluation_interval"):
             value = getattr(self, name)
@@ -333,6 +363,7 @@ class RunConfig(TrainingOptions):
             seed=seed,
             gamma=task.gamma,
             horizon=task.horizon_steps,
+            objective=task.objective,
             evaluation_interval=evaluation_interval or (max(1, steps // 100) if isinstance(steps, int) else 1),
             engine=engine,
             sources={part: source for part, source in sources.items() if source is not None},
@@ -346,7 +377,7 @@ class RunConfig(TrainingOptions):
             FileFormatError: an entry is missing, unknown or of another type.
         """
         try:
-            return read(RunConfig, entry, "the configuration of a run", optional=("engine", "sources"))
+            return read(RunConfig, entry, "the configuration of a run", optional=("engine", "sources", "objective"))
         except ParameterError as error:
             raise FileFormatError(f"the configuration of a run is damaged: {error}") from error
 
@@ -358,6 +389,8 @@ class RunConfig(TrainingOptions):
             del entry["engine"]
         if not sources:
             del entry["sources"]
+        if self.objective is None:
+            del entry["objective"]
         ordered = {name: entry[name] for name in KEYS if name in entry}
         return {name: dict(value) if isinstance(value, Mapping) else value for name, value in ordered.items()}
 
@@ -401,6 +434,7 @@ class RunConfig(TrainingOptions):
             observation_options=dict(self.observation_options),
             gamma=self.gamma,
             horizon=self.horizon,
+            objective=self.objective,
             values=values,
         )
 

@@ -1,7 +1,7 @@
 """A batch: any number of runs, packed into lanes."""
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -83,6 +83,10 @@ class Batch:
     def parameters(self, i: int) -> dict[str, np.ndarray]:
         """The network of run i, under the names of Stable-Baselines3's `policy.state_dict()`."""
         return self.lanes[i // self.width].stored(i % self.width)
+
+    def set_parameters(self, i: int, parameters: Mapping[str, np.ndarray]) -> None:
+        """Replace the network of run i by what `parameters` returned; on the processor alone."""
+        self.lanes[i // self.width].restore_network(i % self.width, parameters)
 
     def state(self) -> dict[str, np.ndarray]:
         """State of the batch for `restore`, which goes on bit for bit; the arrays are copies."""

@@ -6,7 +6,7 @@ The episodes of W runs: each walks the table of its own MDP; runs of one MDP are
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, Generic, TypeVar
 
@@ -417,6 +417,12 @@ class Lane(Generic[Net]):
     def stored(self, i: int) -> dict[str, np.ndarray]:
         """The parameters of run i under Stable-Baselines3's names."""
         return self.as_stored(self.values, i)
+
+    def restore_network(self, i: int, parameters: Mapping[str, np.ndarray]) -> None:
+        """Restore parameters of run i that `stored` returned, in a lane of observations of one shape."""
+        for shape in self.network.parameters.shapes:
+            own = shape.own(parameters[names_of(shape.name)[0]])
+            self.values[shape.name][i] = torch.from_numpy(np.ascontiguousarray(own)).view(shape.shape)
 
     def as_stored(self, views: Values, i: int) -> dict[str, np.ndarray]:
         """name -> one run's part of some views of parameters or gradients, in Stable-Baselines3's shapes."""

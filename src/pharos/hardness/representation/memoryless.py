@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP, executed_actions, lacking, require_all_actions
+from pharos.mdp import TabularMDP, executed_actions, lacking
 from pharos.solvers import Solution, evaluate_policy, value_iteration
 
 TOLERANCE = 1e-7
@@ -47,13 +47,15 @@ def memoryless_loss(
 ) -> MemorylessLoss:
     """Bound V*(start) - max over policies on observations of V(start).
 
+    Where some actions are not available, policies take what is available in all states that look alike.
+
     Args:
         mdp: discounted or with a horizon, as `value_iteration` takes it; random actions, but no sticky ones.
         classes: (S,) the number of the observation of each state, as `observation_classes` gives it.
         optimal: the solution of `mdp`, where there is one.
         budget: seconds after which the bounds so far are returned.
     Raises:
-        ParameterError: actions are sticky, or some are not available in some states.
+        ParameterError: actions are sticky, or no action is available in all states that look alike.
     Cost: up to `budget`, and one solution of the MDP and one policy beyond it.
     Source: Littman (1994), "Memoryless policies: theoretical limitations and practical results".
     """
@@ -61,7 +63,6 @@ def memoryless_loss(
         raise ParameterError(
             f"{mdp}: under sticky actions a policy without memory does not know the state; leave them out"
         )
-    require_all_actions(mdp, "memoryless_loss")
     optimal = optimal or value_iteration(mdp, TOLERANCE)
     search = _PolicySearch(mdp, np.asarray(classes), time.monotonic() + budget)
     lower, upper = search.bounds(optimal)
@@ -76,6 +77,7 @@ class _PolicySearch:
 
     Attributes:
         solved: how many problems and policies were solved.
+        sets: (C, A) bool, the actions that are available in all states of an observation.
     """
 
     def __init__(self, mdp: TabularMDP, classes: np.ndarray, deadline: float):
@@ -85,6 +87,15 @@ class _PolicySearch:
         self.count = int(classes.max()) + 1
         self.is_shared = np.bincount(classes[self.live], minlength=self.count) > 1
         self.is_small = mdp.num_states * mdp.num_actions <= MOST_ENTRIES
+        self.sets = np.ones((self.count, mdp.num_actions), np.bool_)
+        if mdp.available is not None:
+            np.logical_and.at(self.sets, classes, mdp.available)
+        if not self.sets.any(axis=1).all():
+            states = np.flatnonzero(classes == np.flatnonzero(~self.sets.any(axis=1))[0])
+            raise ParameterError(
+                f"{mdp}: states {', '.join(map(str, states[:5].tolist()))} look alike, and no action is available in "
+                f"all of them; expected an observation that tells their actions apart"
+            )
 
     def bounds(self, optimal: Solution) -> tuple[float, float]:
         """(lower, upper) bound of the value of the best policy at the start."""
@@ -100,7 +111,7 @@ class _PolicySearch:
                 return lower, max(lower, upper)
             if conflict < 0 or not self.is_small or time.monotonic() > self.deadline:
                 return lower, upper
-            for action in range(self.mdp.num_actions):
+            for action in np.flatnonzero(self.sets[conflict]):
                 child = fixed.copy()
                 child[conflict] = action
                 solution = value_iteration(self.relaxed(child), TOLERANCE)
@@ -136,8 +147,10 @@ class _PolicySearch:
         if not mdp.is_random:
             return matrix, rewards
         owner = np.repeat(np.arange(mdp.num_states), mdp.num_actions)
-        mixed = executed_actions(mdp, np.tile(choices, (mdp.num_states, 1)), owner, np.zeros_like(owner)) @ matrix
-        return mixed, rewards @ mdp.chance.weights(choices).T
+        choices = np.tile(choices, (mdp.num_states, 1))
+        mixed = executed_actions(mdp, choices, owner, np.zeros_like(owner)) @ matrix
+        weights = mdp.chance.at(owner).weights(choices)
+        return mixed, (weights * rewards[owner]).sum(axis=1).reshape(rewards.shape)
 
     def rounded(self, solution: Solution, fixed: np.ndarray) -> tuple[float, int]:
         """(value at the start of a memoryless policy near the solution; the observation to branch on, -1: none).
@@ -167,7 +180,7 @@ class _PolicySearch:
 
     def best(self, q: np.ndarray, weights: np.ndarray, fixed: np.ndarray) -> np.ndarray:
         """(C,): for each observation the action with the largest weighted value; a fixed one as it is."""
-        actions = self.sums(np.asarray(q), weights).argmax(axis=1)
+        actions = np.where(self.sets, self.sums(np.asarray(q), weights), -np.inf).argmax(axis=1)
         return np.where(fixed < 0, actions, fixed)
 
     def lost(self, q: np.ndarray, weights: np.ndarray, actions: np.ndarray, fixed: np.ndarray) -> np.ndarray:
@@ -180,6 +193,7 @@ class _PolicySearch:
     def sums(self, q: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """(C, A): the sum over the states of each observation of weight times value."""
         weights = np.where(self.live, weights, 0.0)
+        q = np.where(np.isfinite(q), q, 0.0)  # of actions that are not available it is -inf
         columns = (np.bincount(self.classes, weights * q[:, a], minlength=self.count) for a in range(q.shape[1]))
         return np.stack(list(columns), axis=1)
 

@@ -64,7 +64,7 @@ class Results:
 
     @cached_property
     def chances(self) -> dict[tuple[str, str], str]:
-        """Kinds of chance in words by instance and kind: "of the world" where the rules have chance."""
+        """Kinds of chance in words by instance and kind: "(and of the world)" if the rules have chance."""
         words: dict[tuple[str, str], str] = {}
         for run in self.study.runs:
             if (key := (run.instance, run.chance)) not in words:
