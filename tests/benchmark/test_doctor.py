@@ -8,6 +8,7 @@ from pharos.benchmark.doctor import (
     GAMMAS,
     RIGHT,
     contrast,
+    cut_shares,
     optimal,
     readings,
     residuals,
@@ -49,13 +50,15 @@ def examination(world, *, q=None, v=None, policy=None, seed=0, cuts=0.2, **more)
 def solve(world, name, gamma, cuts, policy=None, scale=1.0, at_terminal=0.7):
     """Q of an equation by loops; of a terminal state `at_terminal`; with a policy, its values."""
     states, actions = range(STATES), range(ACTIONS)
-    visits = examination(world).visits
+    steps = examination(world)
     paid, arrivals = [0.0] * STATES, [0.0] * STATES
     for s in states:
         for a in actions:
             for after in states:
-                flow = visits[s, a] * world.transitions[s, a, after]
-                paid[after], arrivals[after] = paid[after] + flow * world.rewards[s, a], arrivals[after] + flow
+                goes_on = (steps.visits[s, a] - steps.cuts[s, a]) * world.transitions[s, a, after]
+                ends = steps.cuts[s, a] * world.transitions[s, a, after]
+                for place, flow in ((0 if world.terminal[after] else after, goes_on), (0, ends)):
+                    paid[place], arrivals[place] = paid[place] + flow * world.rewards[s, a], arrivals[place] + flow
     q = [[at_terminal if world.terminal[s] else 0.0 for _ in actions] for s in states]
     for _ in range(1500):
         new = [list(row) for row in q]
@@ -75,11 +78,10 @@ def solve(world, name, gamma, cuts, policy=None, scale=1.0, at_terminal=0.7):
                         value = sum(p * x for p, x in zip(policy[after], row, strict=True))
                     if name == "to_next_episode" and world.terminal[after]:
                         value = sum(p * x for p, x in zip(policy[0], q[0], strict=True))
-                    elif world.terminal[after] and name not in ("through_ends", "itself"):
+                    elif world.terminal[after] and name != "through_ends":
                         value = 0.0
-                    if name == "itself":
-                        onward = value
-                        break
+                    if name == "itself" and world.terminal[after]:
+                        value = 0.0
                     onward += world.transitions[s, a, after] * value
                 new[s][a] = reward + gamma * onward * (1 - cuts[s][a] if name == "cut_is_end" else 1)
         q = new
@@ -129,6 +131,16 @@ def test_values_of_a_policy_are_told_from_those_that_run_on_into_the_next_episod
         each = examination(here, v=(policy * q).sum(axis=1), policy=policy, cuts=0)
         assert (contrast(each, "to_next_episode", GAMMA, GAMMA) < 0) == is_wrong
         assert residuals(each)[name].min() < 1e-6
+
+
+def test_values_with_the_time_limit_as_an_end_are_all_of_the_way():
+    here = world(1)
+    each = examination(here)
+    cuts = each.cuts / np.maximum(each.visits, 1)
+    for name, share in ((RIGHT, 0), ("cut_is_end", 1)):
+        q = solve(here, name, GAMMA, cuts, at_terminal=0.0)
+        assert cut_shares(examination(here, q=q), GAMMA) == pytest.approx((share, share), abs=1e-6)
+    assert np.isnan(cut_shares(examination(here, q=q, cuts=0), GAMMA)).all()
 
 
 def test_the_factor_of_rewards_is_their_slope():

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pharos.benchmark.limits import Limits
     from pharos.benchmark.loop import LoopRun, TaskEnv, task
     from pharos.benchmark.page import report
+    from pharos.benchmark.profiles import Diagnosis, diagnose
     from pharos.benchmark.ranking import Board, board, reason
     from pharos.benchmark.results import AgentResults, baselines, read_results
     from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, score
@@ -31,6 +32,7 @@ __all__ = [
     "BenchmarkTask",
     "BudgetSpent",
     "Comparison",
+    "Diagnosis",
     "Ladder",
     "LoopRun",
     "Power",
@@ -42,6 +44,7 @@ __all__ = [
     "board",
     "check_agent",
     "compare",
+    "diagnose",
     "frozen",
     "load_suite",
     "power",

@@ -30,6 +30,7 @@ EQUATIONS = {
 """Equations that values may obey: name -> in words."""
 FLOOR = 0.02  # a residual below it is as good as none
 LEAST = 3  # visits of a pair that counts
+CUTS = 30  # steps, of which one is cut by the time limit in worlds that tell whether it is an end
 SAME = 1e-6
 
 
@@ -58,7 +59,7 @@ def targets(examination: Examination, gamma: float) -> dict[str, np.ndarray]:
         "cut_is_end": rewards + gamma * (1 - cuts) * onward,
         "signs": np.sign(rewards) + gamma * onward,
         "earlier_reward": earlier_rewards(examination)[:, None] + gamma * onward,
-        "itself": rewards + gamma * live[:, None],
+        "itself": rewards + gamma * (1 - ends) * live[:, None],
         "negative": gamma * onward - rewards,
     }
     if q is not None:
@@ -76,11 +77,14 @@ def targets(examination: Examination, gamma: float) -> dict[str, np.ndarray]:
 
 
 def earlier_rewards(examination: Examination) -> np.ndarray:
-    """(S,) mean reward of the step that led to each state, over the steps of the run; 0 where episodes begin alone."""
-    world, visits = examination.world, examination.visits
-    flow = visits[:, :, None] * world.transitions
-    arrivals = flow.sum(axis=(0, 1))
-    income = (flow * world.rewards[:, :, None]).sum(axis=(0, 1))
+    """(S,) mean reward of the step before each state, over the steps of the run, if that is not forgotten at a reset:
+    where episodes begin that of the last step of another one counts.
+    """
+    world, visits, cuts = examination.world, examination.visits, examination.cuts
+    flow = (visits - cuts)[:, :, None] * world.transitions * ~world.terminal
+    last = cuts + (visits - cuts) * (world.transitions @ world.terminal)
+    arrivals = flow.sum(axis=(0, 1)) + world.start * last.sum()
+    income = (flow * world.rewards[:, :, None]).sum(axis=(0, 1)) + world.start * (last * world.rewards).sum()
     return np.divide(income, arrivals, out=np.zeros(len(arrivals)), where=arrivals > 0)
 
 
@@ -142,13 +146,40 @@ def contrast(examination: Examination, name: str, gamma: float, right_gamma: flo
     if name not in other:
         return float("nan")
     weights, values = weights_of(examination, examination.visits), answers_of(examination)
-    scale = max(deviation(right, weights), least_scale(examination.world))
-    parts = weights * (np.abs(other[name] - other[RIGHT]) > 0.02 * scale)
+    parts = weights * (np.abs(other[name] - other[RIGHT]) > 0.02 * _scale(other[RIGHT], weights))
     if parts.sum() < 1e-3:
         return float("nan")
     parts = parts / parts.sum()
-    errors = [min(float(np.sqrt((parts * (values - each) ** 2).sum())) / scale, 100.0) for each in (other[name], right)]
-    return float(np.log10(errors[0] + FLOOR) - np.log10(errors[1] + FLOOR))
+    logs = []
+    for target in (other[name], right):
+        error = float(np.sqrt((parts * (values - target) ** 2).sum())) / _scale(target, weights)
+        logs.append(np.log10(min(error, 100.0) + FLOOR))
+    return float(logs[0] - logs[1])
+
+
+def _scale(target: np.ndarray, weights: np.ndarray) -> float:
+    """Deviation of a target under weights, at least a twentieth of its largest value."""
+    return max(deviation(target, weights), 0.05 * float(np.abs(target[weights > 0]).max(initial=0)), 1e-9)
+
+
+def cut_shares(examination: Examination, gamma: float) -> tuple[float, float]:
+    """Shares of the way from the right equation, 0, to that where the time limit is an end, 1, that values are on: by
+    projection, and by regression beside the next values and a constant, which a slow target network does not move.
+
+    NaN where the time limit ends less than one in CUTS steps.
+    """
+    if examination.cuts.sum() * CUTS < examination.visits.sum():
+        return float("nan"), float("nan")
+    backups, values = targets(examination, gamma), answers_of(examination)
+    right, weights = backups[RIGHT], weights_of(examination, examination.visits)
+    way, error = backups["cut_is_end"] - right, values - right
+    length = float((weights * way**2).sum())
+    if length < 1e-12:
+        return float("nan"), float("nan")
+    roots = np.sqrt(weights.ravel())
+    columns = np.stack([way.ravel(), right.ravel(), np.ones(way.size)], axis=1) * roots[:, None]
+    partial = np.linalg.lstsq(columns, error.ravel() * roots, rcond=None)[0][0]
+    return tuple(float(np.clip(x, -2, 3)) for x in ((weights * way * error).sum() / length, partial))  # type: ignore[return-value]
 
 
 def optimal(world: WorldArrays, gamma: float, policy: np.ndarray | None = None, sweeps: int = 2000) -> np.ndarray:
@@ -171,6 +202,8 @@ def readings(examinations: Sequence[Examination]) -> dict[str, float]:
 
     Of an agent with values: `gamma`, the discount that fits them best, as log10 of 1 / (1 - gamma); `consistency`,
     log10 of the residual; of each other equation the residual less that of the right one, negative if it fits better;
+    `cut_share` and `cut_partial`, see `cut_shares`; `image` and `image_size`, the residual and `size` where it sees
+    images less those elsewhere;
     `slope`, log10 of the factor with which rewards enter; `size`, log10 of the deviation of the values relative to
     exact ones; `truth`, their correlation with exact ones, and `truth_unvisited` elsewhere; `bias`, their mean error in
     deviations; `ends`, values of terminal states in deviations; `deaf`, the share of numbers of observations that
@@ -203,6 +236,12 @@ def _of_values(examinations: Sequence[Examination]) -> dict[str, float]:
             own = GAMMAS[int(np.mean([table.get(name, table[RIGHT]) for table in logs], axis=0).argmin())]
             contrasts = [contrast(each, name, own, gamma) for each in examinations]
             numbers[name] = float(np.nanmean(contrasts)) if np.isfinite(contrasts).any() else np.nan
+    is_image = np.array([each.name.endswith("image") for each in examinations])
+    if 0 < is_image.sum() < len(is_image):
+        at_best = np.array([table[RIGHT][place] for table in logs])
+        numbers["image"] = at_best[is_image].mean() - at_best[~is_image].mean()
+        sizes = np.array([_size(each, gamma) for each in examinations])
+        numbers["image_size"] = sizes[is_image].mean() - sizes[~is_image].mean()
     columns: dict[str, list[float]] = {}
     for each in examinations:
         for name, value in _of_one(each, gamma).items():
@@ -222,10 +261,9 @@ def _of_one(examination: Examination, gamma: float) -> dict[str, float]:
     is_live = np.broadcast_to((~world.terminal).reshape(-1, *[1] * (values.ndim - 1)), values.shape)
     is_new = is_live & (weights == 0)
     scale = max(deviation(exact, weights), 1e-6 + 0.05 * float(np.abs(world.rewards).max()))
-    own_scale = max(deviation(values, weights), 1e-9)
     error = np.abs(values - exact) / scale
     numbers = {
-        "size": np.clip(np.log10(own_scale / scale), -3, 3),
+        "size": _size(examination, gamma),
         "truth": correlation(values, exact, weights),
         "bias": np.clip((weights * (values - exact)).sum() / scale, -5, 5),
         "deaf": float((examination.reaction[world.vary] < SAME).mean()),
@@ -236,10 +274,11 @@ def _of_one(examination: Examination, gamma: float) -> dict[str, float]:
         numbers["error_unvisited"] = np.clip(np.log10(error[is_new].mean() + FLOOR), -2, 3)
     if world.terminal.any():
         after = values[world.terminal].max(axis=1) if values.ndim == 2 else values[world.terminal]
-        numbers["ends"] = np.clip(np.log10(np.abs(after).mean() / own_scale + 1e-3), -3, 3)
+        numbers["ends"] = np.clip(np.log10(np.abs(after).mean() / max(deviation(values, weights), 1e-9) + 1e-3), -3, 3)
     late = residuals(examination, examination.last)[RIGHT][GAMMAS.index(gamma)]
     numbers["forgets"] = np.log10(late + FLOOR) - np.log10(residuals(examination)[RIGHT][GAMMAS.index(gamma)] + FLOOR)
     numbers["slope"] = np.clip(reward_slope(examination, gamma), -3, 3)
+    numbers["cut_share"], numbers["cut_partial"] = cut_shares(examination, gamma)
     if examination.q is not None:
         numbers["own"] = np.log10(
             (distance(values, own, weights, 1e-6) + FLOOR) / (distance(values, exact, weights, 1e-6) + FLOOR)
@@ -253,6 +292,22 @@ def _of_one(examination: Examination, gamma: float) -> dict[str, float]:
         parts = [(part * error).sum() / part.sum() for part in (far, near)]
         numbers["far"] = np.clip(np.log10((parts[0] + FLOOR) / (parts[1] + FLOOR)), -2, 2)
     return {name: float(value) for name, value in numbers.items()}
+
+
+def _size(examination: Examination, gamma: float) -> float:
+    """log10 of the deviation of values relative to exact ones, of the optimal policy or of the agent's own."""
+    world, weights = examination.world, weights_of(examination, examination.visits)
+    exact = optimal(world, gamma, None if examination.q is not None else examination.policy)
+    if examination.q is None:
+        exact = (examination.policy * exact).sum(axis=1)
+    least = 1e-6 + least_scale(world)
+    return float(
+        np.clip(
+            np.log10(max(deviation(answers_of(examination), weights), 1e-9) / max(deviation(exact, weights), least)),
+            -3,
+            3,
+        )
+    )
 
 
 def correlation(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> float:

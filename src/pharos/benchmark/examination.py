@@ -234,9 +234,14 @@ class Witness(PolicyRecorder):
 
 
 def value_functions(policy: Any) -> tuple[Callable[[Any], np.ndarray] | None, Callable[[Any], np.ndarray] | None]:
-    """Functions of observations to (N, A) values of actions and to (N,) values of states; None where it has none."""
+    """Functions of observations to (N, A) values of actions and to (N,) values of states; None where it has none.
+
+    A method of an object that offers them, such as `policy` of a class with act and observe, has those of its object.
+    """
+    if not (hasattr(policy, "q_values") or hasattr(policy, "values")):
+        policy = getattr(policy, "__self__", policy)
     q_values, values = getattr(policy, "q_values", None), getattr(policy, "values", None)
-    if isinstance(policy, SB3Model) and not isinstance(policy, np.ndarray):
+    if isinstance(policy, SB3Model):
         network: Any = getattr(policy, "q_net", None)
         inner: Any = getattr(policy, "policy", None)
         if network is not None:

@@ -40,11 +40,11 @@ DQN_FAULTS = {
 }
 PPO_FAULTS = {
     "advantages_not_normalised": "advantages are used as they are, whatever the size of rewards",
-    "stale_log_probabilities": "old log-probabilities are those of the policy that learns, so that nothing is clipped",
+    "stale_log_probabilities": "old log-probabilities are those of the policy that learns: nothing is clipped",
     "value_without_mask": "advantages and values run on over the ends of episodes",
     "truncation_as_end": "an episode that the time limit cuts counts as one that has ended",
     "gamma_half": "the discount is 0.5",
-    "rollout_reshaped": "steps and environments of a rollout are mixed up, so that advantages belong to other steps",
+    "rollout_reshaped": "steps and environments of a rollout are mixed up: advantages are those of other steps",
     "learning_rate_high": "the learning rate is 100 times too high",
     "entropy_penalised": "the sign of the entropy bonus is wrong",
     "action_off_by_one": "the action that is played is the one after the action that was chosen, when it is judged",
@@ -79,14 +79,21 @@ class SmallNetwork:
 
     def __init__(self, inputs: int, width: int, outputs: int, rng: np.random.Generator):
         sizes = (inputs, width, width, outputs)
-        self.parameters = []
-        for fan_in, fan_out in pairwise(sizes):
-            bound = 1 / np.sqrt(fan_in)
-            self.parameters.append(rng.uniform(-bound, bound, (fan_in, fan_out)).astype(np.float32))
-            self.parameters.append(rng.uniform(-bound, bound, fan_out).astype(np.float32))
-        self.moments = [(np.zeros_like(each), np.zeros_like(each)) for each in self.parameters]
+        self.shapes = [shape for fan_in, fan_out in pairwise(sizes) for shape in ((fan_in, fan_out), (fan_out,))]
+        bounds = [bound for fan_in in sizes[:-1] for bound in (1 / np.sqrt(fan_in),) * 2]
+        drawn = [rng.uniform(-bound, bound, shape) for bound, shape in zip(bounds, self.shapes, strict=True)]
+        self.values = np.concatenate([each.ravel() for each in drawn]).astype(np.float32)
+        self.parameters = self.views(self.values)
+        self.mean, self.square, self.gradient = np.zeros((3, len(self.values)), np.float32)
+        self.gradients = self.views(self.gradient)
         self.updates = 0
         self.layers: list[np.ndarray] = []
+
+    def views(self, values: np.ndarray) -> list[np.ndarray]:
+        """Weights and biases of each layer, in an array of all."""
+        ends = np.cumsum([int(np.prod(shape)) for shape in self.shapes])
+        parts = zip(np.split(values, ends[:-1]), self.shapes, strict=True)
+        return [part.reshape(shape) for part, shape in parts]
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         w1, b1, w2, b2, w3, b3 = self.parameters
@@ -97,25 +104,27 @@ class SmallNetwork:
 
     def update(self, gradient: np.ndarray, rate: float, limit: float = 10.0) -> None:
         """One step of Adam along the gradient (N, outputs) of the loss by the outputs of the last call."""
-        weights = self.parameters[::2]
-        gradients: list[np.ndarray] = []
-        for weight, layer in zip(weights[::-1], self.layers[::-1], strict=True):
-            gradients = [layer.T @ gradient, gradient.sum(axis=0), *gradients]
-            gradient = (gradient @ weight.T) * (layer > 0)
-        norm = float(np.sqrt(sum((each**2).sum() for each in gradients)))
-        scale = min(1.0, limit / (norm + 1e-6)) if np.isfinite(norm) else 0.0
+        for k in (2, 1, 0):
+            layer = self.layers[k]
+            np.matmul(layer.T, gradient, out=self.gradients[2 * k])
+            gradient.sum(axis=0, out=self.gradients[2 * k + 1])
+            if k:
+                gradient = (gradient @ self.parameters[2 * k].T) * (layer > 0)
+        norm = float(np.sqrt(self.gradient @ self.gradient))
+        if not np.isfinite(norm):
+            return
+        step = self.gradient * np.float32(min(1.0, limit / (norm + 1e-6)))
         self.updates += 1
         correction = np.sqrt(1 - 0.999**self.updates) / (1 - 0.9**self.updates)
-        for parameter, (mean, square), each in zip(self.parameters, self.moments, gradients, strict=True):
-            step = each * scale if scale else np.zeros_like(each)
-            mean += 0.1 * (step - mean)
-            square += 0.001 * (step**2 - square)
-            parameter -= np.float32(rate * correction) * mean / (np.sqrt(square) + 1e-8)
+        self.mean += np.float32(0.1) * (step - self.mean)
+        self.square += np.float32(0.001) * (step * step - self.square)
+        self.values -= np.float32(rate * correction) * self.mean / (np.sqrt(self.square) + np.float32(1e-8))
 
     def copy(self) -> "SmallNetwork":
         """A network with the same weights, for targets and policies."""
         twin = object.__new__(SmallNetwork)
-        twin.parameters, twin.moments, twin.updates, twin.layers = [w.copy() for w in self.parameters], [], 0, []
+        twin.shapes, twin.values, twin.layers = self.shapes, self.values.copy(), []
+        twin.parameters = twin.views(twin.values)
         return twin
 
 

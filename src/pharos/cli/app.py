@@ -13,6 +13,7 @@ from pharos.cli import (
     benchmark,
     build,
     cache,
+    diagnose,
     evaluate,
     hardness,
     import_,
@@ -188,6 +189,7 @@ app.command("warm")(cache.warm)
 app.add_typer(plot.app, name="plot")
 app.add_typer(study.app, name="study")
 app.add_typer(benchmark.app, name="benchmark")
+app.command("diagnose")(diagnose.diagnose)
 app.command("export")(import_.export)
 app.add_typer(import_.app, name="import")
 app.add_typer(cache.app, name="cache")

@@ -1,0 +1,79 @@
+"""Profiles of known faults for `pharos diagnose`: readings of small agents, healthy ones and ones with a fault.
+
+    python benchmarks/fault_profiles.py --rounds 3
+
+Each round has all faults once, each with hyperparameters and seeds of its own, and three healthy agents of each kind.
+An agent takes about 6 s of a processor. Writes src/pharos/benchmark/data/fault_profiles.csv.
+"""
+
+import argparse
+import csv
+import zlib
+
+import numpy as np
+
+from pharos.benchmark import faults
+from pharos.benchmark.doctor import readings
+from pharos.benchmark.examination import NAMES, examine
+from pharos.benchmark.profiles import DECIMALS, FILE
+
+FURTHER = 100  # between numbers of the healthy agents of a round
+
+
+def setting(agent, fault, number):
+    """Hyperparameters of an agent of a round; in round 0 its own."""
+    if not number:
+        return {}
+    rng = np.random.default_rng([number, zlib.crc32(f"{agent}/{fault}".encode())])
+    values = {
+        "width": int(rng.choice([16, 32, 64])),
+        "learning_rate": float(np.exp(rng.uniform(np.log(5e-4), np.log(2e-3)))),
+        "gamma": float(rng.choice([0.9, 0.95, 0.99])),
+        "batch_size": int(rng.choice([16, 32, 64])),
+    }
+    if agent == "dqn":
+        return values | {"target_interval": int(rng.choice([100, 200, 400]))}
+    return values | {"rollout": int(rng.choice([32, 64])), "epochs": int(rng.choice([5, 10]))}
+
+
+def agents(rounds):
+    """Yield (agent, fault, number) of all agents."""
+    for number in rounds:
+        for agent, table in faults.FAULTS.items():
+            for again in range(3):
+                yield agent, faults.HEALTHY, number + FURTHER * again
+            for fault in table:
+                yield agent, fault, number
+
+
+def examinations(agent, fault, number):
+    """Examinations of one agent: all worlds with one seed, and some with another one."""
+    learn = faults.make(agent, fault, **setting(agent, fault, number))
+    again = examine(learn, worlds=NAMES[::4], seeds=[10 * number + 1])
+    return examine(learn, seeds=[10 * number]) + again
+
+
+def write(rows, file=FILE):
+    """Write (agent, fault, readings) as a table."""
+    names = list(dict.fromkeys(name for *_, numbers in rows for name in numbers if not name.startswith("regret_")))
+    names += [f"regret_{name}" for name in NAMES]
+    with open(file, "w", encoding="utf-8", newline="") as lines:
+        table = csv.writer(lines, lineterminator="\n")
+        table.writerow(["agent", "fault", *names])
+        for agent, fault, numbers in rows:
+            values = [f"{round(numbers[name], DECIMALS) + 0.0:g}" if name in numbers else "" for name in names]
+            table.writerow([agent, fault, *values])
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=3)
+    rows = []
+    for agent, fault, number in agents(range(parser.parse_args().rounds)):
+        rows.append((agent, fault, readings(examinations(agent, fault, number))))
+        print(agent, fault, number, flush=True)
+    write(rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""pharos diagnose: what is wrong with an agent, shown by numbers that only an exactly known world has."""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pharos.cli.answers import Answer, print_table, progress_bar
+from pharos.cli.options import Count
+from pharos.system import storage
+
+if TYPE_CHECKING:
+    from pharos.benchmark import Diagnosis
+
+
+def diagnose(
+    agent: Annotated[str, typer.Argument(metavar="AGENT", help="file.py:learn, module:Class, dqn, ppo, ...")],
+    *,
+    hyperparameters: Mapping[str, Any] | None = None,
+    seeds: Count = 2,
+    steps: Count = 4000,
+    out: Annotated[Path | None, "FILE.md"] = None,
+) -> Answer:
+    """Train an agent on twelve small worlds, and say what is wrong with it, by which number, and what to try.
+
+    Args:
+        hyperparameters: A hyperparameter of the agent.
+        seeds: Of each world, from 0 on.
+        steps: Of each run; the table of known faults has 4,000.
+        out: Write the page there, as Markdown.
+    """
+    from pharos import benchmark
+
+    began = time.perf_counter()
+    with progress_bar("worlds", 1000, "building worlds") as show:
+        diagnosis = benchmark.diagnose(
+            agent,
+            hyperparameters=hyperparameters,
+            seeds=range(seeds),
+            steps=steps,
+            tell=lambda done, text: show(int(1000 * done), text),
+        )
+    if out is not None:
+        storage.replace_file(out, str(diagnosis).encode())
+    answer = {**diagnosis.to_dict(), "seconds": time.perf_counter() - began, "file": out}
+    return Answer(answer, lambda: _print(diagnosis))
+
+
+def _print(diagnosis: "Diagnosis") -> None:
+    scores = ", ".join(f"{name} {score:.2f}" for name, score in diagnosis.scores.items())
+    print_table(
+        f"{diagnosis.agent}: {diagnosis.verdict}",
+        ("", "what no healthy agent shows", "what to try"),
+        ((str(place), each.wrong, each.advice) for place, each in enumerate(diagnosis.findings, start=1)),
+    )
+    print_table(
+        "Nearest known agents",
+        ("", ">likeness", ""),
+        ((name, f"{share:.2f}", text) for name, share, text in diagnosis.nearest()),
+        notes=[diagnosis.how_often, f"Scores, 1 optimal and 0 as uniform play: {scores}"],
+    )
