@@ -242,7 +242,7 @@ def _ties(report: "Report") -> list[str]:
 
 
 PREDICTED = TrainingOptions(agent="dqn", steps=30_000)
-PREDICTED_OPTIONS = "agent steps hyperparameters sticky random lazy reward_noise"
+PREDICTED_OPTIONS = "agent steps hyperparameters sticky random lazy reward_noise scale_rewards"
 
 
 def predict(

@@ -18,7 +18,16 @@ if TYPE_CHECKING:
     from pharos.training import ChanceSetting
 
 
-TAKEN = {"chance", "sticky", "random", "lazy", "reward_noise", "horizon", "hyperparameters"}  # of TrainingOptions
+TAKEN = {
+    "chance",
+    "sticky",
+    "random",
+    "lazy",
+    "reward_noise",
+    "scale_rewards",
+    "horizon",
+    "hyperparameters",
+}  # of TrainingOptions
 NETWORKS_IN_ORDER = OrderCounts(pairs=16, right=3, clear_pairs=16, clear_right=3)
 """Pairs of a DQN's networks, three widths and depths behind each of ten observations, whose regrets differ:
 benchmarks/prediction_choices.py. What a wider network gains its kernel does not see.
@@ -209,8 +218,8 @@ def predict(
         landmarks: as for `representation`.
         common: with the hyperparameters of the published cells, in the place of those of the class.
         progress: called with what is being done.
-        options: sticky, random, lazy, reward_noise, horizon and hyperparameters, as for `pharos.train`; and parameters
-            of the environment.
+        options: sticky, random, lazy, reward_noise, scale_rewards, horizon and hyperparameters, as for `pharos.train`;
+            and parameters of the environment.
     Returns:
         A Prediction, whose cells have a value and an interval, and whose orders say which is easier.
     Raises:
@@ -242,7 +251,8 @@ def predict(
             regret = primary_regret(config, task, network, landmarks)
             low, high = max(0.0, regret.value - width), regret.value + width
             cells.append(PredictedRegret(observation=title, low=low, high=high, **vars(regret)))
-        spread = task.reference.spread() if math.isnan(spread) else spread
+        if math.isnan(spread):  # in the unit that is paid
+            spread = task.reference.spread() / task.scaled_chance.reward_scale
     if not cells:
         raise ParameterError("no observation to predict for; give at least one, such as 'vector'")
     return Prediction(

@@ -10,7 +10,7 @@ configuration has the same id on every machine.
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -135,7 +135,7 @@ class Task:
         options: dict[str, Any] = {
             "observation": self.observation,
             "observation_options": dict(self.observation_options) or None,
-            "chance": self.chance,
+            "chance": self.scaled_chance,
             "previous_action": self.previous_action,
             "time_limit": self.time_limit,
         }
@@ -205,6 +205,20 @@ class Task:
         error = max(solution.error_bound for solution in solutions)
         optimal, uniform, worst = (float(solution.value_at_start) for solution in solutions)
         return ReferenceValues(optimal, uniform, worst, error)
+
+    @cached_property
+    def scaled_chance(self) -> ChanceSetting:
+        """The chance, with a number in the place of `scale_rewards="range"`.
+
+        Raises:
+            ParameterError: no policy beats uniform play, so that there is no such number.
+        """
+        if self.chance.scale_rewards != "range":
+            return self.chance
+        spread = self.reference.spread()
+        if math.isnan(spread):
+            raise ParameterError("scale_rewards is range, but no policy beats uniform play; expected a number")
+        return replace(self.chance, scale_rewards=repr(spread))
 
     @property
     def return_range(self) -> tuple[float, float]:
