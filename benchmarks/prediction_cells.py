@@ -4,7 +4,7 @@
     python benchmarks/prediction_cells.py judge [--cells cells.csv] [--resamples 1000]
     python benchmarks/prediction_cells.py orders [--cells cells.csv]
     python benchmarks/prediction_cells.py sealed [--cells cells.csv] [--resamples 1000]
-    python benchmarks/prediction_cells.py pilots [--cells cells.csv]
+    python benchmarks/prediction_cells.py pilots [--cells cells.csv] [--write]
     python benchmarks/prediction_cells.py draw [--cells cells.csv] [--picture docs/images/sealed.png]
     python benchmarks/prediction_cells.py cost
 
@@ -37,6 +37,8 @@ from pharos.agents import primary_predictors
 from pharos.prediction import Published
 from pharos.prediction.calibration import BINS, FILE, NUMBERS
 from pharos.prediction.learners import primary_regret
+from pharos.prediction.pilot import FILE as PILOT_FILE
+from pharos.prediction.pilot import SHARES as PILOTS
 from pharos.statistics import spearman
 from pharos.study.cross_validation import held_out
 from pharos.study.tables import CELL
@@ -191,7 +193,7 @@ def said_of(cells, resamples):
 SHARES = (0.05, 0.1, 0.25, 0.5, 1.0)
 
 
-def pilots(file):
+def pilots(file, write=False):
     """A pilot beside the measure on the second sealed set: one seed, cut after a share of its steps, for the others.
 
     R2 of classes left out after a line through the cells of the others, of the mean regret of three other seeds: by the
@@ -206,6 +208,9 @@ def pilots(file):
     cells = curves[[*CELL, "seed"]].assign(**so_far)
     others = cells[cells["seed"] > 0].groupby(CELL)["100%"].mean().rename("others").reset_index()
     cells = cells[cells["seed"] == 0].merge(others, on=CELL).merge(frame[frame["study"] == "sealed-2"], on=CELL)
+    kept = cells[[*CELL, "predicted", "others"]].assign(**{str(share): cells[f"{share:.0%}"] for share in PILOTS})
+    if write:
+        kept.round(6).to_csv(PILOT_FILE, index=False, lineterminator="\n")
     for agent in primary_predictors():
         of_agent = cells[cells["agent"] == agent]
         y, classes = of_agent["others"].to_numpy(), np.unique(of_agent["environment"], return_inverse=True)[1]
@@ -309,6 +314,7 @@ def main():
     parser.add_argument("--out", type=Path, default=FILE)
     parser.add_argument("--cells", type=Path, default=FILE)
     parser.add_argument("--block", action="append", choices=[*BLOCKS])
+    parser.add_argument("--write", action="store_true", help="write what `pharos predict --pilot` rests on")
     parser.add_argument("--resamples", type=int, default=1000)
     parser.add_argument("--picture", type=Path, default=STUDIES.parent / "images" / "sealed.png")
     arguments = parser.parse_args()
@@ -321,7 +327,7 @@ def main():
     elif arguments.task == "sealed":
         sealed(arguments.cells, arguments.resamples)
     elif arguments.task == "pilots":
-        pilots(arguments.cells)
+        pilots(arguments.cells, arguments.write)
     elif arguments.task == "cost":
         cost()
     else:

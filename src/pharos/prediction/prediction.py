@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.prediction.calibration import COMMON, LEVEL, OrderCounts, Published, published
 from pharos.prediction.learners import PrimaryRegret, primary_regret
+from pharos.prediction.pilot import pilot_regret, plane
 from pharos.system.storage import plain
 
 if TYPE_CHECKING:
@@ -45,11 +46,13 @@ class PredictedRegret(PrimaryRegret):
     Attributes:
         observation: what the agent sees, with its options.
         low, high: ends of the interval that held LEVEL of the published cells, at least 0; also `lower` and `upper`.
+        pilot: mean regret of a pilot so far, NaN without one; `value` is then what it and the idealised learner say.
     """
 
     observation: str
     low: float
     high: float
+    pilot: float = math.nan
 
     @property
     def lower(self) -> float:
@@ -156,7 +159,11 @@ class Prediction:
 
     @property
     def orders(self) -> list[PairOrder]:
-        """Orders of the easiest cell and each other one; the easiest is named first."""
+        """Orders of the easiest cell and each other one; the easiest is named first. None with pilots, as nobody has
+        counted how often those are right.
+        """
+        if not math.isnan(self.cells[0].pilot):
+            return []
         calibration, ranked = published(self.agent), sorted(self.cells, key=lambda cell: cell.value)
         easiest, orders = ranked[0], []
         for cell in ranked[1:]:
@@ -198,6 +205,7 @@ def predict(
     steps: int = 30_000,
     landmarks: int | None = None,
     common: bool = False,
+    pilot: float | None = None,
     progress: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Prediction:
@@ -217,6 +225,8 @@ def predict(
         steps: of training.
         landmarks: as for `representation`.
         common: with the hyperparameters of the published cells, in the place of those of the class.
+        pilot: train one seed of the real agent for this share of the steps (0.1, 0.25 or 0.5), too. Values and
+            intervals are then of the pilot and the idealised learner together.
         progress: called with what is being done.
         options: sticky, random, lazy, reward_noise, scale_rewards, horizon and hyperparameters, as for `pharos.train`;
             and parameters of the environment.
@@ -231,12 +241,15 @@ def predict(
     from pharos.agents import hyperparameters as hyperparameters_of
     from pharos.training import RunConfig, Task, TrainingOptions
 
-    calibration = published(agent)
+    if pilot is not None and networks is not None:
+        raise ParameterError("a pilot is of the agent's own network; expected no networks")
+    calibration, together = published(agent), None if pilot is None else plane(agent, pilot)
+    covering = calibration if together is None else together.calibration
     training = TrainingOptions(**{name: value for name, value in options.items() if name in TAKEN})
     parameters = {name: value for name, value in options.items() if name not in TAKEN}
     env, chance = Task.of(environment, parameters).env, training.chance
     overrides = {**(COMMON[agent] if common else {}), **(training.hyperparameters or {})}
-    width, cells, states, spread = calibration.half_width(), [], 0, math.nan
+    width, cells, states, spread = covering.half_width(), [], 0, math.nan
     # A cell for each observation and network
     for name, view in _observations(observations):
         task = Task.of(env, chance=chance, observation=name, observation_options=view, horizon=training.horizon)
@@ -249,8 +262,12 @@ def predict(
             if progress is not None:
                 progress(f"predicting {agent} behind {title}")
             regret = primary_regret(config, task, network, landmarks)
+            so_far = math.nan
+            if together is not None and pilot is not None:
+                so_far = pilot_regret(agent, task, steps, settings, pilot)
+                regret = replace(regret, value=together.value(so_far, regret.value))
             low, high = max(0.0, regret.value - width), regret.value + width
-            cells.append(PredictedRegret(observation=title, low=low, high=high, **vars(regret)))
+            cells.append(PredictedRegret(observation=title, low=low, high=high, pilot=so_far, **vars(regret)))
         if math.isnan(spread):  # in the unit that is paid
             spread = task.reference.spread() / task.scaled_chance.reward_scale
     if not cells:
@@ -261,12 +278,12 @@ def predict(
         agent=agent,
         steps=steps,
         states=states,
-        predictor=primary_predictors()[agent],
+        predictor=primary_predictors()[agent] + (f" and a pilot of {pilot * steps:,.0f} steps" if pilot else ""),
         cells=tuple(cells),
         half_width=width,
-        coverage=calibration.coverage(),
-        published_cells=len(calibration.predicted),
-        published_classes=len(set(calibration.classes)),
+        coverage=covering.coverage(),
+        published_cells=len(covering.predicted),
+        published_classes=len(set(covering.classes)),
         warnings=(*_warnings(calibration, states, steps, spread, chance), *_other_hyperparameters(agent, settings)),
         hyperparameters=settings,
     )
