@@ -4,6 +4,7 @@
     python benchmarks/prediction_cells.py judge [--cells cells.csv] [--resamples 1000]
     python benchmarks/prediction_cells.py orders [--cells cells.csv]
     python benchmarks/prediction_cells.py sealed [--cells cells.csv] [--resamples 1000]
+    python benchmarks/prediction_cells.py pilots [--cells cells.csv] [--write]
     python benchmarks/prediction_cells.py draw [--cells cells.csv] [--picture docs/images/sealed.png]
     python benchmarks/prediction_cells.py cost
 
@@ -15,6 +16,7 @@ after a line, Spearman's rank correlation, the share of pairs of observations th
 fit, half the width of the 80 % interval and the share of classes left out that it covers; in brackets 95 % intervals
 over classes drawn anew. Classes weigh alike. `orders` prints the pairs of observations by predicted difference.
 `sealed` prints the same of the second sealed test, by block and predictor, and what the interval of before it held.
+`pilots` prints how well a seed that is cut after a share of its steps predicts others, with the measure and without.
 `draw` draws predicted against observed regret of the second sealed set. `cost` prints the seconds of a cell and the
 memory that it adds, each in a process of its own that has compiled, by states of a grid, agent and observation.
 """
@@ -35,6 +37,8 @@ from pharos.agents import primary_predictors
 from pharos.prediction import Published
 from pharos.prediction.calibration import BINS, FILE, NUMBERS
 from pharos.prediction.learners import primary_regret
+from pharos.prediction.pilot import FILE as PILOT_FILE
+from pharos.prediction.pilot import SHARES as PILOTS
 from pharos.statistics import spearman
 from pharos.study.cross_validation import held_out
 from pharos.study.tables import CELL
@@ -186,6 +190,38 @@ def said_of(cells, resamples):
     return f"{r_squared} | {rho} | {pairs} of {len(known.pairs.first)} | {unfitted} | {width}"
 
 
+SHARES = (0.05, 0.1, 0.25, 0.5, 1.0)
+
+
+def pilots(file, write=False):
+    """A pilot beside the measure on the second sealed set: one seed, cut after a share of its steps, for the others.
+
+    R2 of classes left out after a line through the cells of the others, of the mean regret of three other seeds: by the
+    pilot's mean regret so far alone, and by a plane through it and the measure.
+    """
+    frame, curves = pd.read_csv(file), pd.read_parquet(STUDIES / "sealed-2" / "curves.parquet")
+    curves = curves[curves["part"].str[0].isin(["a", "b", "c"])]
+    spread = curves["value_optimal"] - curves["value_uniform"]
+    regret = (curves["value_optimal"].to_numpy()[:, None] - np.stack(curves["value"])) / spread.to_numpy()[:, None]
+    share = np.linspace(0, 1, regret.shape[1])
+    so_far = {f"{part:.0%}": regret[:, share <= part + 1e-9].mean(axis=1) for part in SHARES}
+    cells = curves[[*CELL, "seed"]].assign(**so_far)
+    others = cells[cells["seed"] > 0].groupby(CELL)["100%"].mean().rename("others").reset_index()
+    cells = cells[cells["seed"] == 0].merge(others, on=CELL).merge(frame[frame["study"] == "sealed-2"], on=CELL)
+    kept = cells[[*CELL, "predicted", "others"]].assign(**{str(share): cells[f"{share:.0%}"] for share in PILOTS})
+    if write:
+        kept.round(6).to_csv(PILOT_FILE, index=False, lineterminator="\n")
+    for agent in primary_predictors():
+        of_agent = cells[cells["agent"] == agent]
+        y, classes = of_agent["others"].to_numpy(), np.unique(of_agent["environment"], return_inverse=True)[1]
+        counts = np.ones((1, classes.max() + 1), int)
+        for words, more in (("a pilot", []), ("a pilot and the measure", ["predicted"])):
+            r_squared = [held_out(of_agent[[name, *more]].to_numpy(), y, classes, counts)[0][0] for name in so_far]
+            print(f"| {agent.upper()} | {words} | {' | '.join(f'{each:.2f}' for each in r_squared)} |")
+        alone = held_out(of_agent[["predicted"]].to_numpy(), y, classes, counts)[0][0]
+        print(f"| {agent.upper()} | the measure alone | {' | '.join([f'{alone:.2f}'] + ['' for _ in SHARES[1:]])} |")
+
+
 def draw(file, picture):
     """Predicted against observed on the second sealed set, a panel for each agent."""
     from pharos.plots import save
@@ -274,10 +310,11 @@ def statistics(known, counts):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("task", choices=("compute", "judge", "orders", "sealed", "draw", "cost"))
+    parser.add_argument("task", choices=("compute", "judge", "orders", "sealed", "pilots", "draw", "cost"))
     parser.add_argument("--out", type=Path, default=FILE)
     parser.add_argument("--cells", type=Path, default=FILE)
     parser.add_argument("--block", action="append", choices=[*BLOCKS])
+    parser.add_argument("--write", action="store_true", help="write what `pharos predict --pilot` rests on")
     parser.add_argument("--resamples", type=int, default=1000)
     parser.add_argument("--picture", type=Path, default=STUDIES.parent / "images" / "sealed.png")
     arguments = parser.parse_args()
@@ -289,6 +326,8 @@ def main():
         orders(arguments.cells)
     elif arguments.task == "sealed":
         sealed(arguments.cells, arguments.resamples)
+    elif arguments.task == "pilots":
+        pilots(arguments.cells, arguments.write)
     elif arguments.task == "cost":
         cost()
     else:

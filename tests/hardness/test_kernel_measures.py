@@ -402,6 +402,14 @@ def test_exploration_time_is_that_of_a_linear_system(sticky, random):
     assert found.episodes == pytest.approx(1 / found.probability)
 
 
+def test_where_rewards_are_costs_alone_the_smaller_ones_are_large():
+    """Less a constant, rewards of 0 and 1 are costs, and the same actions are met: terminal states have no say."""
+    mdp = chain(3, horizon=5)
+    gains = (mdp.rewards > 0.5).astype(float)
+    found, shifted = (hardness.exploration_time(mdp.with_rewards(rewards)) for rewards in (gains, gains - 2.0))
+    assert (shifted.steps, shifted.probability) == (found.steps, found.probability) and shifted.threshold == -1.5
+
+
 def test_an_episode_has_met_a_large_reward_once_though_it_would_go_on():
     always = TabularMDP.from_arrays([[0, 0]], [[1.0, 1.0]], gamma=1.0, horizon=5)
     found = hardness.exploration_time(always)
@@ -415,8 +423,9 @@ def test_what_does_not_exist_says_so():
         with pytest.raises(UndefinedMeasure, match=f"{name} is defined for episodes"):
             getattr(hardness, name)(endless, seen)
     assert "episodes" in refusal(UndefinedMeasure, hardness.exploration_time, endless)
-    with pytest.raises(UndefinedMeasure, match="no reward is positive"):
-        hardness.exploration_time(chain().with_rewards(np.zeros((4, 2))))
+    for cost in (0.0, -1.0):
+        with pytest.raises(UndefinedMeasure, match=f"all rewards are {cost:g}, so none is large"):
+            hardness.exploration_time(chain().with_rewards(np.full((4, 2), cost)))
     for name in ("kernel_regret", "kernel_policy_regret"):
         with pytest.raises(UndefinedMeasure, match=f"{name}: uniform play is optimal"):
             getattr(hardness, name)(chain().with_rewards(np.zeros((4, 2))), seen)

@@ -5,6 +5,7 @@ agree with it to 1e-9; what draws has to pass a chi-square (or Kolmogorov-Smirno
 """
 
 import itertools
+import math
 from collections import Counter
 from dataclasses import dataclass
 
@@ -14,10 +15,12 @@ from scipy.stats import chisquare, kstest
 
 import pharos
 from naive.learning import paid as paid_of
+from pharos import importers
 from pharos.agents import QLearning
 from pharos.agents.batched import BatchRun
 from pharos.agents.batched.lane import BatchedEpisodes
 from pharos.environments import Layer
+from pharos.errors import ParameterError
 from pharos.interaction import GymEnv, VectorEnv
 from pharos.mdp import ChanceSetting, lazy_actions, paid_outcomes, rewards_of_staying
 from pharos.policies.policy import TableAnswers
@@ -362,3 +365,62 @@ def test_frames_are_the_last_states_of_the_episode_and_its_first_one_before(spac
         first, current = (episodes.flags[0] > 0), episodes.state[0].copy()
         np.testing.assert_array_equal(episodes.seen[0], np.stack([np.where(first, current, batched), current], axis=1))
         before, state, batched = now, one.state[0], current
+
+
+def test_rewards_in_another_unit_are_paid_and_the_earned_ones_are_told():
+    env = pharos.GymEnv("river_swim", length=4, scale_rewards=4, reward_delay=0)
+    env.reset(seed=0)
+    steps = [env.step(action) for action in [1, 1, 1, 0, 1, 0, 0, 1] * 8]
+    assert all(reward == info["earned_reward"] / 4 for _, reward, _, _, info in steps)
+    assert any(reward for _, reward, *_ in steps)
+
+
+@pytest.mark.parametrize("wrong", [0, -1, "many", math.inf])
+def test_rewards_are_not_divided_by_what_is_no_unit(wrong):
+    with pytest.raises(ParameterError, match="expected a number above 0, or range"):
+        ChanceSetting(scale_rewards=wrong)
+    with pytest.raises(ParameterError, match="expected a number here"):
+        pharos.GymEnv("river_swim", length=4, scale_rewards="range")
+
+
+def test_a_reward_scale_is_a_number_in_runs_and_a_word_in_cells():
+    assert ChanceSetting.from_dict({"scale_rewards": 4}) == ChanceSetting(scale_rewards="4")
+    assert ChanceSetting(scale_rewards=4).to_dict() == {"sticky": 0.0, "random": 0.0, "scale_rewards": 4.0}
+    assert str(ChanceSetting(scale_rewards=4, lazy=0.1)) == "lazy 0.1, scale_rewards 4"
+    assert str(ChanceSetting(scale_rewards="range")) == "scale_rewards range"
+    assert str(ChanceSetting()) == "plain" and not ChanceSetting()
+
+
+@pytest.mark.slow
+def test_a_table_learns_the_same_in_any_unit(tmp_path, monkeypatch):
+    """A power of two rounds nothing, so policies are the same to the last bit; V* - U divides to 1 in any unit."""
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    table, rewards = [[0, 1], [0, 2], [0, 2]], np.array([[0.25, 0.0], [0.25, 0.0], [0.25, 1.0]])
+
+    def curve(unit, **options):
+        mdp = pharos.TabularMDP.from_arrays(table, unit * rewards, gamma=0.9, horizon=20)
+        options |= {"steps": 800, "evaluation_interval": 100, "reward_noise": 0.5}
+        run = pharos.train("q_learning", importers.environment(mdp), **options)
+        return [row["normalized_regret"] for row in run.curve], run.config["chance"]
+
+    usual, _ = curve(1.0)
+    scaled, chance = curve(4.0, scale_rewards=4)
+    assert chance["scale_rewards"] == 4.0 and scaled == usual and len(set(usual)) > 1
+    (one, chance), (other, _) = (curve(unit, scale_rewards="range") for unit in (1.0, 8.0))
+    assert chance["scale_rewards"] == "range" and one == other
+
+
+@pytest.mark.slow
+def test_batches_divide_what_is_paid_and_count_what_is_earned(space):
+    usual, scaled = (batch({"reward_delay": 1, "scale_rewards": unit}, space, 200) for unit in (1, 4))
+    for step in range(2 * HORIZON):
+        for episodes in (usual, scaled):
+            episodes.step(step, POLICY[episodes.state], counts=True)
+        assert (scaled.reward == usual.reward / 4).all() and (scaled.state == usual.state).all()
+    assert usual.reward.any() and scaled.returns == usual.returns != 0
+
+
+def test_the_unit_of_a_task_is_its_value_less_that_of_uniform_play():
+    task = Task.of("river_swim", {"length": 4}, scale_rewards="range")
+    spread = task.reference.optimal - task.reference.uniform
+    assert task.scaled_chance.reward_scale == task.interaction["chance"].reward_scale == spread

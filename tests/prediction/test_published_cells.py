@@ -91,7 +91,7 @@ def test_the_pages_have_the_numbers_of_the_cells(cells, capsys):
             assert f"| {agent} | {count} | {r_squared} | {rho} | {pairs} | {width} | {coverage} |" in page
         if (name, agent) == ("the first fourteen sealed", "DQN"):
             assert f"| DQN | `sampled_regret`, named before the second | {r_squared}, known by then |" in page
-    for line in lines_of(capsys, cells.orders, cells.FILE):
+    for line in [*lines_of(capsys, cells.orders, cells.FILE), *lines_of(capsys, cells.pilots, cells.FILE)]:
         assert line in page
     tested = lines_of(capsys, cells.sealed, cells.FILE, 1000)
     assert len(tested) == 13

@@ -54,6 +54,18 @@ def test_every_run_is_executed_once_and_a_second_command_finds_nothing_to_do(tmp
     assert json.loads((tmp_path / "out" / "status.json").read_text())["finished"] == 6
 
 
+def test_a_part_of_a_study_is_executed_and_the_rest_afterwards(tmp_path, log):
+    spec = specification()
+    part = [run.id for run in spec.runs if run.config["agent"] == "dqn"]
+    end = study.run(spec, tmp_path, runner=fake_training.train, workers=2, block=[1], agent=["dqn"])
+    assert (end.total, end.finished) == (3, 3) and sorted(log.read_text().split()) == sorted(part)
+    for wrong, message in (({"block": [2]}, "has blocks 1 to 1"), ({"observation": ["hash"]}, "hash")):
+        with pytest.raises(PharosError, match=message):
+            study.run(spec, tmp_path, runner=fake_training.train, **wrong)
+    assert study.run(spec, tmp_path, runner=fake_training.train, workers=2).finished == 6
+    assert len(log.read_text().split()) == 6
+
+
 @pytest.mark.slow
 def test_the_folder_of_a_study_is_a_specification_of_the_same_runs(tmp_path):
     spec = specification(chance=["plain", {"sticky": 0.25}])

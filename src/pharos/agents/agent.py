@@ -50,6 +50,9 @@ class LearningTask(Protocol):
     def chance(self) -> ChanceSetting: ...
 
     @property
+    def scaled_chance(self) -> ChanceSetting: ...
+
+    @property
     def time_limit(self) -> int: ...
 
     @property

@@ -211,15 +211,18 @@ class QLearningAgent(TableBasedAgent):
         checked_options(hyperparameters)
 
     def table(self, run: LearningRun) -> QLearning:
-        task, chance = run.task, run.task.chance
+        task, chance = run.task, run.task.scaled_chance
+        # In another unit of rewards a table learns the same policies, from values and with noise in that unit
+        scale = chance.reward_scale
+        initial = {"initial_q": scale * float(run.hyperparameters.get("initial_q", DEFAULTS["initial_q"]))}
         return QLearning(
             task.mdp,
             total_steps=run.config.steps,
             seed=run.config.seed,
             time_limit=task.time_limit,
-            reward_noise=chance.reward_noise,
+            reward_noise=chance.reward_noise * scale,
             reward_delay=chance.reward_delay,
-            **run.hyperparameters,
+            **{**run.hyperparameters, **initial},
         )
 
 

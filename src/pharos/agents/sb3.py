@@ -358,7 +358,7 @@ def _batch_run(run: LearningRun) -> "BatchRun":
     from pharos.agents.batched import BatchRun, ObservationSource
     from pharos.mdp import rewards_of_outcomes, rewards_of_staying
 
-    config, task, chance = run.config, run.task, run.config.chance
+    config, task, chance = run.config, run.task, run.task.scaled_chance
     space, staying = task.space, None
     if chance.lazy:
         staying = run.shared("staying", WORLD, lambda: rewards_of_staying(space).array.astype(float))

@@ -242,7 +242,7 @@ def _ties(report: "Report") -> list[str]:
 
 
 PREDICTED = TrainingOptions(agent="dqn", steps=30_000)
-PREDICTED_OPTIONS = "agent steps hyperparameters sticky random lazy reward_noise"
+PREDICTED_OPTIONS = "agent steps hyperparameters sticky random lazy reward_noise scale_rewards"
 
 
 def predict(
@@ -252,6 +252,7 @@ def predict(
     network: list[str] | None = None,
     training: Annotated[TrainingOptions, PREDICTED_OPTIONS] = PREDICTED,
     preset: Annotated[str | None, typer.Option("--hyperparameters", metavar="common")] = None,
+    pilot: float | None = None,
     horizon: Count | None = None,
     landmarks: Annotated[int | None, typer.Option(min=0)] = None,
     plot: Annotated[Path | None, file_ending(".png", ".pdf", ".svg")] = None,
@@ -264,6 +265,7 @@ def predict(
             when not given.
         agent: dqn or ppo.
         steps: Steps that it would learn from.
+        pilot: Train one seed for this share of the steps, too: 0.1, 0.25 or 0.5. Values are of both together.
         preset: Those of the published cells, for which the interval is calibrated; --set goes before them.
         horizon: Steps of an episode; the environment's time limit when not given.
         landmarks: Approximate the kernel by so many; 0: never; beyond 2,048 if not given.
@@ -281,6 +283,7 @@ def predict(
             networks=network or None,
             landmarks=landmarks,
             common=preset is not None,
+            pilot=pilot,
             progress=tell,
             **{name: getattr(training, name) for name in ("agent", "steps", "hyperparameters", "chance")},
             horizon=horizon or "limit",

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 OPTIONS = "agent observation observation_options steps engine hyperparameters evaluation_interval"
-CHANCE = "sticky random lazy reward_noise reward_delay"
+CHANCE = "sticky random lazy reward_noise reward_delay scale_rewards"
 UNIFORM_IS_OPTIMAL = "-  (uniform play is optimal as well: give a shorter --horizon, or a --gamma below 1)"
 BEFORE = "loading, building, compiling, first evaluation"
 

@@ -424,7 +424,7 @@ register(
     definition="expected steps after which uniform play, in episodes of T steps, meets a reward above half the largest",
     source="pharos",
     complexity="visitation",
-    version=1,
+    version=2,
     depends="episodes",
     on_request=True,
 )

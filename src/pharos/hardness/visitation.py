@@ -401,21 +401,27 @@ def exploration_time(
     """Return the expected steps, and episodes, after which uniform play has executed an action with a large reward.
 
     With p the probability that an episode meets one, and l the expected steps of an episode up to its end or to there:
-    1 / p episodes, and l / p steps, by Wald's identity. A reward r(s, a) is large above half of the largest one.
+    1 / p episodes, and l / p steps, by Wald's identity. A reward r(s, a) is large above half of the largest one; if
+    rewards are costs alone, above the middle between the smallest and the largest.
 
     Args:
         horizon: steps of an episode; None: that of the MDP.
         progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
-        UndefinedMeasure: there are no episodes, or no reward is positive.
+        UndefinedMeasure: there are no episodes, or all rewards are costs of one size.
     Cost: O(S A) a step.
     Source: pharos; goal-finding by random walk, as in Koenig and Simmons (1996).
     """
     steps = steps_of("exploration_time", mdp, horizon)
     rewards, live = mdp.rewards, ~np.asarray(mdp.terminal)
     threshold = LARGE * float(rewards.max(initial=0.0))
-    if not threshold > 0:
-        raise UndefinedMeasure("exploration_time: no reward is positive, so none is large")
+    if not threshold > 0:  # costs alone: from the largest on
+        counts = np.broadcast_to(live[:, None], rewards.shape)
+        costs = rewards[counts if mdp.available is None else counts & mdp.available]
+        low, high = float(costs.min(initial=0.0)), float(costs.max(initial=-np.inf))
+        if not low < high:
+            raise UndefinedMeasure(f"exploration_time: all rewards are {low:g}, so none is large")
+        threshold = low + LARGE * (high - low)
     is_large = rewards > threshold
     mass = np.zeros((mdp.num_states, 1))
     np.add.at(mass[:, 0], mdp.start_states, mdp.start_probabilities)

@@ -341,9 +341,9 @@ class FrameStack:
 
 
 class RewardChannel:
-    """Delayed and noisy rewards of N environments. Values and regret are of the rewards without delay and noise.
+    """Delayed, noisy and scaled rewards of N environments. Values and regret are of the rewards that are earned.
 
-    At step t of an episode of n steps, t = 1 .. n, r_t being what is earned:
+    At step t of an episode of n steps, t = 1 .. n, r_t being what is earned, divided by `scale_rewards`:
 
         paid_t = r_(t - delay) + noise z_t for t < n, with r_0 = r_-1 = ... = 0
         paid_n = r_(n - delay) + ... + r_n + noise z_n
@@ -359,7 +359,7 @@ class RewardChannel:
     """
 
     def __init__(self, chance: ChanceSetting, num_envs: int):
-        self.noise, self.delay = float(chance.reward_noise), int(chance.reward_delay)
+        self.noise, self.delay, self.scale = float(chance.reward_noise), int(chance.reward_delay), chance.reward_scale
         self.earned = np.zeros(num_envs)
         self._pending = np.zeros((num_envs, self.delay))
         self._steps = np.zeros(num_envs, np.int64)
@@ -383,6 +383,6 @@ class RewardChannel:
             ended: (N,) bool, whether its episode is over, so that everything is due.
         """
         self.earned = earned
-        amounts = earned.copy()
+        amounts = earned / self.scale
         stepping.modify_rewards(self._rng, self.noise, self._pending, self._steps, is_step, ended, amounts)
         return amounts

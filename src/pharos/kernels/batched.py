@@ -196,8 +196,8 @@ def advance(
     effect, (0, 0) where all have one; terminal (S,); starts, cumulative: start states and their cumulated
     probabilities.
     setting: (keys (W,) uint64, step, chances (W, 4), limits (W,), gammas (W,)), as in `stepping.Setting`.
-    knobs (W, 3): the probability that an action has no effect, the deviation of the noise of rewards, their delay in
-    steps.
+    knobs (W, 4): the probability that an action has no effect, the deviation of the noise of rewards, their delay in
+    steps, and what they are divided by.
     pending (W, E, D): rewards earned and not paid yet; see `delayed_reward`.
     episodes: (state, previous, elapsed (W, E) int64, return, discount (W, E) float64) of the running episodes, and
     (number, sum of returns (W,)) of the finished ones, which this step adds to where `counts` is true.
@@ -232,9 +232,9 @@ def advance(
             timeout = not ended and elapsed[i, e] >= limits[i]
             next_states[i, e] = s if t < 0 else t
             flags[i, e] = (DONE if ended or timeout else 0) | (TIMEOUT if timeout else 0)
-            reward[i, e] = earned
+            reward[i, e] = earned / knobs[i, 3]
             if delay > 0:
-                reward[i, e] = delayed_reward(pending[i, e, :delay], elapsed[i, e] - 1, earned, ended or timeout)
+                reward[i, e] = delayed_reward(pending[i, e, :delay], elapsed[i, e] - 1, reward[i, e], ended or timeout)
             if noise > 0.0:
                 reward[i, e] += noise * normal_by_numbers(unit(effect_words[1]), unit(effect_words[2]))
             # the running episode; at its end count it and start another

@@ -440,6 +440,10 @@ class Chance:
         return {name: value for name, value in vars(self).items() if name != "available"}
 
 
+RANGE = "range"
+"""V* - U, as a number by which rewards are divided."""
+
+
 @dataclass(frozen=True)
 class ChanceSetting:
     """Chance added to an environment: of acting, which changes the MDP, and noise and delay of rewards, which do not.
@@ -454,6 +458,8 @@ class ChanceSetting:
             paid, as `lazy_actions` has it.
         reward_noise: standard deviation of noise in what is paid; 0 on average.
         reward_delay: steps by which rewards are paid late, the last at the end.
+        scale_rewards: what is earned is divided by this number before noise and delay; or `range`, by V* - U, the value
+            of optimal less that of uniform play.
     Raises:
         ParameterError: one of them is out of range.
     """
@@ -463,8 +469,19 @@ class ChanceSetting:
     lazy: float = parameter(0.0, low=0, high=1)
     reward_noise: float = parameter(0.0, low=0)
     reward_delay: int = parameter(0, low=0)
+    scale_rewards: str = ""
 
     def __post_init__(self) -> None:
+        if self.scale_rewards not in ("", RANGE):
+            try:
+                divisor = float(self.scale_rewards)
+            except (TypeError, ValueError):
+                divisor = math.nan
+            if not 0 < divisor < math.inf:
+                raise ParameterError(
+                    f"ChanceSetting: scale_rewards is {self.scale_rewards!r}; expected a number above 0, or {RANGE}"
+                )
+            object.__setattr__(self, "scale_rewards", repr(divisor))
         for name, declared in declared_parameters(ChanceSetting).items():
             value = getattr(self, name)
             number = declared.checked(self, name, value)
@@ -489,12 +506,25 @@ class ChanceSetting:
 
     def to_dict(self) -> dict[str, float]:
         """`{"sticky": .., "random": ..}`, and the others where they are not 0."""
-        return {name: value for name, value in vars(self).items() if value or name in ("sticky", "random")}
+        entry = {name: value for name, value in vars(self).items() if value or name in ("sticky", "random")}
+        is_number = self.scale_rewards not in ("", RANGE)
+        return {**entry, "scale_rewards": float(self.scale_rewards)} if is_number else entry
 
     @property
     def modifies_rewards(self) -> bool:
-        """Whether rewards are paid late or with noise."""
-        return bool(self.reward_noise or self.reward_delay)
+        """Whether rewards are paid late, with noise, or in another unit."""
+        return bool(self.reward_noise or self.reward_delay or self.scale_rewards)
+
+    @property
+    def reward_scale(self) -> float:
+        """The number by which rewards are divided; 1 if by none.
+
+        Raises:
+            ParameterError: it is `range`, which takes a task (`pharos.training.Task.scaled_chance`).
+        """
+        if self.scale_rewards == RANGE:
+            raise ParameterError(f"scale_rewards is {RANGE}, which training knows; expected a number here")
+        return float(self.scale_rewards or 1.0)
 
     @property
     def changes_mdp(self) -> bool:
@@ -517,6 +547,7 @@ class ChanceSetting:
         parts += [f"{name} actions {p:g}" for name in ("sticky", "random", "lazy") if (p := getattr(self, name))]
         parts += [f"reward noise {self.reward_noise:g}"] * bool(self.reward_noise)
         parts += [f"rewards {self.reward_delay} steps late"] * bool(self.reward_delay)
+        parts += [f"rewards divided by {self.to_dict().get('scale_rewards')}"] * bool(self.scale_rewards)
         return ", ".join(parts) or "none"
 
     def __bool__(self) -> bool:
@@ -524,7 +555,9 @@ class ChanceSetting:
 
     def __str__(self) -> str:
         """`plain`, `sticky 0.25`, `random 0.1`, or several of them."""
-        return ", ".join(f"{name} {value:g}" for name, value in vars(self).items() if value) or "plain"
+        named = {name: value for name, value in self.to_dict().items() if value}
+        texts = (f"{name} {value if isinstance(value, str) else f'{value:g}'}" for name, value in named.items())
+        return ", ".join(texts) or "plain"
 
 
 @require_mdp

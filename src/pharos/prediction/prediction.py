@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,13 +12,23 @@ from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.prediction.calibration import COMMON, LEVEL, OrderCounts, Published, published
 from pharos.prediction.learners import PrimaryRegret, primary_regret
+from pharos.prediction.pilot import pilot_regret, plane
 from pharos.system.storage import plain
 
 if TYPE_CHECKING:
     from pharos.training import ChanceSetting
 
 
-TAKEN = {"chance", "sticky", "random", "lazy", "reward_noise", "horizon", "hyperparameters"}  # of TrainingOptions
+TAKEN = {
+    "chance",
+    "sticky",
+    "random",
+    "lazy",
+    "reward_noise",
+    "scale_rewards",
+    "horizon",
+    "hyperparameters",
+}  # of TrainingOptions
 NETWORKS_IN_ORDER = OrderCounts(pairs=16, right=3, clear_pairs=16, clear_right=3)
 """Pairs of a DQN's networks, three widths and depths behind each of ten observations, whose regrets differ:
 benchmarks/prediction_choices.py. What a wider network gains its kernel does not see.
@@ -36,11 +46,13 @@ class PredictedRegret(PrimaryRegret):
     Attributes:
         observation: what the agent sees, with its options.
         low, high: ends of the interval that held LEVEL of the published cells, at least 0; also `lower` and `upper`.
+        pilot: mean regret of a pilot so far, NaN without one; `value` is then what it and the idealised learner say.
     """
 
     observation: str
     low: float
     high: float
+    pilot: float = math.nan
 
     @property
     def lower(self) -> float:
@@ -147,7 +159,11 @@ class Prediction:
 
     @property
     def orders(self) -> list[PairOrder]:
-        """Orders of the easiest cell and each other one; the easiest is named first."""
+        """Orders of the easiest cell and each other one; the easiest is named first. None with pilots, as nobody has
+        counted how often those are right.
+        """
+        if not math.isnan(self.cells[0].pilot):
+            return []
         calibration, ranked = published(self.agent), sorted(self.cells, key=lambda cell: cell.value)
         easiest, orders = ranked[0], []
         for cell in ranked[1:]:
@@ -189,6 +205,7 @@ def predict(
     steps: int = 30_000,
     landmarks: int | None = None,
     common: bool = False,
+    pilot: float | None = None,
     progress: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Prediction:
@@ -208,9 +225,11 @@ def predict(
         steps: of training.
         landmarks: as for `representation`.
         common: with the hyperparameters of the published cells, in the place of those of the class.
+        pilot: train one seed of the real agent for this share of the steps (0.1, 0.25 or 0.5), too. Values and
+            intervals are then of the pilot and the idealised learner together.
         progress: called with what is being done.
-        options: sticky, random, lazy, reward_noise, horizon and hyperparameters, as for `pharos.train`; and parameters
-            of the environment.
+        options: sticky, random, lazy, reward_noise, scale_rewards, horizon and hyperparameters, as for `pharos.train`;
+            and parameters of the environment.
     Returns:
         A Prediction, whose cells have a value and an interval, and whose orders say which is easier.
     Raises:
@@ -222,14 +241,17 @@ def predict(
     from pharos.agents import hyperparameters as hyperparameters_of
     from pharos.training import RunConfig, Task, TrainingOptions
 
-    calibration = published(agent)
+    if pilot is not None and networks is not None:
+        raise ParameterError("a pilot is of the agent's own network; expected no networks")
+    calibration, together = published(agent), None if pilot is None else plane(agent, pilot)
+    covering = calibration if together is None else together.calibration
     training = TrainingOptions(**{name: value for name, value in options.items() if name in TAKEN})
     if training.horizon in (None, "none"):
         raise ParameterError("predictions are of episodes of some number of steps; found horizon none; give a number")
     parameters = {name: value for name, value in options.items() if name not in TAKEN}
     env, chance = Task.of(environment, parameters).env, training.chance
     overrides = {**(COMMON[agent] if common else {}), **(training.hyperparameters or {})}
-    width, cells, states, spread = calibration.half_width(), [], 0, math.nan
+    width, cells, states, spread = covering.half_width(), [], 0, math.nan
     # A cell for each observation and network
     for name, view in _observations(observations):
         task = Task.of(env, chance=chance, observation=name, observation_options=view, horizon=training.horizon)
@@ -242,9 +264,14 @@ def predict(
             if progress is not None:
                 progress(f"predicting {agent} behind {title}")
             regret = primary_regret(config, task, network, landmarks)
+            so_far = math.nan
+            if together is not None and pilot is not None:
+                so_far = pilot_regret(agent, task, steps, settings, pilot)
+                regret = replace(regret, value=together.value(so_far, regret.value))
             low, high = max(0.0, regret.value - width), regret.value + width
-            cells.append(PredictedRegret(observation=title, low=low, high=high, **vars(regret)))
-        spread = task.reference.spread() if math.isnan(spread) else spread
+            cells.append(PredictedRegret(observation=title, low=low, high=high, pilot=so_far, **vars(regret)))
+        if math.isnan(spread):  # in the unit that is paid
+            spread = task.reference.spread() / task.scaled_chance.reward_scale
     if not cells:
         raise ParameterError("no observation to predict for; give at least one, such as 'vector'")
     return Prediction(
@@ -253,12 +280,12 @@ def predict(
         agent=agent,
         steps=steps,
         states=states,
-        predictor=primary_predictors()[agent],
+        predictor=primary_predictors()[agent] + (f" and a pilot of {pilot * steps:,.0f} steps" if pilot else ""),
         cells=tuple(cells),
         half_width=width,
-        coverage=calibration.coverage(),
-        published_cells=len(calibration.predicted),
-        published_classes=len(set(calibration.classes)),
+        coverage=covering.coverage(),
+        published_cells=len(covering.predicted),
+        published_classes=len(set(covering.classes)),
         warnings=(*_warnings(calibration, states, steps, spread, chance), *_other_hyperparameters(agent, settings)),
         hyperparameters=settings,
     )

@@ -373,3 +373,35 @@ def registered() -> list[str]:
 
 def _jsonable(value: Mapping[str, Any]) -> dict[str, Any]:
     return json.loads(json.dumps(value))
+
+
+def part_of(
+    study: Specification,
+    blocks: Sequence[int] | None,
+    agents: Sequence[str] | None,
+    observations: Sequence[str] | None,
+) -> Iterator[Run]:
+    """Runs of some blocks, counted from 1, agents and observations; None: of all.
+
+    Raises:
+        ParameterError: one of these is not in the study.
+    """
+    runs = study.runs
+    if blocks is not None:
+        wrong = [block for block in blocks if not 1 <= block <= len(study.blocks)]
+        if wrong:
+            raise ParameterError(f"block {wrong[0]}: study {study.name!r} has blocks 1 to {len(study.blocks)}")
+        ids = {run.id for block in blocks for run in study.runs_of(study.blocks[block - 1])}
+        runs = tuple(run for run in runs if run.id in ids)
+    for what, some, name_of in (
+        ("agent", agents, lambda run: run.configuration.agent),
+        ("observation", observations, lambda run: run.configuration.observation),
+    ):
+        unknown = {*(some or ())} - {name_of(run) for run in runs}
+        if unknown:
+            raise UnknownName(f"{what} of study {study.name!r}", min(unknown), sorted({name_of(run) for run in runs}))
+    for run in runs:
+        if agents is not None and run.configuration.agent not in agents:
+            continue
+        if observations is None or run.configuration.observation in observations:
+            yield run

@@ -12,7 +12,7 @@ from typing import Any
 
 from pharos.errors import MissingExtra, ParameterError
 from pharos.study import worker as _worker
-from pharos.study.blocks import Run
+from pharos.study.blocks import Run, part_of
 from pharos.study.execution import Status, StudyExecution, claim, opened, run, shard_of, train
 from pharos.study.specification import Source, specification
 from pharos.system.records import takes
@@ -66,7 +66,8 @@ def submit(
     usual = {"cpus_per_task": how.workers, "timeout_min": 24 * 60, "name": f"pharos-{study.name}"}
     executor.update_parameters(**{**usual, **(parameters or {})})
     parts = [f"{part}/{shards}" for part in range(1, shards + 1)]
-    parts = [part for part in parts if _has_work(shard_of(study.runs, part), place, how.retry_failed)]
+    runs = tuple(part_of(study, how.block, how.agent, how.observation))
+    parts = [part for part in parts if _has_work(shard_of(runs, part), place, how.retry_failed)]
     if not parts:
         return []
     with executor.batch():

@@ -22,7 +22,7 @@ from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, StateS
 from pharos.state_space import build
 from pharos.study import batches as _batches
 from pharos.study import worker as _worker
-from pharos.study.blocks import Run, Specification
+from pharos.study.blocks import Run, Specification, part_of
 from pharos.study.specification import Source
 from pharos.study.status import Forecast, Status, claim, duration, opened, status
 from pharos.system.records import takes
@@ -79,7 +79,8 @@ def run(
         batch_runner: `runner(configs, folders, folder for checkpoints)` of runs that the study says are batched; None:
             the usual one for the usual runner, else each of them alone.
         foretold: called before the first run with how many are to come, and how long they will take.
-        options: of `pharos.training.ExecutionOptions`: shard, retry_failed, resume, timeout, workers, device.
+        options: of `pharos.training.ExecutionOptions`: shard, retry_failed, resume, timeout, workers, device, block,
+            agent, observation.
     Returns:
         The Status at the end. Failed runs do not stop the others.
     Raises:
@@ -123,7 +124,8 @@ class StudyExecution(Execution[Run]):
         pool: Workers | None = None,
     ):
         self.study, self.folder, self.options, self.progress = study, folder, options, progress
-        self.runs = shard_of(study.runs, options.shard)
+        part = part_of(study, options.block, options.agent, options.observation)
+        self.runs = shard_of(tuple(part), options.shard)
         claim(study, folder)
         if batch_runner is None and runner is train:
             batch_runner = partial(_batches.train_batch, device=options.device)

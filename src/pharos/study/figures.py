@@ -187,7 +187,15 @@ def all_curves(points: "pd.DataFrame", profiles: "pd.DataFrame") -> dict[str, Cu
 # Figures --------------------------------------------------------------------------------------------------------------
 
 
-CHANCE_MARKERS = {"plain": "o", "random": "^", "sticky": "s", "lazy": "v", "reward_noise": "P", "reward_delay": "X"}
+CHANCE_MARKERS = {
+    "plain": "o",
+    "random": "^",
+    "sticky": "s",
+    "lazy": "v",
+    "reward_noise": "P",
+    "reward_delay": "X",
+    "scale_rewards": "D",
+}
 OTHER_IMAGE = "complex_image"
 
 

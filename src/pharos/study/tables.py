@@ -7,7 +7,7 @@ A cell is one agent on one instance under one kind of chance with one observatio
 import json
 import os
 import warnings
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cache
@@ -22,7 +22,7 @@ from pharos.environments import classes, make
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.regret import regret_scale
 from pharos.study import worker as _worker
-from pharos.study.blocks import Run, Specification
+from pharos.study.blocks import Run, Specification, part_of
 from pharos.study.specification import Source
 from pharos.study.status import opened
 from pharos.system.storage import ResultCache
@@ -430,7 +430,7 @@ def predict(
 
     study, _ = opened(source, folder)
     rows: dict[tuple[str, ...], dict[str, Any]] = {}
-    for run in _part_of(study, blocks, agents, observations):
+    for run in part_of(study, blocks, agents, observations):
         if agent_called(run.configuration.agent).has_table:
             continue
         key = tuple(run.cell.values())
@@ -443,35 +443,3 @@ def predict(
         raise ParameterError(f"study {study.name!r}: no agent learns from observations, so there is nothing to predict")
     frame = pd.DataFrame(list(rows.values()))
     return frame.fillna({name: "" for name in POLICY_CURVES if name in frame})
-
-
-def _part_of(
-    study: Specification,
-    blocks: Sequence[int] | None,
-    agents: Sequence[str] | None,
-    observations: Sequence[str] | None,
-) -> Iterator[Run]:
-    """Runs of some blocks, agents and observations.
-
-    Raises:
-        ParameterError: one of these is not in the study.
-    """
-    runs = study.runs
-    if blocks is not None:
-        wrong = [block for block in blocks if not 1 <= block <= len(study.blocks)]
-        if wrong:
-            raise ParameterError(f"block {wrong[0]}: study {study.name!r} has blocks 1 to {len(study.blocks)}")
-        ids = {run.id for block in blocks for run in study.runs_of(study.blocks[block - 1])}
-        runs = tuple(run for run in runs if run.id in ids)
-    for what, names, name_of in (
-        ("agent", agents, lambda run: run.configuration.agent),
-        ("observation", observations, lambda run: run.configuration.observation),
-    ):
-        unknown = {*(names or ())} - {name_of(run) for run in runs}
-        if unknown:
-            raise UnknownName(f"{what} of study {study.name!r}", min(unknown), sorted({name_of(run) for run in runs}))
-    for run in runs:
-        if agents is not None and run.configuration.agent not in agents:
-            continue
-        if observations is None or run.configuration.observation in observations:
-            yield run

@@ -51,6 +51,7 @@ def compiled_curves(
             "irrelevant entries": context.observation.irrelevant,
             "previous_action": task.previous_action,
             "reward_delay": task.chance.reward_delay,
+            "scale_rewards": task.chance.scale_rewards,
         }.items()
         if is_wanted
     ]

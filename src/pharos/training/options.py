@@ -104,6 +104,9 @@ class ExecutionOptions:
         timeout: seconds after which a run is ended, and failed. A batch gets as many for each of its runs.
         workers: processes; as many as processors when not given, one on a GPU, whose memory they would share.
         device: of batches: cpu or cuda. As torch names it.
+        block: of this block alone, from 1. Again for another one.
+        agent: of this agent alone. Again for another one.
+        observation: of this observation alone. Again for another one.
     """
 
     shard: Annotated[str | None, "I/N"] = None
@@ -112,3 +115,6 @@ class ExecutionOptions:
     timeout: float | None = parameter(None, kind=float, low=0)
     workers: int | None = parameter(None, kind=int, low=1)
     device: str = "cpu"
+    block: list[int] | None = None
+    agent: list[str] | None = None
+    observation: list[str] | None = None

@@ -10,7 +10,7 @@ configuration has the same id on every machine.
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -146,7 +146,7 @@ class Task:
         options: dict[str, Any] = {
             "observation": self.observation,
             "observation_options": dict(self.observation_options) or None,
-            "chance": self.chance,
+            "chance": self.scaled_chance,
             "previous_action": self.previous_action,
             "time_limit": self.time_limit,
         }
@@ -228,6 +228,20 @@ class Task:
     def gains(self) -> dict[str, GainInterval]:
         """Average rewards a step in the long run, from the start, of the optimal, the uniform and the worst policy."""
         return {name: average_reward(self.mdp, name).gain_at_start for name in ("optimal", "uniform", "worst")}
+
+    @cached_property
+    def scaled_chance(self) -> ChanceSetting:
+        """The chance, with a number in the place of `scale_rewards="range"`.
+
+        Raises:
+            ParameterError: no policy beats uniform play, so that there is no such number.
+        """
+        if self.chance.scale_rewards != "range":
+            return self.chance
+        spread = self.reference.spread()
+        if math.isnan(spread):
+            raise ParameterError("scale_rewards is range, but no policy beats uniform play; expected a number")
+        return replace(self.chance, scale_rewards=repr(spread))
 
     @property
     def return_range(self) -> tuple[float, float]:

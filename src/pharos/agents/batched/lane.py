@@ -516,7 +516,8 @@ class BatchedEpisodes:
         self._limits = np.array([run.time_limit for run in runs], np.int64)
         self._gammas = np.array([run.gamma for run in runs], np.float64)
         chances = [run.chance for run in runs]
-        self._knobs = np.array([(each.lazy, each.reward_noise, each.reward_delay) for each in chances], np.float64)
+        knobs = [(each.lazy, each.reward_noise, each.reward_delay, each.reward_scale) for each in chances]
+        self._knobs = np.array(knobs, np.float64)
         self.pending = np.zeros((width, copies, max(each.reward_delay for each in chances)))
         self.state = np.zeros((width, copies), np.int64)
         self.previous = np.full((width, copies), -1, np.int64)

@@ -1,0 +1,77 @@
+"""Pilots: the beginning of a run, and what it and the prediction say together."""
+
+import csv
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pharos
+from pharos.agents import primary_predictors
+from pharos.errors import ParameterError
+from pharos.prediction import pilot
+from pharos.prediction.pilot import SHARES, Plane, cut, pilot_regret, plane
+from pharos.training import Task
+
+PAGE = (Path(__file__).parents[2] / "docs" / "prediction.md").read_text(encoding="utf-8")
+
+
+def epsilon(settings, step, steps):
+    """The exploration of a DQN, linear over a fraction of its steps."""
+    first, last = settings["exploration_initial_eps"], settings["exploration_final_eps"]
+    return first + (last - first) * min(1.0, step / (settings["exploration_fraction"] * steps))
+
+
+@pytest.mark.parametrize("share", SHARES)
+@pytest.mark.parametrize("fraction", [0.05, 0.25, 0.3, 1.0])
+def test_a_cut_run_explores_as_the_beginning_of_the_whole_one(share, fraction):
+    whole = {"exploration_initial_eps": 1.0, "exploration_final_eps": 0.05, "exploration_fraction": fraction}
+    settings = cut(whole, share)
+    assert settings["exploration_fraction"] <= 1
+    for step in np.linspace(0, share * 1000, 20):
+        assert epsilon(settings, step, share * 1000) == pytest.approx(epsilon(whole, step, 1000))
+    assert cut({"n_steps": 64}, share) == {"n_steps": 64}
+
+
+def test_a_plane_gives_back_a_plane_and_weighs_classes_alike():
+    rng = np.random.default_rng(0)
+    classes, x = np.repeat(["a", "b", "c", "d"], [2, 9, 4, 5]), rng.random((20, 2))
+    exact = Plane(classes, x, 0.1 + 0.5 * x[:, 0] + 0.25 * x[:, 1])
+    assert exact.value(0.4, 0.8) == pytest.approx(0.5) and exact.value(-9.0, 0.0) == 0.0
+    assert exact.calibration.half_width() < 1e-12
+    level = Plane(classes, np.zeros((20, 2)), np.array([1.0, 2.0, *rng.random(9), *[3.0] * 9]))
+    means = [level.calibration.observed[classes == name].mean() for name in "abcd"]
+    assert level.value(0.0, 0.0) == pytest.approx(np.mean(means))
+    assert level.calibration.predicted[0] == pytest.approx(np.mean(means[1:]))  # of the other classes
+
+
+@pytest.mark.parametrize("agent", primary_predictors())
+def test_published_pilots_are_those_of_the_page(agent):
+    with pilot.FILE.open(newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["agent"] == agent]
+    assert len(rows) == 98 and len({row["environment"] for row in rows}) == 14
+    widths = [plane(agent, share).calibration.half_width() for share in SHARES]
+    said = re.search("± ([0-9., and]+) for " + agent.upper(), " ".join(PAGE.split()))[1]
+    assert [float(each) for each in re.findall("[0-9.]+", said)] == [round(width, 2) for width in widths]
+    assert all(0.7 < plane(agent, share).calibration.coverage() < 0.9 for share in SHARES)
+
+
+@pytest.mark.slow
+def test_a_pilot_and_the_prediction_are_put_together():
+    options = {"length": 5, "agent": "ppo", "steps": 5120, "common": True}
+    alone, both = (pharos.predict("river_swim", **options, pilot=share) for share in (None, 0.5))
+    (measure,), (cell,) = alone.cells, both.cells
+    so_far = pilot_regret("ppo", Task.of("river_swim", {"length": 5}), 5120, both.hyperparameters, 0.5)
+    assert cell.pilot == so_far and math.isnan(measure.pilot)
+    assert cell.value == plane("ppo", 0.5).value(so_far, measure.value)
+    assert both.half_width == plane("ppo", 0.5).calibration.half_width() and not both.orders
+    assert both.predictor == "clipped_regret_evaluated and a pilot of 2,560 steps"
+
+
+def test_other_shares_and_networks_have_no_calibration():
+    with pytest.raises(ParameterError, match=r"pilot is 0.2; expected one of 0.1, 0.25, 0.5"):
+        pharos.predict("river_swim", pilot=0.2)
+    with pytest.raises(ParameterError, match="expected no networks"):
+        pharos.predict("river_swim", pilot=0.1, networks=["mlp8"])
