@@ -323,10 +323,13 @@ def _time_limit(seconds: float) -> Iterator[None]:
         raise TimeLimit(f"takes more than {seconds:g} s")
 
     before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-6), 1.0)
     try:
-        yield
-    finally:
+        signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-6), 1.0)
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+    finally:  # once more: the alarm may have come before the block began, or while it was turned off
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
 

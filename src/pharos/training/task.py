@@ -234,13 +234,14 @@ class Task:
         """The chance, with a number in the place of `scale_rewards="range"`.
 
         Raises:
-            ParameterError: no policy beats uniform play, so that there is no such number.
+            ParameterError: no policy beats uniform play, or V* - U is infinite, so that there is no such number.
         """
         if self.chance.scale_rewards != "range":
             return self.chance
         spread = self.reference.spread()
-        if math.isnan(spread):
-            raise ParameterError("scale_rewards is range, but no policy beats uniform play; expected a number")
+        if not math.isfinite(spread):
+            reason = "no policy beats uniform play" if math.isnan(spread) else "uniform play has no finite value"
+            raise ParameterError(f"scale_rewards is range, but {reason}; expected a number")
         return replace(self.chance, scale_rewards=repr(spread))
 
     @property
