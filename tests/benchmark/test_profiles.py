@@ -63,7 +63,7 @@ def test_only_what_no_healthy_agent_shows_is_a_symptom():
         assert healthy and not any(failed(each.readings, known) for each in healthy)
         for symptom in SYMPTOMS:
             values = [each.readings[symptom.reading] for each in healthy if symptom.reading in each.readings]
-            if not values:
+            if not values or symptom.kind not in ("", kind):
                 continue
             sign = 1 if symptom.is_high else -1
             edge = sign * max(*(sign * value + symptom.margin for value in values), sign * symptom.beyond)

@@ -40,6 +40,7 @@ class Symptom:
         margin: beyond the most extreme healthy agent. beyond: what it is beyond besides, wherever healthy agents are.
         wrong: sentence, with {value} for `show(reading)`. advice: what to look at.
         faults: of the library that it is a sign of, the most likely first.
+        kind: of agents that it is a symptom of; empty: of all.
     """
 
     reading: str
@@ -50,6 +51,7 @@ class Symptom:
     advice: str
     faults: tuple[str, ...] = ()
     show: Callable[[float], str] = "{:.2f}".format
+    kind: str = ""
 
 
 def _factor(value: float) -> str:
@@ -290,6 +292,7 @@ SYMPTOMS = (
         "play greedily when a learner of values is judged; look at the temperature and at the entropy bonus",
         ("plays_at_random",),
         _percent,
+        "dqn",
     ),
     Symptom(
         "behind",
@@ -428,7 +431,7 @@ def failed(numbers: Mapping[str, float], library: Sequence[Profile]) -> list[Fin
     findings = []
     for symptom in SYMPTOMS:
         values = [each[symptom.reading] for each in healthy if symptom.reading in each]
-        if symptom.reading not in numbers or not values:
+        if symptom.reading not in numbers or not values or symptom.kind not in ("", kind_of(numbers)):
             continue
         value, sign = numbers[symptom.reading], 1 if symptom.is_high else -1
         limit = sign * max(*(sign * each + symptom.margin for each in values), sign * symptom.beyond)
