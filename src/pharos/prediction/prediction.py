@@ -243,8 +243,8 @@ def predict(
 
     if pilot is not None and networks is not None:
         raise ParameterError("a pilot is of the agent's own network; expected no networks")
-    calibration, together = published(agent), None if pilot is None else plane(agent, pilot)
-    covering = calibration if together is None else together.calibration
+    calibration, joint = published(agent), None if pilot is None else plane(agent, pilot)
+    covering = calibration if joint is None else joint.calibration
     training = TrainingOptions(**{name: value for name, value in options.items() if name in TAKEN})
     if training.horizon in (None, "none"):
         raise ParameterError("predictions are of episodes of some number of steps; found horizon none; give a number")
@@ -265,9 +265,9 @@ def predict(
                 progress(f"predicting {agent} behind {title}")
             regret = primary_regret(config, task, network, landmarks)
             so_far = math.nan
-            if together is not None and pilot is not None:
+            if joint is not None and pilot is not None:
                 so_far = pilot_regret(agent, task, steps, settings, pilot)
-                regret = replace(regret, value=together.value(so_far, regret.value))
+                regret = replace(regret, value=joint.value(so_far, regret.value))
             low, high = max(0.0, regret.value - width), regret.value + width
             cells.append(PredictedRegret(observation=title, low=low, high=high, pilot=so_far, **vars(regret)))
         if math.isnan(spread):  # in the unit that is paid
