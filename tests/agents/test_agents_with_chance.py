@@ -80,6 +80,7 @@ def test_policies_over_observations_are_worth_what_their_tables_are(task):
     assert abs(estimated.value - table.value_at_start) <= estimated.error_bound + table.error_bound
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("setting", [{"horizon": 3}, {"gamma": 0.5, "horizon": None}])
 def test_the_range_of_returns_holds_every_sequence_of_actions_and_outcomes(setting):
     task = Task.of(ChanceWorld(num_positions=20, seed=7, num_starts=2), **setting)

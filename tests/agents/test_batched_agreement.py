@@ -130,6 +130,7 @@ def test_an_update_of_ppo_values_what_a_time_limit_cuts_off():
     assert np.array_equal(lane.rewards, expected)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("max_grad_norm", (0.05, 10.0))
 def test_updates_of_ppo_are_those_of_stable_baselines3(task, max_grad_norm):
     hyperparameters = {**PPO, "max_grad_norm": max_grad_norm}

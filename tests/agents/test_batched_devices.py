@@ -34,6 +34,7 @@ def grids(agent, observation, sizes, number=2):
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("observation", ["one_hot", "simple_image"])
 @pytest.mark.parametrize("agent", AGENTS)
 def test_runs_that_see_more_or_less_share_a_lane_and_learn_what_they_learn_alone(agent, observation):

@@ -217,6 +217,7 @@ def test_what_is_looked_up_is_what_is_drawn(sight, monkeypatch):
 # What policies are worth, and runs ------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_frames_are_of_a_group_of_their_own_and_what_the_engine_lacks_is_named():
     seen = {
         frames: Task(BREAKOUT, observation="simple_image", observation_options={"frames": frames, "scale": 4})

@@ -42,6 +42,7 @@ def within(counts, probabilities):
     return (np.abs(counts - total * probabilities) <= SIGMAS * spread + 1e-9).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("chance", ("plain", "sticky and random"))
 def test_episodes_are_as_likely_as_the_mdp_says(slippery, chance):
     mdp, successors, probabilities, rewards = slippery
@@ -147,6 +148,7 @@ def test_pay_is_late_and_noisy_as_elsewhere_and_returns_are_of_what_is_earned(sl
     assert len({tuple(part) for part in worlds.returns.reshape(5, 8)}) == 1
 
 
+@pytest.mark.long
 def test_returns_are_counted_until_the_end_of_the_training_alone(slippery):
     mdp, *_ = slippery
     runs = runs_on(mdp, 3, gamma=0.5)

@@ -74,7 +74,7 @@ def test_the_agent_of_the_page_learns(tmp_path):
     assert outcome.results.curves[task.name][0, -1] < 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_loops_of_the_pages_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     agents = (ROOT / "docs" / "agents.md").read_text()

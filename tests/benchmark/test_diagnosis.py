@@ -83,6 +83,7 @@ def test_page_and_compare_never_contradict_each_other():
     assert min(counts.values()) > 10, counts
 
 
+@pytest.mark.long
 def test_a_short_horizon_is_credit_on_the_page_as_in_compare():
     """Regrets of an agent with discount 0.5 on the umbrellas, whose last rung opened the interval of its frontier."""
     regrets = [
@@ -251,7 +252,7 @@ def test_groups_have_the_difference_of_plain_python_and_holm_of_their_table():
     assert [found[name].adjusted for name in order] == pytest.approx(expected)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_properties_of_tasks_are_those_of_their_worlds():
     suite = benchmark.load_suite("v1")
     names = ("frozen_lake-5-0-vector-random-0.1", "mini_grid_rooms-4x3-vector", "cliff_walking-3-9-hash-random-0.1")

@@ -375,7 +375,7 @@ def test_names_are_shown_as_they_are(entry, file):
     assert "evil:x: on" in command_line.run("benchmark", "verify", file).output
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_a_network_claims_is_computed_again(tmp_path):
     pytest.importorskip("stable_baselines3")
     options = {"net_arch": [16, 8], "buffer_size": 500}

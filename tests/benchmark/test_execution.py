@@ -338,7 +338,7 @@ DEATHS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("death", DEATHS)
 def test_a_run_that_dies_says_why_stops_no_other_and_is_the_only_one_that_is_repeated(suite, tmp_path, death):
     write_suite(suite, tmp_path / "small.yaml")
@@ -406,7 +406,7 @@ def learn(env, steps, seed):
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nothing_of_a_run_reaches_another(suite, tmp_path):
     """Globals, class attributes, arrays, modules of others, threads, variables, working directory, global settings."""
     (tmp_path / "mine.py").write_text(STATEFUL)

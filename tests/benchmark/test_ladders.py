@@ -53,6 +53,7 @@ def test_an_umbrella_waits_for_the_end_and_a_memory_does_not(scripts):
     assert scripts[0].advantage_lag(*task("memory_chain", memory_length=9)) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("length", [1, 4])
 def test_memory_goes_back_to_what_was_seen_first(scripts, length):
     chain = {"memory_length": length, "num_bits": 2}

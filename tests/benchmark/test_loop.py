@@ -234,6 +234,7 @@ def test_what_is_wrong_with_a_run_is_said(tmp_path):
         pharos.Run("frozen_lake", steps=10, out=tmp_path / "other")
 
 
+@pytest.mark.long
 def test_environments_of_a_run_go_into_vector_environments():
     with pharos.Run("catch", steps=100, rows=4, columns=3) as run:
         run.evaluate(0, always(0))

@@ -75,6 +75,7 @@ def test_below_random_is_what_the_whole_interval_says():
     assert score(replace(agent, curves=curves), SUITE).below_random == ("core-a",)
 
 
+@pytest.mark.long
 @examples(50, REGRETS)
 def test_frontier_is_that_of_plain_python_within_its_interval(regrets):
     found = frontier(np.array(LEVELS), [np.array(own) for own in regrets])

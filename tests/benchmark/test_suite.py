@@ -81,6 +81,7 @@ def entry():
     return yaml.safe_load((FOLDER / "v1.yaml").read_text())
 
 
+@pytest.mark.long
 def test_a_file_that_was_changed_is_refused(entry):
     suite_of(entry, "file")
     for change in (
@@ -197,6 +198,7 @@ def test_every_array_of_the_world_counts(digest_of):
     assert len(set(digests)) == len(digests)
 
 
+@pytest.mark.long
 def test_the_order_of_outcomes_does_not_count(digest_of):
     other = {"successors": [[[1, 0], [-1, 1]], [[-1, 0], [0, 1]]]}
     other["probabilities"] = [[[0.75, 0.25], [0.5, 0.5]], [[1.0, 0.0], [0.875, 0.125]]]

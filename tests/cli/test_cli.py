@@ -180,6 +180,7 @@ def test_a_list_in_a_pipe_has_no_trailing_blanks(pharos):
     assert len(lines) > 20 and [line for line in lines if line != line.rstrip()] == []
 
 
+@pytest.mark.long
 def test_help_is_a_verb_and_shows_no_type_beside_flags(pharos):
     for words in (["help"], ["help", "train"], ["study", "run", "-h"], []):
         shown = pharos(*words)
@@ -271,7 +272,7 @@ def test_a_built_folder_is_a_target(answer, tmp_path):
     assert again["parameters"]["penalties"] == [[[1, 1], -1.0]]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_users_own_class_is_a_target(answer, tmp_path, monkeypatch):
     (tmp_path / "corridor_of_mine.py").write_text(code_of(Row, Corridor))
     monkeypatch.chdir(tmp_path)
@@ -343,6 +344,7 @@ def test_with_a_horizon_values_are_undiscounted_unless_told_otherwise(answer):
     assert answer("solve", "simple_grid", "--horizon", 6, "--gamma", 0.5)["value_at_start"] == 0.5**5
 
 
+@pytest.mark.long
 def test_solving_until_the_end_and_reaching(answer):
     lake = ("frozen_lake/4x4", "slippery=true")
     solved = answer("solve", *lake, "--objective", "total")
@@ -362,6 +364,7 @@ def test_solving_until_the_end_and_reaching(answer):
     )
 
 
+@pytest.mark.long
 def test_the_long_run(answer, tmp_path):
     solved = answer("solve", "endless_sea", "size=4", "--objective", "average", "--out", tmp_path / "sea.npz")
     assert solved["gain_at_start"]["lower"] <= 0.25 <= solved["gain_at_start"]["upper"] < 0.25 + 1e-6
@@ -518,7 +521,7 @@ def test_a_full_or_forbidden_disk_is_one_line(failure, monkeypatch):
 # As a process --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_pipe_gets_one_json_object_and_silence_beside_it(cache, tmp_path):
     done = command_line.process(
         "build", "simple_grid", "--out", tmp_path / "grid", "--json", environment={"PHAROS_CACHE_DIR": cache}
@@ -535,7 +538,7 @@ def test_exit_codes_reach_the_shell(cache):
         assert "Traceback" not in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_solve_that_is_terminated_says_that_the_same_command_goes_on(cache, tmp_path):
     code = "import time; from pharos import solvers; from pharos.cli import main; import sys; "
     code += f"solvers.value_iteration = lambda *_, **__: (open('began', 'w'), time.sleep({PATIENCE})); "

@@ -32,6 +32,7 @@ def test_train_prints_a_table_for_people():
     assert "q_learning on frozen_lake/4x4" in done.stdout
 
 
+@pytest.mark.long
 def test_wrong_words_are_usage_errors(tmp_path):
     for words in (("--agent", "dqm"), ("--set", "learning_rate"), ("--steps", 0)):
         assert run("simple_grid", *words).exit_code == 2

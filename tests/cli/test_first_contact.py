@@ -73,6 +73,7 @@ def test_a_space_too_large_to_measure_is_compiled_for_all_the_same(tmp_path, mon
     cache._use(pharos.make("simple_grid/4x4-plain"), ChanceSetting())
 
 
+@pytest.mark.long
 def test_shells_complete_environments_instances_and_parameters():
     assert completed("hardness", "simple") == [name for name in list_environments() if name.startswith("simple_grid")]
     assert completed("build", "breakout", "h") == ["height="]

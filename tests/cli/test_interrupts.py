@@ -90,7 +90,7 @@ def test_a_command_that_loads_ends_at_once(interrupted, number):
     assert interrupted("module", number, "list", "--json")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "place",
     [
@@ -105,7 +105,7 @@ def test_what_would_lose_an_interrupt_does_not(interrupted, place):
     assert interrupted(place, 1, "count", "simple_grid", "--json")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_script_that_is_installed_is_interrupted_like_the_module(interrupted, tmp_path):
     script = tmp_path / "bin" / "pharos"
     script.parent.mkdir()

@@ -119,7 +119,7 @@ def test_a_study_keeps_where_its_code_comes_from(lab):
     assert records["index"]["config"]["environment"] == "cab"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_shard_of_one_worker_finds_nothing_missing(lab):
     words = ("--out", lab / "elsewhere" / "results", "--shard", "1/2", "--workers", 1)
     done = process("study", "run", "own.yaml", *words, cwd=lab)

@@ -238,7 +238,7 @@ class Keys(pharos.Environment):
         return 1, 3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_value_map_of_states_with_more_variables_is_a_slice():
     space = pharos.build(Keys(), progress=False)
     solution = pharos.value_iteration(space.mdp(gamma=0.5))

@@ -28,7 +28,7 @@ def test_the_tables_are_those_of_the_packed_runs(monkeypatch, packed_runs):
     assert len(re.findall(r"\n\n\| ", PAGE)) == len(tables)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_numbers_of_the_text_are_those_of_the_packed_runs(monkeypatch, packed_runs):
     words = " ".join(PAGE.split())
     for phrase in script("article", monkeypatch).facts():

@@ -51,6 +51,7 @@ def test_every_command_has_keys_and_every_key_a_meaning(page):
     assert all("--json" in {name for each in command.params for name in each.opts} for _, command in page.commands())
 
 
+@pytest.mark.long
 def test_the_tables_have_every_option_and_no_row_is_long(page):
     text = page.tables()
     for name, command in page.commands():

@@ -84,12 +84,14 @@ def test_importing_pharos_loads_nothing_heavy(command):
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.long
 def test_measures_and_training_load_sparse_matrices_where_they_use_them():
     code = "import sys, pharos.training, pharos.hardness.registry; print('scipy.sparse' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 
 
+@pytest.mark.long
 def test_former_names_need_no_extra_that_they_did_not_need():
     code = "import sys; sys.modules['yaml'] = None; from pharos.validation import predict\n"
     code += "from pharos.leaderboard import verify, submit; print(predict.__name__, verify.__name__)"
@@ -117,7 +119,7 @@ def test_imports_point_to_what_comes_before():
     assert used == set(LICENSED), "a licence that nobody needs"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nothing_stands_on_study_and_benchmark():
     found = [(path, name) for path, name, _ in imports() if path != "__init__.py"]  # whose names load late
     users = {(path, name) for path, name in found if name.split(".")[1] in TOP}

@@ -44,7 +44,7 @@ def test_no_package_outgrows_its_limit(size):
     assert not limits().keys() - lines.keys(), "the page has limits of packages that are gone"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_annotations_that_are_plain_any_become_fewer(size):
     count = sum(size.plain_any(size.tree_of(path)) for paths in size.files_of(ROOT).values() for path in paths)
     limit = int(re.search(r"At most (\d+) annotations are plain `Any`", PAGE.read_text())[1])

@@ -23,6 +23,7 @@ def test_the_study_on_the_page_is_valid():
     assert f"pharos: {caught.value}\n" in PAGE
 
 
+@pytest.mark.long
 def test_the_numbers_of_runs_on_the_page_are_those_of_the_presets(tmp_path):
     (tmp_path / "one.yaml").write_text("- taxi/5x5")
     lists = {"hardness-sealed": tmp_path / "one.yaml"}  # the number is of each environment that is given

@@ -102,7 +102,7 @@ def test_its_named_instances_are_made_by_name(corridor):
     assert names == ["corridor", "corridor/short", "corridor/long"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_its_gymnasium_ids_follow_its_name_its_instances_and_the_version_of_its_rules(corridor):
     for name, length in (("Corridor", 5), ("Corridor-short", 3), ("Corridor-long", 40)):
         env = gymnasium.make(f"pharos/{name}-v1")

@@ -123,7 +123,7 @@ def courts(draw):
     }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(200, courts(), st.floats(0, 1), st.randoms(use_true_random=False))
 def test_breakout_plays_like_its_twin(parameters, skill, rng):
     env = pharos.make("breakout", **parameters)

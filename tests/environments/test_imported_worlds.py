@@ -304,6 +304,7 @@ def test_a_table_of_looks_and_looks_one_by_one_are_the_same(screens, monkeypatch
     assert (pharos.observe(pharos.make(str(folder)), "recorded", **options)(states) == kept).all()
 
 
+@pytest.mark.long
 def test_frames_are_the_last_screens_of_an_episode(screens):
     shown, folder = screens
     env = pharos.GymEnv(str(folder), observation="recorded", observation_options={"frames": 3})

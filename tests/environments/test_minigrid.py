@@ -57,7 +57,7 @@ def isomorphic(one, other):
     return len(names) == len(set(names.values())) == one.num_states == other.num_states
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_key_corridor_is_what_bridge_published():
     """Its 168 states, transition by transition: those that differ only in whether the key was ever carried are told
     apart."""
@@ -190,7 +190,7 @@ def test_without_the_package_the_extra_is_named(monkeypatch):
     assert "pharos-rl[minigrid]" in refusal(MissingExtra, importers.minigrid, CORRIDOR)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_line_keeps_an_environment_in_a_folder(tmp_path):
     words = ["import", "minigrid", CORRIDOR, "--out", str(tmp_path / "kept"), "--json"]
     answer = json.loads(run(*words).stdout)

@@ -154,6 +154,7 @@ def test_a_number_of_the_unit_interval_stands_for_an_outcome():
     assert make("cliff_walking/4x12").drawn_outcome((3, 0), 1, 0.9) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("rows", "columns"), [(3, 3), (2, 3), (1, 3), (3, 2), (3, 1)])
 def test_planes_of_three_columns_are_no_colors(rows, columns):
     env = make("game_2048", rows=rows, columns=columns, canonical=False)

@@ -80,6 +80,7 @@ def expected_sets(length):
     return sets
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "length"), [(Corridor, 6), (Slippery, 6), (Corridor, 3000), (Slippery, 3000)])
 def test_a_built_space_has_the_sets_of_the_rules_and_leads_nowhere_else(kind, length):
     space = pharos.build(kind(length=length))
@@ -98,6 +99,7 @@ def test_a_built_space_has_the_sets_of_the_rules_and_leads_nowhere_else(kind, le
     assert pharos.value_iteration(mdp).v[space.index((length - 1,))] == 1.0
 
 
+@pytest.mark.long
 def test_a_class_that_changes_the_sets_alone_has_its_own():
     mdp = pharos.build(OpenEnd()).mdp(gamma=1.0)
     assert mdp.available.sum(axis=1).tolist() == [1] * (mdp.num_states - 1) + [3]
@@ -113,6 +115,7 @@ def test_given_rewards_of_a_space_count_for_available_actions():
     assert set(np.unique(mdp.rewards)) == {0.0, 2.0}
 
 
+@pytest.mark.long
 def test_masks_are_in_the_infos_and_asked_for_as_sb3_contrib_does():
     env = GymEnv(Corridor())
     _, info = env.reset(seed=0)
@@ -190,6 +193,7 @@ def test_a_choice_that_is_not_available_acts_as_the_first_one_that_is_before_cha
     assert env.step(0)[4]["executed_action"] == 1  # open, which is not there
 
 
+@pytest.mark.long
 def test_a_state_without_actions_is_refused():
     @dataclass(frozen=True, kw_only=True)
     class Stuck(Corridor):
@@ -212,6 +216,7 @@ def tree():
     return TabularMDP.from_arrays(after, np.where(sets, rewards, -np.inf), gamma=0.9)
 
 
+@pytest.mark.long
 def test_a_folder_keeps_the_sets(tmp_path):
     mdp = tree()
     folder = importers.save(mdp, tmp_path / "tree", actions=["a", "b", "c"])

@@ -44,6 +44,7 @@ def trays(draw):
     return {"rows": rows, "columns": columns, "seed": draw(st.integers(0, 1000))}
 
 
+@pytest.mark.long
 @examples(100, trays(), st.lists(st.sampled_from(["up", "right", "down", "left"]), max_size=60))
 def test_tiles_slide_like_those_of_its_twin(parameters, actions):
     env = pharos.make("sliding_tiles", **parameters)
@@ -102,6 +103,7 @@ def test_exactly_the_positions_that_can_be_solved_are_taken_as_a_start():
             assert "SlidingTiles: start=" in refusal(ParameterError, pharos.make, "sliding_tiles/2x2", start=tiles)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("tray", sorted(COUNTS))
 def test_as_many_positions_need_as_many_moves_as_published(tray):
     """Every position is within reach, the solved one included, though it ends the episode."""
@@ -123,7 +125,7 @@ def test_the_named_hardest_start_needs_31_moves():
     assert env.max_episode_steps > 31 == solution_lengths(space)[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_tray_of_two_by_five_has_1814400_positions_and_radius_55():
     space = pharos.build(pharos.make("sliding_tiles/2x5"), progress=False)
     assert space.num_states == 1_814_400

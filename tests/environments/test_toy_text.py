@@ -85,7 +85,7 @@ def law_of(row):
     return dict(law)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("walk", ["rules", "table"])
 def test_slipping_into_the_cliff_from_the_start_pays_another_reward_than_bumping_into_the_wall(walk):
     """Of 30 thousand steps right and left from the start, those that stay there: within five standard errors."""
@@ -219,6 +219,7 @@ def test_the_optimal_policy_of_blackjack_is_that_of_the_book(blackjack):
                 assert action == expected == naive_value(total, dealer, ace)[1], (total, dealer, ace)
 
 
+@pytest.mark.long
 def test_values_of_blackjack_are_those_of_a_recursion_over_cards(blackjack):
     space, solution = blackjack
     for index in range(space.num_states):

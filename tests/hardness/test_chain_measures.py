@@ -75,7 +75,7 @@ def lump(chain, nodes, mdp):
     return (chain @ members)[first]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, small_mdps(max_states=5, max_actions=2), st.booleans())
 def test_the_mixing_time_is_that_of_powers_of_the_matrix(mdp, restart):
     chain, nodes = chain_of(mdp, restart)
@@ -139,6 +139,7 @@ def test_the_mismatch_contains_the_largest_ratio_of_visits(mdp):
         assert found.upper == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.long
 def test_the_mismatch_counts_terminal_states_and_the_end_alike():
     """Half of uniform play comes to the state that the optimal policy always comes to; it is the same process, told in
     three ways."""
@@ -180,7 +181,7 @@ def test_the_mismatch_counts_states_that_are_met_after_all_that_is_worth_a_step(
     assert found.lower > 1e4
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(100, small_mdps(max_states=6, max_actions=3), st.integers(0, 2**32 - 1))
 def test_support_is_where_the_walk_may_be(mdp, seed):
     """Without chance each state is met within S steps, under sticky actions each pair within S A."""
@@ -229,7 +230,7 @@ def test_the_action_gap_is_as_regular_as_all_gaps_say(mdp, zeta):
         assert share <= found.constant * t**zeta * (1 + 1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_they_are_part_of_a_report_when_asked_for():
     mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp(gamma=0.9)
     names = ["action_gap_regularity", "distribution_mismatch", "mixing_time", "tight_effective_horizon"]

@@ -26,7 +26,7 @@ def graphs(draw):
     return Graph.of(mdp, restart), distances(mdp, restart=restart)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(60, graphs())
 def test_the_largest_distance_to_each_source_is_found(drawn):
     graph, distance = drawn
@@ -54,7 +54,7 @@ def test_bounds_that_follow_along_edges_hold_and_are_the_least_of_all_paths(draw
         np.testing.assert_array_equal(found, np.where(np.isfinite(expected), expected, unknown).astype(graph.dtype))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(50, graphs(), st.integers(1, 20))
 def test_nodes_that_are_spread_out_are_no_successors_of_those_before(drawn, limit):
     graph, distance = drawn
@@ -79,6 +79,7 @@ def test_the_diameter_of_a_small_tray_is_the_largest_of_all_distances():
     assert found.upper == distances(mdp).max()
 
 
+@pytest.mark.long
 def test_a_puzzle_of_nearly_equal_eccentricities_takes_searches_from_a_quarter_of_its_states():
     """The solved position leads to the start alone, so the largest distance is one more than that from the start; all
     others are known to be no larger from those whose blank is in the middle."""

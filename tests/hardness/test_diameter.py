@@ -261,6 +261,7 @@ def test_the_distance_from_several_start_states_is_its_mean():
     assert hardness.start_eccentricity(random_actions(ring(10, [0, 5]), 0.5)) == pytest.approx(6.5, rel=1e-6)
 
 
+@pytest.mark.long
 @examples(100, deterministic_mdps(), st.data())
 def test_the_start_eccentricity_is_the_largest_mean_distance(mdp, data):
     starts = data.draw(st.lists(st.integers(0, mdp.num_states - 1), min_size=1, max_size=4))

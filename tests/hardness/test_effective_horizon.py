@@ -189,7 +189,7 @@ def test_a_report_with_a_horizon_has_it_and_one_without_says_what_is_missing():
     assert "give a horizon" in hardness.report(mdp, "effective_horizon", keep=False)["effective_horizon"].undefined
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(
     60,
     st.one_of(

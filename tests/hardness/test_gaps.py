@@ -24,7 +24,7 @@ from strategies import deterministic_mdps, examples, small_mdps
 TOLERANCE = 1e-7
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, small_mdps())
 def test_gaps_are_those_of_the_explicit_matrices(mdp):
     result = hardness.gaps(mdp, pharos.value_iteration(mdp, 1e-9), tie_tolerance=TOLERANCE)
@@ -200,7 +200,7 @@ def test_intervals_of_gaps_hold_the_exact_fractions(mdp, gamma):
         check_against_exact(mdp, result)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_small_gaps_of_a_grid_are_gaps_not_ties():
     mdp = pharos.build(pharos.make("simple_grid", height=20, width=20)).mdp(gamma=0.5)
     result = hardness.gaps(mdp)

@@ -120,7 +120,7 @@ def paying_once(draw):
     ).with_initial(int(mdp.start_states[0]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(60, paying_once(), st.integers(1, 4), st.integers(1, 2), st.integers(1, 3))
 def test_the_exact_method_is_the_probability_of_failure(mdp, steps, k, m):
     assume(mdp.num_actions**k <= 4)

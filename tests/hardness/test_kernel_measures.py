@@ -109,6 +109,7 @@ def plain_curve(mdp, kernel, schedule, learn):
     return np.array(greedy_regrets), np.array(played_regrets), np.array(episodes)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sticky", [0.0, 0.3])
 @pytest.mark.parametrize("random", [0.0, 0.2])
 def test_the_measure_is_what_its_definition_says(sticky, random):
@@ -242,6 +243,7 @@ def test_states_that_look_alike_are_one_observation():
     assert hardness.aliasing_floor(mdp, everything) == pytest.approx(1.0)
 
 
+@pytest.mark.long
 def test_landmarks_are_exact_where_there_are_enough_of_them_and_say_so_where_not():
     mdp, kernel = chain(12, horizon=40), kernel_of(12)
     exact = kernel_regret(mdp, Representation.of_matrix(kernel), schedule=SHORT)
@@ -526,7 +528,7 @@ OWN_ERRORS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_network_of_ones_own_has_its_empirical_kernel(grid, tmp_path):
     """By the name of a function; what landmarks ask for is part of the same kernel."""
     pytest.importorskip("torch")

@@ -50,7 +50,7 @@ def explicit(mdp, policy, steps):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(120, small_mdps(), st.integers(1, 6), st.data())
 def test_each_step_is_that_of_the_explicit_matrices(mdp, steps, data):
     policy, rows = policies(mdp, data)
@@ -64,7 +64,7 @@ def test_each_step_is_that_of_the_explicit_matrices(mdp, steps, data):
         assert (found.steps, found.error_bound) == (steps, 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(120, small_mdps(), st.integers(1, 8) | st.none(), st.data())
 def test_the_expected_return_is_the_reward_of_what_is_executed(mdp, horizon, data):
     policy, _ = policies(mdp, data)

@@ -182,7 +182,7 @@ def spent(mdp, names="all", **options):
     return hardness.report(mdp, names, budget=0, keep=False, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_spent_budget_ends_every_measure_of_a_world_with_chance():
     space = pharos.build(Lift(floors=3), progress=False)
     assert space.num_states == 567

@@ -93,7 +93,7 @@ def layered(draw):
     return following, rewards, depth + 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(100, layered())
 def test_where_each_state_has_one_depth_it_is_the_time_indexed_one(case):
     following, rewards, steps = case

@@ -33,7 +33,7 @@ def chancy_mdps(draw):
     return random_actions(sticky_actions(mdp, draw(some)), draw(some))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(60, chancy_mdps(), st.booleans())
 def test_diameters_are_those_of_the_explicit_matrices(mdp, restart):
     if mdp.is_deterministic and len(mdp.start_states) == 1:
@@ -298,7 +298,7 @@ def test_hitting_times_beyond_the_digits_of_a_float_are_proven(length):
     assert Fraction(start.lower) <= truth <= Fraction(start.upper)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("length", [130, 150, 300])
 def test_where_floats_prove_no_closer_bounds_an_interval_comes_before_the_budget_ends(length):
     truth = time_to_open(length)

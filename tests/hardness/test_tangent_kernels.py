@@ -180,7 +180,7 @@ def test_what_has_no_kernel_says_so_in_a_line(grid, monkeypatch):
     assert "10 states fit into memory" in refusal(ParameterError, ntk, grid, "vector")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_kernels_need_no_torch():
     code = "import sys; from pharos.observations import ntk; ntk('simple_grid', 'vector', 'mlp8'); "
     code += "assert 'torch' not in sys.modules"

@@ -41,7 +41,7 @@ def naive_norm(mdp):
     return math.sqrt(variance[reached(P, start) & ~is_over(mdp)].max(initial=0.0))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, small_mdps())
 def test_the_norm_is_that_of_the_explicit_matrices(mdp):
     assert hardness.environmental_value_norm(mdp) == pytest.approx(naive_norm(mdp), rel=1e-5, abs=2e-6)
@@ -137,6 +137,7 @@ def test_values_whose_squares_are_no_floats_have_their_deviation(reward):
     assert found.lower <= reward / 2 <= found.upper <= reward * (0.5 + 1e-6)
 
 
+@pytest.mark.long
 @given(st.floats(2e-15, 1e-3), st.floats(0.1, 0.99))
 def test_what_a_row_lacks_is_an_end_for_values_and_measures_alike(lack, gamma):
     """A state that pays 1 and goes on with what its row holds, written as a matrix and as outcomes."""

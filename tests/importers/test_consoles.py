@@ -48,7 +48,7 @@ def test_layers_are_those_of_plain_python(horizon):
     assert sum(found.sizes) == len(next_states) and found.num_steps == rewards.size
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_processes_share_a_layer_and_find_the_same():
     assert parts(explored(6, workers=2)) == parts(explored(6))
 

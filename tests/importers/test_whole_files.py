@@ -97,7 +97,7 @@ def be_endless(path):
     path.symlink_to("/dev/zero")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("become", [be_a_pipe, be_endless])
 @pytest.mark.parametrize("name", ["run.json", "curve.csv", "policy.npy"])
 def test_pipes_and_devices_in_the_folder_of_a_run_are_refused(name, become, tmp_path, with_patience):
@@ -107,6 +107,7 @@ def test_pipes_and_devices_in_the_folder_of_a_run_are_refused(name, become, tmp_
         read_rows(tmp_path / "run") if name == "curve.csv" else load_agent(tmp_path / "run")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("become", [be_a_pipe, be_endless])
 def test_pipes_and_devices_among_the_files_of_mdps_are_refused(become, tmp_path, with_patience):
     importers.save(mdp(), tmp_path / "mdp")

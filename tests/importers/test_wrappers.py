@@ -178,6 +178,7 @@ def test_a_reward_that_no_walk_meets_is_compared_all_the_same():
     assert "TransformReward" in refusal(ParameterError, importers.gymnasium, env, check=False)
 
 
+@pytest.mark.long
 def test_the_ways_that_refusals_name_give_the_values_of_the_wrapped_environment():
     def steps_to_goal(env):  # the shortest way, of deterministic rewards: six steps, the last one pays
         env.reset(seed=0)

@@ -88,7 +88,7 @@ def freeway(tmp_path_factory):
     return pharos.build(env, tmp_path_factory.mktemp("freeway") / "space")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["breakout", "freeway"])
 @pytest.mark.parametrize("chance", [{}, {"sticky": 0.3}, {"random": 0.2}, {"sticky": 0.3, "random": 0.2}])
 def test_a_walk_agrees_with_the_table_at_every_step(name, chance, request):
@@ -266,7 +266,7 @@ def test_any_named_instance_can_be_made_through_gymnasium():
     assert env.unwrapped.environment == pharos.make("breakout/12x10x1")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("env_id", ["pharos/Breakout-v0", "pharos:pharos/Breakout-v0"])
 def test_gymnasium_finds_the_environments_in_a_fresh_process(env_id):
     heavy = "'numba', 'scipy', 'pandas', 'matplotlib', 'torch', 'stable_baselines3', 'pygame'"

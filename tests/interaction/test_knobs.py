@@ -223,6 +223,7 @@ def test_states_are_as_probable_as_the_definition_of_the_knobs_says(implementati
     assert chisquare([counts[states] for states in possible], expected).pvalue > LEVEL
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("knobs", KNOBS.values(), ids=KNOBS)
 def test_values_are_those_of_the_enumerated_paths(knobs):
     """Exact evaluation, and the mean of simulated episodes within four standard errors."""
@@ -308,6 +309,7 @@ def test_noise_is_normal_about_what_is_earned(implementation, space):
     assert kstest(np.concatenate(noise) / 0.5, "norm").pvalue > LEVEL
 
 
+@pytest.mark.long
 def test_values_do_not_know_how_rewards_are_paid():
     plain, other = (Task.of(RING, horizon=4, **pay) for pay in ({}, {"reward_noise": 0.5, "reward_delay": 2}))
     assert plain.optimal.value_at_start == other.optimal.value_at_start

@@ -233,6 +233,7 @@ def test_stable_baselines_gets_what_it_needs_at_the_ends_of_episodes():
     assert kinds == {True, False}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("observation", ["vector", "simple_image"])
 def test_stable_baselines_trains_on_it(observation):
     from stable_baselines3 import PPO

@@ -88,7 +88,7 @@ sys.stdout.buffer.write(pickle.dumps((found, test_interpreted.compiled_kernels()
     assert "optimal_sweep" in compiled_kernels()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_hardness_of_a_lake_compiles_nothing(tmp_path):
     caches = {"PHAROS_CACHE_DIR": str(tmp_path), "NUMBA_CACHE_DIR": ""}
     answer = json.loads(in_another_process("-m", "pharos", "hardness", "frozen_lake/8x8", "--json", **caches))

@@ -68,6 +68,7 @@ def naive_values(world, sticky, random, choose):
     return v
 
 
+@pytest.mark.long
 @examples(25, worlds(), CHANCE)
 def test_values_are_those_of_plain_python(world, chance):
     sets, mdp = world[2], of_chance(world, *chance)
@@ -98,6 +99,7 @@ def test_values_are_those_of_plain_python(world, chance):
     assert (visits * mdp.rewards).sum() == pytest.approx(value, abs=1e-6)
 
 
+@pytest.mark.long
 @examples(15, worlds(), st.sampled_from([(0.0, 0.0), (0.0, 0.25)]))
 def test_uniform_play_takes_what_is_available(world, chance):
     mdp = of_chance(world, *chance)
@@ -124,6 +126,7 @@ def reached(world, sticky):
     return pairs
 
 
+@pytest.mark.long
 @examples(20, worlds(), st.sampled_from([(0.0, 0.0), (0.3, 0.0), (0.0, 0.25), (0.3, 0.25)]))
 def test_gaps_and_the_value_norm_are_those_of_actions_that_exist(world, chance):
     (P, R, sets), mdp = world, of_chance(world, *chance)
@@ -182,6 +185,7 @@ def test_an_action_that_is_not_available_is_a_copy_of_one_that_is_to_optimal_pla
     assert hardness.diameter(mdp).upper == hardness.diameter(copies).upper
 
 
+@pytest.mark.long
 def test_the_largest_set_is_the_base_of_the_effective_horizon():
     # a column of actions that never exist changes nothing
     chain = np.array([[1, 0, 0], [2, 0, 0], [2, 2, 2]])
@@ -255,6 +259,7 @@ def test_a_policy_that_takes_an_action_that_is_not_available_is_refused():
         assert message == "the policy takes action 1 in state 0, where it is not available; expected one of 0"
 
 
+@pytest.mark.long
 @examples(40, worlds(), st.sampled_from([0.0, 0.25, 1.0]))
 def test_total_rewards_choose_what_is_available(world, random):
     """Worlds that end by each action with probability 0.1: the total is that of a long horizon."""

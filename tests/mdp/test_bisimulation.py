@@ -49,7 +49,7 @@ def test_classes_are_those_of_the_greatest_bisimulation(mdp):
     assert ((classes[:, None] == classes[None]) == bisimilar(mdp)[:-1, :-1]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(80, deterministic_mdps(max_states=7, max_actions=2), probabilities, probabilities)
 def test_values_are_kept_under_every_chance(mdp, sticky, random):
     mdp = random_actions(sticky_actions(mdp, sticky), random)

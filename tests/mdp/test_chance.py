@@ -51,7 +51,7 @@ def assert_agrees(space: pharos.StateSpace, env) -> None:
     np.testing.assert_allclose(mdp.rewards, R, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(25, env=chance_worlds())
 def test_build_agrees_with_a_plain_enumeration_on_random_worlds(env, tmp_path_factory):
     assert_agrees(build(env, tmp_path_factory.mktemp("space") / "space"), env)
@@ -83,14 +83,14 @@ def test_files_do_not_depend_on_threads_or_blocks(tmp_path, undisturbed, small_b
     assert files_of(folder) == undisturbed
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_files_do_not_depend_on_where_the_table_is(tmp_path, undisturbed, small_blocks, monkeypatch):
     monkeypatch.setattr(table.MemoryTable, "fits", lambda *_: False)
     folder = build(WORLD, tmp_path / "space", workers=2, checkpoint_seconds=0.0).folder
     assert files_of(folder) == undisturbed
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_files_do_not_depend_on_the_engine(tmp_path, undisturbed, monkeypatch):
     monkeypatch.setattr(rules, "compiled_or_none", lambda *_: None)
     space = build(WORLD, tmp_path / "space", workers=2)
@@ -103,6 +103,7 @@ def test_files_do_not_depend_on_the_engine(tmp_path, undisturbed, monkeypatch):
 # Drawing outcomes -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_compiled_and_interpreted_outcomes_are_drawn_alike_and_as_often_as_they_should():
     env = ChanceWorld(num_positions=40, seed=5)
     compiled, interpreted = rules.rules_of(env).stepping, stepping.InterpretedStepping(env)
@@ -119,6 +120,7 @@ def test_compiled_and_interpreted_outcomes_are_drawn_alike_and_as_often_as_they_
     assert compiled.outcome_one(compiled.parameters, np.array([0]), 0, 1 - 2**-53)[1] > 0
 
 
+@pytest.mark.long
 def test_many_environments_draw_outcomes_compiled_as_interpreted():
     env = ChanceWorld(num_positions=40, seed=5)
     ranges = np.stack([env.components.low, env.components.high])
@@ -208,6 +210,7 @@ def test_a_rule_that_breaks_the_contract_is_named_with_its_outcome(broken, expec
     assert pharos.state_space.read_manifest(tmp_path / "space")["complete"] is False  # what was found is kept
 
 
+@pytest.mark.long
 def test_growth_counts_states_by_their_distance(tmp_path):
     for env in (WORLD, pharos.make("simple_grid")):
         space = build(env, tmp_path / env.name)
@@ -226,6 +229,7 @@ def test_the_arrays_that_a_space_does_not_have_are_refused_in_one_line(tmp_path)
         grid.outcomes  # noqa: B018
 
 
+@pytest.mark.long
 def test_ages_are_those_of_the_rule(tmp_path, monkeypatch):
     space = build(Dice(), tmp_path / "space")
     assert (space.ages == space.states()[:, 0] - 5).all()

@@ -70,6 +70,7 @@ def check(mdp, pairs=None):
     assert set(map(tuple, np.argwhere(choices).tolist())) == set().union(*(inside for _, inside in expected))
 
 
+@pytest.mark.long
 @examples(300, small_mdps(), st.data())
 def test_they_are_the_maximal_sets_that_no_choice_leaves(mdp, data):
     if mdp.num_states * mdp.width > 9:

@@ -279,6 +279,7 @@ def test_a_run_with_lazy_actions_has_exact_values_and_an_id_of_its_own(lake, tmp
     assert ChanceSetting.from_dict(task.chance.to_dict()) == task.chance
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("slippery", [False, True])
 def test_exported_tables_have_the_chance_of_staying_and_its_pay(grid, slippery):
     space = pharos.build(pharos.make("cliff_walking", height=2, width=3, slippery=True)) if slippery else grid

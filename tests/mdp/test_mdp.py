@@ -56,6 +56,7 @@ def executed_distribution(stages, choice, previous, num_actions):
     return distribution
 
 
+@pytest.mark.long
 @examples(100, st.lists(st.tuples(st.sampled_from(["random", "sticky"]), probabilities), max_size=4))
 def test_any_nesting_of_chance_is_three_weights(stages):
     mdp = TabularMDP.from_arrays([[0, 0, 0]], [[0.0, 0.0, 0.0]])
@@ -188,7 +189,7 @@ def test_a_state_space_becomes_an_mdp_with_its_own_or_other_rewards(tmp_path):
     assert (space.mdp(rewards=lambda self, state, action, next_state: 3.0).rewards[~own.terminal] == 3).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(100, small_mdps(), st.integers(1, 6))
 def test_states_that_an_episode_cannot_meet_do_not_matter_to_it(mdp, steps):
     found = mdp_within(mdp, steps)

@@ -190,6 +190,7 @@ def test_names_of_a_folder_that_was_changed_are_refused(tmp_path):
     assert "no such file" in refusal(FileFormatError, importers.load, folder)
 
 
+@pytest.mark.long
 def test_names_belong_to_the_states_that_are_left():
     part = pharos.mdp.mdp_within(corridor().with_initial(4), 1)
     assert names_of(part).variables["x"].tolist() == [-297, -296, -295]

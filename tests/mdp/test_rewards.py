@@ -191,7 +191,7 @@ class Bet(Row):
         return 5.0 if action == 1 else -3e6 if next_state[0] == 1 else 7e6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("engine", ["compiled", "interpreted"])
 def test_means_by_the_rules_count_their_rounding(engine, monkeypatch, tmp_path):
     if engine == "interpreted":

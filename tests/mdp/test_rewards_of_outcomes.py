@@ -86,6 +86,7 @@ def test_an_instance_without_chance_pays_outcome_0(engine, tmp_path):
     assert env.step(1)[1] == 1.0
 
 
+@pytest.mark.long
 def test_the_contract_is_checked_with_the_outcome():
     pharos.check_environment(Toll())
 
@@ -98,6 +99,7 @@ def test_the_contract_is_checked_with_the_outcome():
         pharos.check_environment(Broken())
 
 
+@pytest.mark.long
 def test_a_reward_function_in_place_of_the_rules_may_look_at_the_outcome(tmp_path):
     space = pharos.build(Toll(), tmp_path / "space", progress=False)
 
@@ -109,6 +111,7 @@ def test_a_reward_function_in_place_of_the_rules_may_look_at_the_outcome(tmp_pat
         space.mdp(rewards=lambda state: 0.0)
 
 
+@pytest.mark.long
 def test_the_exported_table_of_a_class_that_nobody_registered_pays_each_outcome(tmp_path):
     """And so it does where only the MDP knows whose states these are."""
     mdp = pharos.build(Toll(), tmp_path / "toll", progress=False).mdp()

@@ -40,6 +40,7 @@ def solved(*arguments, **named):
     return pharos.value_iteration(TabularMDP.from_matrices(*arguments, gamma=0.9, **named)).v
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("p", [0.3333333, 0.33333334, 0.33333366])
 def test_rounded_thirds_are_thirds(p):
     """The end that seven digits leave makes 9,994 of a value of 10,000, and 16,666,667 of a diameter of 5."""
@@ -204,6 +205,7 @@ def exact_values(probabilities, means, gamma, choose):
         policy = better
 
 
+@pytest.mark.long
 @examples(150, stated_rows(), st.sampled_from(["matrices", "outcomes", "table"]))
 def test_the_model_as_it_was_stated_is_within_the_bound(drawn, kind):
     """Rows that lack something end the episode there, rows that exceed 1 are left out: they are no model."""

@@ -81,7 +81,7 @@ def test_a_simple_image_has_a_plane_for_each_layer(env):
         np.testing.assert_array_equal(image.one(state)[:, ::scale, ::scale] > 0, planes > 0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_channels_come_first_or_last_and_colour_becomes_luminance(env):
     states = random_states(env, 20)
     last, first = observe(env, "complex_image"), observe(env, "complex_image", channels_first=True)
@@ -176,7 +176,7 @@ def test_an_environment_with_images_is_copied_as_it_stands(name, copied):
     np.testing.assert_array_equal(env.reset(seed=1)[0], other.reset(seed=1)[0])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_copy_in_another_process_compiles_nothing_anew(tmp_path):
     env = GymEnv("freeway", num_cars=6, lane_length=5, observation="simple_image")
     env.reset(seed=0)

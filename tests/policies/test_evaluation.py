@@ -35,7 +35,7 @@ def linear(task, seed, sharp):
     return policy
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(
     60,
     st.sampled_from(["simple_grid/4x4-decoy", "frozen_lake/4x4", "frozen_lake/8x8"]),

@@ -277,6 +277,7 @@ def test_a_model_of_gymnasium_has_the_same_exact_value_by_every_way(lake, import
     assert found == pytest.approx(solvers.evaluate_policy(sticky, table).value_at_start, abs=1e-6)
 
 
+@pytest.mark.long
 def test_numbers_of_another_kind_or_size_are_refused(lake, imported, of_gymnasium, tmp_path):
     world = importers.environment(imported)
     ours = Task(world, observation="index", horizon=100)
@@ -319,6 +320,7 @@ def test_worlds_without_a_source_have_no_numbers(imported, lake):
     assert zero.value_at_start == 0.0
 
 
+@pytest.mark.long
 def test_imported_worlds_show_the_number_in_their_folder(tmp_path):
     table = importers.matrices(np.eye(3)[[[1, 2], [2, 2], [2, 0]]], np.eye(3, 2), gamma=0.5, initial=1)
     env = importers.environment(importers.save(table, tmp_path / "kept"))
@@ -334,6 +336,7 @@ def test_imported_worlds_show_the_number_in_their_folder(tmp_path):
 # The page ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_page_gives_exact_values_of_the_models_that_it_trains():
     code = "\n".join(re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL))
     assert "learn(30_000)" in code

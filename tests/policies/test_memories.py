@@ -90,7 +90,7 @@ def sight_of(classes, num_actions, previous_action=False):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(
     150, small_mdps(max_states=4, max_actions=2), st.integers(0, 10**6), st.booleans(), st.booleans(), st.integers(1, 4)
 )
@@ -233,7 +233,7 @@ def test_recurrent_ppo_is_worth_what_it_plays_over_all_histories(tmp_path):
     assert evaluate_agent(load_agent(tmp_path / "run")[1], task).value == found.value
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_qrdqn_is_worth_what_its_greedy_actions_are():
     pytest.importorskip("sb3_contrib")
     task = Task.of("simple_grid/4x4-decoy", random=0.2)

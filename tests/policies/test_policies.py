@@ -19,7 +19,7 @@ from refusals import failing
 from strategies import examples, small_mdps
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(100, small_mdps(), st.integers(0, 10**6), st.sampled_from([None, 3]))
 def test_what_a_policy_reaches_has_the_values_of_the_whole_mdp(mdp, seed, horizon):
     mdp, rng = mdp.with_horizon(horizon), np.random.default_rng(seed)

@@ -173,7 +173,7 @@ def test_a_dqn_is_predicted_by_the_sampled_learner_with_its_schedule():
     assert any("learning_starts, batch_size" in warning for warning in answer.warnings)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_ppo_is_predicted_as_it_is_evaluated():
     answer = pharos.predict("river_swim", agent="ppo", steps=2048, length=5)
     space = pharos.build(pharos.make("river_swim", length=5))
@@ -201,7 +201,7 @@ def test_a_shortlist_is_of_the_same_predictions():
     assert predicted(own) == pytest.approx(np.mean(cells), abs=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_noise_of_rewards_makes_it_harder_to_learn():
     quiet, loud = (
         pharos.predict("deep_sea", size=4, steps=3000, hyperparameters=SHORT, reward_noise=noise).cells[0].tabular
@@ -287,6 +287,7 @@ def test_what_cannot_be_predicted_is_one_line(monkeypatch):
         pharos.predict("river_swim", length=5)
 
 
+@pytest.mark.long
 def test_a_world_where_nothing_can_be_learnt_has_no_prediction(tmp_path, monkeypatch):
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
     mdp = pharos.TabularMDP.from_arrays([[1, 1], [0, 0]], [[1.0, 1.0], [0.0, 0.0]], gamma=0.9, horizon=20)

@@ -84,7 +84,7 @@ def test_the_reason_names_the_signature_that_is_missing():
     assert reason_of(ValueError(coloured)) == reason_of(ValueError(message))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rules_that_mention_a_private_attribute_run_interpreted(cache, tmp_path):
     def reward(self, state, action, next_state):
         return 1.0 + self._bonus
@@ -134,7 +134,7 @@ def test_damaged_files_are_compiled_again(cache, filled, tmp_path):
     assert files_of(cache) == after, "what was mended is read"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_folder_of_compiled_rules_is_private(filled):
     assert (filled / "compiled").stat().st_mode & 0o777 == 0o700
 
@@ -170,7 +170,7 @@ def test_kernels_do_not_depend_on_rules_that_they_do_not_call():
     assert changed(is_terminal=lambda self, state: state[0] >= self.length - 1) == others
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="no users to tell apart")
 def test_a_folder_that_others_can_write_to_is_not_read(cache, filled, tmp_path):
     shutil.copytree(filled / "compiled", cache / "planted")

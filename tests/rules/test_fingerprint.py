@@ -61,18 +61,18 @@ def fingerprint(folder, rules=RULES, hash_seed="0"):
     return subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rules_with_dictionaries_sets_and_objects_have_the_same_text_in_every_process(tmp_path):
     assert fingerprint(tmp_path, hash_seed="1") == fingerprint(tmp_path, hash_seed="2")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("change", (('"right": 1', '"right": 2'), ('"nowhere"', '"right"'), ("(2, 3)", "(1, 3)")))
 def test_other_contents_are_other_rules(change, tmp_path):
     assert fingerprint(tmp_path / "one") != fingerprint(tmp_path / "other", RULES.replace(*change))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rules_with_dictionaries_are_enumerated_interpreted(tmp_path):
     (tmp_path / "line.py").write_text(RULES)
     with pytest.warns(RuntimeWarning, match="Numba cannot compile its rules"):

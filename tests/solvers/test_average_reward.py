@@ -237,6 +237,7 @@ def test_the_taxicab_whose_towns_have_sets_of_actions():
     assert pharos.average_reward(mdp, "uniform").gain_at_start == pytest.approx(of_sets)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("chance", [(0.25, 0.0), (0.3, 0.2)])
 def test_the_taxicab_whose_actions_stick(chance):
     """(1 - gamma) V_gamma is near the gain, in whatever way the sets of actions and chance go together."""

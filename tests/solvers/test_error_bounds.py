@@ -77,7 +77,7 @@ def test_values_of_uniform_play_are_within_their_bound(mdp):
     assert largest_error(solution, naive_exact.values_of(solution.mdp, nothing)) <= Fraction(solution.error_bound)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, hard_mdps(), st.integers(0, 2**32))
 def test_values_of_a_stochastic_policy_are_within_their_bound(mdp, seed):
     assert_policy_is_within_its_bound(mdp, drawn_policy(mdp, seed))
@@ -113,7 +113,7 @@ def test_over_a_thousand_steps_a_softmax_in_float32_gains_nothing_by_its_roundin
     assert solution.value_at_start <= value_iteration(mdp).value_at_start
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, hard_mdps(), st.integers(0, 2**32))
 def test_values_of_a_deterministic_policy_are_within_their_bound(mdp, seed):
     actions = np.random.default_rng(seed).integers(mdp.num_actions, size=mdp.num_states)
@@ -135,7 +135,7 @@ def test_one_pass_gives_the_values_of_mdps_that_visit_no_state_twice(drawn, seed
         assert_policy_is_within_its_bound(mdp, drawn_policy(mdp, seed))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_bound_of_one_pass_counts_the_longest_path_and_not_the_discount():
     length, gamma = 1000, 1 - 1e-9
     path = TabularMDP.from_arrays([[i + 1] for i in range(length - 1)] + [[-1]], np.full((length, 1), 0.1), gamma=gamma)

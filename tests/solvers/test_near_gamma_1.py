@@ -67,6 +67,7 @@ def test_large_systems_are_solved_inexactly_and_agree_with_sweeps():
     assert solution.error_bound <= 1e-6 and solution.sweeps < swept.sweeps
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [300, 5000])  # by direct solves, and by Krylov steps
 def test_progress_is_told_while_equations_are_solved_so_that_a_budget_can_end_them(size):
     mdp, sweeps = random_actions(ring(size, 0.5), 0.5).with_gamma(0.999999), []

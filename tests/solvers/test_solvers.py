@@ -32,7 +32,7 @@ def assert_near(mdp, solution, truth, allowed):
     assert abs(solution.value_at_start - start @ truth) <= allowed
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("solve", "sign"), [(value_iteration, 1), (worst_value, -1)])
 @examples(150, small_mdps())
 def test_optimal_and_worst_values_are_those_of_the_explicit_matrices(solve, sign, mdp):
@@ -42,7 +42,7 @@ def test_optimal_and_worst_values_are_those_of_the_explicit_matrices(solve, sign
     assert_near(mdp, solution, naive_mdp.optimal_values(P, R, mdp.gamma, sign), solution.error_bound + TWIN)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, small_mdps(), st.integers(1, 6))
 def test_values_with_a_horizon_are_those_of_backward_induction(mdp, horizon):
     P, R, _ = naive_mdp.augmented(mdp)
@@ -51,7 +51,7 @@ def test_values_with_a_horizon_are_those_of_backward_induction(mdp, horizon):
     assert_near(mdp, solution, naive_mdp.finite_values(P, R, mdp.gamma, horizon), TWIN)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, small_mdps(), st.data())
 def test_values_of_any_stochastic_policy_are_those_of_the_linear_system(mdp, data):
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
@@ -77,7 +77,7 @@ def test_a_deterministic_policy_on_a_deterministic_mdp_is_evaluated_exactly(mdp,
     assert np.abs(exact.v - naive_mdp.by_state(mdp, truth)[:, -1]).max() <= exact.error_bound + TWIN
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, small_mdps())
 def test_the_greedy_policy_of_the_solution_attains_its_value(mdp):
     solution = value_iteration(mdp, 1e-9)
@@ -86,14 +86,14 @@ def test_the_greedy_policy_of_the_solution_attains_its_value(mdp):
     assert (np.abs(attained.v - solution.v) <= loss + attained.error_bound + solution.error_bound).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, deterministic_mdps())
 def test_sticky_actions_with_probability_zero_change_nothing(mdp):
     plain, sticky = value_iteration(mdp), value_iteration(sticky_actions(mdp, 0.0))
     assert (plain.v == sticky.v).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, deterministic_mdps())
 def test_random_actions_with_probability_one_give_the_uniform_policy(mdp):
     randomized = value_iteration(random_actions(mdp, 1.0))
@@ -102,7 +102,7 @@ def test_random_actions_with_probability_one_give_the_uniform_policy(mdp):
         assert np.abs(each.v - uniform.v).max() <= randomized.error_bound + uniform.error_bound
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, small_mdps())
 def test_uniform_value_is_that_of_the_uniform_policy(mdp):
     direct, policy = uniform_value(mdp), evaluate_policy(mdp, uniform_policy(mdp))
@@ -110,21 +110,21 @@ def test_uniform_value_is_that_of_the_uniform_policy(mdp):
     assert abs(direct.value_at_start - policy.value_at_start) <= direct.error_bound + policy.error_bound
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, deterministic_mdps(rewards=st.sampled_from([0.0, 0.5, 1.0])), probabilities)
 def test_values_grow_with_gamma_where_no_reward_is_negative(mdp, p):
     low, high = (value_iteration(random_actions(mdp.with_gamma(gamma), p)) for gamma in (0.5, 0.9))
     assert (low.v <= high.v + low.error_bound + high.error_bound).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, small_mdps(), st.sampled_from([0.5, 2.0, 10.0]))
 def test_scaling_rewards_scales_values(mdp, scale):
     one, scaled = value_iteration(mdp), value_iteration(mdp.with_rewards(scale * mdp.rewards))
     assert np.abs(scale * one.v - scaled.v).max() <= scale * one.error_bound + scaled.error_bound
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, deterministic_mdps(ends=False), probabilities)
 def test_shifting_all_rewards_shifts_values_by_a_geometric_series(mdp, p):
     endless = TabularMDP.from_arrays(mdp.next_states, mdp.rewards, gamma=mdp.gamma)
@@ -133,7 +133,7 @@ def test_shifting_all_rewards_shifts_values_by_a_geometric_series(mdp, p):
     assert np.abs(one.v + 1 / (1 - mdp.gamma) - two.v).max() <= one.error_bound + two.error_bound + TWIN
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, deterministic_mdps(ends=False))
 def test_a_closed_part_of_an_mdp_has_the_same_values_alone(mdp):
     reached = {0}
@@ -158,7 +158,7 @@ def test_backups_contract_in_the_maximum_norm(mdp, seed):
     assert after <= mdp.gamma * before + 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, small_mdps())
 def test_a_finer_tolerance_moves_values_by_less_than_the_bounds(mdp):
     coarse, fine = value_iteration(mdp, 1e-2), value_iteration(mdp, 1e-9)

@@ -55,11 +55,13 @@ def check(mdp, solve, sign):
         assert np.abs(best - solution.v)[~mdp.terminal].max(initial=0.0) <= 2 * solution.error_bound
 
 
+@pytest.mark.long
 @examples(700, mdps_with_cycles(), st.sampled_from([1, -1]))
 def test_values_are_those_of_the_best_policy_of_all(mdp, sign):
     check(mdp, pharos.value_iteration if sign > 0 else worst_value, sign)
 
 
+@pytest.mark.long
 @examples(200, mdps_with_cycles(rewards=(0.0, 0.0, 1.0)))
 def test_rewards_of_one_sign(mdp):
     check(mdp, pharos.value_iteration, 1)
@@ -74,6 +76,7 @@ def test_every_kind_of_mdp_and_chance(mdp):
         check(mdp, pharos.value_iteration, 1)
 
 
+@pytest.mark.long
 @examples(200, mdps_with_cycles(), st.data())
 def test_values_of_policies(mdp, data):
     actions = np.array([data.draw(st.integers(0, mdp.num_actions - 1)) for _ in range(mdp.num_states)])
@@ -191,6 +194,7 @@ def test_the_slippery_lake_without_a_limit():
     assert solution.value_at_start == pytest.approx(14 / 17, abs=1e-9)
 
 
+@pytest.mark.long
 def test_whole_rewards_without_chance_are_exact():
     mdp = pharos.build(pharos.make("taxi")).mdp(gamma=1.0)
     solution = pharos.value_iteration(mdp)
@@ -200,6 +204,7 @@ def test_whole_rewards_without_chance_are_exact():
     assert (solution.optimal_actions(0.0) == solution.optimal_actions(0.5)).all()  # so every tie is one
 
 
+@pytest.mark.long
 @examples(200, deterministic_mdps())
 def test_paths_of_deterministic_mdps(mdp):
     mdp = mdp.with_gamma(1.0)

@@ -317,7 +317,7 @@ def test_a_drawing_must_not_write_to_its_state():
     assert "draw in state (position=0) writes to its state" in message(corridor(draw=draw))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_slices_of_the_planes_may_be_drawn():
     def draw(self, state, planes):
         planes[0, :, 1:3] = 1
@@ -354,7 +354,7 @@ def test_rules_must_say_the_same_compiled():
     assert "draw in state (position=0) writes 0 at [0, 0, 0] compiled, 1 interpreted" in message(corridor(draw=draw))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_value_in_between_must_stay_in_the_range_too():
     def transition(self, state, action, out):
         out[0] = state[0] + 2 * action - 1
@@ -389,7 +389,7 @@ def test_a_drawing_that_numba_cannot_compile_is_noted():
     assert "Numba cannot compile draw" in report.notes[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_built_state_space_is_compared(monkeypatch):
     import pharos.state_space
 
@@ -466,12 +466,14 @@ def test_attributes_that_nothing_reads_and_are_near_to_one_of_the_contract_are_n
     assert pharos.check_environment(corridor(**{name: 60})).notes[-1] == f"{name} is not used; did you mean {meant}?"
 
 
+@pytest.mark.long
 def test_attributes_of_the_users_own_are_not_noted():
     reward = lambda self, state, action, next_state: float(self.rewards[next_state[0]])  # noqa: E731
     report = pharos.check_environment(corridor(rewards=(0, 0, 0, 0, 1), reward=reward, palette=RED, speed=3))
     assert report.notes == ()
 
 
+@pytest.mark.long
 def test_a_world_without_ends_says_when_episodes_end():
     def transition(self, state, action, out):
         out[0] = (state[0] + action) % 5

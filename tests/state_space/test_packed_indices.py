@@ -128,6 +128,7 @@ def folder(spaces, tmp_path):
     return shutil.copytree(spaces("breakout")[1].folder, tmp_path / "space")
 
 
+@pytest.mark.long
 def test_a_folder_holds_five_bytes_a_successor_and_says_so(spaces):
     narrow, wide = spaces("breakout")
     entry = wide.manifest["arrays"]["successors40.bin"]

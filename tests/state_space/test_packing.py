@@ -110,7 +110,7 @@ few = st.lists(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(200, few, st.integers(0, 2**32), st.data())
 def test_the_compiled_view_reads_and_writes_components(ranges, seed, data):
     components = components_of(ranges)

@@ -66,6 +66,7 @@ def build_by_threads(env, folder, size, *, wide=0, rows=64, disturb=lambda rank:
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("world", ["breakout", pytest.param("chance", marks=pytest.mark.long)])
 def test_three_ranks_write_the_files_of_one_process(world, tmp_path):
     assert files_of(build_by_threads(WORLDS[world], tmp_path / "space", 3, wide=30)) == expected(world)

@@ -110,7 +110,7 @@ def _build_a_part(env, folder):
     build(env, folder, checkpoint_seconds=0.0, workers=2, progress=go_on)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_build_killed_again_and_again_ends_in_the_same_files(tmp_path, undisturbed, small_blocks):
     folder = tmp_path / "space"
     rng = np.random.default_rng(0)
@@ -212,7 +212,7 @@ class _InterruptAtLine:
             sys.settrace(previous)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings(
     "ignore::pytest.PytestUnraisableExceptionWarning"
 )  # a file interrupted between open and with
@@ -273,7 +273,7 @@ def test_files_do_not_depend_on_where_the_table_is(
     assert_same_files(tmp_path / "space", undisturbed[env.name])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("limit", (1 << 16, 1 << 20, 3 << 19))
 @pytest.mark.parametrize("chunk", (64, 1 << 16))
 def test_the_table_moves_to_disk_in_the_middle_of_a_build(limit, chunk, wall, tmp_path, any_memory, monkeypatch):
@@ -315,7 +315,7 @@ def test_memory_may_come_and_go_between_sessions(tmp_path, undisturbed, any_memo
     assert_same_files(folder, undisturbed["breakout"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_build_on_disk_killed_again_and_again_leaves_no_table_behind(tmp_path, undisturbed, little_memory):
     folder = tmp_path / "space"
     rng = np.random.default_rng(0)
@@ -335,7 +335,7 @@ def test_a_chunk_has_whole_bytes_of_terminal_bits_and_candidates_that_int32_can_
     assert rows >= 8 and rows % 8 == 0 and rows * num_actions < 2**31
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_indices_widen_while_the_table_is_on_disk(widened, tmp_path, little_memory, monkeypatch):
     monkeypatch.setattr(search, "INT32_STATES", 5000)
     build(BREAKOUT, tmp_path / "space")
@@ -345,7 +345,7 @@ def test_indices_widen_while_the_table_is_on_disk(widened, tmp_path, little_memo
     assert (wide.packed_states == expected.packed_states).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_interpreted_rules_are_enumerated_with_the_table_on_disk(tmp_path, undisturbed, little_memory, interpreted):
     assert_resumes(tmp_path / "space", undisturbed["breakout"])
 
@@ -367,7 +367,7 @@ def test_a_disk_without_room_for_the_table_loses_nothing(wall, tmp_path, any_mem
     assert_same_files(tmp_path / "space", wall.folder)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_rule_that_fails_is_blamed_with_the_table_on_disk(tmp_path, little_memory):
     @dataclass(frozen=True, kw_only=True)
     class Overflowing(TableWorld):

@@ -317,7 +317,7 @@ class OtherEnd(Walk):
         return state[0] == self.length - 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_folder_of_another_version_of_the_rules_is_refused(folder):
     build(Walk(), folder)
     assert "with rules_version = 1; expected 2" in refusal(StateSpaceMismatch, build, RaisedVersion(), folder)
@@ -448,7 +448,7 @@ class WritesToItsState(Walk):
         state[0] = min(max(state[0] + 2 * action - 1, 0), self.length - 1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_rule_that_writes_to_the_state_is_neither_compiled_nor_interpreted(folder):
     with (
         pytest.warns(RuntimeWarning, match="WritesToItsState: Numba cannot compile its rules"),

@@ -58,7 +58,7 @@ def cells(rows, measured):
     return study.cells(rows, measured)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_there_is_a_row_for_each_finished_run_with_the_numbers_of_its_file(done, rows):
     found, folder = done
     assert sorted(rows["id"]) == sorted(run.id for run in found.runs)

@@ -177,6 +177,7 @@ def test_packed_studies_of_older_versions_are_read(folder, packed, tmp_path):
 LARGE = Path(__file__).parents[2] / "docs" / "studies" / "classes" / "large.parquet"
 
 
+@pytest.mark.long
 def test_a_study_packed_when_the_library_had_other_hyperparameters_is_read_with_those(tmp_path):
     place, added = study.unpack(LARGE, tmp_path / "large")
     status = study.status(place)

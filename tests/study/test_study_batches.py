@@ -81,6 +81,7 @@ def test_runs_of_a_checkpoint_stay_together(tmp_path):
     assert seeds == [[0, 2, 4], [1, 3]]
 
 
+@pytest.mark.long
 @pytest.mark.skipif("forkserver" not in multiprocessing.get_all_start_methods(), reason="nothing is forked here")
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_what_trains_on_a_gpu_is_not_forked(tmp_path, sizes, monkeypatch, device):
@@ -165,7 +166,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_runner_that_is_killed_leaves_nothing_half_done(tmp_path, sizes):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)

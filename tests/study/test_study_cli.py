@@ -58,7 +58,7 @@ def test_show_counts_the_runs(folder):
     assert "2 runs, 400 steps" in pharos("show", "lake.yaml", cwd=folder).stdout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -88,7 +88,7 @@ def test_a_study_with_failed_runs_ends_with_exit_code_1_and_says_where_to_look(f
     assert "2 x " in done.stderr and "learning_rat" in done.stderr and "--retry-failed" in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_study_is_found_by_its_name_after_it_was_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     spec = fake_training.specification("lake", steps=10, evaluations=1, seeds=1)
