@@ -49,6 +49,19 @@ def test_diameters_are_those_of_the_explicit_matrices(mdp, restart):
         assert found.lower <= expected * (1 + 1e-9) and expected <= found.upper * (1 + 1e-9)
 
 
+@pytest.mark.long
+@examples(15, st.integers(2, 5), st.integers(1, 3), st.integers(0, 10**6))
+def test_the_other_solver_of_expected_steps_agrees(num_states, num_actions, seed):
+    """Without terminal states the diameter is the largest of the least expected costs of 1 a step."""
+    probabilities = np.random.default_rng(seed).dirichlet(np.full(num_states, 0.3), (num_states, num_actions))
+    mdp = TabularMDP.from_matrices(probabilities, np.zeros((num_states, num_actions)), axes="SAS")
+    bounds = [pharos.reach(mdp, [s], costs=np.ones(mdp.rewards.shape)).least_cost for s in range(num_states)]
+    diameter = hardness.diameter(mdp, restart=False)
+    assert diameter.lower <= max(each.upper.max() for each in bounds) * (1 + 1e-9)
+    assert max(each.lower.max() for each in bounds) <= diameter.upper * (1 + 1e-9)
+    assert diameter.exact and max(each.upper.max() for each in bounds) == pytest.approx(diameter.upper, rel=1e-6)
+
+
 @pytest.mark.parametrize("workers", [2, 5])
 def test_results_do_not_depend_on_the_number_of_threads(workers, monkeypatch):
     mdp = random_actions(pharos.build(pharos.make("frozen_lake/8x8")).mdp(), 0.1)
