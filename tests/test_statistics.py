@@ -190,6 +190,7 @@ def test_one_run_has_no_interval_and_equal_runs_are_a_point():
     assert student_interval(0.9, 0.2, 5.0, (0.0, 1.0))[2] == 1.0
 
 
+@pytest.mark.long
 def test_the_error_of_an_interquartile_mean_is_that_of_resamples():
     rng = np.random.default_rng(0)
     tasks = [rng.beta(*shape, 40) for shape in ((2, 5), (5, 1), (0.5, 0.5), (9, 9))]
@@ -211,6 +212,7 @@ def test_intervals_of_ten_skewed_runs_cover_the_mean():
     assert 0.93 <= np.mean([low <= truth <= high for _, low, high in found]) <= 0.97
 
 
+@pytest.mark.long
 @examples(50, st.lists(st.lists(st.floats(0, 1), min_size=3, max_size=3), min_size=4, max_size=4), st.floats(0.2, 0.8))
 def test_the_interval_of_a_crossing_is_that_of_plain_python(regrets, target):
     if min(map(naive.variance, regrets)) < 1e-6:
@@ -252,7 +254,7 @@ def test_ends_of_the_interval_of_a_crossing_are_where_students_interval_ends_at_
     assert fieller_interval(levels[:2], [runs, np.full(2, 1.0)], upper - 1e-9)[0] == -math.inf
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_intervals_of_a_crossing_cover_it():
     """Normal runs about 0.05, 0.3, 0.7, 0.95: the crossing of 0.5 is halfway between the second and the third level."""
     rng, levels = np.random.default_rng(0), np.array([1.0, 2.0, 4.0, 8.0])

@@ -171,6 +171,7 @@ def test_updates_of_ppo_are_those_of_stable_baselines3(task, max_grad_norm):
     assert_same_parameters(model, batch.parameters(i))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("agent", ("dqn", "ppo"))
 def test_the_policy_is_that_of_the_model(task, agent):
     hyperparameters = {"dqn": DQN, "ppo": PPO}[agent]

@@ -54,6 +54,7 @@ def test_runs_that_see_more_or_less_share_a_lane_and_learn_what_they_learn_alone
             assert np.abs(np.subtract(*answers)).max() <= 1e-4
 
 
+@pytest.mark.long
 def test_what_a_run_has_not_stays_zero():
     """Weights of inputs that only the others of a lane have."""
     batch = learned("dqn", grids("dqn", "simple_image", (4, 6)), device=ELSEWHERE)

@@ -235,6 +235,7 @@ def test_frames_are_of_a_group_of_their_own_and_what_the_engine_lacks_is_named()
             runs_of(Task(BREAKOUT, **more), DQN_OPTIONS, 1)
 
 
+@pytest.mark.long
 def test_policies_of_frames_that_walk_together_are_worth_what_they_are_alone():
     """Policies of the bytes that are seen, so that nothing is compiled."""
     task = task_of()

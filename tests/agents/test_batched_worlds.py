@@ -79,6 +79,7 @@ def test_episodes_are_as_likely_as_the_mdp_says(slippery, chance):
         assert within(executed_after[previous, chosen], likely)
 
 
+@pytest.mark.long
 def test_what_is_executed_is_in_the_sets_and_as_likely_as_it_should_be():
     sets = np.array([[1, 1, 0], [0, 1, 1], [1, 1, 1]], np.bool_)
     free = TabularMDP.from_arrays([[1, 2, 0], [2, 0, 1], [0, 1, 2]], np.zeros((3, 3)), gamma=0.9)
@@ -106,6 +107,7 @@ def test_what_is_executed_is_in_the_sets_and_as_likely_as_it_should_be():
         assert within(seen, 0.7 * choice + 0.3 * np.eye(3)[b] if sticks else choice)
 
 
+@pytest.mark.long
 def test_lazy_actions_stay_as_often_as_they_should_and_pay_what_staying_pays(slippery):
     mdp, successors, probabilities, rewards = slippery
     staying = 100.0 + np.arange(10.0).reshape(5, 2)
@@ -125,6 +127,7 @@ def test_lazy_actions_stay_as_often_as_they_should_and_pay_what_staying_pays(sli
     assert within(met, np.bincount(successors[1, 0], probabilities[1, 0], 5))
 
 
+@pytest.mark.long
 def test_pay_is_late_and_noisy_as_elsewhere_and_returns_are_of_what_is_earned(slippery):
     mdp, *_, rewards = slippery
     late, noisy = {"reward_delay": 3}, {"reward_noise": 2.0}
@@ -193,6 +196,7 @@ def test_runs_of_several_instances_learn_as_they_do_alone(mixed):
     assert outcomes(mixed) == [outcomes([run])[0] for run in mixed]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("observation", ("vector", "simple_image"))
 def test_observations_that_fit_no_table_change_nothing(monkeypatch, observation):
     task = Task.of(make("frozen_lake/4x4"), observation=observation)

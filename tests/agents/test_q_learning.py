@@ -74,6 +74,7 @@ def test_values_converge_to_those_of_value_iteration():
     np.testing.assert_allclose(agent.q.max(axis=1)[0], pharos.value_iteration(mdp).v[0], atol=1e-2)
 
 
+@pytest.mark.long
 def test_an_agent_that_sees_previous_actions_has_a_policy_for_each():
     mdp = mdp_of("simple_grid/4x4-plain", sticky=0.25)
     agent = QLearning(mdp, total_steps=50_000, seed=0, sees_previous_action=True, initial_q=1.0).learn(50_000)

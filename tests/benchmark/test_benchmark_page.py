@@ -55,6 +55,7 @@ def test_the_report_of_results_in_a_file_is_written_by_the_command(tmp_path, mon
     assert " & mine & other" in Path("mine.tex").read_text()
 
 
+@pytest.mark.long
 def test_commands_of_the_page_are_there():
     for line in re.findall(r"^pharos (benchmark [^#\n]*)", PAGE, re.MULTILINE):
         words = shlex.split(line)

@@ -152,6 +152,7 @@ def test_one_environment_in_several_places_of_a_vector_environment_is_refused():
     env.reset(seed=7), env.step(0), env.reset(seed=8)
 
 
+@pytest.mark.long
 def test_a_policy_without_a_counted_step_is_refused():
     """The agent of an honest user of `deepcopy` as it was, whose steps nobody counted; here it steps what is within."""
 
@@ -188,6 +189,7 @@ def test_uniform_play_and_a_first_policy_before_the_first_step_are_none_of_it():
     assert [curve_of(learn).counted_steps for learn in (nothing, uniform, initial)] == [0, 0, 300]
 
 
+@pytest.mark.long
 def test_facts_on_policies_are_those_of_plain_counting():
     """A policy that prefers optimal actions with probability 0.7 is optimal if it is played greedily."""
     task = SEA.training_task(PROTOCOL)

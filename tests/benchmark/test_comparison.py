@@ -154,6 +154,7 @@ def test_power_refuses_one_seed_and_no_difference():
             power(drawn(), suite=SUITE, difference=difference)
 
 
+@pytest.mark.long
 def test_commands_print_tables_and_json(tmp_path):
     suite, files = load_suite("v1"), []
     for agent, regret, seeds in (("mine", 0.2, 3), ("theirs", 0.4, 3), ("one", 0.4, 1)):

@@ -179,6 +179,7 @@ def test_what_is_below_two_hundredths_has_no_verdict():
     assert near.core.adjusted < 0.05 and near.core.verdict == "less than 0.02 apart" and far.core.verdict == "worse"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_one_run_ten_times_has_neither_intervals_nor_verdicts(seed):
     """One seed of the shipped DQN as ten, which was better and worse than DQN with p < 0.0001."""
@@ -218,6 +219,7 @@ def lesioned(tasks, by=0.6):
     return replace(real, agent="mine.py:DQN", curves=curves)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("group", "number"),
     [("vector", 6), ("rewards of several sizes", 6), ("ended by time alone", 2)],
@@ -237,6 +239,7 @@ def test_a_fault_of_one_group_of_tasks_has_its_name(group, number):
     assert f"The largest loss is on {group}, " in section
 
 
+@pytest.mark.long
 def test_groups_have_the_difference_of_plain_python_and_holm_of_their_table():
     ours, theirs = AgentResults.read("dqn"), AgentResults.read("ppo")
     groups = groups_of(contents_of("dqn"))[0]
@@ -277,6 +280,7 @@ def residual_section(html):
     return html.split("<h2>Residuals: worse than theory says</h2>")[1].split("</section>")[0]
 
 
+@pytest.mark.long
 def test_residuals_of_the_shipped_agent_are_those_of_theory_and_those_of_a_fault_its_own():
     text = residual_section(page(contents_of("ppo")))
     assert "Theory is too hopeful: PPO of pharos fares alike." in text and "look for a bug here" not in text

@@ -122,6 +122,7 @@ def test_healthy_values_with_noise_obey_no_wrong_equation(seed):
     assert numbers["truth"] > 0.99 and abs(numbers["slope"]) < 0.05 and abs(numbers["size"]) < 0.05
 
 
+@pytest.mark.long
 def test_values_of_a_policy_are_told_from_those_that_run_on_into_the_next_episode():
     here, rng = world(2), np.random.default_rng(0)
     policy = rng.dirichlet(np.ones(ACTIONS), STATES)
@@ -143,6 +144,7 @@ def test_values_with_the_time_limit_as_an_end_are_all_of_the_way():
     assert np.isnan(cut_shares(examination(here, q=q, cuts=0), GAMMA)).all()
 
 
+@pytest.mark.long
 def test_the_factor_of_rewards_is_their_slope():
     here = world(3)
     for scale in (0.01, 0.5, 10.0):

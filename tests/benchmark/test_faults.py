@@ -50,7 +50,7 @@ def test_there_are_two_dozen_faults_and_others_are_refused():
         next(faults.ppo(None, 10, 0, fault="gamma_haf"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("agent", faults.FAULTS)
 def test_each_fault_runs_and_leaves_what_it_says(agent):
     def seen(fault, worlds=("still",), seeds=(0, 1)):
@@ -121,6 +121,7 @@ def test_visits_and_cuts_are_those_of_all_copies():
     assert (each.policy[:, 2] == 1).all()
 
 
+@pytest.mark.long
 def test_values_are_asked_in_another_order_and_with_other_numbers():
     class Table:
         def q_values(self, observations):
@@ -140,6 +141,7 @@ def test_values_are_asked_in_another_order_and_with_other_numbers():
     assert each.reaction[:2].min() > 0.0 and each.q.shape == (*each.visits.shape[:1], 2)
 
 
+@pytest.mark.long
 def test_a_class_that_is_stepped_is_asked_as_the_object_that_it_is():
     class Stepped:
         def __init__(self, observation_space, action_space, num_envs, seed):

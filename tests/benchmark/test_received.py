@@ -66,6 +66,7 @@ def place(finished, tmp_path, monkeypatch):
 # Code -----------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("named", ["evil.py:Evil", "evil:Evil", "observation"])
 def test_a_received_suite_runs_code_only_if_it_is_trusted(named, suite, place):
     (place / "evil.py").write_text(EVIL)

@@ -136,7 +136,7 @@ def test_another_suite_is_refused(suite, honest):
     assert "name its suite" in refusal(ParameterError, verify, honest[1], replace(suite, name="other", digest="0" * 64))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("agent", ["q_learning", "dqn"])
 def test_tables_and_networks_of_pharos_hold(suite, tmp_path, agent):
     if agent == "dqn":

@@ -203,7 +203,7 @@ def test_slippery_ice_is_found_where_it_is(pharos):
     assert "unknown parameter 'is_slippery' of frozen_lake: it is called slippery here" in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("words", "expected"), [("pharos sol", "solve"), ("pharos solve --hor", "--horizon")])
 def test_the_shell_completes_verbs_and_options(monkeypatch, words, expected):
     monkeypatch.setenv("_PHAROS_COMPLETE", "complete_bash")
@@ -382,7 +382,7 @@ def test_the_long_run(answer, tmp_path):
         )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_solving_a_folder_is_solving_its_environment(answer, tmp_path):
     answer("build", "breakout", "height=7", "columns=3", "--out", tmp_path / "court")
     options = ("--sticky", 0.25, "--random", 0.1)
@@ -565,7 +565,7 @@ def test_what_the_environment_lacks_or_forbids_is_a_line(cache):
         assert done.returncode == done.stderr.count("\n") == code and done.stderr.startswith(said)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("words", [["list"], ["--help"], ["list", "--json"]])
 def test_help_and_list_load_nothing_heavy(words):
     heavy = ("numba", "scipy.stats", "pandas", "matplotlib", "torch")
@@ -590,7 +590,7 @@ def test_a_game_that_is_played_draws_the_outcomes_of_chance_in_the_rules(monkeyp
         assert game.state == state
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("verb", ["solve", "hardness"])
 def test_a_world_with_chance_is_not_said_to_have_none(pharos, verb):
     words = [verb, "frozen_lake/4x4", *(["--measures", "minimal_gap"] if verb == "hardness" else [])]

@@ -45,7 +45,7 @@ def test_an_agent_is_read_back_with_its_task(folders):
     assert found.value_at_start == pytest.approx(read_record(folders["ppo-0"])["result"]["final_value"], abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_regret_of_runs_is_drawn(folders, tmp_path):
     out = tmp_path / "regret.png"
     found = answer("plot", "regret", *folders.values(), "--out", out)

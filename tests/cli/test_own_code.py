@@ -146,7 +146,7 @@ def test_what_was_learnt_is_drawn_where_it_is_trusted(lab):
     assert done.returncode == 0 and (lab / "a.gif").stat().st_size > 0, done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_can_be_read_in_python(lab, monkeypatch):
     monkeypatch.setattr(catalog, "_REGISTERED", {})
     record = runs_of(lab)["index"]
@@ -536,7 +536,7 @@ def test_count_and_show_tell_where_no_policy_beats_uniform_play(tmp_path, monkey
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_class_that_is_no_dataclass_is_a_line(tmp_path):
     (tmp_path / "mine.py").write_text(ONCE.replace("@dataclass(frozen=True, kw_only=True)\n", ""))
     done = process("count", "mine.py:Once", cwd=tmp_path)

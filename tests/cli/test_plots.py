@@ -169,6 +169,7 @@ def test_a_value_map_refuses_what_is_no_grid():
         plots.value_map(grid, pharos.value_iteration(pharos.sticky_actions(grid.mdp(), 0.5)))
 
 
+@pytest.mark.long
 def test_the_plane_places_instances_by_their_measures():
     names = ("simple_grid/4x4-plain", "frozen_lake/8x8")
     reports = {name: hardness.report(pharos.build(pharos.make(name)).mdp()) for name in names}

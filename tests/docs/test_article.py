@@ -35,7 +35,7 @@ def test_the_numbers_of_the_text_are_those_of_the_packed_runs(monkeypatch, packe
         assert phrase in words
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_sealed_cells_are_the_kept_ones(monkeypatch, packed_runs):
     """The regret of each cell, computed from curves, is that of cells.csv; the measures are those of the kept table."""
     import pandas as pd
@@ -49,7 +49,7 @@ def test_the_sealed_cells_are_the_kept_ones(monkeypatch, packed_runs):
         assert article.judged()[key]["r_squared"] == pytest.approx(rows["r_squared"][key], abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_findings_of_the_runs_are_the_kept_ones(monkeypatch, packed_runs):
     import pandas as pd
 

@@ -33,6 +33,7 @@ def test_the_code_of_the_page_reads_what_pharos_wrote(name, tmp_path, monkeypatc
     assert (read["terminal"] == space.terminal).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("most_codes", "possible_share"), [(2**16, 1.0), (2**16, 0.3), (2, 1.0), (2, 0.3)])
 def test_the_code_of_the_page_reads_chance(most_codes, possible_share, tmp_path, monkeypatch):
     """Dense and one after another, with a palette and without."""

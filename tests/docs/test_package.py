@@ -209,6 +209,7 @@ def test_files_that_docstrings_name_are_there():
                 assert {*re.findall(r"\b(\w+\.py)\b", ast.get_docstring(node) or "")} <= there, path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("folder", ["benchmarks", "scripts"])
 def test_scripts_import_what_is_there(folder):
     absent = []

@@ -36,7 +36,7 @@ def check(text, number):
     assert float(text) == float(f"{number:.{digits}f}"), f"{text} is {number}"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("words", TABLES)
 def test_the_large_tables_are_those_of_the_packed_runs(words, monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "scripts")

@@ -128,7 +128,7 @@ def test_nothing_stands_on_study_and_benchmark():
     assert {part_of(path) for path, _ in users} >= TOP | USERS_OF_TOP
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_strangers_never_meet():
     met = {(part_of(path), name.split(".")[1]) for path, name, _ in imports()}
     assert {(part, other) for part, others in STRANGERS.items() for other in others} & met == set()

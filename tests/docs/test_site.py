@@ -62,7 +62,7 @@ def test_links_of_pages_lead_somewhere(page):
             assert anchor in anchors_of(target.read_text()), link
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_code_of_the_first_page_prints_what_it_says():
     name, namespace, compared = "start.md", {}, 0
     for code, expected in BLOCK.findall((DOCS / name).read_text()):

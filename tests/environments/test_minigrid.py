@@ -77,7 +77,7 @@ def test_key_corridor_with_equal_states_merged():
     assert isomorphic(minimize(published).mdp, mdp)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("remember", [False, True])
 def test_key_corridor_has_its_published_values(remember):
     mdp = importers.minigrid(CORRIDOR, remember_carried=remember)
@@ -87,7 +87,7 @@ def test_key_corridor_has_its_published_values(remember):
     assert (found.k_min, found.value) == (1, 16.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", SMALL)
 def test_the_table_and_the_environment_agree_at_every_step_of_walks(name):
     env = FullyObsWrapper(gymnasium.make(name, disable_env_checker=True, max_steps=10**6))
@@ -121,7 +121,7 @@ def test_done_is_an_action_only_where_it_does_something():
     assert (turning.num_states, turning.num_actions) == (4, 2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_environment_that_was_made_is_taken_as_it_is():
     env = gymnasium.make(CORRIDOR, disable_env_checker=True)
     assert isomorphic(importers.minigrid(env, seed=2), importers.minigrid(CORRIDOR, seed=2))

@@ -106,6 +106,7 @@ def test_a_class_that_changes_the_sets_alone_has_its_own():
     assert pharos.value_iteration(mdp).value_at_start == uniform_value(mdp).value_at_start == pytest.approx(0.97)
 
 
+@pytest.mark.long
 def test_given_rewards_of_a_space_count_for_available_actions():
     space = pharos.build(Corridor())
     sets = space.mdp().available
@@ -171,6 +172,7 @@ def test_steps_execute_what_is_available_as_often_as_they_should(chance, tabulat
         assert (np.abs(seen - seen.sum() * p) <= 5 * np.sqrt(seen.sum() * p * (1 - p)) + 1e-9).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("chance", CHANCES)
 def test_one_environment_and_many_draw_the_same_within_the_sets(chance):
     one = GymEnv(Slippery(), **CHANCES[chance])

@@ -118,6 +118,7 @@ def test_as_many_positions_need_as_many_moves_as_published(tray):
     assert pharos.value_iteration(undiscounted, horizon=env.max_episode_steps).value_at_start == -RADIUS[tray]
 
 
+@pytest.mark.long
 def test_the_named_hardest_start_needs_31_moves():
     """One of the two that A089473 prints."""
     env = pharos.make("sliding_tiles/3x3-hardest")

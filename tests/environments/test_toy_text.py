@@ -48,6 +48,7 @@ def test_cliff_walking_has_gymnasiums_table(slippery):
     assert_table_is_gymnasiums(env, table, lambda number: divmod(int(number), 12), range(37))  # 37 .. 46 are the cliff
 
 
+@pytest.mark.long
 def test_the_exported_table_of_slippery_cliff_walking_is_gymnasiums():
     theirs = gymnasium.make("CliffWalking-v1", is_slippery=True).unwrapped.P
     space = pharos.build("cliff_walking/4x12-slippery", progress=False)

@@ -54,6 +54,7 @@ def lake():
 # What is told of a position -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_position_tells_the_values_and_outcomes_of_the_mdp_written_out(sticky):
     P, R, _ = naive_mdp.augmented(sticky.mdp)
     q = R + 0.9 * P @ naive_mdp.optimal_values(P, R, 0.9)

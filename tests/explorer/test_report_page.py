@@ -108,7 +108,7 @@ document.body.replaceChildren(); document.body.textContent = "SAID" + JSON.strin
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
 def test_a_reader_points_at_curves_hides_lines_and_sorts_tables(tmp_path):
     curves = Curves(

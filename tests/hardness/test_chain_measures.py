@@ -208,7 +208,7 @@ def test_the_mismatch_of_the_optimal_policy_with_itself_is_one():
     assert found.lower == pytest.approx(1) and found.upper == pytest.approx(1, abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(100, small_mdps(max_states=5, max_actions=3), st.sampled_from([0.0, 0.5, 1.0, 2.0]))
 def test_the_action_gap_is_as_regular_as_all_gaps_say(mdp, zeta):
     solution = pharos.value_iteration(mdp, 1e-9)

@@ -38,6 +38,7 @@ def test_the_largest_distance_to_each_source_is_found(drawn):
     np.testing.assert_array_equal(largest, np.where(np.isfinite(distance), distance, 0).max(axis=0))
 
 
+@pytest.mark.long
 @examples(60, graphs(), st.integers(0, 2**32 - 1))
 def test_bounds_that_follow_along_edges_hold_and_are_the_least_of_all_paths(drawn, seed):
     """From exact values of a few nodes: in(v) <= in(u) + d(u, v) and out(v) <= d(v, u) + out(u), and no less."""

@@ -60,7 +60,7 @@ def strongly_connected(rng, num_states, num_actions):
     return TabularMDP.from_arrays(table, np.zeros(table.shape), initial=int(order[0]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(60, st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 3), st.integers(0, 40))
 def test_every_budget_gives_an_interval_that_holds_the_diameter_and_larger_budgets_narrower_ones(
     seed, size, num_actions, most
@@ -108,6 +108,7 @@ def test_a_terminal_state_leads_to_the_start_in_one_step():
     assert "infinite" in str(without)
 
 
+@pytest.mark.long
 def test_the_default_budget_is_not_spent_on_counting_the_pairs_of_an_infinite_diameter(monkeypatch):
     monkeypatch.setattr(sum_sweep, "COUNTING", 0.0)
     size = 5000
@@ -253,6 +254,7 @@ def test_every_start_state_counts_where_a_state_is_out_of_reach_of_one():
     assert hardness.start_eccentricity(mdp.with_initial(0), restart=False) == 9
 
 
+@pytest.mark.long
 def test_the_distance_from_several_start_states_is_its_mean():
     """To the state before a start: 9 steps from it, and 4 from the other."""
     found = hardness.start_eccentricity_interval(ring(10, [0, 5]))

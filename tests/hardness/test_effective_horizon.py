@@ -69,7 +69,7 @@ def test_returns_of_key_corridor_are_the_published_ones():
     assert (found.optimal_return, found.worst_return) == (1.0, 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name, horizon", PUBLISHED)
 def test_published_analyses_with_sticky_actions_are_reproduced(name, horizon):
     found = hardness.effective_horizon(sticky_actions(bridge_mdp(name, horizon), 0.25))
@@ -225,6 +225,7 @@ def test_a_freeway_is_analysed_for_the_states_that_an_episode_meets():
     assert found.optimal_return == pharos.value_iteration(mdp.with_horizon(100)).value_at_start
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("less", [0.0, 5e-5, 2e-4])
 def test_actions_that_rounding_or_less_than_the_tie_tolerance_tells_apart_are_both_optimal(less):
     """0.1 + 0.2 is more than 0.3 by rounding. Random play prefers 0.3 at once; that is optimal unless it is 1e-4

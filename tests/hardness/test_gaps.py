@@ -310,6 +310,7 @@ def test_intervals_of_gaps_of_every_step_hold_the_exact_fractions(gamma):
     assert result.error >= 2 * pharos.value_iteration(mdp).error_bound > 0
 
 
+@pytest.mark.long
 @examples(100, st.integers(0, 2**32 - 1), st.sampled_from([1.0, 0.25, 2.0**20]), st.sampled_from([1, 6, 40]))
 def test_whole_rewards_without_discount_have_exact_values_and_every_tie_is_proven(seed, unit, horizon):
     rng = np.random.default_rng(seed)

@@ -129,7 +129,7 @@ def test_the_exact_method_is_the_probability_of_failure(mdp, steps, k, m):
         assert search.failure(m, k) == pytest.approx(failure_probability(mdp, steps, k, m), abs=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(60, paying_once(), st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 2), st.integers(1, 3))
 def test_within_sets_the_exact_method_is_the_probability_of_failure(mdp, seed, steps, k, m):
     assume(mdp.num_actions**k <= 4)

@@ -262,6 +262,7 @@ def test_landmarks_are_exact_where_there_are_enough_of_them_and_say_so_where_not
     np.testing.assert_allclose(identity.curve.greedy, identity.tabular.greedy, atol=1e-3)
 
 
+@pytest.mark.long
 def test_gradient_steps_in_a_series_are_those_made_one_by_one():
     """Of all three operators, with 300 observations and rows of more than one block."""
     from pharos.hardness.representation.learning import Exact, Identity, Landmarks
@@ -589,7 +590,7 @@ def test_an_action_that_is_nowhere_available_changes_no_measure(sticky, random, 
         assert floors[0] == pytest.approx(floors[1], abs=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_names_of_actions_that_differ_between_states_change_nothing_for_a_table():
     """Two of three actions in each state, others in each: the table's curve is that of the two."""
     rng = np.random.default_rng(4)

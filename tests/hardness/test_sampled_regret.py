@@ -202,6 +202,7 @@ def test_the_scale_of_rewards_changes_nothing():
     assert small["value"] == pytest.approx(large["value"], abs=1e-9)
 
 
+@pytest.mark.long
 def test_noise_of_rewards_makes_it_harder():
     space = pharos.build(pharos.make("catch", rows=6, columns=3))
     mdp = space.mdp(gamma=1.0).with_horizon(8)

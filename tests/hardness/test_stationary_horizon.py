@@ -123,7 +123,7 @@ def test_it_is_part_of_a_report_when_asked_for_and_says_what_is_not_defined():
         hardness.stationary_effective_horizon(mdp, steps=0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(40, deterministic_mdps(max_states=6, max_actions=3))
 def test_values_that_are_not_written_out_are_the_same(mdp):
     module = importlib.import_module("pharos.hardness.effective_horizon")

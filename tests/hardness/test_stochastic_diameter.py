@@ -62,6 +62,7 @@ def test_the_other_solver_of_expected_steps_agrees(num_states, num_actions, seed
     assert diameter.exact and max(each.upper.max() for each in bounds) == pytest.approx(diameter.upper, rel=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("workers", [2, 5])
 def test_results_do_not_depend_on_the_number_of_threads(workers, monkeypatch):
     mdp = random_actions(pharos.build(pharos.make("frozen_lake/8x8")).mdp(), 0.1)
@@ -72,6 +73,7 @@ def test_results_do_not_depend_on_the_number_of_threads(workers, monkeypatch):
     assert (found.lower, found.upper, found.searches) == (expected.lower, expected.upper, expected.searches)
 
 
+@pytest.mark.long
 @examples(40, chancy_mdps(), st.booleans())
 def test_start_eccentricities_are_those_of_the_explicit_matrices(mdp, restart):
     mdp = random_actions(mdp, 0.25)

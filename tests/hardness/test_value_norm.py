@@ -120,7 +120,7 @@ def test_large_values_that_lie_close_together_have_their_deviation(gamma, value)
     assert found.lower - rounding <= deviation <= found.upper + rounding
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(100, small_mdps(), st.sampled_from([1e-3, 1e-6]))
 def test_the_interval_holds_the_norm_however_coarse_the_values_are(mdp, tolerance):
     found = certified_value_norm(mdp, pharos.value_iteration(mdp, tolerance))
@@ -154,6 +154,7 @@ def test_what_a_row_lacks_is_an_end_for_values_and_measures_alike(lack, gamma):
         assert found.lower - 1e-9 * truth <= truth <= found.upper + 1e-9 * truth
 
 
+@pytest.mark.long
 def test_what_the_rounding_of_a_row_lacks_is_no_end():
     thirds, tenths = [1 / 3] * 3, [0.1] * 10
     assert sum(tenths) < 1
@@ -164,6 +165,7 @@ def test_what_the_rounding_of_a_row_lacks_is_no_end():
         assert not pharos.bisimulation.minimize(mdp).mdp.has_ends
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("reward", [1e3, 1e9, 1e15])
 def test_a_measure_answers_by_itself_however_large_the_values_are(reward):
     """An error of 1e-9 is beyond floats there; the interval says what was reached."""

@@ -213,7 +213,7 @@ def test_raw_imports_keep_what_merging_would_merge():
     assert (recording.observations[again.representatives] == others.observations[np.arange(merged.num_states)]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_options_change_the_game_as_they_say():
     pytest.importorskip("ale_py")
     _, recording = importers.atari("freeway", horizon=1, frame_skip=4)

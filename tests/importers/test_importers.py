@@ -127,7 +127,7 @@ def test_screens_come_one_a_state(tmp_path):
     assert "names a screen that is not there" in refusal(FileFormatError, importers.bridge_screens, file)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "options", "value"),
     [
@@ -208,7 +208,7 @@ def test_folders_that_were_changed_are_refused(tmp_path):
     assert "holds no imported MDP" in refusal(ParameterError, importers.save, mdp, tmp_path / "other")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_imported_file_and_folder_are_targets(tmp_path):
     done = run("import", "bridge", CORRIDOR, "--horizon", 100, "--out", tmp_path / "kc", "--json")
     assert json.loads(done.stdout)["num_states"] == 168
@@ -413,7 +413,7 @@ def test_an_array_header_that_promises_more_than_there_is_ends_in_one_line(impor
         assert "rewards.npy: cannot be read" in refusal(FileFormatError, importers.load, imported)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_bit_of_a_compressed_file_of_bridge_ends_in_a_traceback(tmp_path):
     data, expected = CORRIDOR.read_bytes(), importers.bridge(CORRIDOR, horizon=100)
     file = tmp_path / "damaged.npz"

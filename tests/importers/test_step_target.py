@@ -88,7 +88,7 @@ def test_a_killed_import_goes_on(tmp_path, here):
     assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_disk_that_is_full_is_one_line_and_loses_nothing(tmp_path, here, monkeypatch):
     """Full from the n-th file on, for each n until the import fits."""
     command = ["import", "env", "planted.py:Clock", "--no-check", "--out"]
@@ -173,7 +173,7 @@ def test_two_processes_find_the_same(tmp_path, here):
         importers.stepping(lambda: planted.Walk(), workers=2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_folders_are_environments(tmp_path, here):
     import pharos
 

@@ -356,7 +356,7 @@ def test_counts_that_are_refused_are_less_likely_than_one_in_a_million(p):
     assert refused > n / 2 and probability <= 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", ["FrozenLake-v1", "FrozenLake8x8-v1", "Taxi-v4", "CliffWalking-v1", "CliffWalkingSlippery-v1"]
 )

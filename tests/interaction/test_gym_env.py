@@ -27,7 +27,7 @@ SMALL = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("env_id", SMALL)
 @pytest.mark.parametrize(
     "options", [{}, {"sticky": 0.25, "previous_action": True}, {"random": 0.3, "remaining_time": True}]
@@ -129,6 +129,7 @@ def executed_counts(env, steps, seed):
     return counts
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("sticky", "random"), [(0.25, 0.0), (0.0, 0.4), (0.5, 0.5), (1.0, 0.5), (0.0, 1.0)])
 def test_the_first_executed_action_has_the_distribution_of_the_tabular_mdp(sticky, random, breakout):
     chance = pharos.random_actions(pharos.sticky_actions(breakout.mdp(), sticky), random).chance
@@ -199,6 +200,7 @@ def test_gymnasiums_max_episode_steps_is_a_limit_too():
     assert [env.step(0)[3] for _ in range(5)] == [False] * 4 + [True]
 
 
+@pytest.mark.long
 def test_an_episode_starts_where_the_options_say(breakout):
     env = GymEnv(breakout.environment, space=breakout, observation="index")
     terminal = int(np.flatnonzero(breakout.terminal)[0])
@@ -302,7 +304,7 @@ def test_wrong_use_is_named():
     assert "action -1; expected 0 to 2" in refusal(ParameterError, env.step, -1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("observation", "options"),
     (("vector", {}), ("simple_image", {}), ("simple_image", {"scale": 8}), ("simple_image", {"grey": True})),
@@ -382,6 +384,7 @@ def test_the_observation_index_builds_its_state_space_so_that_a_specification_su
     assert env.reset(seed=1)[0] == again.reset(seed=1)[0] == 0
 
 
+@pytest.mark.long
 def test_the_observation_index_says_what_to_do_where_there_are_too_many_states(tmp_path, monkeypatch):
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr("pharos.interaction.simulator.LARGEST_INDEX", 5)

@@ -18,6 +18,7 @@ def test_without_jax_it_says_which_extra_brings_it(monkeypatch):
         pharos.to_gymnax(pharos.build("simple_grid/4x4-plain", progress=False))
 
 
+@pytest.mark.long
 def test_nothing_loads_jax_unless_it_is_asked_for():
     code = "import pharos, pharos.interaction; pharos.to_gymnax; import sys; print('jax' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -369,6 +369,7 @@ def test_frames_are_the_last_states_of_the_episode_and_its_first_one_before(spac
         before, state, batched = now, one.state[0], current
 
 
+@pytest.mark.long
 def test_rewards_in_another_unit_are_paid_and_the_earned_ones_are_told():
     env = pharos.GymEnv("river_swim", length=4, scale_rewards=4, reward_delay=0)
     env.reset(seed=0)
@@ -393,7 +394,7 @@ def test_a_reward_scale_is_a_number_in_runs_and_a_word_in_cells():
     assert str(ChanceSetting()) == "plain" and not ChanceSetting()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_table_learns_the_same_in_any_unit(tmp_path, monkeypatch):
     """A power of two rounds nothing, so policies are the same to the last bit; V* - U divides to 1 in any unit."""
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
@@ -422,6 +423,7 @@ def test_batches_divide_what_is_paid_and_count_what_is_earned(space):
     assert usual.reward.any() and scaled.returns == usual.returns != 0
 
 
+@pytest.mark.long
 def test_the_unit_of_a_task_is_its_value_less_that_of_uniform_play():
     task = Task.of("river_swim", {"length": 4}, scale_rewards="range")
     spread = task.reference.optimal - task.reference.uniform

@@ -150,6 +150,7 @@ def test_gaps_and_the_value_norm_are_those_of_actions_that_exist(world, chance):
     assert hardness.environmental_value_norm(mdp) == pytest.approx(variance**0.5, abs=1e-6)
 
 
+@pytest.mark.long
 @examples(15, worlds(), st.sampled_from([(0.0, 0.0), (0.3, 0.0)]))
 def test_covering_is_of_uniform_play_over_what_is_available(world, chance):
     (P, _, sets), mdp = world, of_chance(world, *chance)

@@ -58,6 +58,7 @@ def test_values_are_kept_under_every_chance(mdp, sticky, random):
     assert found.mdp.chance == mdp.chance
 
 
+@pytest.mark.long
 @examples(50, deterministic_mdps(max_states=7, max_actions=2))
 def test_a_minimal_mdp_stays_as_it_is(mdp):
     smaller = minimize(mdp)

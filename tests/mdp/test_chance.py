@@ -241,7 +241,7 @@ def test_ages_are_those_of_the_rule(tmp_path, monkeypatch):
         build(pharos.make("frozen_lake/4x4"), tmp_path / "lake").ages  # noqa: B018
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_mdp_of_a_class_with_an_age_is_solved_in_one_pass(tmp_path):
     space = build(Dice(), tmp_path / "space")
     mdp = space.mdp(gamma=0.9)

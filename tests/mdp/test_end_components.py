@@ -80,6 +80,7 @@ def test_they_are_the_maximal_sets_that_no_choice_leaves(mdp, data):
     check(mdp, np.array(data.draw(bits)).reshape(mdp.num_states, mdp.num_actions))
 
 
+@pytest.mark.long
 def test_a_component_inside_of_another_one_appears_where_choices_are_left_out():
     # 0 <-> 1 by action 0; 1 -> 2 -> 0 by action 1; 2 may leave to 3, the terminal state
     mdp = TabularMDP.from_arrays([[1, 0], [0, 2], [0, 3], [3, 3]], np.zeros((4, 2)), terminal=[0, 0, 0, 1])

@@ -68,6 +68,7 @@ def test_values_are_those_of_the_chain_that_is_written_out(mdp, horizon, seed):
     assert abs(solution.value_at_start - mdp.start_probabilities @ first) <= solution.error_bound + 1e-9
 
 
+@pytest.mark.long
 @examples(25, deterministic_mdps(), LAZINESS)
 def test_waiting_without_pay_discounts_as_a_smaller_gamma_does(mdp, p):
     """v = (1 - p) (r + gamma v') + p gamma v is v = f r + g v', f = (1 - p) / (1 - p gamma), g = f gamma."""
@@ -77,6 +78,7 @@ def test_waiting_without_pay_discounts_as_a_smaller_gamma_does(mdp, p):
     np.testing.assert_allclose(lazy.v, factor * other.v, rtol=0, atol=lazy.error_bound + other.error_bound + 1e-12)
 
 
+@pytest.mark.long
 def test_chance_of_all_kinds_composes_in_any_order_of_the_lazy_ones():
     orders = [
         random_actions(sticky_actions(lazy_actions(RING, 0.3), 0.2), 0.1),

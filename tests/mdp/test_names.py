@@ -217,6 +217,7 @@ def test_own_environments_are_asked_by_their_variables():
     assert worth.v[0] == pytest.approx(14 / 17, abs=1e-9)
 
 
+@pytest.mark.long
 def test_the_policies_of_costs_attain_them():
     result = pharos.reach(corridor(), "x=-295")
     for bounds in (result.least_cost, result.maximum, result.minimum):
@@ -233,6 +234,7 @@ def rows_of(*words):
     return json.loads(done.stdout)
 
 
+@pytest.mark.long
 def test_a_printed_policy_names_states_and_actions(tmp_path):
     folder = importers.save(corridor(), tmp_path / "corridor")
     answer = rows_of("solve", folder)

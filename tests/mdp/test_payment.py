@@ -167,7 +167,7 @@ def test_q_learning_finds_the_optimal_policy_under_noise():
     assert abs(agent.q[mdp.start_states].max() - value_iteration(mdp).value_at_start) < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_dqn_and_ppo_are_paid_late_and_measured_by_what_they_earn():
     for agent, options in (("dqn", {"learning_starts": 50, "buffer_size": 1000}), ("ppo", {"n_steps": 64})):
         run = pharos.train(agent, GRID, steps=256, hyperparameters=options, evaluation_interval=128, **BOTH)

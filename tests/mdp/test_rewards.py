@@ -106,6 +106,7 @@ def test_rewards_of_different_size_are_mixed_without_cancellation(pay, p, stayin
     assert_bounded(value_iteration(mdp, horizon=1), np.array([[truth]], object))
 
 
+@pytest.mark.long
 @examples(200, st.data(), LAZINESS)
 def test_a_mean_of_two_rewards_lies_between_them_and_equal_pairs_stay_equal(data, p):
     own, other = (data.draw(hnp.arrays(np.float64, (7, 3), elements=PAY)) for _ in range(2))
@@ -216,6 +217,7 @@ def test_rewards_that_are_given_have_no_rounding(tmp_path):
 # Where MDPs are made of others ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_every_mdp_made_of_another_keeps_the_rounding_of_its_rewards():
     mdp = TabularMDP.from_outcomes([[[0]], [[1]]], [[[1.0]], [[1.0]]], [[[0.1]], [[3.0]]], gamma=0.9, horizon=5)
     rounding = mdp.reward_table.rounding

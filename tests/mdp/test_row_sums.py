@@ -242,6 +242,7 @@ def test_the_model_as_it_was_stated_is_within_the_bound(drawn, kind):
     assert naive_exact.largest_error(solution.v, exact) <= Fraction(solution.error_bound)
 
 
+@pytest.mark.long
 def test_the_bound_of_an_example_by_hand():
     """One state that stays with 1 - 1e-7 and pays 1, gamma 0.99: 100, and 1 / (1 - 0.99 (1 - 1e-7)) as stated."""
     stays = Fraction(1 - 1e-7)
@@ -316,6 +317,7 @@ def test_a_malformed_table_is_refused_by_the_row_that_is_wrong(table, message):
     assert message in said and len(said) < 200
 
 
+@pytest.mark.long
 @examples(60, worlds(), st.sampled_from([0.0, 0.3]), st.booleans())
 def test_what_is_exported_comes_back_with_its_sets(world, random, is_written_as_empty):
     mdp = of_chance(world, 0.0, random)

@@ -112,7 +112,7 @@ def by_pixels(num_actions, seed=0):
     return policy
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("chance", [{}, {"sticky": 0.25}, {"random": 0.2, "lazy": 0.3}])
 @pytest.mark.parametrize("env", [LAKE, SLIPPERY], ids=["lake", "slippery"])
 def test_a_policy_of_two_frames_is_worth_what_the_mdp_of_histories_says(env, chance):

@@ -71,6 +71,7 @@ def test_mixed_tells_all_states_keeps_the_length_of_codes_and_grows_by_states(sh
     assert abs(is_word.mean() - less) <= 6 * deviation + 1 / len(CELLS)
 
 
+@pytest.mark.long
 def test_a_vector_environment_and_a_kernel_take_mixed():
     grid = pharos.make("simple_grid", height=3, width=3)
     vec = pharos.make_vec(grid, 2, observation="mixed", observation_options={"share": 0.5}, seed=0)

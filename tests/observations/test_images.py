@@ -92,7 +92,7 @@ def test_channels_come_first_or_last_and_colour_becomes_luminance(env):
     assert np.abs(luminance - grey(states)[..., 0]).max() <= 2 * len(env.layers)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["simple_image", "complex_image"])
 def test_different_pictures_for_different_drawings(env, name):
     states = random_states(env, 60, seed=3)

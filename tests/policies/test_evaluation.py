@@ -212,7 +212,7 @@ def test_what_cannot_be_observed_is_refused():
     assert 0 <= undiscounted.value_at_start <= 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(40, st.integers(0, 10**6))
 def test_the_most_probable_action_of_a_table_is_that_of_its_rows(seed):
     task = Task.of("frozen_lake/4x4")

@@ -307,6 +307,7 @@ def test_a_model_of_pharos_on_index_is_taken_there_and_nowhere_else(lake):
     assert "numbers of states, index; 'number' numbers them as the source does" in said
 
 
+@pytest.mark.long
 def test_worlds_without_a_source_have_no_numbers(imported, lake):
     for world in ("simple_grid/4x4-plain", "blackjack", "deep_sea"):
         said = refusal(ParameterError, pharos.observe, make(world), "number")

@@ -25,6 +25,7 @@ def test_losses_of_all_states_sum_to_the_regret(mdp, seed):
     assert losses.sum() == pytest.approx(expected, abs=within)
 
 
+@pytest.mark.long
 def test_a_state_loses_its_gap_as_often_as_it_is_visited():
     """State 0 pays 1 or nothing and goes on to state 1, which pays 1 or nothing and ends."""
     mdp = TabularMDP.from_arrays([[1, 1], [-1, -1]], [[1.0, 0.0], [1.0, 0.0]], gamma=0.5)

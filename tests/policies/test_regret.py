@@ -50,6 +50,7 @@ def runs(draw):
     return np.cumsum(between) - between[0], np.array(lost)
 
 
+@pytest.mark.long
 @examples(80, deterministic_mdps(), st.integers(0, 2**31), st.booleans())
 def test_no_policy_has_a_regret_below_zero_or_above_that_of_the_worst(mdp, seed, sharp):
     rng = np.random.default_rng(seed)

@@ -58,7 +58,7 @@ def test_published_pilots_are_those_of_the_page(agent):
     assert all(0.7 < plane(agent, share).calibration.coverage() < 0.9 for share in SHARES)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_pilot_and_the_prediction_are_put_together():
     options = {"length": 5, "agent": "ppo", "steps": 5120, "common": True}
     alone, both = (pharos.predict("river_swim", **options, pilot=share) for share in (None, 0.5))

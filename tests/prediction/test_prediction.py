@@ -218,7 +218,7 @@ def test_imported_tables_are_predicted(tmp_path, monkeypatch):
     assert table.states == 2 and 0 <= table.cells[0].value <= 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_networks_of_ones_own_are_predicted():
     import torch
 

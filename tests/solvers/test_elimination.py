@@ -44,6 +44,7 @@ def largest_relative_error(x, expected):
     )
 
 
+@pytest.mark.long
 @examples(200, rare_exits(), st.sampled_from([(float, 2.0**-46), (complex, 2.0**-96)]))
 def test_each_entry_is_as_accurate_as_its_numbers(dense, precision):
     dtype, limit = precision

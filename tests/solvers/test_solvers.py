@@ -65,7 +65,7 @@ def test_values_of_any_stochastic_policy_are_those_of_the_linear_system(mdp, dat
     assert_near(mdp, solution, naive_mdp.values_of(P, R, mdp.gamma, everywhere), solution.error_bound + TWIN)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, deterministic_mdps(), st.integers(0, 2**32))
 def test_a_deterministic_policy_on_a_deterministic_mdp_is_evaluated_exactly(mdp, seed):
     actions = np.random.default_rng(seed).integers(mdp.num_actions, size=mdp.num_states)
@@ -147,7 +147,7 @@ def test_a_closed_part_of_an_mdp_has_the_same_values_alone(mdp):
     assert np.abs(alone.v - whole.v[part]).max() <= alone.error_bound + whole.error_bound
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @examples(150, small_mdps(), st.integers(0, 2**32))
 def test_backups_contract_in_the_maximum_norm(mdp, seed):
     backup = Backup(mdp, BEST)

@@ -142,6 +142,7 @@ def test_a_folder_holds_five_bytes_a_successor_and_says_so(spaces):
     assert manifests.read_manifest(narrow.folder)["format_version"] == 1
 
 
+@pytest.mark.long
 def test_the_code_of_the_page_reads_them(spaces, monkeypatch):
     narrow, wide = spaces("breakout")
     monkeypatch.chdir(wide.folder)

@@ -107,6 +107,7 @@ def test_a_build_goes_on_whoever_failed_and_however_many_go_on(world, size, who,
         assert files_of(path) == expected(world)
 
 
+@pytest.mark.long
 def test_a_failure_of_another_rank_is_told_by_the_first(tmp_path):
     with pytest.raises(RankFailed, match="rank 2: Killed: at exchange 7"):
         build_by_threads(WORLDS["breakout"], tmp_path / "space", 3, disturb=fails_at(2, 7))

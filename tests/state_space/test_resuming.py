@@ -306,7 +306,7 @@ def test_a_fuller_table_stays_in_memory_where_one_of_twice_the_size_does_not_fit
     assert room > 142_063 > 0.5 * slots and 4 * slots + 8 * room <= 3 << 20
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_memory_may_come_and_go_between_sessions(tmp_path, undisturbed, any_memory):
     folder = tmp_path / "space"
     for limit, memory in ((3000, 1 << 16), (9000, None), (15_000, 1 << 16), (25_000, 1 << 20)):

@@ -323,6 +323,7 @@ def test_a_folder_of_another_version_of_the_rules_is_refused(folder):
     assert "with rules_version = 1; expected 2" in refusal(StateSpaceMismatch, build, RaisedVersion(), folder)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("other", (OtherRules(), OtherEnd()), ids=lambda env: type(env).__name__)
 def test_a_folder_of_other_rules_is_refused_even_with_the_same_version(other, folder):
     build(Walk(), folder)
@@ -422,7 +423,7 @@ class DividesByZero(Walk):
         out[0] = min(state[0] + 1 + 0 // (700 - state[0]), self.length - 1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("workers", (1, 2))
 @pytest.mark.parametrize("wide", (1, 1 << 13))
 @pytest.mark.parametrize(

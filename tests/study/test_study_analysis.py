@@ -68,6 +68,7 @@ def test_there_is_a_row_for_each_finished_run_with_the_numbers_of_its_file(done,
         assert row["seed"] == results[row["id"]]["config"]["seed"]
 
 
+@pytest.mark.long
 def test_a_study_without_results_says_what_to_do(done, tmp_path):
     with pytest.raises(ParameterError, match="no run of 'formulas' is finished; execute `pharos study run`"):
         study.table(done[0], tmp_path)
@@ -82,7 +83,7 @@ def test_runs_that_are_missing_or_failed_are_no_rows(tmp_path):
     assert list(study.table(SPECIFICATION, tmp_path)["id"]) == [first.id]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_curves_hold_every_evaluation_of_every_run(done):
     points = study.curves(*done)
     assert len(points) == len(done[0].runs) * 20
@@ -91,6 +92,7 @@ def test_curves_hold_every_evaluation_of_every_run(done):
     assert (one["cumulative_expected_regret"].diff().dropna() >= 0).all()
 
 
+@pytest.mark.long
 def test_a_cell_is_the_mean_over_seeds(rows, cells):
     assert len(cells) == 8 * (2 * 2 + 1) and set(cells["seeds"]) == {3}
     cell = cells.iloc[17]
@@ -297,7 +299,7 @@ def test_kept_hardness_that_was_edited_cut_or_swapped_is_measured_again(tmp_path
     assert list(study.hardness_table(spec, tmp_path)["diameter"]) == expected
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_runs_with_estimates_say_so_with_the_half_width_of_their_regret(done, tmp_path):
     spec, folder = done
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
@@ -318,7 +320,7 @@ def test_runs_with_estimates_say_so_with_the_half_width_of_their_regret(done, tm
     assert cell["half_width"] == pytest.approx(row["half_width"] / 3)  # three seeds
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_records_of_absurd_numbers_are_damaged(done, tmp_path):
     spec, folder = done
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)

@@ -166,7 +166,7 @@ def test_progress_tells_how_long_it_will_take(tmp_path):
     assert str(told[-1]) == "fake: 6 of 6 runs finished"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_instances_are_prepared_once_each_before_the_runs_and_a_failure_there_stops_nothing(tmp_path, log):
     spec = specification(agents=["dqn"], seeds=2, environments=["frozen_lake/4x4", "frozen_lake/8x8"])
     end = study.run(spec, tmp_path / "out", runner=fake_training.train, prepare=prepare, workers=2)
@@ -429,7 +429,7 @@ def test_a_run_that_another_process_holds_is_busy_and_says_so_of_training(tmp_pa
     assert not issubclass(FolderLocked, StateSpaceLocked)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("sent", (signal.SIGINT, signal.SIGTERM))
 def test_an_interrupted_study_leaves_no_warning_of_semaphores(tmp_path, log, sent):
     (tmp_path / "fake.yaml").write_text(json.dumps(specification().model_dump(mode="json", exclude_unset=True)))

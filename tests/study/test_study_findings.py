@@ -58,7 +58,7 @@ OBSERVATION = "the harder observation of DQN"
 LEARNER = "the learner with more regret"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("shift", "ours", "grids", "games"), ((1, "image", "agrees", "disagrees"), (-1, "vector", "disagrees", "agrees"))
 )
@@ -95,7 +95,7 @@ def test_equal_observations_are_undecided_as_often_as_the_level_says(without_eff
     assert len(decided) == 100 and sum(decided) <= 14  # 5 expected
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_model_that_explains_much_disagrees_with_the_paper():
     name = ("one model explains next to nothing", "all")
     assert verdicts(made())[name].verdict == "disagrees"
@@ -103,7 +103,7 @@ def test_one_model_that_explains_much_disagrees_with_the_paper():
     assert row.verdict == "agrees" and row.p > 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_slopes_of_their_own_are_needed_where_they_differ():
     by_class, by_representation = (f"models by {model} explain more than one" for model in ("class", "representation"))
     alike, classes, images = verdicts(made()), verdicts(made(slopes=(1, -1, 2, 0))), verdicts(made(image_slope=-1.0))
@@ -142,7 +142,7 @@ def test_the_test_of_slopes_is_that_of_an_analysis_of_variance():
     assert found["one model explains next to nothing", "all"].p == pytest.approx(small.f_pvalue, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("finding", ("one model explains next to nothing", "models by class explain more than one"))
 def test_a_task_seen_twice_is_one_piece_of_evidence(finding):
     """Images repeat what vectors told: the p-value is that of the vectors alone."""
@@ -196,7 +196,7 @@ def test_r_squared_outside_leaves_out_the_whole_task():
     assert single.cross_validated_r_squared == pytest.approx(1 - press / total)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_where_tasks_differ_in_their_observations_errors_are_clustered():
     cells = made(noise=1.0)
     lacking = cells.drop(cells[(cells["observation"] == "vector") & (cells["agent"] == "dqn")].index[:3])
@@ -205,7 +205,7 @@ def test_where_tasks_differ_in_their_observations_errors_are_clustered():
     assert verdicts(lacking)["one model explains next to nothing", "all"].evidence.startswith("F(6, 38)")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_vectors_that_hardness_explains_better_are_found():
     name = ("hardness explains vectors better than images", "all")
     assert verdicts(made(image_slope=0.0, noise=0.3))[name].verdict == "agrees"
@@ -252,6 +252,7 @@ def test_the_power_of_a_difference_is_that_of_the_normal_approximation():
     assert _findings._power_of_mean(0.5, 1.0, number) == pytest.approx(0.8, abs=0.01)
 
 
+@pytest.mark.long
 def test_each_finding_says_with_what_power_it_could_have_been_found():
     found = study.findings(made(), study.models(made()), resamples=50)
     tested = found[found["finding"] != LEARNER]
@@ -313,6 +314,7 @@ def test_a_verdict_has_the_sign_of_the_effect_beside_it(paper):
     assert (row.ours, row.verdict) == ("image", "agrees" if paper == "image" else "disagrees")
 
 
+@pytest.mark.long
 @examples(300, st.lists(st.integers(-4, 9), min_size=1, max_size=24))
 def test_the_signed_rank_test_its_effect_and_its_interval_agree(integers):
     """With ties and zeros too: significant if and only if the interval excludes 0, and then on the effect's side."""
@@ -336,7 +338,7 @@ def test_the_signed_rank_test_is_exact_on_all_signs():
         assert _findings._signed_ranks(row * sizes)[1] == pytest.approx(share)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_interval_of_a_share_covers_as_often_as_it_says():
     random, added, free, share = np.random.default_rng(0), 4, 40, 0.3
     held = []

@@ -106,7 +106,7 @@ def test_the_page_is_well_formed_and_loads_nothing_from_outside(written):
     assert f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'" in page
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_section_is_there_and_every_link_leads_to_one(written):
     page = written[1].html.read_text()
     reader = read(page)
@@ -250,6 +250,7 @@ def test_what_has_no_run_is_not_measured_and_the_cost_is_told_beforehand(tmp_pat
     assert len(study.hardness_table(spec, tmp_path)) == 2
 
 
+@pytest.mark.long
 def test_a_report_begins_with_who_won_by_how_much_and_how_sure_that_is(tmp_path, sketched):
     _, page = report_of(tmp_path, agents=["ppo"])
     text = " ".join(page.text)
@@ -259,6 +260,7 @@ def test_a_report_begins_with_who_won_by_how_much_and_how_sure_that_is(tmp_path,
     assert re.search(r"PPO, \w+: \d\.\d\d, \d\.\d\d more on \d tasks? \(95 % interval .* p [<=] ", first)
 
 
+@pytest.mark.long
 def test_a_report_says_where_chance_is_of_the_world(tmp_path, sketched):
     slippery = {"name": "frozen_lake", "parameters": {"slippery": True}}
     _, page = report_of(tmp_path, agents=["ppo"], environments=[slippery, "frozen_lake/4x4"])
@@ -266,6 +268,7 @@ def test_a_report_says_where_chance_is_of_the_world(tmp_path, sketched):
     assert "of the world" in text and "plain" in text
 
 
+@pytest.mark.long
 def test_estimated_regret_is_marked_and_its_half_width_stands_in_the_summary(tmp_path, sketched):
     def estimate(spec):
         file = tmp_path / "runs" / spec.runs[0].id / "curve.parquet"
@@ -306,6 +309,7 @@ def test_texts_that_a_spreadsheet_would_run_are_escaped_and_numbers_stay_numbers
     assert (safe["number"] == -1.5).all() and safe["number"].dtype == float
 
 
+@pytest.mark.long
 def test_received_records_reach_the_tables_without_formulas(tmp_path, sketched):
     def inject(spec):
         with edited_json(tmp_path / "runs" / spec.runs[0].id / "run.json") as record:
@@ -324,7 +328,7 @@ def test_the_page_escapes_whatever_a_study_says(tmp_path, sketched):
     assert "<script>alert" not in page and page.count("<script") == 1 and "&lt;script&gt;" in page
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_report_says_which_images_hide_something(tmp_path, sketched):
     small = {"name": "breakout", "parameters": {"height": 7, "columns": 4, "brick_rows": 1}}
     report, page = report_of(tmp_path, agents=["ppo"], environments=[small, "frozen_lake/4x4"])

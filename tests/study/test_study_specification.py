@@ -68,7 +68,7 @@ def test_the_id_of_a_run_is_the_xxh3_hash_of_its_sorted_json():
     assert run_id(dict(reversed(run.config.items()))) == run.id
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ids_are_the_same_in_another_process_with_another_hash_seed():
     code = "from pharos.study import specification; print(*[run.id for run in specification('quick').runs])"
     options = {"env": {"PYTHONHASHSEED": "7"}, "capture_output": True, "text": True, "check": True}

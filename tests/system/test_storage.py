@@ -291,7 +291,7 @@ def _count(folder, times, counter):
             continue
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_processes_with_claims_never_hold_a_folder_together(no_locks, tmp_path):
     """Half of them are killed while they hold it, so that others race to take the claim over."""
     folder, counter = tmp_path / "folder", tmp_path / "counter"

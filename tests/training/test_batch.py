@@ -282,6 +282,7 @@ def test_what_the_engine_itself_has_learnt_is_read_and_resumed(tmp_path, monkeyp
         assert evaluate_agent(agent, task).value == pytest.approx(end.result["final_value"], abs=1e-9)
 
 
+@pytest.mark.long
 def test_a_trial_of_a_search_is_one_batch(engine, tmp_path):
     instances, chances = ["simple_grid/4x4-plain", "simple_grid/4x4-decoy"], [{}, {"random": 0.1}]
     options = {"steps": 40, "seeds": [5, 6], "chances": chances, "engine": "batched"}
@@ -326,6 +327,7 @@ def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
     assert all(isinstance(end, FailedRun) and "optimize_memory_usage" in end.error for end in lacking.value.outcome)
 
 
+@pytest.mark.long
 def test_knobs_of_chance_and_pay_are_those_of_the_run_alone():
     knobs = {"lazy": 0.2, "sticky": 0.1, "reward_noise": 0.5, "reward_delay": 2}
     together = many(seeds=(0, 1, 2), **knobs)

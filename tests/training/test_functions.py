@@ -248,6 +248,7 @@ def test_a_search_tries_keywords_and_begins_with_the_defaults(mine):
     assert told["counted_steps"] == 60
 
 
+@pytest.mark.long
 def test_a_study_trains_functions_of_files_and_a_received_one_needs_trust(mine, tmp_path):
     block = f"{{environments: [{GRID}], observations: [one_hot], agents: ['{mine}', q_learning]}}"
     Path("own.yaml").write_text(f"name: own\nsteps: 200\nevaluations: 4\nseeds: 2\nblocks: [{block}]\n")

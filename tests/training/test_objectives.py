@@ -84,6 +84,7 @@ def test_each_snapshot_has_the_gain_that_walking_finds():
     assert result["gain_at_start"]["lower"] == run.curve[-1]["gain_lower"]
 
 
+@pytest.mark.long
 def test_other_columns_are_those_of_a_run_without_the_option(tmp_path):
     for name, options in (("plain", {}), ("average", {"objective": "average"})):
         train("q_learning", "endless_sea", out=tmp_path / name, p_rand=0.2, **SEA, **options)
@@ -124,6 +125,7 @@ def test_networks_have_averages_of_what_they_are_asked(agent, engine):
         assert gain.lower <= 0.25 + 1e-9
 
 
+@pytest.mark.long
 def test_an_agent_that_sees_frames_is_between_the_worst_and_the_best_where_histories_are_too_many():
     task = Task.of("endless_sea", {"size": 4}, observation="simple_image", observation_options={"frames": 2})
     average = Task.of(task.env, observation="simple_image", observation_options={"frames": 2}, objective="average")
@@ -189,6 +191,7 @@ def test_the_total_reward_of_a_walk_is_its_length(tmp_path):
     assert (never["value_at_start"], never["regret"], never["horizon"]) == (None, None, None)
 
 
+@pytest.mark.long
 def test_a_run_of_total_rewards_is_evaluated_as_it_was_trained(tmp_path):
     run = answer(
         "train", "frozen_lake/4x4", "--random", "0.5", "--objective", "total", "--steps", 300, "--out", tmp_path
@@ -219,6 +222,7 @@ def _sum_of_returns(run):
     return sum(n * row["mean_return"] for n, row in zip(counts, run.curve[1:], strict=True) if n)
 
 
+@pytest.mark.long
 def test_a_policy_whose_sum_has_no_limit_has_no_value():
     """Going round two states pays +1 and -1, leaving pays nothing."""
     ring = pharos.TabularMDP.from_arrays([[1, -1], [0, -1]], [[1.0, 0.0], [-1.0, 0.0]], gamma=1.0)

@@ -22,6 +22,7 @@ def test_lanes_hold_each_run_once_with_equal_keys_and_no_more_than_a_width(keys,
         assert sum(keys[lane[0]] == key for lane in groups) == -(-keys.count(key) // width)
 
 
+@pytest.mark.long
 @given(st.lists(st.floats(0, 100), max_size=30), st.integers(1, 6))
 def test_no_worker_is_busier_than_the_mean_and_one_job(costs, workers):
     parts = dealt(costs, workers)

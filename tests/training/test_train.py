@@ -57,7 +57,7 @@ def test_a_run_writes_its_record_and_its_curve(agent, tmp_path):
     assert not any(path.suffix in (".pkl", ".zip") for path in (tmp_path / "run").rglob("*"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("agent", ["q_learning", "dqn", "ppo"])
 def test_the_same_seed_gives_the_same_file_and_another_seed_another(agent, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
@@ -183,7 +183,7 @@ def test_a_checkpoint_is_on_the_disk_before_the_older_one_goes(tmp_path, monkeyp
     assert moves == [swap, ("checkpoint", "checkpoint.old"), swap]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("agent", ["dqn", "ppo"])
 def test_a_resumed_agent_does_not_repeat_its_first_random_numbers(agent, tmp_path):
     import torch
@@ -229,7 +229,7 @@ def _long_run(folder, **options):
     train("q_learning", "frozen_lake/8x8", steps=40_000_000, evaluation_interval=100_000, out=folder, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_process_loses_no_more_than_an_interval(tmp_path):
     folder = tmp_path / "run"
     process = multiprocessing.get_context("spawn").Process(target=_long_run, args=(folder,))
@@ -371,7 +371,7 @@ def test_a_folder_that_is_no_run_is_said_to_be_none(tmp_path):
     assert "cannot be read" in refusal(FileFormatError, read_curve, tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tabular_agents_need_the_core_alone(tmp_path):
     """In a process in which nothing that an extra brings is installed; what it wrote is read with and without."""
     code = f"""

@@ -38,13 +38,13 @@ def mean_regret(chances):
     return sum(rows) / len(rows)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_several_kinds_of_chance_count_alike():
     chances = [{}, {"random": 0.1}, {"sticky": 0.25, "random": 0.1}]
     assert search(1, chances=chances).score == pytest.approx(mean_regret(chances))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_best_is_never_worse_than_what_the_table_said():
     result = search(8, space=ONE)
     scores = [trial["score"] for trial in result.trials if trial["status"] == "finished"]
@@ -54,7 +54,7 @@ def test_the_best_is_never_worse_than_what_the_table_said():
     assert search(8, space=ONE, search_seed=5).trials[1] != result.trials[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_search_goes_on_and_writes_what_train_reads(tmp_path):
     search(2, tmp_path / "found")
     result = search(4, tmp_path / "found")
@@ -70,7 +70,7 @@ def test_a_search_goes_on_and_writes_what_train_reads(tmp_path):
         tune("q_learning", LAKE, steps=3000, trials=4, seeds=[7, 8], out=tmp_path / "found")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_of_a_shortlist_what_is_predicted_best_is_tried(tmp_path):
     asked = []
 
@@ -90,7 +90,7 @@ def test_of_a_shortlist_what_is_predicted_best_is_tried(tmp_path):
         search(4, space=ONE, shortlist=5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_shortlists_by_prediction():
     words = ("tune", "simple_grid/4x4-plain", "--agent", "ppo", "--engine", "batched", "--steps", "2048", "--trials=2")
     space = ("--search", "gamma=0.5,0.9,0.99", "--seeds", "3", "--shortlist-by-prediction", "2", "--json")
@@ -150,7 +150,7 @@ def test_a_search_that_cannot_be_done_is_refused(change, message):
         tune(options.pop("agent"), options.pop("environments"), **options)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_answers_in_json_and_train_takes_its_file(tmp_path):
     options = ("--agent", "q_learning", "--steps", 1000, "--trials", 2, "--seeds", 4)
     options += ("--search", "learning_rate=0.5,0.7")
@@ -232,6 +232,7 @@ def journal(tmp_path):
     return old, result
 
 
+@pytest.mark.long
 def test_a_journal_of_an_earlier_pharos_is_read_on(journal):
     folder, result = journal
     again = tune("q_learning", LAKE, steps=200, trials=3, seeds=[0], out=folder)
@@ -258,7 +259,7 @@ def test_a_record_that_was_changed_is_one_line(tmp_path):
         tune("q_learning", LAKE, steps=200, trials=3, seeds=[0], out=tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_interrupted_search_says_one_line(tmp_path):
     code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); from pharos.cli import main; "
     code += f"sys.argv = 'pharos tune {LAKE} --agent q_learning --steps 200000 --trials 99 --out out'.split(); main()"
