@@ -3,7 +3,7 @@
     python benchmarks/qcomp.py CHECKOUT [--states 3000] [--out docs/evidence/goals.md]
 
 CHECKOUT is one of https://github.com/ahartmanns/qcomp, whose models stay there. Each exact result of an MDP or a Markov
-chain with at most so many states is query for by its name, as `pharos import prism FILE --property NAME` does, at
+chain with at most so many states is asked for by its name, as `pharos import prism FILE --property NAME` does, at
 gamma 1 without a horizon. Needs stormpy, which builds the models; the values are those of pharos. An interval is right
 if it holds the published rational number, and tight if it is less than 1e-6 wide, or 1e-6 of the number beyond 1.
 """
