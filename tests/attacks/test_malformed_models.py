@@ -139,8 +139,8 @@ ENTRIES = (
 
 
 def test_tables(count):
-    """Rows, entries and outcomes of a table that are dropped or replaced."""
-    rng, refused = np.random.default_rng(1), 0
+    """Rows, entries and outcomes of a table that are dropped or replaced: refused, or an action that is not available."""
+    rng, tally = np.random.default_rng(1), Counter()
     plain = [[[(1.0, (s + a) % STATES, float(a), False)] for a in range(ACTIONS)] for s in range(STATES)]
     whole = {s: dict(enumerate(row)) for s, row in enumerate(plain)}
     for _ in range(400):
@@ -157,9 +157,12 @@ def test_tables(count):
         else:
             table[s][a] = [ENTRIES[int(rng.integers(len(ENTRIES)))]]
         mdp, line = tried(lambda table=table: importers.gymnasium(table))
-        assert mdp is None and line.startswith("table: "), table
-        refused += 1
-    count(f"400 malformed tables: {refused} refused")
+        if what == 1 or (what == 3 and table[s][a] == []):
+            assert mdp is not None and np.argwhere(~mdp.available).tolist() == [[s, a]], table
+        else:
+            assert mdp is None and line.startswith("table: "), table
+        tally["refused" if mdp is None else "read as not available"] += 1
+    count(f"400 malformed tables: {dict(tally)}")
 
 
 TARGET = '(x=3 | y>-1 & !goal) & x+2*y <= 4 & !"goal"'

@@ -65,7 +65,7 @@ def make(agent: str, fault: str = HEALTHY, **hyperparameters: Any) -> partial[It
     if agent not in FAULTS:
         raise UnknownName("agent with faults", agent, FAULTS)
     _check(agent, fault)
-    learn: Any = dqn if agent == "dqn" else ppo
+    learn: Any = {"dqn": dqn, "ppo": ppo}[agent]
     return partial(learn, fault=fault, **hyperparameters)
 
 
