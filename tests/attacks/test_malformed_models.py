@@ -139,7 +139,7 @@ ENTRIES = (
 
 
 def test_tables(count):
-    """Rows, entries and outcomes of a table that are dropped or replaced: refused, or an action that is not available."""
+    """Rows, entries and outcomes of a table that are dropped or replaced: refused, or an action not available."""
     rng, tally = np.random.default_rng(1), Counter()
     plain = [[[(1.0, (s + a) % STATES, float(a), False)] for a in range(ACTIONS)] for s in range(STATES)]
     whole = {s: dict(enumerate(row)) for s, row in enumerate(plain)}
