@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable
-from typing import NoReturn
 
 import pytest
 
@@ -16,10 +15,18 @@ def refusal(error: type[Exception], call: Callable, *arguments, **options) -> st
     return message
 
 
-def failing(error: BaseException | int) -> Callable[..., NoReturn]:
-    """Return a function that fails whatever it is given; with an error of the system, where `error` is its number."""
+def failing(error: BaseException | int, after: int = 0, call: Callable | None = None) -> Callable:
+    """Return a function that fails whatever it is given, once it was `call` for the first `after` times.
 
-    def fails(*_, **__):
+    error: what it fails with; an error of the system if it is a number.
+    """
+    left = after
+
+    def fails(*arguments, **options):
+        nonlocal left
+        left -= 1
+        if left >= 0:
+            return call(*arguments, **options)
         raise OSError(error, os.strerror(error)) if isinstance(error, int) else error
 
     return fails

@@ -76,17 +76,8 @@ def test_a_search_that_was_interrupted_goes_on_from_its_last_layer(broken_at, mo
 
 
 def test_a_disk_that_is_full_leaves_the_layers_that_were_finished(monkeypatch, tmp_path):
-    fsync, room = os.fsync, 9
-
-    def write(descriptor):
-        nonlocal room
-        room -= 1
-        if room < 0:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        fsync(descriptor)
-
     with monkeypatch.context() as disk, pytest.raises(OSError, match="No space left"):
-        disk.setattr(os, "fsync", write)
+        disk.setattr(os, "fsync", failing(errno.ENOSPC, 9, os.fsync))
         explored(6, tmp_path)
     stored = len(list(tmp_path.glob("layer-*.npz")))
     resumed, whole = explored(6, tmp_path), explored(6)

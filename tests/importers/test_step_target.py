@@ -16,6 +16,7 @@ from command_line import run
 from pharos import importers, value_iteration
 from pharos.errors import FolderLocked, ParameterError, RuleError, StateSpaceTooLarge
 from pharos.system import storage
+from refusals import failing
 
 HERE = Path(planted.__file__)
 
@@ -93,19 +94,9 @@ def test_a_disk_that_is_full_is_one_line_and_loses_nothing(tmp_path, here, monke
     """Full from the n-th file on, for each n until the import fits."""
     command = ["import", "env", "planted.py:Clock", "--no-check", "--out"]
     assert run(*command, tmp_path / "whole").exit_code == 0
-    fsync, room = os.fsync, 0
-
-    def write(descriptor):
-        nonlocal room
-        room -= 1
-        if room < 0:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        fsync(descriptor)
-
     for files in range(20):
-        room = files
         with monkeypatch.context() as disk:
-            disk.setattr(os, "fsync", write)
+            disk.setattr(os, "fsync", failing(errno.ENOSPC, files, os.fsync))
             done = run(*command, tmp_path / f"full-{files}")
         if done.exit_code == 0:
             break
