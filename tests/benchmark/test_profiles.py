@@ -20,6 +20,7 @@ from pharos.benchmark.profiles import (
     meanings,
     shipped,
 )
+from refusals import failing
 
 
 def library(rng, spread=0.1, agents=4, readings=6):
@@ -127,6 +128,21 @@ def test_a_lost_feature_is_said_in_words_and_in_json(tmp_path):
     done = run("diagnose", name, "--steps", 400, "--seeds", 1)
     assert done.exit_code == 0 and "Nearest known agents" in done.stdout
     assert run("diagnose", "q_learning").exit_code == 2
+
+
+def test_a_page_that_cannot_be_written_is_refused_before_anything_is_trained(tmp_path, monkeypatch):
+    monkeypatch.setattr("pharos.benchmark.diagnose", failing(AssertionError("it was trained")))
+    done = run("diagnose", "pharos.benchmark.faults:dqn", "--out", tmp_path / "nowhere" / "page.md")
+    assert done.exit_code == 1 and done.stderr == f"pharos: {tmp_path}/nowhere/page.md: No such file or directory\n"
+
+
+def test_an_older_page_stays_if_the_agent_fails_and_a_link_is_followed(tmp_path):
+    page, link = tmp_path / "page.md", tmp_path / "link.md"
+    page.write_text("older")
+    link.symlink_to(page)
+    assert run("diagnose", "nope.py:learn", "--out", link).exit_code == 2
+    assert page.read_text() == "older" and [each.name for each in tmp_path.glob("*")].count("page.md") == 1
+    assert link.is_symlink() and len(list(tmp_path.iterdir())) == 2
 
 
 @pytest.mark.long

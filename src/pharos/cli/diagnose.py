@@ -1,5 +1,6 @@
 """pharos diagnose: what is wrong with an agent, shown by numbers that only an exactly known world has."""
 
+import contextlib
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -34,16 +35,18 @@ def diagnose(
     from pharos import benchmark
 
     began = time.perf_counter()
-    with progress_bar("worlds", 1000, "building worlds") as show:
-        diagnosis = benchmark.diagnose(
-            agent,
-            hyperparameters=hyperparameters,
-            seeds=range(seeds),
-            steps=steps,
-            tell=lambda done, text: show(int(1000 * done), text),
-        )
-    if out is not None:
-        storage.replace_file(out, str(diagnosis).encode())
+    # the page is opened first: one that cannot be written is refused before anything is trained
+    with contextlib.nullcontext() if out is None else storage.replacing(out, follow=True) as page:
+        with progress_bar("worlds", 1000, "building worlds") as show:
+            diagnosis = benchmark.diagnose(
+                agent,
+                hyperparameters=hyperparameters,
+                seeds=range(seeds),
+                steps=steps,
+                tell=lambda done, text: show(int(1000 * done), text),
+            )
+        if page is not None:
+            page.write(str(diagnosis).encode())
     answer = {**diagnosis.to_dict(), "seconds": time.perf_counter() - began, "file": out}
     return Answer(answer, lambda: _print(diagnosis))
 
