@@ -136,6 +136,17 @@ def test_a_page_that_cannot_be_written_is_refused_before_anything_is_trained(tmp
     assert done.exit_code == 1 and done.stderr == f"pharos: {tmp_path}/nowhere/page.md: No such file or directory\n"
 
 
+@pytest.mark.parametrize(
+    ("body", "line"),
+    [("sys.exit(0)", "SystemExit: 0"), ("raise RuntimeError('boo' + chr(10) + 'hoo')", "RuntimeError: boo hoo")],
+)
+def test_what_the_code_of_an_agent_raises_is_one_line(tmp_path, body, line):
+    file = tmp_path / "mine.py"
+    file.write_text(f"import sys\ndef learn(env, steps, seed):\n    {body}\n    yield\n")
+    done = run("diagnose", f"{file}:learn")
+    assert done.exit_code == 1 and done.stderr == f"pharos: agent {file}:learn raised {line} (mine.py, line 3)\n"
+
+
 def test_an_older_page_stays_if_the_agent_fails_and_a_link_is_followed(tmp_path):
     page, link = tmp_path / "page.md", tmp_path / "link.md"
     page.write_text("older")

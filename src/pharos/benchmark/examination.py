@@ -18,7 +18,17 @@ from pharos.benchmark.suite import BenchmarkTask, Protocol
 from pharos.errors import ParameterError, UnknownName
 from pharos.policies import PolicyLike, SB3Model
 from pharos.system.sources import find, load
-from pharos.training import BudgetSpent, CountedEnv, PolicyRecorder, StepBudget, Task, evaluate_agent, generate, regret
+from pharos.training import (
+    BudgetSpent,
+    CountedEnv,
+    PolicyRecorder,
+    StepBudget,
+    Task,
+    errors_in_one_line,
+    evaluate_agent,
+    generate,
+    regret,
+)
 
 PROTOCOL = Protocol(steps=4000, evaluations=10, seeds=2)
 LATE, LAST = 0.2, 0.025  # parts of a run
@@ -292,6 +302,13 @@ def learner_of(agent: str | Callable[..., Any], hyperparameters: Mapping[str, An
     return partial(_model_learner, code, {**defaults, **setting})
 
 
+def _file_of(agent: str | Callable[..., Any]) -> str | None:
+    """The file with the code of an agent of the user's own."""
+    if isinstance(agent, str):
+        return None if is_known(agent) else find(agent).file
+    return getattr(getattr(agent, "__code__", None), "co_filename", None)
+
+
 def _model_learner(
     agent: str | Callable[..., Any], setting: dict[str, Any], env: Any, steps: int, seed: int
 ) -> Iterator[Any]:
@@ -321,16 +338,17 @@ def examine(
         worlds: of NAMES. seeds: of the runs of each. steps: of each run.
         tell: called with the share that is done, and a text.
     Raises:
-        ParameterError: it is no agent, or it yields no policy; or whatever its code raises.
+        ParameterError: it is no agent, or it yields no policy.
+        PharosError: its code raises something, SystemExit included.
     Cost: `len(worlds) * len(seeds)` runs, and values of some hundred states.
     """
-    learn = learner_of(agent, hyperparameters)
+    learn, file = learner_of(agent, hyperparameters), _file_of(agent)
     examinations: list[Examination] = []
     for name in worlds:
         for seed in seeds:
             tell(len(examinations) / (len(worlds) * len(seeds)), f"{name}, seed {seed}")
             witness = Witness(name, seed, steps)
-            with np.errstate(all="ignore"):  # of an agent that diverges
+            with np.errstate(all="ignore"), errors_in_one_line(str(agent), file):  # of an agent that diverges
                 generate(learn, witness, seed)
             examinations.append(witness.examination())
     return examinations

@@ -537,7 +537,8 @@ def diagnose(
         agent, hyperparameters, worlds, seeds, steps, tell: as `examine` takes them. Limits and likeness are those of
             agents with all worlds, two seeds and 4,000 steps.
     Raises:
-        ParameterError: it is no agent, or it yields no policy; or whatever its code raises.
+        ParameterError: it is no agent, or it yields no policy.
+        PharosError: its code raises something, SystemExit included.
     Cost: 24 runs of 4,000 steps, in this process.
     """
     label = agent if isinstance(agent, str) else getattr(agent, "__qualname__", repr(agent))

@@ -36,12 +36,14 @@ from pharos.errors import ParameterError, PharosError
 from pharos.interaction import GymEnv
 from pharos.mdp import uniform_choice
 from pharos.policies import PolicyAnswers, PolicyLike, RecurrentPolicy, SB3Model, deep_policy
-from pharos.system.wording import in_one_line
+from pharos.system.wording import capped, in_one_line, line_in
+from pharos.system.workers import Terminated
 from pharos.training.curve import Curve, Evaluation, evaluate_agent, policy_facts
 from pharos.training.task import Task
 
 BLOCK = 4096  # observations that a policy is asked about at once
 LARGEST = 100_000  # states that it is asked about in advance
+LONGEST = 500  # letters of an agent's error
 KEPT = 1 << 28  # bytes of observations that are kept between snapshots
 TOLERANCE = 1e-9  # of normalised regret: as far from uniform play a policy without a step may be, by rounding
 IGNORED = 1000
@@ -440,6 +442,23 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
     recorder = PolicyRecorder(task, steps=steps, interval=steps // evaluations, seed=seed)
     generate(learn, recorder, seed)
     return recorder.curve()
+
+
+@contextlib.contextmanager
+def errors_in_one_line(agent: str, file: str | None) -> Iterator[None]:
+    """Raise PharosError, which names the agent and the line of its file, for what its code raises, SystemExit included.
+
+    file: with the code of the agent; errors that do not pass through it are raised as they are, such as a full disk.
+    """
+    try:
+        yield
+    except (PharosError, MemoryError, KeyboardInterrupt, Terminated):
+        raise
+    except BaseException as error:
+        if not (line := line_in(error, file)):
+            raise
+        text = capped(in_one_line(error).rstrip(": "), LONGEST)
+        raise PharosError(f"agent {agent} raised {text}{line}") from error
 
 
 def generate(learn: Callable[..., Any], recorder: PolicyRecorder, seed: int) -> None:

@@ -15,17 +15,13 @@ from typing import Any, NoReturn
 import numpy as np
 
 from pharos.agents import COMPILED, GENERATOR, generator_of, register_form
-from pharos.errors import ParameterError, PharosError
+from pharos.errors import ParameterError
 from pharos.policies import PolicyLike
 from pharos.solvers import GainInterval
-from pharos.system.wording import capped, in_one_line, line_in
-from pharos.system.workers import Terminated
-from pharos.training.budget import IGNORED, PolicyRecorder, generate, uniform_policy
+from pharos.training.budget import IGNORED, PolicyRecorder, errors_in_one_line, generate, uniform_policy
 from pharos.training.curve import Evaluation, evaluate_agent
 from pharos.training.jax_agents import compiled_curves
 from pharos.training.results import write_policy
-
-LONGEST = 500  # letters of an agent's error
 
 
 class GeneratorLearner(PolicyRecorder):
@@ -55,15 +51,8 @@ class GeneratorLearner(PolicyRecorder):
             PharosError: its code raises something, SystemExit included.
         """
         self.at_point = at_point
-        try:
+        with errors_in_one_line(self.run.config.agent, self._file):
             generate(partial(generator_of(self.function), **self.run.hyperparameters), self, self.run.config.seed)
-        except (PharosError, MemoryError, KeyboardInterrupt, Terminated):
-            raise
-        except BaseException as error:
-            if not (line := line_in(error, self._file)):  # of pharos, such as a full disk
-                raise
-            text = capped(in_one_line(error).rstrip(": "), LONGEST)
-            raise PharosError(f"agent {self.run.config.agent} raised {text}{line}") from error
         self.run.curve.counted_steps = self.budget.steps
         self.pass_points(math.inf)
         self.check_steps(self.run.curve)
