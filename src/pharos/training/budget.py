@@ -56,7 +56,10 @@ SAME = 1e-3
 """Probabilities that differ by less are the same: a network may round in another way."""
 NETWORK_POLICY = "network(torch.as_tensor(seen)).argmax(dim=1).numpy()"
 CHECKED = 3
-"""First policies of a run that are asked a second time."""
+"""First policies of a run that are asked again."""
+AGAIN, FEW = 8, 128
+"""Up to AGAIN times, as long as the answers together are FEW: a policy that samples seldom would answer the same by
+chance where there are few observations."""
 INFO = ("action_mask", "prob")
 """Entries of `info` that Gymnasium's own environments give as well; others say what an agent is to find out."""
 SEVERAL = (
@@ -253,7 +256,8 @@ class Snapshots:
             tables.append(_answer(answers, policy, observations, count))
             if len(tables) == 1 and self._num_checked < CHECKED:
                 self._num_checked += 1
-                _check_again(tables[0], _answer(answers, policy, observations, count))
+                for _ in range(min(max(1, FEW // count), AGAIN)):
+                    _check_again(tables[0], _answer(answers, policy, observations, count))
         return np.concatenate(tables)
 
     def _observations(self) -> Iterator[tuple[int, Any]]:
