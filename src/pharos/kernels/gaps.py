@@ -2,9 +2,9 @@
 
 gap (N, A) float64 >= 0, 0 for the best actions; counted (N,) int64, how often a row counts.
 
-A tie is proven where equal values have equal rewards and next values. The map from a value to these: places (C, 3)
-int64, or (C, 5) where there are several previous actions, with open addressing: the bits of a value (FREE where there
-is none), of the reward and the value that follow, and of those of the previous action; C is a power of two.
+A tie is proven if equal values have equal rewards and next values. The map from a value to these: places (C, 3)
+int64, or (C, 5) if there are several previous actions, with open addressing: the bits of a value (FREE if there
+is none), of the reward and the value that follow, and the same two of the previous action; C is a power of two.
 """
 
 import math
@@ -30,7 +30,7 @@ def empty_sums() -> np.ndarray:
 
 
 def empty_counts() -> np.ndarray:
-    """(3,) zeros: gaps that exceed the tolerance, those in (0, tolerance], and those of 0 beyond the first of a row."""
+    """(3,) zeros: gaps that exceed the tolerance, those in (0, tolerance], and gaps of 0 beyond the first of a row."""
     return np.zeros(3, np.int64)
 
 
@@ -118,14 +118,14 @@ FREE = -1  # the bits of a NaN, which no value is
 @interpreted_first("gap")
 @kernel
 def extend(values, rewards, next_values, gap, counted, begin, places, filled):
-    """Map values[i, b] to (rewards, next_values) of the best actions; where there are several b, also to those of b.
+    """Map values[i, b] to (rewards, next_values) of the best actions; if there are several b, also to those under b.
 
     values (N, W), rewards, next_values (N, A): int64, the bits of floats. The best actions of a row have the same
     value, so they must have the same rewards and next values; then one of them stands for all.
 
     Returns:
-        (i, filled): where it stopped, because all are done (i = N) or half of the places are taken, and how many those
-        are; i = -1 where a value has two different rows.
+        (i, filled): the row at which it stopped, because all are done (i = N) or half of the places are taken, and how
+        many those are; i = -1 if a value has two different rows.
     """
     num_actions, width = gap.shape[1], values.shape[1]
     for i in range(begin, len(gap)):
@@ -166,7 +166,7 @@ def refill(old_places, places):
 
 @kernel
 def _put(key, reward, next_value, other_reward, other_next_value, places):
-    """Enter a key with its row; returns 1 where the key is new, 0 where it has this row, -1 where it has another."""
+    """Enter a key with its row; returns 1 if the key is new, 0 if it has this row, -1 if it has another."""
     place = _place(key, places)
     is_new = places[place, 0] == FREE
     if is_new:
@@ -183,7 +183,7 @@ def _put(key, reward, next_value, other_reward, other_next_value, places):
 
 @kernel
 def _place(key, places):
-    """The place of a key in the map, or the free one where it belongs.
+    """The index of a key in the map, or of the free entry in which it belongs.
 
     Its hash is the finalizer of SplitMix64: similar floats go to different places.
     """

@@ -8,17 +8,17 @@ of a state. -1 marks a free slot.
 
 In a search by several processes each state has an owner, the process that its hash names, whoever finds it. An owner
 has keys (capacity, W) uint64, states in the order in which it received them, and numbers (capacity,) int64: the number
-of a state, or -1 - place while it waits for one, where place is the first of the places in the block that lead to it.
-table (slots,) leads from the hash of a state to its entry, a row of keys and numbers.
+of a state, or -1 - place while it waits for one, `place` being the first of the places in the block that lead to
+it. table (slots,) leads from the hash of a state to its entry, a row of keys and numbers.
 
 On disk each entry is a whole state and its index: entries (slots, W + 1) uint64, a mapped file, holds the W words of a
 state, then 1 + its index, 0 in a free slot, or NEW + j while candidate j waits for its number. Memory is read and
 written in order of slots: many candidates are first sorted by the 16 highest bits of their hash, their bucket, which
 are the highest bits of their slot in a table of any size. keys (M, W) uint64: candidates; indices (M,) int64:
--1 - bucket, or an index where it is known; order (M,) int32: candidates that are looked up, by bucket, each bucket in
+-1 - bucket, or an index if it is known; order (M,) int32: candidates that are looked up, by bucket, each bucket in
 the order of candidates.
 
-The last section packs states into words and unpacks them a few at a time, where NumPy (rules/layout.py) would take a
+The last section packs states into words and unpacks them a few at a time, whereas NumPy (rules/layout.py) would take a
 call for each component.
 """
 
@@ -150,7 +150,7 @@ def fill_range(table, states, count, low, high, left_over):
     n, over = 0, 0
     for first in range(0, count, _BATCH):
         stop = min(first + _BATCH, count)
-        # collect the states of this range; n only grows where the slot is in it
+        # collect the states of this range; n only grows if the slot is in it
         for i in range(first, stop):
             slots[n] = slot_of(hash_of_row(states, i), capacity)
             indices[n] = i
@@ -250,7 +250,7 @@ def insert_missing(table, states, keys, indices, successors, progress):
                     publish(table, slot, count)
                     count += 1
                     break
-                # an occupied slot: compare all words, and go on to the next slot where they differ
+                # an occupied slot: compare all words, and go on to the next slot if they differ
                 equal = True
                 for k in range(words):
                     equal = equal and states[index, k] == keys[j, k]
@@ -276,9 +276,9 @@ _OWNER_BITS = 24  # the lowest of a hash, which the slots of tables below 2^32 o
 def route(keys, indices, size, order, counts):
     """Sort candidates by their owners.
 
-    keys (M, W); indices (M,): negative where a candidate must be looked up by its owner. order (M,) int64 gets these
-    candidates, those of the first owner first and each owner's in their order; counts (size,) int64 gets the number of
-    each owner's.
+    keys (M, W); indices (M,): negative if a candidate must be looked up by its owner. order (M,) int64 gets these
+    candidates, the candidates of the first owner first and each owner's in their order; counts (size,) int64 gets the
+    number of each owner's.
     """
     owners = np.empty(len(keys), np.int64)
     counts[:] = 0
@@ -302,7 +302,7 @@ def route(keys, indices, size, order, counts):
 def claim(table, keys, numbers, count, candidates, places, entries):
     """Find the entry of each candidate that this owner is asked for, and make one for each that is new.
 
-    candidates (N, W), places (N,): states and where in the block they stand; entries (N,) int64 gets their entries. Of
+    candidates (N, W), places (N,): states and their places in the block; entries (N,) int64 gets their entries. Of
     the places that lead to a new state the first is kept, whatever the order in which they come. Returns the number of
     entries.
     """
@@ -345,7 +345,7 @@ _NEW = uint64(1 << 63)
 
 @njit(forceinline=True)
 def _slot_for(entries, keys, j):
-    """(slot, its entry) of keys[j]: the slot where it is, or the free one where it belongs, whose entry is 0."""
+    """(slot, its entry) of keys[j]: its slot, or the free one in which it belongs, whose entry is 0."""
     capacity, words = entries.shape[0], keys.shape[1]
     slot = slot_of(hash_of_row(keys, j), capacity)
     while True:
@@ -385,7 +385,7 @@ def sort_by_bucket(indices, first, order):
                 order[size] = j
                 size += 1
         return size
-    # counting sort by bucket: sizes, then where each bucket begins, then the candidates
+    # counting sort by bucket: sizes, then the beginning of each bucket, then the candidates
     place = np.zeros(BUCKETS + 1, np.int64)
     for j in range(len(indices)):
         if indices[j] >= 0:
@@ -407,7 +407,7 @@ def sort_by_bucket(indices, first, order):
 def look_up(entries, keys, order, low, high, indices, slots):
     """Look up candidates order[low:high], entering those that are new.
 
-    indices[j] becomes the index of candidate j; -1 where it is new, slots[j] then being its slot; -2 - i where it
+    indices[j] becomes the index of candidate j; -1 if it is new, slots[j] then being its slot; -2 - i if it
     equals the earlier candidate i, which is new.
     """
     capacity = entries.shape[0]

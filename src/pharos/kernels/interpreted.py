@@ -1,8 +1,8 @@
 """Kernels run by Python for little work, which is done long before a kernel is compiled, with the same results.
 
 `interpreted_first` makes a kernel count the entries that its calls read. As long as they are few, and the kernel is not
-compiled, Python runs its text, and that of the functions it calls: the same operations on the same numbers, so the same
-bits. (NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64; few entries do not come that far.)
+compiled, Python runs its text, and the text of the functions it calls: the same operations on the same numbers, so the
+same bits. (NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64; few entries do not come that far.)
 """
 
 from collections.abc import Callable

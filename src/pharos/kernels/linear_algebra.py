@@ -65,7 +65,7 @@ def entries_of_factor(first, columns, limit, starts=None, rows=None):
 
     Row i of the matrix has its entries in columns[first[i] : first[i + 1]]; pivots are taken in order. In place of the
     counts of all rows those so far are returned as soon as their sum passes the limit. Unless they are None, rows holds
-    the rows of those of column j from starts[j] on, in order.
+    the rows of the entries of column j from starts[j] on, in order.
 
     Cost: O(entries of the factor) time, 24 bytes a row.
     """

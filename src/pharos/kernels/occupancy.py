@@ -1,7 +1,7 @@
 """Distributions of states under a policy, moved one step forward.
 
 transitions: see kernels/outcomes.py; live (S,) bool: states in which episodes go on; now, after (S, W) float64:
-the distribution over states, W = 1, or over pairs (state, previously executed action), W = A; that of the first step
+the distribution over states, W = 1, or over pairs (state, previously executed action), W = A; the one of the first step
 has W = 1. policy (S, B, A) probabilities, B = 1 or, for policies that look at the previous action, A; weights: (chosen,
 previous, uniform), with sets behind, see kernels/bellman.py.
 """

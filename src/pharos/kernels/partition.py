@@ -1,10 +1,10 @@
 """Partitions of states: equal rows get equal numbers; classes split by the classes that their members lead to.
 
-Exact: hashes only say where to look, and rows are compared entry by entry. `slots` is a hash table of at least twice as
-many entries as rows, -1 where empty, that is empty again after each call.
+Exact: hashes only narrow the search, and rows are compared entry by entry. `slots` is a hash table of at least twice as
+many entries as rows, -1 if empty, that is empty again after each call.
 
 Under transition probabilities classes split by the probabilities of reaching classes, into the coarsest stable
-partition. Rows are those of a sparse matrix, row s A + a of state s and action a; columns from S on are no state. Two
+partition. Rows form a sparse matrix, row s A + a of state s and action a; columns from S on are no state. Two
 rows are equal if they reach every class with the same probability, rounded to 2^-40, so that the order of additions
 does not matter. Members of a class lie side by side in `elements`. Of the groups into which it falls the largest keeps
 its number, and only states that lead to a class with a new number are looked at again, the candidates of the next
@@ -58,7 +58,7 @@ def number_rows(rows, before, slots, numbers):
 def numbered_rows(rows, before=None):
     """((N,) int64, how many): equal rows (N, ...) get equal numbers, in the order in which they appear first.
 
-    before (N,) int64: rows are equal only where these are, too.
+    before (N,) int64: rows are equal only if these are, too.
     """
     rows = np.ascontiguousarray(rows)
     before = np.zeros(len(rows), np.int64) if before is None else before
@@ -90,8 +90,8 @@ def affected_states(next_states, changed, candidates):
 def split(next_states, classes, sizes, count, candidates, n, slots, used, new, changed):
     """Split classes by the classes that the candidates lead to; returns the number of classes.
 
-    Members that are no candidates lead where their class led before, and keep its number; so does the first group where
-    all members are candidates. classes (S,), sizes (S,) members of each class; candidates (S,), of which the first n
+    Members that are no candidates lead to what their class led to before, and keep its number; so does the first group
+    if all members are candidates. classes (S,), sizes (S,) members of each class; candidates (S,), of which the first n
     count; used, new (S,) scratch; changed (S,) bool: whose class changed.
     """
     mask = len(slots) - 1
@@ -163,13 +163,13 @@ def predecessors(first, column, num_actions, edges, states):
     """
     size = len(edges) - 1
     edges[:] = 0
-    # how many outcomes lead to each state, and where its predecessors begin
+    # how many outcomes lead to each state, and the beginning of its predecessors
     for k in range(len(column)):
         if column[k] < size:
             edges[column[k] + 1] += 1
     for t in range(size):
         edges[t + 1] += edges[t]
-    # fill; edges[t] moves to where t ends, and is moved back by one place
+    # fill; edges[t] moves to the end of t, and is moved back by one place
     for s in range(size):
         for k in range(first[s * num_actions], first[(s + 1) * num_actions]):
             t = column[k]
@@ -303,7 +303,7 @@ def _move_to_front(candidates, n, classes, layout, num_candidates, touched):
 def _group_members(matrix, num_actions, c, k, classes, layout, groups, group_sizes, rows):
     """group[j] of the first k members of class c, the candidates, by equal rows; returns how many groups.
 
-    The others lead where they led before: one of them stands for all, and opens group 0.
+    The others lead to what they led to before: one of them stands for all, and opens group 0.
     """
     elements, _, begin, sizes = layout
     group, member, hashes, slots, used = groups
@@ -343,7 +343,7 @@ def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, num
     """
     elements, place, begin, sizes = layout
     group, ends, _, _, states = groups
-    # where each group begins, and which one is the largest
+    # the beginning of each group, and which one is the largest
     largest, at = 0, begin[c]
     for g in range(num_groups - 1, -1, -1):
         ends[g] = at

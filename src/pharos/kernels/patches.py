@@ -5,7 +5,7 @@ A patch is a pixel with its eight neighbours. Pictures of worlds have few differ
 p, and the two layers and their gradients are computed once for each group g, not for each picture:
 
     h_g = max(0, patch_g K + k),   z_b = c + sum_p W_p h_g(b, p),   dz_g = sum of dz_b over b in g
-    dW_p = sum_g h_g dz_g,   dh_g = W_p' dz_g where h_g > 0,   dK = sum_g patch_g dh_g
+    dW_p = sum_g h_g dz_g,   dh_g = W_p' dz_g if h_g > 0,   dK = sum_g patch_g dh_g
 
 A patch that is met at several pixels is convolved once. It is the same sum in another order, not an approximation.
 
@@ -34,9 +34,9 @@ def _is_alike(one, pixel, other, at, channels, pixels):
 
 @kernel
 def patch_keys(pictures, shape, keys):
-    """keys (pixels, B) int64: equal where patches are; pictures (B, C pixels), shape (C, H, W).
+    """keys (pixels, B) int64: equal if patches are; pictures (B, C pixels), shape (C, H, W).
 
-    Seven bits for the number of each of nine colours. Where there are more than COLOURS of them all keys differ.
+    Seven bits for the number of each of nine colours. If there are more than COLOURS of them all keys differ.
     """
     channels, height, width = shape
     pixels, count = height * width, 0
@@ -92,7 +92,7 @@ def _grouped(keys, members, samples, slots):
 
 @kernel(fastmath={"contract"})
 def _convolve(picture, neighbours, kernel, bias, hidden):
-    """hidden (16,) = max(0, patch K + k); neighbours (9 C,): of a pixel in the picture, beyond its end where none."""
+    """hidden (16,) = max(0, patch K + k); neighbours (9 C,): of a pixel in the picture, beyond its end if none."""
     for f in range(FILTERS):
         hidden[f] = bias[f]
     for k in range(len(neighbours)):
@@ -107,7 +107,7 @@ def _convolve(picture, neighbours, kernel, bias, hidden):
 
 @kernel
 def _live(values, at):
-    """Write to `at` where values (n,) are not 0; return how many there are."""
+    """Write to `at` the indices of the values (n,) other than 0; return their number."""
     count = 0
     for k in range(len(values)):
         at[count] = k

@@ -5,7 +5,7 @@ and in rules/interaction.py), of Q-learning (below), of the batched engine (batc
 environments on a table. A stream's whole state is one 64-bit word that can be stored and restored.
 
 Q-learning, compiled: in a table (agents/q_learning.py), and in a kernel from drawn transitions, which is the loop of
-`hardness.sampled_regret`: Q(c, a) of observation c is q[a, c] where the kernel is a matrix K, else F[c] .
+`hardness.sampled_regret`: Q(c, a) of observation c is q[a, c] if the kernel is a matrix K, else F[c] .
 W[a] + q[a, c] for features F and a diagonal.
 """
 
@@ -29,7 +29,7 @@ class Setting(NamedTuple):
         ranges: (2, D) int64, lowest and highest value of each component; (2, 0) on a table.
         scale: (D,) float64, of the vectors that `step_many` writes.
         chance: (chosen, previous, uniform, first_chosen, lazy), weights of the executed action, the fourth that of the
-            chosen one where there is no previous action; and the probability that it has no effect.
+            chosen one if there is no previous action; and the probability that it has no effect.
         limit: steps after which an episode is truncated.
         mode: NEXT_STEP, SAME_STEP or DISABLED.
         first_previous: the previous action on the first step of an episode, -1 for none.
@@ -57,8 +57,8 @@ class EnvironmentBatch(NamedTuple):
         previous, elapsed, ended: (N,) the previous action, steps of the episode so far, whether it is over.
         rewards, terminated, truncated, executed: (N,) of this step; executed is -1 after a reset.
         final: as states; the last state of an episode that was over and reset in the same step.
-        vector: (N, D) float32, the states as vectors; (0, D) where they are not wanted.
-        probabilities: (N,) float64, of the outcomes that were drawn, 1 after a reset; (0,) where the rules have no
+        vector: (N, D) float32, the states as vectors; (0, D) if they are not wanted.
+        probabilities: (N,) float64, of the outcomes that were drawn, 1 after a reset; (0,) if the rules have no
             chance.
     """
 
@@ -114,12 +114,12 @@ def normal_number(rng, i):
 
 @njit(forceinline=True)
 def delayed_reward(pending, elapsed, earned, is_last):
-    """Reward paid at a step where rewards come D steps late, and all at once at the end of an episode.
+    """Reward paid at a step if rewards come D steps late, and all at once at the end of an episode.
 
     pending (D,): rewards of the last steps, not paid yet; elapsed: steps of the episode before this one; earned: the
     reward of this step.
     """
-    # a ring: the reward of D steps ago leaves, that of this step comes in
+    # a ring: the reward of D steps ago leaves, the reward of this step comes in
     place = elapsed % len(pending)
     total = pending[place]
     pending[place] = earned
@@ -157,7 +157,7 @@ def flip_coins(rng, out):
 def executed_by_number(choice, previous, chance, num_actions, u):
     """The executed action, by one uniform number u in [0, 1): the choice, then the previous action, then a uniform one.
 
-    chance: as in `Setting`; previous: -1 where there is none, and the choice has the weight of the first step.
+    chance: as in `Setting`; previous: -1 if there is none, and the choice has the weight of the first step.
     """
     if previous < 0:
         if u < chance[3]:
@@ -251,7 +251,7 @@ def _action_of_set(chance, num_actions, rng, s):
 
 @njit(forceinline=True)
 def executed_action(choice, previous, chance, num_actions, rng, i):
-    """The executed action of stream i; nothing is drawn where the choice is always executed."""
+    """The executed action of stream i; nothing is drawn if the choice is always executed."""
     if chance[0] >= 1.0:
         return choice
     return executed_by_number(choice, previous, chance, num_actions, uniform_number(rng, i))
@@ -259,7 +259,7 @@ def executed_action(choice, previous, chance, num_actions, rng, i):
 
 @njit(forceinline=True)
 def has_no_effect(chance, rng, i):
-    """Whether the executed action of stream i changes nothing; nothing is drawn where every action has an effect."""
+    """Whether the executed action of stream i changes nothing; nothing is drawn if every action has an effect."""
     return chance[4] > 0.0 and uniform_number(rng, i) < chance[4]
 
 
@@ -274,7 +274,7 @@ def start_by_number(cumulative, u):
 
 @njit(forceinline=True)
 def drawn_start(cumulative, rng, i):
-    """The number of a start state; nothing is drawn where there is one."""
+    """The number of a start state; nothing is drawn if there is one."""
     return start_by_number(cumulative, uniform_number(rng, i)) if len(cumulative) > 1 else 0
 
 
@@ -301,7 +301,7 @@ def execute_choices(policy, places, numbers, chance, table, palette, states, dis
 
     policy: (M, A), probabilities; places: (N,), rows of the episodes there; numbers: (u, v, w), (N,) each: u chooses,
     v decides between the choice, the previous action and w, a uniform one; chance: (chosen, previous, uniform,
-    first_chosen); table, palette: of rewards; states, previous (A where there is none), returns: of all episodes.
+    first_chosen); table, palette: of rewards; states, previous (A if there is none), returns: of all episodes.
     """
     u, v, w = numbers
     num_actions = policy.shape[1]
@@ -320,7 +320,7 @@ def execute_choices(policy, places, numbers, chance, table, palette, states, dis
 
 
 def outcome_on_table(transitions, rewards, s, a, rng, i):
-    """(next state, reward, probability) of the outcome of (s, a) that stream i draws; nothing is drawn where there is
+    """(next state, reward, probability) of the outcome of (s, a) that stream i draws; nothing is drawn if there is
     one.
     """
 
@@ -342,7 +342,7 @@ def walk_table(transitions, table_rewards, staying, is_terminal, setting, batch,
     """One step of environments first .. last - 1 on a tabulated state space: `step_many`, with indices for states.
 
     transitions: see kernels/outcomes.py; table_rewards: their rewards, (S, A), or with chance as `transitions`, with
-    rewards in the place of the successors; staying: (S, A), the reward of an action without effect; (0, 0) where all
+    rewards in the place of the successors; staying: (S, A), the reward of an action without effect; (0, 0) if all
     have one.
     """
     _, _, chance, limit, mode, first_previous, starts, cumulative = setting
@@ -384,7 +384,7 @@ def walk_table(transitions, table_rewards, staying, is_terminal, setting, batch,
 
 
 def _next_state(transitions, s, a, word):
-    """A next state of (s, a), -1 for the end; draws a number only where there are several outcomes."""
+    """A next state of (s, a), -1 for the end; draws a number only if there are several outcomes."""
 
 
 @overload(_next_state)
@@ -419,9 +419,9 @@ def q_learning(
 
     transitions: see kernels/outcomes.py; table, palette: rewards; starts (K,), cumulative (K,): start states and their
     cumulated probabilities;
-    chance: (chosen, previous, uniform, first_chosen), with sets behind where some actions are not available; limit:
+    chance: (chosen, previous, uniform, first_chosen), with sets behind if some actions are not available; limit:
     steps of an episode; q, visits (R, A): values and number
-    of updates, R = S, or S (A + 1) with rows s (A + 1) + b where the agent observes the previous action b (A: none).
+    of updates, R = S, or S (A + 1) with rows s (A + 1) + b if the agent observes the previous action b (A: none).
     schedule: (learning rate, exponent of visits or 0, gamma, first epsilon, last epsilon, steps of exploration,
         exponential?, gamma of returns).
     place: int64 (state or -1, previous action, steps in the episode, steps in all, episodes); sums: float64 (return of
@@ -558,7 +558,7 @@ def learn(
 
     outcomes: (offsets (S A + 1,), states (N,), -1 for the end; rewards (N,); cumulative probabilities of a row (N,)).
     terminal: (S,); group: (S,) the observation of each state; starts, cumulative (K,): of episodes; chance: (chosen,
-    previous, uniform, first_chosen), with the sets of observations (C, A) behind where some actions are not available;
+    previous, uniform, first_chosen), with the sets of observations (C, A) behind if some actions are not available;
     limit: steps of an episode.
     kernel: (K (C, C) or (0, 0), F (C, m), diagonal (C,)); learnt, target: each (q (A, C), weights (A, m)), of which
     target stays as it is. memory: (observations (M,), actions (M,), next observations (M,), -1 for an end, rewards
