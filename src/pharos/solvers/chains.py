@@ -1,7 +1,7 @@
 """Markov chains of proper policies: linear equations by elimination without subtraction, component by component.
 
-A policy's chain has small strongly connected components even where those of the MDP are large: it is eliminated from
-the components that lead to no other one up, each in the order of minimum degree. See kernels/elimination.py.
+A policy's chain has small strongly connected components even if the components of the MDP are large: it is eliminated
+from the components that lead to no other one up, each in the order of minimum degree. See kernels/elimination.py.
 """
 
 import math
@@ -52,7 +52,7 @@ class Chain:
     """Linear equations x(n) sum_m p(n, m) = b(n) + sum_m p(n, m) x(m) of M nodes, 0 at the end, node M.
 
     Elimination keeps the relative accuracy of what is not negative: floats give x to some 1e-13 of itself, pairs of
-    floats to some 1e-29, even where a loop is left once in 1e300 steps.
+    floats to some 1e-29, even if a loop is left once in 1e300 steps.
 
     Attributes:
         dtype: of x: float, or complex, which is pairs of floats. unit: the relative rounding of such a number.
@@ -96,7 +96,7 @@ class Chain:
         elimination.factorize(*self._parts, leaving, self._pivot, work)
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """(M + 1,) x of b (M,), 0 at the end; infinite or NaN where numbers are too small, or it is too large."""
+        """(M + 1,) x of b (M,), 0 at the end; infinite or NaN if numbers are too small, or it is too large."""
         with np.errstate(all="ignore"):
             x, least, own = self._solved(right), math.inf, np.arange(len(right))
             for _ in range(0 if np.iscomplexobj(x) else REFINEMENTS):
@@ -118,7 +118,7 @@ class Chain:
         return x
 
     def _iterated(self, right: np.ndarray) -> np.ndarray:
-        """(M,) x, as BiCGSTAB has it: where any state soon leads anywhere, it converges within some tens of steps."""
+        """(M,) x, as BiCGSTAB has it: if any state soon leads anywhere, it converges within some tens of steps."""
         from scipy import sparse
 
         leaving = np.asarray(self._matrix.sum(axis=1)).ravel()
