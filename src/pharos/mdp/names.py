@@ -1,6 +1,6 @@
 """Names of states and actions, and sets of states by labels and by expressions over variables.
 
-The expressions are those of PRISM's language without functions: comparisons of sums and products of whole numbers and
+The expressions follow PRISM's language without functions: comparisons of sums and products of whole numbers and
 variables, joined by & | ! and parentheses. They are parsed, never executed.
 
 Source: Kwiatkowska, Norman and Parker (2011), "PRISM 4.0"; its manual, section "Expressions", for what binds stronger.
@@ -310,7 +310,7 @@ class Parser:
     # Kinds ----------------------------------------------------------------------------------------------------------
 
     def _truth(self, term: Term) -> np.ndarray:
-        """The truth of a term; a variable that is only 0 or 1 is true where it is 1."""
+        """The truth of a term; a variable that is only 0 or 1 is true if it is 1."""
         if not term.is_number:
             return term.values
         if term.values.ndim and term.size <= 1 and term.values.min(initial=0) >= 0:

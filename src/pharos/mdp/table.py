@@ -98,7 +98,7 @@ class Table(Dynamics):
         return Table(local), halo
 
     def _restricted_to(self, states: np.ndarray) -> "Table":
-        # transitions that leave them lead back to where they came from
+        # transitions that leave them lead back to their own state
         number = np.full(self.num_states, -1, np.int64)
         number[states] = np.arange(len(states))
         table = np.asarray(self.next_states[states])
@@ -125,7 +125,8 @@ class Lazy(Dynamics):
     Under sticky actions the action that had no effect counts as executed.
 
     Attributes:
-        tables: the dynamics without laziness; where they are lazy already, their own tables, and p is that of both.
+        tables: the dynamics without laziness; if they are lazy already, their own tables, and p is the probability of
+            both.
         laziness: p, in (0, 1).
         roundings: of p and of the mean. Joining two p is off by at most 4 units, which move as much weight from one
             value to another.
@@ -296,7 +297,7 @@ def compact_outcomes(
 def _palette(vectors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray | None]:
     """(codes (N,), the distinct ones (P, K) in the order in which they appear) of vectors (N, K).
 
-    None where they are more than `most`.
+    None if they are more than `most`.
     """
     from pharos.kernels import partition
 
@@ -329,7 +330,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
     def from_arrays(successors: npt.ArrayLike, probabilities: npt.ArrayLike) -> "OutcomeTable":
         """Make a table of (S, A, K) successors, -1 for the end, and probabilities, without impossible outcomes.
 
-        Up to 65,536 distinct vectors of probabilities become a palette. Rows are kept one after another where more than
+        Up to 65,536 distinct vectors of probabilities become a palette. Rows are kept one after another if more than
         30 % of (S, A, K) would be padding.
 
         Raises:
@@ -339,7 +340,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
         return OutcomeTable(**compact_outcomes(*checked_outcomes(successors, probabilities)[:2]))
 
     def check(self) -> None:
-        """ParameterError where the arrays, whoever wrote them, are not what the attributes say. Cost: O(S A K)."""
+        """ParameterError if the arrays, whoever wrote them, are not what the attributes say. Cost: O(S A K)."""
         pairs, size = (self.num_states, self.num_actions), self.successors.shape
         fitting = {
             "successors": ("iu", size if len(size) == 1 else (*pairs, *size[2:3])),
@@ -401,7 +402,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
     def mass(self) -> float:  # type: ignore[override]
         if self.is_deterministic:
             return 1.0
-        if self.palette is not None:  # the sign of a sum by fsum is that of the exact one
+        if self.palette is not None:  # the sign of a sum by fsum is the sign of the exact sum
             beyond = max(math.fsum([*vector, -1.0]) for vector in np.asarray(self.palette).tolist())
             return 1.0 if beyond <= 0 else math.nextafter(1.0 + beyond, 2.0)
         sums = self.expected(np.ones(self.num_states + 1))
@@ -462,7 +463,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
         return self._of_states(slice(start, stop), slice(first, last), local), halo
 
     def _restricted_to(self, states: np.ndarray) -> "OutcomeTable":
-        # transitions that leave them lead back to where they came from
+        # transitions that leave them lead back to their own state
         number = np.full(self.num_states + 1, -2, np.int64)
         number[states], number[-1] = np.arange(len(states)), -1
         return self._renumbered(states, number)
@@ -481,7 +482,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
     # Parts of it ------------------------------------------------------------------------------------------------------
 
     def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
-        """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for where it came from."""
+        """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for the state of the row."""
         which, places = self.places(self._rows(np.asarray(states)))
         next_states = number[self.flat[places]]
         next_states = np.where(next_states == -2, which // self.num_actions, next_states)
@@ -510,7 +511,7 @@ class Matrices(OutcomeTable):
 
     Attributes:
         transitions: (S A, S) CSR float64, row s A + a; 1 minus the sum of a row is the probability that the episode
-            ends, where it exceeds 4 (n + 2) units of 2^-53 for rows of n entries: less may be rounding.
+            ends, if it exceeds 4 (n + 2) units of 2^-53 for rows of n entries: less may be rounding.
     """
 
     def __init__(self, transitions: "csr_matrix", num_actions: int):
