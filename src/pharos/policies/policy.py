@@ -41,7 +41,7 @@ class TabularAgent(Protocol):
     """Chooses actions from the index of the state."""
 
     def policy_table(self) -> np.ndarray:
-        """(S,) actions, (S, A) probabilities, or (S, A + 1, A) where previous actions are seen."""
+        """(S,) actions, (S, A) probabilities, or (S, A + 1, A) if previous actions are seen."""
 
 
 Arrays: TypeAlias = Any
@@ -60,7 +60,7 @@ class RecurrentPolicy(Protocol):
         """The state of n episodes that begin."""
 
     def __call__(self, observations: Arrays, state: Arrays, starts: np.ndarray) -> tuple[np.ndarray, Arrays]:
-        """((N, A) probabilities or (N,) actions, the next state); starts: (N,) bool, where an episode begins."""
+        """((N, A) probabilities or (N,) actions, the next state); starts: (N,) bool, whether an episode begins."""
 
 
 PolicyLike = np.ndarray | TabularAgent | Policy | RecurrentPolicy | SB3Model | Callable[[Any], Any]
@@ -74,7 +74,7 @@ def policy_function(policy: PolicyLike, *, masked: bool = False) -> Callable[...
     Args:
         masked: whether the function takes (N, A) masks as well.
     Raises:
-        ParameterError: it is none, has a memory, or takes masks where there are none, or the other way round.
+        ParameterError: it is none, has a memory, or takes masks although there are none, or the other way round.
     """
     if isinstance(policy, RecurrentPolicy) and not isinstance(policy, Policy | SB3Model):
         raise memory_error(policy)
@@ -106,7 +106,7 @@ def masks_for(policy: PolicyLike, mdp: TabularMDP, masks: "MasksLike | None") ->
 # Observations in one query of a policy.
 BATCH = 4096
 SINGLE, HALF = 1.1e-4, 1e-2  # by which a sum of probabilities may miss 1, of 32 bits and of 16
-SOME = 1024  # rows that stand for all where these are too many for an exact value
+SOME = 1024  # rows that stand for all if these are too many for an exact value
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +188,7 @@ class ReachableRows(NamedTuple):
 
 
 class QueriedPolicy:
-    """Answers of a policy so far, by row: a state s, or s (A + 1) + b where the previous action b matters (A: none).
+    """Answers of a policy so far, by row: a state s, or s (A + 1) + b if the previous action b matters (A: none).
 
     Attributes:
         by_pairs: whether rows are pairs of state and previous action.
@@ -295,8 +295,8 @@ class QueriedPolicy:
     def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
         """Query the policy in all rows of `reach` at once; True.
 
-        False where there are more rows, and the policy reaches all of these (every action has a positive probability,
-        as seen in SOME of them). None where an action has probability 0, so that it may reach less. Then nothing is
+        False if there are more rows, and the policy reaches all of these (every action has a positive probability,
+        as seen in SOME of them). None if an action has probability 0, so that it may reach less. Then nothing is
         stored.
         """
         chance = self.mdp.chance
@@ -319,8 +319,8 @@ class QueriedPolicy:
         return states * self.width + (actions if self.by_pairs else 0)
 
     def reached_states(self) -> np.ndarray:
-        """(N,) the state that each state of `reached_mdp` behaves as: that of a row, or each once under sticky actions,
-        where the MDP tells previous actions apart itself."""
+        """(N,) the state that each state of `reached_mdp` behaves as: the state of a row, or each once under sticky
+        actions, if the MDP tells previous actions apart itself."""
         states = self.rows // self.width
         return np.unique(states) if self.mdp.is_sticky else states
 
@@ -496,7 +496,7 @@ class PolicyAnswers(QueriedPolicy):
         return self.ask(rows) if self.observer.previous_action else self.by_state.query(rows // self.width)
 
     def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
-        """Query the policy as `QueriedPolicy` does. Where that is None, one of vectors under chance has answered in all
+        """Query the policy as `QueriedPolicy` does. If that is None, one of vectors under chance has answered in all
         states of `reach` nevertheless, in blocks: level by level it would be asked about few at a time."""
         is_whole = super().query_all(reach)
         has_chance = self.by_pairs or self.mdp.dynamics.has_chance
@@ -522,7 +522,7 @@ class PolicyAnswers(QueriedPolicy):
         return total / 2**irrelevant
 
     def answer(self, observations: Observations, count: int = 1, states: np.ndarray | None = None) -> np.ndarray:
-        """(N, A) probabilities for a batch of `count` observations, of these states (N,) where masks need them."""
+        """(N, A) probabilities for a batch of `count` observations, of these states (N,) if masks need them."""
         if self.masks is None:
             return self.checked(self.policy(observations), count)
         assert states is not None
