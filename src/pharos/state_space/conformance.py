@@ -65,8 +65,8 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
     Rules, on the states nearest to the start and on states far from it: values are integers in their declared ranges,
     the same question has the same answer, nothing but `out` and the planes is written to, rewards are finite, drawings
     stay inside their planes, the probabilities of the outcomes of an action sum to 1, ages increase, and compiled rules
-    agree with interpreted ones. Where all states fit into `max_states`,
-    the state space is built, too, and compared: the same states in the same order, terminal states absorbing.
+    agree with interpreted ones. If all states fit into `max_states`, the state space is built, too, and compared: the
+    same states in the same order, terminal states absorbing.
 
     Args:
         max_states: how many states are looked at; half of them nearest to the start, half by depth-first search.
@@ -120,7 +120,7 @@ def _some_states(env: Environment, check: InterpretedCheck, max_states: int, see
     """(expanded states in the order of discovery, whether these are all reachable ones)."""
     starts, _ = start_distribution(env)
     states = dict.fromkeys(starts)
-    # breadth-first: the states nearest to the start, all of them where they are few
+    # breadth-first: the states nearest to the start, all of them if they are few
     queue = deque(starts)
     while queue and len(states) <= max_states:
         for successor in check.expand(queue.popleft()):
@@ -222,7 +222,7 @@ def _names_in(value: object) -> tuple[str, ...]:
 
 
 def _check_compiled(env: Environment, check: InterpretedCheck, states: list[State], notes: list[str]) -> bool:
-    """Compare compiled rules with interpreted ones on `states`; False, and a note, where Numba cannot compile them."""
+    """Compare compiled rules with interpreted ones on `states`; False, and a note, if Numba cannot compile them."""
     from pharos.rules import CompiledExpansion, not_compiled, rules_of
 
     rules = rules_of(env)
@@ -273,7 +273,7 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
 def _check_compiled_branch(
     check: InterpretedCheck, branch: tuple[State, int, int], probability: float, successor: State
 ) -> None:
-    """Raise a RuleError where an outcome of an action in a state differs between compiled and interpreted rules."""
+    """Raise a RuleError if an outcome of an action in a state differs between compiled and interpreted rules."""
     if probability != check.probabilities.get(branch, 0.0):
         raise RuleError(
             f"{check.where('probability', *branch)} is {probability} compiled, "
@@ -287,7 +287,7 @@ def _check_compiled_branch(
 
 
 def _check_compiled_sets(check: InterpretedCheck, rules: "Rules", states: list[State]) -> None:
-    """Raise a RuleError where the actions that are available in a state differ."""
+    """Raise a RuleError if the actions that are available in a state differ."""
     sets = np.empty((len(states), check.env.num_actions), np.bool_)
     rules.stepping.mark_available(np.array(states, np.int64), sets)
     for state, compiled in zip(states, sets.tolist(), strict=True):
@@ -299,7 +299,7 @@ def _check_compiled_sets(check: InterpretedCheck, rules: "Rules", states: list[S
 
 
 def _check_compiled_rewards(check: InterpretedCheck, rules: "Rules", states: list[State], every: np.ndarray) -> None:
-    """Raise a RuleError where a reward differs between compiled and interpreted rules.
+    """Raise a RuleError if a reward differs between compiled and interpreted rules.
 
     Args:
         every: the states, packed, and then the successors of each one by all branches.
@@ -328,7 +328,7 @@ def _check_compiled_rewards(check: InterpretedCheck, rules: "Rules", states: lis
 
 
 def _check_compiled_drawings(check: InterpretedCheck, states: list[State], notes: list[str]) -> None:
-    """Raise a RuleError where a drawing differs between compiled and interpreted rules."""
+    """Raise a RuleError if a drawing differs between compiled and interpreted rules."""
     from pharos.rules import CompiledDrawing, CompiledMotion, reason_of
 
     planes = np.zeros((len(states), *check.drawings[states[0]].shape), np.uint8)
@@ -396,7 +396,7 @@ SPRITE_LETTERS = set(".#123456789")
 
 
 def check_declarations(env: Environment) -> None:
-    """Raise a RuleError where an attribute, the parameters, the variables or the start states break the contract."""
+    """Raise a RuleError if an attribute, the parameters, the variables or the start states break the contract."""
     cls = type(env)
     whose = cls.__name__
     # attributes of the class
@@ -452,7 +452,7 @@ def check_declarations(env: Environment) -> None:
 
 
 def check_layers(env: Environment, notes: list[str]) -> None:
-    """Raise a RuleError where a layer or the grid breaks the contract; a note where there are no layers."""
+    """Raise a RuleError if a layer or the grid breaks the contract; a note if there are no layers."""
     whose = type(env).__name__
     if not isinstance(env.layers, dict) or not all(isinstance(name, str) for name in env.layers):
         raise RuleError(f"{whose}.layers is {env.layers!r}; expected a dict of name -> Layer")
@@ -493,7 +493,7 @@ def _told(error: Exception) -> str:
 
 
 def _check_layer(where: str, name: object, layer: object) -> None:
-    """Raise a RuleError where a layer, called `where` in messages, breaks the contract."""
+    """Raise a RuleError if a layer, called `where` in messages, breaks the contract."""
     if not isinstance(name, str) or not isinstance(layer, Layer):
         raise RuleError(f"{where} is {layer!r}; expected a Layer")
     glyphs = layer.glyph if isinstance(layer.glyph, tuple) else (layer.glyph,)
@@ -523,7 +523,7 @@ def _named(whose: str) -> Iterator[None]:
 
 
 def _check_sprites(whose: str, sprite: Sequence[Any], num_values: int) -> None:
-    """Raise a RuleError where the sprites of a layer are no pixels, or too few or many for its values."""
+    """Raise a RuleError if the sprites of a layer are no pixels, or too few or many for its values."""
     sprites = sprite if sprite and isinstance(sprite[0], tuple) else (sprite,)
     for rows in sprites:
         if not rows or len(set(map(len, rows))) != 1 or not rows[0] or set("".join(rows)) - SPRITE_LETTERS:

@@ -14,7 +14,7 @@ So numbers, and all files, are the same whatever the number of ranks. Rank 0 dis
 
 Rank 0 runs the search and writes the files. While the frontier is narrow (Freeway: 148 thousand levels of 9 states) it
 works alone, as exchanges would cost more than the states. Once it is wide, or the table does not fit, all ranks share
-the table and expand blocks together; the memory for it is then that of all ranks.
+the table and expand blocks together; the memory for it is then the sum over ranks.
 """
 
 import contextlib
@@ -42,7 +42,7 @@ SUCCESSORS = 1 << 20  # of a rank's rows, at most
 _END, _TAKE, _EXPAND = range(3)
 _HEADER = np.zeros(4, np.int64)
 _INT32 = np.dtype(np.int32)
-_NOTHING = np.full(1 << 16, -1, np.int32)  # a table that holds nothing, where the slot of a state is its bucket
+_NOTHING = np.full(1 << 16, -1, np.int32)  # a table that holds nothing, in which the slot of a state is its bucket
 
 
 def rows_of_rank(plan: Plan) -> int:
@@ -71,7 +71,7 @@ class Owner:
         self.count = 0
 
     def claim(self, candidates: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Entries of candidates; new ones wait for their numbers. `places`: where in the block candidates stand."""
+        """Entries of candidates; new ones wait for their numbers. `places`: indices of the candidates in the block."""
         if self.table.is_full(self.count):
             self._grow()
         entries = np.empty(len(candidates), np.int64)
