@@ -53,7 +53,7 @@ class LookAhead:
         k_min: smallest k for which acting greedily in Q^k is optimal, Q^1 being the value of uniform play.
         effective_planning_window: the same from Q^1 = r: the number of rewards ahead that planning needs.
         ks, ms, gaps, vars: for each k that was tried and does not fail: k, the samples m_k, and gap and variance bound
-            where m_k is attained.
+            of the node at which m_k is attained.
     """
 
     value: float
@@ -84,7 +84,7 @@ class EffectiveHorizon(LookAhead):
     Attributes:
         value, k_min, effective_planning_window, ks, ms, gaps, vars: see LookAhead; `value` is the effective horizon by
             the simple bound.
-        tight: a tighter bound by GORP's failure probability, where it was asked for; else None.
+        tight: a tighter bound by GORP's failure probability, if it was asked for; else None.
         greedy_returns: J_k for k = 1, ..., 5: return of the policy greedy in Q^k, ties broken adversarially.
         optimal_return, random_return, worst_return: from the start.
         num_states: number of states that can be met at some step; under sticky actions, as BRIDGE counts, of pairs
@@ -117,18 +117,19 @@ def effective_horizon(
         m_k = max over states met of max(1, ceil(16 max_a var^k / gap_k^2 ln(2 T A^k))),  H = min_k k + log_A m_k
 
     gap_k is the difference between the largest Q^k and the largest Q^k of an action that is not optimal; states met are
-    those that actions better than all of the latter lead to. k fails where that difference is exactly 0. Where some
-    actions are not available, the uniform policy takes those that are, and A is the largest number of them in a state.
+    the states that actions better than all of the latter lead to. k fails if that difference is exactly 0. If
+    some actions are not available, the uniform policy takes the available ones, and A is the largest number of them in
+    a state.
 
     Args:
-        horizon: T; None: that of the MDP.
+        horizon: T; None: the MDP's.
         tight: the largest k for which the tight bound of `gorp_bound` is computed as well; 0: none.
         progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: there is no horizon, or the table of all steps does not fit into memory: 8 GiB under chance,
-            else 60 % of that of the machine. PrecisionError: returns may pass 1e150.
-    Cost: a pass over T x nodes x A for every k that is tried, of those that can be met within T steps. Memory 40 bytes
-        for each of them under chance; 17 bytes for each of T x S without.
+            else 60 % of the machine's memory. PrecisionError: returns may pass 1e150.
+    Cost: a pass over T x nodes x A for every k that is tried, of the nodes that can be met within T steps. Memory 40
+        bytes for each of them under chance; 17 bytes for each of T x S without.
     Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", theorem
         5.4 and appendix C; sticky actions: Laidlaw et al. (2024).
     """
@@ -161,7 +162,7 @@ class LookaheadValues(Protocol):
     """Q^k for one k after the other, k = 1 at first, with the questions of both effective horizons."""
 
     def samples(self, log: float) -> tuple[int, float, float] | None:
-        """(m_k, gap, variance where it is attained), log = ln(2 T A^k); None where k fails."""
+        """(m_k, gap, variance of the node that attains it), log = ln(2 T A^k); None if k fails."""
 
     def is_greedy_optimal(self) -> bool:
         """Whether all actions greedy in Q^k, from the start on, are optimal."""
@@ -180,7 +181,7 @@ def look_ahead(
     greedy_return: Callable[[], float] | None = None,
     tell: Callable[[str], object] = str,
 ) -> tuple[LookAhead, list[float]]:
-    """(LookAhead of episodes of `steps` steps, `greedy_return` for k = 1, ..., 5, where it is given)."""
+    """(LookAhead of episodes of `steps` steps, `greedy_return` for k = 1, ..., 5, if it is given)."""
     best, log_actions = float(steps), math.log(num_actions)
     rows: list[tuple[int, int, float, float]] = []
     greedy: list[float] = []
@@ -253,7 +254,7 @@ class NodeHorizon:
             self.spread.append(((e - w) * (b - w)).max(axis=1))
 
     def _after(self, rows: Iterable[np.ndarray]) -> list[np.ndarray]:
-        """Rows (N,) that come after each step, of those of each step: zeros after the last of T steps."""
+        """Rows (N,) that come after each step, from the rows of each step: zeros after the last of T steps."""
         return list(rows) if self.steps is None else [*rows, np.zeros(self.num_nodes)][1:]
 
     def samples(self, log: float) -> tuple[int, float, float] | None:
@@ -280,7 +281,7 @@ class NodeHorizon:
         return self.met(greedy) is not None
 
     def met(self, actions: Callable[[int, np.ndarray], np.ndarray | None]) -> list[np.ndarray] | None:
-        """The nodes that are met at each of T steps by some actions, or at any step; None where `actions` is None.
+        """The nodes that are met at each of T steps by some actions, or at any step; None if `actions` is None.
 
         actions: from a step and nodes (n,) to (n, A) bool, the actions that are chosen there.
         """
@@ -333,7 +334,7 @@ class NodeHorizon:
 
 
 class _ActionValues:
-    """Action values r + gamma E value(next) of nodes; on demand where there are many and each leads to one node."""
+    """Action values r + gamma E value(next) of nodes; on demand if there are many and each leads to one node."""
 
     def __init__(self, nodes: NodeHorizon, value: np.ndarray):
         self.nodes, self.value = nodes, value
@@ -388,7 +389,7 @@ class LargeHorizon:
     Attributes:
         ahead: (T + 1, S) W^{k-1}, for the present k; row T is 0.
         spread: (T, S) max over a of var^k.
-        optimal: (T, S) bit a is set where a is optimal.
+        optimal: (T, S) bit a is set if a is optimal.
     """
 
     def __init__(self, mdp: TabularMDP, steps: int, tie: float, tell: Callable[[str], object] = str):
@@ -497,7 +498,7 @@ class StationaryHorizon(LookAhead):
     """Effective horizon of a discounted MDP, of values that do not depend on the step.
 
     Attributes:
-        value, k_min, effective_planning_window, ks, ms, gaps, vars: see LookAhead; k_min is `steps` where no k will do.
+        value, k_min, effective_planning_window, ks, ms, gaps, vars: see LookAhead; k_min is `steps` if no k will do.
         conventions: gamma, steps, tie tolerance, slack of comparisons.
     """
 
@@ -525,7 +526,7 @@ def stationary_effective_horizon(
         m_k = max over states met of max(1, ceil(16 max_a var^k / gap_k^2 ln(2 T A^k))),  H = min_k k + log_A m_k
 
     As `effective_horizon`, but for values that do not depend on the step: in place of T steps there are states, and T,
-    the time limit, only counts the decisions. Where an MDP ends by itself within T steps, each state at one depth, both
+    the time limit, only counts the decisions. If an MDP ends by itself within T steps, each state at one depth, both
     are the same for gamma = 1.
 
     Args:
@@ -533,7 +534,7 @@ def stationary_effective_horizon(
         steps: T; None: the MDP's horizon, else ceil(1 / (1 - gamma)).
         tie_tolerance: an action is optimal if its value is within it of the best; None: 2.5 times the largest error of
             the values, at least 1e-9.
-        tolerance: largest error of the values; a larger one is used where floats cannot reach it.
+        tolerance: largest error of the values; a larger one is used if floats cannot reach it.
         progress: called with a line on the progress.
     Raises:
         UndefinedMeasure: gamma is 1.

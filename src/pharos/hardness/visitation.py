@@ -1,13 +1,14 @@
 """Visits of policies and the time that they take: occupancy, exploration, covering, mixing.
 
 Occupancy measures: how often a policy is in a state and takes an action. Source: Puterman (1994), section 6.9. Measures
-of representations weigh states by `standard_occupancy`: half the visits of uniform play, half those of optimal play.
+of representations weigh states by `standard_occupancy`: half the visits of uniform play, half the visits of optimal
+play.
 
 Exploration time: how long uniform play takes to find a large reward, the cost of exploration without any learning.
 Covering: how long random play takes to see everything. Source: Laidlaw, Russell and Dragan (2023), appendix. The bound
 on the covering length: Even-Dar and Mansour (2003).
 
-Mixing time: how many steps until a policy has forgotten where it began. The distribution mismatch coefficient: how much
+Mixing time: how many steps until a policy has forgotten its start. The distribution mismatch coefficient: how much
 rarer an exploring policy visits the states of the optimal policy.
 """
 
@@ -17,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy  # whose `sparse` is loaded where it is used
+import scipy  # whose `sparse` is loaded on first use
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.gaps import optimal_solution
@@ -54,7 +55,7 @@ class Occupancy:
         largest: (S, A) float64, the maximum over t of mu_t(s, a), without discount.
         steps: t that were gone through.
         error_bound: the entries of `visits` lack no more than this together; 0 with a horizon.
-        by_step: (T, S, A), mu_t(s, a), where all were asked for; else None.
+        by_step: (T, S, A), mu_t(s, a), if all were asked for; else None.
         conventions: gamma, horizon, and whether actions are chosen or executed ones.
     """
 
@@ -107,7 +108,7 @@ def occupancy(
     Args:
         policy: as for `evaluate_policy`: (S,) actions, (S, A) probabilities, under sticky actions also one for each
             previous action; None: uniform.
-        horizon: T, steps t = 0, ..., T - 1; None: that of the MDP; where it has none, until what is left is within
+        horizon: T, steps t = 0, ..., T - 1; None: the MDP's; if it has none, until what is left is within
             `tolerance`.
         executed: whether a_t is the action that is executed, after chance; otherwise the one that the policy chooses.
         keep_all: whether to keep mu_t for all t, with a horizon.
@@ -167,7 +168,7 @@ def discounted_visits(
     Args:
         policy, tolerance: as for `occupancy`.
     Returns:
-        (S,) float64, and the bound; it is above `tolerance` only where all that is left has less than 1e-280 in each
+        (S,) float64, and the bound; it is above `tolerance` only if all that is left has less than 1e-280 in each
         state.
     Raises:
         UndefinedMeasure: gamma is 1. ParameterError: the policy is wrong.
@@ -189,7 +190,7 @@ def discounted_arrivals(
     """Return the visits of states without a horizon, in terminal states and the end by arrival; and what they may lack
     together.
 
-        d(s) = sum over t of gamma^t P(s_t = s), times 1 - gamma where s is terminal or the end, which is never left
+        d(s) = sum over t of gamma^t P(s_t = s), times 1 - gamma if s is terminal or the end, which is never left
 
     Args, cost, errors: as for `discounted_visits`.
     Returns:
@@ -255,7 +256,7 @@ class Propagation:
     def after_the_start(self) -> tuple[np.ndarray, np.ndarray]:
         """((S,), (S, W)): under sticky actions the mass of the start, and that one step later; else 0, and the start.
 
-        The second is the first mass that moves by the rules of later steps. Without states where play ends.
+        The second is the first mass that moves by the rules of later steps. Without states in which play ends.
         """
         start = next(self.distributions())[0]
         started, now = np.zeros(len(start)), np.zeros((len(start), self.width))
@@ -269,7 +270,7 @@ class Propagation:
 
     def executed(self, started: np.ndarray, visits: np.ndarray) -> np.ndarray:
         """(S, A): the mass that executes each action: of started (S,) by the rules of the first step, of visits (S, W)
-        by those of later ones."""
+        by the rules of later steps."""
         later = self.later.chance.executed(visits, self.later.policy)
         return later + self.first.chance.executed(started[:, None], self.first.policy)
 
@@ -373,7 +374,7 @@ class ExplorationTime:
     """Expected time until uniform play finds a large reward.
 
     Attributes:
-        steps: expected, episodes after episodes; infinite where it never does.
+        steps: expected, episodes after episodes; infinite if it never does.
         episodes: expected, the one in which it happens included: 1 / probability.
         probability: that an episode has one.
         threshold: a reward above it is large.
@@ -405,7 +406,7 @@ def exploration_time(
     rewards are costs alone, above the middle between the smallest and the largest.
 
     Args:
-        horizon: steps of an episode; None: that of the MDP.
+        horizon: steps of an episode; None: the MDP's.
         progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: there are no episodes, or all rewards are costs of one size.
@@ -482,13 +483,13 @@ def covering(
     """Return how rarely random play meets the rarest state and action.
 
         mu_t(s, a) = P(s_t = s, a_t = a) for uniform play from the start;  L <= ln(2 S A) / min over s, a of max over t
-        of mu_t(s, a); where actions are not available everywhere, S A is the number of pairs that there are
+        of mu_t(s, a); if actions are not available everywhere, S A is the number of pairs that there are
 
     Pairs run over the states that can be met within T steps and are not terminal; under sticky actions over pairs
     (state, previously executed action), and a start without one.
 
     Args:
-        horizon: T; None: that of the MDP.
+        horizon: T; None: the MDP's.
         progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: there is no horizon.
@@ -537,11 +538,11 @@ ROUNDING = 1e-12  # of a distance, that a tie with epsilon is one
 
 @dataclass(frozen=True)
 class MixingTime:
-    """Mixing time of a policy: steps until it has forgotten where it began.
+    """Mixing time of a policy: steps until it has forgotten its start.
 
     Attributes:
-        value: t_mix in steps; infinite where the chain does not converge.
-        period: of the recurrent class; 0 where there are several.
+        value: t_mix in steps; infinite if the chain does not converge.
+        period: of the recurrent class; 0 if there are several.
         distance: the total variation distance at t_mix.
         conventions: epsilon, restart, policy, nodes.
     """
@@ -583,7 +584,7 @@ def mixing_time(
         lazy: of the chain (I + P) / 2, which has no period.
         progress: called with a line now and then; an exception of its own ends the computation.
     Returns:
-        A MixingTime; infinite where the chain has a period, or several recurrent classes.
+        A MixingTime; infinite if the chain has a period, or several recurrent classes.
     Raises:
         UndefinedMeasure: there are more than 4096 nodes (states, under sticky actions pairs with the previous action).
         ParameterError: an option or the policy is wrong.
@@ -642,7 +643,7 @@ def _too_many(nodes: int) -> str:
 
 
 def _period(chain: "csr_matrix") -> int:
-    """The period of the recurrent class; 0 where there are several."""
+    """The period of the recurrent class; 0 if there are several."""
     count, labels = scipy.sparse.csgraph.connected_components(chain, directed=True, connection="strong")
     rows, columns = chain.nonzero()
     leaves = np.zeros(count, np.bool_)
@@ -704,8 +705,8 @@ def distribution_mismatch(
 
         max over s with d*(s) > 0 of d*(s) / d(s),   d(s) = sum over t of gamma^t P(s_t = s),   t = 0, 1, ...
 
-    over all states, terminal ones and the implicit end of an episode among them, which are never left. d* is that of
-    the optimal policy that takes the first of the best actions everywhere, d that of `policy`, both from the start. The
+    over all states, terminal ones and the implicit end of an episode among them, which are never left. d* belongs to
+    the optimal policy that takes the first of the best actions everywhere, d to `policy`, both from the start. The
     result is at least 1.
 
     Args:
@@ -714,7 +715,7 @@ def distribution_mismatch(
         tolerance: of the sums of d and of d*.
         progress: called with a line now and then; an exception of its own ends the computation.
     Returns:
-        An interval: it is wide where d(s) is not much larger than `tolerance`, and infinite at the upper end where it
+        An interval: it is wide if d(s) is not much larger than `tolerance`, and infinite at the upper end if it
         is smaller.
     Raises:
         UndefinedMeasure: gamma is 1, or there is a horizon: the optimal policy then depends on the step.
