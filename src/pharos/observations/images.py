@@ -1,6 +1,6 @@
 """Simple images, one small plane for each kind of thing, and complex images, sprites on a ground like an Atari screen.
 
-Both come from the rules' `draw`, compiled where possible, over blocks of states; `render` gives them beside the
+Both come from the rules' `draw`, compiled if possible, over blocks of states; `render` gives them beside the
 pictures for people. Several frames in one image: the last k pictures of an episode, as agents of Atari games see them.
 
 Source: Mnih et al. (2015), "Human-level control through deep reinforcement learning", methods.
@@ -39,12 +39,12 @@ def num_values(layer: Layer) -> int:
 
 
 class Drawing:
-    """Runs a drawing kernel of the rules on batches of states; a twin in Python where Numba cannot compile it.
+    """Runs a drawing kernel of the rules on batches of states; a twin in Python if Numba cannot compile it.
 
     Attributes:
         env: the environment; rows, columns: of its grid. `block` frames are worth a thread's while.
-        motion: whether the planes of `draw_motion` follow those of `draw`; not where the class defines none.
-        layers: those of all planes.
+        motion: whether the planes of `draw_motion` follow those of `draw`; not if the class defines none.
+        layers: of all planes.
     Raises:
         ParameterError: the environment declares no grid, no layers or no draw(), or motion is no truth.
     """
@@ -116,8 +116,8 @@ MOST = 16
 class Frames(Observation):
     """An image of one state, or of the last k states of an episode, the oldest first, along the channels.
 
-    At the start of an episode the first frame stands k times. As a function of one state it is what an agent sees where
-    an episode starts in that state; elsewhere it depends on the k - 1 states before, see `of_histories`.
+    At the start of an episode the first frame stands k times. As a function of one state it is what an agent sees if
+    an episode starts in that state; otherwise it depends on the k - 1 states before, see `of_histories`.
 
     Attributes:
         frames: k.
@@ -125,7 +125,7 @@ class Frames(Observation):
     """
 
     def _stack(self, frames: object, channels: int) -> None:
-        """Set `space` to k stacked frames, where it was the space of one; `channels` is the axis of its channels.
+        """Set `space` to k stacked frames, if it was the space of one; `channels` is the axis of its channels.
 
         Raises:
             ParameterError: k is no integer from 1 to MOST.
@@ -157,20 +157,20 @@ DARKEST = 128  # of the shades of things on a plane of their own
 
 
 class SimpleImage(Frames):
-    """One plane for each layer of the environment, channel first: (L, rows k, columns k) uint8, 0 where nothing is.
+    """One plane for each layer of the environment, channel first: (L, rows k, columns k) uint8, 0 if a cell is empty.
 
     A layer with one kind of thing shows it as 255; one with several (such as cars of several colours) in even shades
-    from 255 down to 128. Shows where things are, not where they go: directions and timers that `draw` leaves out cannot
-    be seen without `motion`.
+    from 255 down to 128. Shows the positions of things, not their motion: directions and timers that `draw` leaves out
+    cannot be seen without `motion`.
 
     Args:
         motion: planes for the M motion layers follow, such as the cell that a ball comes from: with them no two states
-            of the classes of pharos look alike. Where a class declares none, `draw` shows all that there is.
+            of the classes of pharos look alike. If a class declares none, `draw` shows all that there is.
         frames: k, the last k pictures of the episode, the oldest first: (k L, rows, columns). See `Frames`.
         hide: names of layers that the agent does not see: their planes stay, and are always 0.
         grey: one plane (1, rows k, columns k) for all things, each in a shade of its own, later layers over earlier
             ones.
-        scale: k, pixels on each side of a cell. None: 1, or more where there are more planes than rows or columns,
+        scale: k, pixels on each side of a cell. None: 1, or more if there are more planes than rows or columns,
             because Stable-Baselines3 takes the smallest dimension for the channels.
     Attributes:
         shades: (L, 256) uint8, the shade of every value on the plane of every layer.
@@ -342,7 +342,7 @@ def _natural_size(scenery: Scenery, rows: int, columns: int) -> tuple[int, int]:
 
 
 def _edges(before: int, cell: int, number: int, natural: int, size: int) -> np.ndarray:
-    """(number + 1,) where each cell begins, in pixels of the picture."""
+    """(number + 1,) the beginning of each cell, in pixels of the picture."""
     return np.rint((before + cell * np.arange(number + 1)) * size / natural).astype(np.int64)
 
 

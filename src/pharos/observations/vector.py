@@ -162,7 +162,7 @@ class Number(Observation):
     Toy text has the numbers of Gymnasium: row x columns + column in frozen_lake and cliff_walking; ((row x size +
     column) x (L + 1) + passenger) x L + destination in taxi with L landmarks, 500 numbers on 5 x 5 cells, which do not
     say whether a fickle passenger may still change his mind. An imported world has the number in its folder, which is
-    that of the table, matrix or file; 0 for the end of an episode.
+    the number in the table, matrix or file; 0 for the end of an episode.
 
     Raises:
         ParameterError: the source does not number its states.
@@ -242,10 +242,10 @@ class Mixed(Observation):
     """`one_hot` with a share of the states given random words instead: (sum of the sizes of the ranges,) float32.
 
     One-hot codes of neighbours are alike, words are not, so the share says how much of a representation is lost while
-    the size of the input and the length of every code, sqrt(D) for D components, stay. A state is in the share where a
+    the size of the input and the length of every code, sqrt(D) for D components, stay. A state is in the share if a
     random number of its own in [0, 1) is below it: a larger share has the same states, and more. A word has L entries
-    of +-sqrt(D / L), the signs being those of `hash` with L bits and the same seed. Complete: words differ from each
-    other, and a one-hot code has entries that no word has.
+    of +-sqrt(D / L), the signs being the signs of `hash` with L bits and the same seed. Complete: words differ from
+    each other, and a one-hot code has entries that no word has.
 
     Args:
         share: of the states, from 0 (one_hot) to 1 (words only).
