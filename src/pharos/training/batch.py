@@ -61,7 +61,7 @@ def train_group(
 
     Args:
         runs: none of which was trained before, each with its place.
-        checkpoints: folder for those of programs; None: none are written.
+        checkpoints: folder for checkpoints of programs; None: none are written.
         tell: called with each evaluation and each end.
         lane: the most runs in a program; None: all that fit together.
         is_single: whether the run is the only one of its call.
@@ -99,7 +99,7 @@ def train_group(
 
 
 def _refuse(run: PreparedRun, error: Exception, tell: Tell, raises: bool) -> None:
-    """Raise the error of a run that could not begin where `raises` is set, else write it down and tell it."""
+    """Raise the error of a run that could not begin if `raises` is set, else write it down and tell it."""
     if raises:
         raise error
     if run.folder is not None and not (run.folder / _results.RECORD).exists():
@@ -138,7 +138,7 @@ def _stored_programs(
         try:
             for run in program:
                 run.prepare()
-        except Exception:  # what is wrong with a run is said later, where it fails alone
+        except Exception:  # what is wrong with a run is said later, when it fails alone
             continue
         for config in configs:
             if config.id in by_id:
@@ -159,8 +159,8 @@ def _is_foreign(config: RunConfig, runs: Sequence[PreparedRun]) -> bool:
 class Program:
     """Runs under one loop: trained, evaluated, resumed, and brought into their folders; arguments as `train_group`."""
 
-    learner: Learner  # from when the runs begin; gone where they failed
-    evaluators: Evaluators | None = None  # where policies are evaluated apart
+    learner: Learner  # from when the runs begin; gone if they failed
+    evaluators: Evaluators | None = None  # if policies are evaluated apart
     pending: Counts | None = None  # of the policies that are evaluated apart
 
     def __init__(
@@ -169,7 +169,7 @@ class Program:
         self.runs, self.config, self.is_alone = runs, runs[0].config, runs[0].is_alone
         self.checkpoints, self.tell, self.raises, self.tensorboard = checkpoints, tell, raises, tensorboard
         self.has_begun = self.holds = False  # whether runs are marked as running; whether checkpoints are this batch's
-        self.held = contextlib.ExitStack()  # the folder of checkpoints, or that of a run alone
+        self.held = contextlib.ExitStack()  # the folder of checkpoints, or the folder of a run alone
 
     def train(self) -> None:
         """Train the runs, and tell what becomes of them."""
@@ -226,7 +226,7 @@ class Program:
 
     @property
     def _folder(self) -> Path | None:
-        """The folder for checkpoints of a batch; None for a run alone, or where none are written."""
+        """The folder for checkpoints of a batch; None for a run alone, or if none are written."""
         if self.is_alone or self.checkpoints is None:
             return None
         return self.checkpoints / digest_of_json([run.id for run in self.runs])[:16]
@@ -238,7 +238,7 @@ class Program:
             return False
         folder.mkdir(parents=True, exist_ok=True)
         self.held.enter_context(lock(folder, FolderLocked, "training"))
-        remove_leftovers(folder / "regret.png")  # of a killed process; those of other files go with the next one
+        remove_leftovers(folder / "regret.png")  # of a killed process; leftovers of other files go with the next one
         done = finished_result(folder, self.config)
         if done is not None:
             clear_run(folder)
@@ -279,7 +279,7 @@ class Program:
         steps, interval = self.config.steps, self.config.evaluation_interval
         if not any(run.curve.rows for run in self.runs):
             self._evaluate(0)
-        # Steps of the evaluations to come, after those of a checkpoint
+        # Steps of the evaluations to come, after the steps of a checkpoint
         start = max((run.curve.rows[-1]["step"] for run in self.runs if run.curve.rows), default=0)
         points = [point for point in [*range(interval, steps, interval), steps] if point > start]
 
@@ -358,7 +358,7 @@ class Program:
         return rows
 
     def _publish(self, seconds: float, compiled: float) -> None:
-        """Write and keep the result of each run; its seconds are its share of those of the batch."""
+        """Write and keep the result of each run; its seconds are its share of the seconds of the batch."""
         size = {"runs": len(self.runs), "seconds": seconds, "device": self.runs[0].tasks.device}
         share = seconds - compiled if self.is_alone else seconds / len(self.runs)
         entries: dict[str, Any] = {"compiling_seconds": compiled} if self.is_alone else {"batch": size}

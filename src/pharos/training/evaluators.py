@@ -43,7 +43,7 @@ class NetworkLearner(Learner, Protocol):
 def evaluates_apart(device: str, runs: Sequence[PreparedRun]) -> bool:
     """Whether the policies of runs that learn joint are evaluated in processes of their own.
 
-    Never where these would have to import the user's script, which may have no guard.
+    Never if these would have to import the user's script, which may have no guard.
     """
     return device != "cpu" and len(runs) >= FEWEST and not is_in_main(*runs[0].config.definitions)
 

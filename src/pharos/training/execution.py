@@ -1,7 +1,7 @@
 """Execution: the one loop behind `train`, `train_many`, `tune`, studies and the benchmark.
 
 Groups of runs wait until a process is free, are trained there (or in this process), and end. A group is halved here
-alone: where its program failed for several runs, as for want of memory, or where its process was killed too often. A
+alone: if its program failed for several runs, as for want of memory, or if its process was killed too often. A
 run does not depend on who else is in its group, so nothing does on how groups are made, halved and begun again.
 """
 
@@ -48,13 +48,13 @@ Work = tuple[Callable[..., Any], Sequence[Any], Sequence[object]]
 
 
 class Execution(Generic[R]):
-    """Groups of runs that wait, are trained, and end; a subclass says what a run is, and where its result lies.
+    """Groups of runs that wait, are trained, and end; a subclass says what a run is, and which folder its result is in.
 
     Args:
         groups: runs that one process trains.
         pool: of processes; None: they are trained in this one.
         workers: most processes at a time.
-        checkpoints: folder for those of programs of several runs; None: none are written.
+        checkpoints: folder for checkpoints of programs of several runs; None: none are written.
         timeout: seconds for each run, after which it has failed.
         attempts: ATTEMPTS; 1 for a pool that begins again itself.
     Attributes:
@@ -129,7 +129,7 @@ class Execution(Generic[R]):
         """Let the halves of runs that cannot be trained together begin anew, before all others.
 
         Args:
-            key: of the process that has, or had, them. reason: told once; empty where each run will say it.
+            key: of the process that has, or had, them. reason: told once; empty if each run will say it.
         """
         if key in self.running:
             group, leaving = self.running[key][0], {id(run) for run in runs}
@@ -290,18 +290,18 @@ def train_configs(
     workers: int = 1,
     seconds: Sequence[float] | None = None,
 ) -> list[TrainingResult | FailedRun]:
-    """Train a run for each configuration; those of the batched engine that fit together train as one program.
+    """Train a run for each configuration; runs of the batched engine that fit together train as one program.
 
     Args:
         folders: of the runs, one for each; None: nothing is written. Finished runs there are returned.
-        checkpoints: folder for those of whole batches; None: none are written. A batch that was killed goes on from
-            there with the runs that it had.
+        checkpoints: folder for checkpoints of whole batches; None: none are written. A batch that was killed goes on
+            from there with the runs that it had.
         progress: called after each evaluation; what it raises ends the training and is raised here.
-        tasks: makes tasks, with values that are known already, and code of the user's own where it is trusted; None:
+        tasks: makes tasks, with values that are known already, and code of the user's own if it is trusted; None:
             from scratch, trusting none.
-        device: "cpu" or "cuda"; None: that of the tasks, and "cpu" where there are none.
+        device: "cpu" or "cuda"; None: the tasks' device, and "cpu" if there are none.
         lane: the most runs in a batch; None: all that fit together. Changes no result.
-        workers: processes that share the runs, lane by lane, where there are folders; what they learn is in these
+        workers: processes that share the runs, lane by lane, if there are folders; what they learn is in these
             alone. They trust the code that the configurations name. Changes no result.
         seconds: that each run takes, in any unit, by which they are shared out; None: all take as long.
     Returns:

@@ -4,7 +4,7 @@
         ...
         return apply, snapshots
 
-`env, params` are those of `pharos.to_gymnax`, `key` is that of the seed, and `steps` an integer that is known when it
+`env, params` come from `pharos.to_gymnax`, `key` from the seed, and `steps` is an integer that is known when it
 is compiled. `snapshots` are parameters: a tree of arrays whose first axis has K entries, after steps / K, 2 steps / K,
 ..., `steps` steps. `apply(parameters, observations)` gives (N, A) probabilities or (N,) actions. Observations of all
 states are one batch, so that a policy is one forward pass.
@@ -37,7 +37,7 @@ def compiled_curves(
     """Train with a function of JAX for each seed, and evaluate the policy in force at each evaluation point.
 
     Returns:
-        A curve for each seed: a row before the first step, that of uniform play, and one for each point. There are no
+        A curve for each seed: a row before the first step, for uniform play, and one for each point. There are no
         episodes in it.
     Raises:
         MissingExtra: JAX or gymnax is not installed.
