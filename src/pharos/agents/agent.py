@@ -75,7 +75,7 @@ class LearningRun(Protocol):
         config: its `pharos.training.RunConfig`.
         task: its task, which is made when it is first used.
         algorithm: name of the agent, or a class or function of the user's own.
-        hyperparameters: all that are known, those of the configuration first.
+        hyperparameters: all that are known, the configuration's first.
         world_mdp: states and rewards without chance and horizon.
     """
 

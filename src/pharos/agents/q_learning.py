@@ -30,7 +30,7 @@ class QLearning:
 
         Q(s, a) += alpha (r + gamma max_b Q(s', b) - Q(s, a))
 
-    There is no next value where the episode ended in a terminal state.
+    There is no next value if the episode ended in a terminal state.
 
     An episode that the time limit cuts off is not an end of that kind: the next value is used. Under chance the update
     belongs to the chosen action, as the agent does not know which one was executed.
@@ -134,7 +134,7 @@ class QLearning:
     def policy_table(self) -> np.ndarray:
         """The greedy policy: (S,) actions, the first among equals.
 
-        (S, A + 1, A) probabilities where previous actions are seen.
+        (S, A + 1, A) probabilities if previous actions are seen.
 
         In the second form [s, b] is the policy after executing b, b = A standing for no previous action.
         """

@@ -102,7 +102,7 @@ def make_batch(agent: str, runs: Sequence[BatchRun], *, device: str = "cpu", thr
     """A batch of runs of one group.
 
     Args:
-        device: of torch, where networks are; episodes and replay memories stay on the processor.
+        device: of torch, for the networks; episodes and replay memories stay on the processor.
         threads: of torch; None for one, as studies use processes.
     Raises:
         ParameterError: the engine lacks a hyperparameter, or the runs are of several groups.

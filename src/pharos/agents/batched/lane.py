@@ -1,6 +1,6 @@
 """A lane: a fixed number of runs that advance together; the common part of DQN and PPO.
 
-Observations of W runs are tensors: gathered from one table where it fits, else drawn for those who ask.
+Observations of W runs are tensors: gathered from one table if it fits, else drawn for those who ask.
 
 The episodes of W runs: each walks the table of its own MDP; runs of one MDP are advanced by one compiled call.
 """
@@ -62,7 +62,7 @@ class NetworkView:
 class ObservationTable:
     """Observations of runs whose observations have the same shape.
 
-    Images are kept as bytes. Where they do not fit, minibatches are drawn: 0.3 us an image of a small Breakout. Where
+    Images are kept as bytes. If they do not fit, minibatches are drawn: 0.3 us an image of a small Breakout. If
     several frames are seen single ones are kept, and put together for those who ask.
 
     Attributes:
@@ -103,7 +103,7 @@ class ObservationTable:
     def at(self, states: PinnedBuffer, out: torch.Tensor) -> torch.Tensor:
         """Write the observations of states (W, B) into out (W, B, size) float32; images from 0 to 255.
 
-        Where k frames are seen states are (W, B, k), the last ones of the episode, the oldest first.
+        If k frames are seen states are (W, B, k), the last ones of the episode, the oldest first.
         """
         target = flat_view(out).numpy()
         if self._table is not None:
@@ -202,7 +202,7 @@ class ActionSets:
 
     @staticmethod
     def of(runs: Sequence[BatchRun], device: str) -> "ActionSets | None":
-        """The sets of runs; None where all actions are available to all of them."""
+        """The sets of runs; None if all actions are available to all of them."""
         return None if all(run.mdp.available is None for run in runs) else ActionSets(runs, device)
 
     def of_states(self, states: torch.Tensor) -> torch.Tensor:
@@ -235,7 +235,7 @@ class Lane(Generic[Net]):
         shared: hyperparameters of all of them; own: name -> (W,) those that are numbers.
         steps: of each run so far; calls: of all copies together; collected: calls of the rollout that goes on.
         total: steps of the whole training.
-        depth: (k,) where k frames are seen, so that what is seen is k numbers of states; else ().
+        depth: (k,) if k frames are seen, so that what is seen is k numbers of states; else ().
         is_due: whether an update waits.
     """
 
@@ -379,7 +379,7 @@ class Lane(Generic[Net]):
         self.arithmetic.adam((self.parameters, self.gradients, self.means, self.squares))
 
     def _initial(self) -> np.ndarray:
-        """(W, P) initial parameters; each run draws those of its own network."""
+        """(W, P) initial parameters; each run draws the parameters of its own network."""
         if all(network is self.network for network in self._own_networks):
             return self.network.initial(partial(self._draws, self.keys))
         rows = np.zeros((self.width, self.network.parameters.length), np.float32)
@@ -400,7 +400,7 @@ class Lane(Generic[Net]):
     # Training state -------------------------------------------------------------------------------------------------
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Arrays of the training state by name; those of more than one number are changed in place."""
+        """Arrays of the training state by name; arrays of more than one number are changed in place."""
         tensors = {name: getattr(self, name).cpu().numpy() for name in self.tensors}
         counters = np.array([self.steps, self.calls, self.collected, self.is_due], np.int64)
         return {**tensors, "updates": self.updates, "counters": counters, **self.worlds.arrays(), **self.own_arrays()}
@@ -486,8 +486,8 @@ class BatchedEpisodes:
     """The running episodes of W runs with E copies of their environment each.
 
     Attributes:
-        state: (W, E) int64, where each is.
-        depth: () where an agent sees the state alone, (k,) where it sees the last k states of the episode.
+        state: (W, E) int64, the state of each copy.
+        depth: () if an agent sees the state alone, (k,) if it sees the last k states of the episode.
         history: (W, E, k), those states, the oldest first; the first one of an episode stands for those before it.
         episodes, returns: (W,) finished episodes, and the sums of their returns.
         next_state, reward, flags: (W, E) of the last step; the reward is what was paid, late or with noise.
@@ -543,7 +543,7 @@ class BatchedEpisodes:
         return self.next_history if self.depth else self.next_state
 
     def step(self, step: int, actions: np.ndarray, *, counts: bool) -> None:
-        """Execute actions (W, E); finished episodes are added up where `counts` is true."""
+        """Execute actions (W, E); finished episodes are added up if `counts` is true."""
         chances = self._chances
         if self._sets is not None:
             choices, actions, chances = actions, np.empty_like(actions), self._none

@@ -39,7 +39,7 @@ class Shape:
     Attributes:
         name: in Stable-Baselines3.
         shape: of one run's, here.
-        offset: where it begins in a row of parameters.
+        offset: at which it begins in a row of parameters.
         fan_in: of the layer.
         stored: (shape) -> the array as Stable-Baselines3 has it.
         own: the array as Stable-Baselines3 has it -> as it is kept here.
@@ -147,7 +147,7 @@ class LinearLayer(NetworkLayer):
     """y = activation(x w + b).
 
     Args:
-        pixels: where the inputs are `pixels` places of a picture with all channels each; Stable-Baselines3 has the
+        pixels: if the inputs are `pixels` places of a picture with all channels each; Stable-Baselines3 has the
             channels outside.
     """
 
@@ -171,7 +171,7 @@ class LinearLayer(NetworkLayer):
         """The outputs."""
         y, _ = self._buffers(x)
         if x.shape[1] == 1 and x.device.type == "cpu" and self.activation != TANH:
-            # to act once is to read all weights; those of inputs that a ReLU made 0 need not be
+            # to act once is to read all weights; weights of inputs that a ReLU made 0 need not be
             rows = values[ROWS].numpy()
             weight, bias = self._offsets
             linear_row(rows, weight, bias, x[:, 0].numpy(), self.activation == RELU, y[:, 0].numpy())
@@ -193,8 +193,8 @@ class PatchConvolutionLayer(NetworkLayer):
     """A convolution of 3 x 3 with padding as one product: x holds the 9 C neighbours of each pixel, from 0 to 255.
 
     They come out of a table, so that nothing is unfolded here; 1 / 255 is a factor of the weights. y is (W, B, pixels
-    x filters). Runs whose pictures are smaller than those of others in their lane have a mask (W, pixels) among the
-    values, which keeps what is no pixel of theirs at 0.
+    x filters). Runs whose pictures are smaller than the pictures of others in their lane have a mask (W, pixels) among
+    the values, which keeps what is no pixel of theirs at 0.
     """
 
     def __init__(self, parameters: Parameters, name: str, shape: tuple[int, ...], filters: int):
@@ -315,7 +315,7 @@ class ConvolutionLayer(NetworkLayer):
 class PictureLayers(NetworkLayer):
     """The small convolution and the linear layer after it, on the processor: each different patch once.
 
-    x (W, B, C pixels), from 0 to 255. The parameters are those of the two layers; see kernels/patches.py.
+    x (W, B, C pixels), from 0 to 255. The parameters belong to the two layers; see kernels/patches.py.
     """
 
     def __init__(self, parameters: Parameters, name: str, shape: tuple[int, ...]):
@@ -556,7 +556,7 @@ class ActorCritics:
 
 
 def orthogonal(drawn: np.ndarray) -> np.ndarray:
-    """Orthonormal rows, or columns where there are more rows, from a matrix of normal numbers."""
+    """Orthonormal rows, or columns if there are more rows, from a matrix of normal numbers."""
     turned = len(drawn) < drawn.shape[1]
     q, r = np.linalg.qr(drawn.T if turned else drawn)
     q = q * np.sign(np.diag(r))

@@ -19,7 +19,7 @@ class PPOLane(Lane[ActorCritics]):
 
     Attributes:
         states, next_states (W, T, E, *depth), actions_taken (W, T, E) int64, log_probabilities, kept_values, rewards,
-            begins, advantages (W, T, E) float32: the rollout that goes on; begins is 1 where a step is the first of its
+            begins, advantages (W, T, E) float32: the rollout that goes on; begins is 1 if a step is the first of its
             episode.
         timeouts: (W, T, E) bool, whether a step was cut off by the time limit.
         begin: (W, E) float32, whether the next step is the first of its episode.
@@ -106,11 +106,11 @@ class PPOLane(Lane[ActorCritics]):
                     return
 
     def add_values_of_cut_episodes(self) -> None:
-        """rewards += gamma V(s') where the time limit cut an episode off, a block of E steps of each run at a time."""
+        """Add gamma V(s') to rewards of steps at which the time limit cut an episode off, E steps a run at once."""
         runs, places = np.nonzero(self.timeouts.reshape(self.width, -1))
         if not len(runs):
             return
-        rank = np.arange(len(runs)) - np.searchsorted(runs, runs)  # of each among those of its run
+        rank = np.arange(len(runs)) - np.searchsorted(runs, runs)  # of each in its run
         rewards, next_values = (
             part.reshape(self.width, -1, *part.shape[3:]) for part in (self.rewards, self.next_states)
         )
