@@ -137,8 +137,8 @@ def effective_horizon(
     check_returns("effective_horizon", mdp, steps)
     mdp = mdp_within(mdp, steps)
     compiled = applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > COMPILED
-    tell = progress or str
-    parts = parts_of(LargeHorizon(mdp, steps, TIE, tell) if compiled else NodeHorizon.of_steps(mdp, steps, tell))
+    report = progress or str
+    parts = parts_of(LargeHorizon(mdp, steps, TIE, report) if compiled else NodeHorizon.of_steps(mdp, steps, report))
     bound = gorp_bound(mdp, horizon=steps, max_k=tight, progress=progress).value if tight else None
     conventions = {
         "horizon": steps,
@@ -153,7 +153,7 @@ def effective_horizon(
 def parts_of(values: "NodeHorizon | LargeHorizon") -> dict[str, Any]:
     """Fields of an `EffectiveHorizon`, but for `tight` and `conventions`."""
     assert values.steps is not None
-    ahead, greedy = look_ahead(values, values.steps, values.most_actions, values.greedy_return, values.tell)
+    ahead, greedy = look_ahead(values, values.steps, values.most_actions, values.greedy_return, values.report)
     returns = dict(zip(("optimal_return", "random_return", "worst_return"), values.returns, strict=True))
     return {**vars(ahead), **returns, "greedy_returns": greedy, "num_states": values.num_visitable}
 
@@ -179,7 +179,7 @@ def look_ahead(
     steps: int,
     num_actions: int,
     greedy_return: Callable[[], float] | None = None,
-    tell: Callable[[str], object] = str,
+    report: Callable[[str], object] = str,
 ) -> tuple[LookAhead, list[float]]:
     """(LookAhead of episodes of `steps` steps, `greedy_return` for k = 1, ..., 5, if it is given)."""
     best, log_actions = float(steps), math.log(num_actions)
@@ -189,7 +189,7 @@ def look_ahead(
     k_min, k = 0, 1
     # Q^1 of uniform play, Q^2, ...: the smallest k + log_A m_k, and the smallest k that acts optimally.
     while k < best or k <= last or not k_min:
-        tell(f"k = {k}, bound {best:.4g}")
+        report(f"k = {k}, bound {best:.4g}")
         if k < best and (needed := values.samples(math.log(2 * steps) + k * log_actions)) is not None:
             rows.append((k, *needed))
             best = min(best, k + (math.log(needed[0]) / log_actions if num_actions > 1 else 0.0))
@@ -203,7 +203,7 @@ def look_ahead(
     values.restart_from_rewards()
     window = 1
     while window < steps and not values.is_greedy_optimal():
-        tell(f"window {window}")
+        report(f"window {window}")
         values.advance(spread=False)
         window += 1
     ks, ms, gaps, variances = (list(each) for each in zip(*rows, strict=True)) if rows else ([], [], [], [])
@@ -229,14 +229,14 @@ class NodeHorizon:
         self.choices, self.rewards, self.gamma, self.steps = choices, rewards, gamma, steps
         self.num_nodes, self.starts = len(rewards), np.array(sorted(node for node, _ in choices.starts))
         self.is_large = choices.table is not None and choices.table.size > WRITTEN_OUT
-        self.tell: Callable[[str], object] = str
+        self.report: Callable[[str], object] = str
 
     @staticmethod
-    def of_steps(mdp: TabularMDP, steps: int, tell: Callable[[str], object] = str) -> "NodeHorizon":
+    def of_steps(mdp: TabularMDP, steps: int, report: Callable[[str], object] = str) -> "NodeHorizon":
         """Values of T steps, all of which are written out."""
-        tree = FiniteHorizonValues(mdp, steps, tell)
+        tree = FiniteHorizonValues(mdp, steps, report)
         nodes = NodeHorizon(tree.choices, tree.rewards, steps=steps)
-        nodes.tell, nodes.most_actions, nodes.num_visitable = tell, tree.most_actions, tree.num_visitable
+        nodes.report, nodes.most_actions, nodes.num_visitable = report, tree.most_actions, tree.num_visitable
         values = (tree.best.max(axis=2)[0], tree.explored_value[0], tree.worst.min(axis=2)[0])
         nodes.returns = tuple(map(tree.at_start, values))
         nodes.values = [_ActionValues(nodes, value) for value in nodes._after(tree.explored_value)]
@@ -303,7 +303,7 @@ class NodeHorizon:
     def advance(self, spread: bool = True) -> None:
         best = []
         for t, values in enumerate(self.values):
-            self.tell(f"lookahead of step {t} of {self.steps}")
+            self.report(f"lookahead of step {t} of {self.steps}")
             best.append(values.best)
         self.values = [_ActionValues(self, value) for value in self._after(best)]
         if spread:
@@ -392,10 +392,10 @@ class LargeHorizon:
         optimal: (T, S) bit a is set if a is optimal.
     """
 
-    def __init__(self, mdp: TabularMDP, steps: int, tie: float, tell: Callable[[str], object] = str):
+    def __init__(self, mdp: TabularMDP, steps: int, tie: float, report: Callable[[str], object] = str):
         from pharos.kernels import horizon as kernels
 
-        self.kernels, self.steps, self.most_actions, self.tell = kernels, steps, mdp.num_actions, tell
+        self.kernels, self.steps, self.most_actions, self.report = kernels, steps, mdp.num_actions, report
         states = mdp.num_states
         bits = next(
             kind for kind in (np.uint8, np.uint16, np.uint32, np.uint64) if mdp.num_actions <= 8 * kind(0).itemsize
@@ -420,7 +420,7 @@ class LargeHorizon:
         best, worst = np.zeros((2, states)), np.zeros((2, states))
         for t in range(steps - 1, -1, -1):
             now, after = t % 2, 1 - t % 2
-            tell(f"values of step {t} of {steps}")
+            report(f"values of step {t} of {steps}")
             kernels.values(
                 *(self.next_states, self.rewards, tie, best[after], worst[after], self.ahead[t + 1]),
                 *(best[now], worst[now], self.ahead[t], self.optimal[t], self.spread[t]),
@@ -456,7 +456,7 @@ class LargeHorizon:
         n, most = self._begin(), np.zeros(3)
         now, after = self.nodes
         for t in range(self.steps):
-            self.tell(f"states met at step {t} of {self.steps}")
+            self.report(f"states met at step {t} of {self.steps}")
             n = self.kernels.step_along(
                 *(self.next_states, self.rewards, self.ahead[t + 1], self.optimal[t], self.spread[t], log, near),
                 *(now, n, after, self.is_visited, most),
@@ -472,7 +472,7 @@ class LargeHorizon:
     def advance(self, spread: bool = True) -> None:
         nothing = np.zeros(len(self.next_states))
         for t in range(self.steps):
-            self.tell(f"lookahead of step {t} of {self.steps}")
+            self.report(f"lookahead of step {t} of {self.steps}")
             self.kernels.lookahead(self.next_states, self.rewards, 1.0, self.ahead[t + 1], self.ahead[t])
             if spread:
                 after = self.spread[t + 1] if t + 1 < self.steps else nothing
@@ -552,8 +552,8 @@ def stationary_effective_horizon(
         )
     limit = mdp.horizon or math.ceil(1 / (1 - mdp.gamma)) if steps is None else whole_number(steps, "steps", STEPS)
     endless = mdp if mdp.horizon is None else mdp.with_horizon(None)
-    tell = progress or str
-    nodes, values, error = _nodes_of(endless, solution, tolerance, tell)
+    report = progress or str
+    nodes, values, error = _nodes_of(endless, solution, tolerance, report)
     floor = 2 * error
     tie = max(1e-9, 1.25 * floor) if tie_tolerance is None else float(tie_tolerance)
     if not tie > floor:
@@ -563,7 +563,7 @@ def stationary_effective_horizon(
         )
     slack = max(1e-12, 2 * floor)
     nodes.compare([values], tie, slack)
-    ahead, _ = look_ahead(nodes, limit, most_actions(mdp), tell=tell)
+    ahead, _ = look_ahead(nodes, limit, most_actions(mdp), report=report)
     conventions = {
         "gamma": mdp.gamma,
         "steps": limit,
@@ -576,16 +576,16 @@ def stationary_effective_horizon(
 
 
 def _nodes_of(
-    mdp: TabularMDP, solution: Solution | None, tolerance: float, tell: Callable[[str], object]
+    mdp: TabularMDP, solution: Solution | None, tolerance: float, report: Callable[[str], object]
 ) -> tuple[NodeHorizon, list[np.ndarray], float]:
     """(Lookahead values without time, action values (N, A) of the best, worst and uniform play, their error)."""
     choices = _states_and_the_end(mdp) if mdp.is_deterministic else ExpandedMDP.of(mdp, restart=False).reachable()
     nodes = NodeHorizon(choices, choices.rewards(mdp), mdp.gamma)
 
-    def solution_of(solve: Callable[..., Solution], whose: str) -> Solution:
-        tell(f"values of {whose} play")
+    def solution_of(solve: Callable[..., Solution], play: str) -> Solution:
+        report(f"values of {play} play")
         return solved(
-            solve, mdp, tolerance, progress=lambda sweeps, _: tell(f"sweep {sweeps} of the values of {whose} play")
+            solve, mdp, tolerance, progress=lambda sweeps, _: report(f"sweep {sweeps} of the values of {play} play")
         )
 
     best = solution_of(value_iteration, "optimal") if solution is None else optimal_solution(mdp, solution)

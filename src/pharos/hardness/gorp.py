@@ -240,8 +240,8 @@ def _needs_one_outcome(name: str, mdp: TabularMDP) -> None:
 class GorpSearch:
     """The smallest m, to 1 %, that is proven to make GORP fail with probability 1/2 at most."""
 
-    def __init__(self, mdp: TabularMDP, steps: int, methods: tuple[str, ...], tell: Callable[[str], object] = str):
-        self.tree, self.methods, self.tell = FiniteHorizonValues(mdp, steps, tell), methods, tell
+    def __init__(self, mdp: TabularMDP, steps: int, methods: tuple[str, ...], report: Callable[[str], object] = str):
+        self.tree, self.methods, self.report = FiniteHorizonValues(mdp, steps, report), methods, report
         assert self.tree.table is not None
         self.nodes_at = [self.tree.first]
         for t in range(steps - 1):
@@ -278,7 +278,7 @@ class GorpSearch:
             open_ = np.flatnonzero(f.max(axis=1) > f.min(axis=1))
             for block in np.array_split(open_, max(1, len(open_) * tree.num_actions ** (2 * k) // 10**6)):
                 if len(block):
-                    self.tell(f"k = {k}, m = {m:.4g}, step {t} of {tree.steps}")
+                    self.report(f"k = {k}, m = {m:.4g}, step {t} of {tree.steps}")
                     now[nodes[block]] = self._worst_case(nodes[block], t, f[block], m, k)
             after = now
         return tree.at_start(after)

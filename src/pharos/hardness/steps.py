@@ -61,9 +61,9 @@ class FiniteHorizonValues:
         first: (N,) bool, the start nodes. num_visitable: states (pairs under sticky actions) that can be visited.
     """
 
-    def __init__(self, mdp: TabularMDP, steps: int, tell: Callable[[str], object] = str):
-        """tell: called with a line for each step."""
-        self.tell = tell
+    def __init__(self, mdp: TabularMDP, steps: int, report: Callable[[str], object] = str):
+        """report: called with a line for each step."""
+        self.report = report
         size = (mdp.num_states + 1) * mdp.policy_width
         needed = 40 * steps * size * mdp.num_actions
         if needed > MEMORY:
@@ -85,7 +85,7 @@ class FiniteHorizonValues:
         self.explored_value = np.empty(shape[:2])
         self.best[-1] = self.worst[-1] = self.explored[-1] = self.rewards
         for t in range(steps - 1, -1, -1):
-            tell(f"values of step {t} of {steps}")
+            report(f"values of step {t} of {steps}")
             if t < steps - 1:
                 self.best[t] = self.backup(self.best[t + 1].max(axis=1))
                 self.worst[t] = self.backup(self.worst[t + 1].min(axis=1))

@@ -132,9 +132,9 @@ def occupancy(
     if not tolerance > 0:
         raise ParameterError(f"tolerance is {tolerance!r}; expected a number above 0")
     total, largest = np.zeros(shape), np.zeros(shape)
-    by_step, scale, steps, left, tell = [], 1.0, 0, 0.0, progress or str
+    by_step, scale, steps, left, report = [], 1.0, 0, 0.0, progress or str
     for now, first, alive in walk.distributions():
-        tell(f"visits of step {steps}")
+        report(f"visits of step {steps}")
         if walk.horizon is None:
             left = scale * alive / (1 - mdp.gamma)
             if left <= tolerance:
@@ -185,7 +185,7 @@ def discounted_arrivals(
     policy: TablePolicy | None = None,
     *,
     tolerance: float = 1e-9,
-    tell: Callable[[str], object] = str,
+    report: Callable[[str], object] = str,
 ) -> tuple[np.ndarray, float]:
     """Return the visits of states without a horizon, in terminal states and the end by arrival; and what they may lack
     together.
@@ -197,7 +197,7 @@ def discounted_arrivals(
         (S + 1,) float64, entry S for the end; and the bound.
     """
     walk = Propagation(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
-    started, visits, left = walk.discounted(tolerance, tell)
+    started, visits, left = walk.discounted(tolerance, report)
     executed = walk.executed(started, visits)
     result = np.append(started + visits.sum(axis=1), 0.0)
     over = np.flatnonzero(~walk.live)
@@ -274,7 +274,7 @@ class Propagation:
         later = self.later.chance.executed(visits, self.later.policy)
         return later + self.first.chance.executed(started[:, None], self.first.policy)
 
-    def discounted(self, tolerance: float, tell: Callable[[str], object] = str) -> tuple[np.ndarray, np.ndarray, float]:
+    def discounted(self, tolerance: float, report: Callable[[str], object] = str) -> tuple[np.ndarray, np.ndarray, float]:
         """((S,), (S, W), bound): discounted visits of the first step, under sticky actions alone; of the others; and a
         bound on the visits that are missing."""
         started, waiting = self.after_the_start()
@@ -283,7 +283,7 @@ class Propagation:
         visits, before = np.zeros_like(waiting), math.inf
         while True:
             left = self.mdp.dynamics.accumulate_visits(self.later, gamma, _LEAST, waiting, visits) / (1 - gamma)
-            tell(f"visits are known to {left:.2g}")
+            report(f"visits are known to {left:.2g}")
             if left <= tolerance or left >= before:
                 return started, visits, left
             before = left
@@ -336,23 +336,23 @@ class StandardOccupancy:
 
 
 def standard_occupancy(
-    mdp: TabularMDP, gamma: float, episode: int, tell: Callable[[str], object] = str
+    mdp: TabularMDP, gamma: float, episode: int, report: Callable[[str], object] = str
 ) -> StandardOccupancy:
     """The mean of the undiscounted occupancies of uniform play and of optimal play over episodes of some steps.
 
     Args:
         gamma: the learner's discount, of the values that optimal play follows; its ties are chosen alike.
-        tell: called with a line for each sweep of values and each step of play.
+        report: called with a line for each sweep of values and each step of play.
     """
 
-    def tell_sweep(sweeps: int, _bound: float) -> None:
-        tell(f"sweep {sweeps} of the learner's values")
+    def report_sweep(sweeps: int, _bound: float) -> None:
+        report(f"sweep {sweeps} of the learner's values")
 
-    solution = value_iteration(mdp.with_gamma(gamma).with_horizon(None), progress=tell_sweep)
+    solution = value_iteration(mdp.with_gamma(gamma).with_horizon(None), progress=report_sweep)
     best = solution.optimal_actions(max(1e-8, 4 * solution.error_bound))
     plain, total = mdp.with_gamma(1.0), np.zeros(mdp.num_states)
     for policy in (None, best / best.sum(axis=1, keepdims=True)):
-        visits = occupancy(plain, policy, horizon=episode, progress=tell).states
+        visits = occupancy(plain, policy, horizon=episode, progress=report).states
         total += visits / (2 * visits.sum())
     return StandardOccupancy(total, solution.q)
 
@@ -427,9 +427,9 @@ def exploration_time(
     mass = np.zeros((mdp.num_states, 1))
     np.add.at(mass[:, 0], mdp.start_states, mdp.start_probabilities)
     probability = length = 0.0
-    chance, play, tell = mdp.chance.first, uniform_choice(mdp)[:, None], progress or str
+    chance, play, report = mdp.chance.first, uniform_choice(mdp)[:, None], progress or str
     for t in range(steps):
-        tell(f"step {t} of {steps}")
+        report(f"step {t} of {steps}")
         mass[~live] = 0.0
         total = mass.sum(axis=1, keepdims=True)
         length += float(total.sum())
@@ -507,14 +507,14 @@ def covering(
     return Covering(omega_max, omega_sum, length, states, {"horizon": steps, "exploration": "uniform"})
 
 
-def _occupied(mdp: TabularMDP, steps: int, tell: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray, int]:
+def _occupied(mdp: TabularMDP, steps: int, report: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray, int]:
     """(max over t, sum over t) of the probability of each action in each node that uniform play meets and that is not
     terminal, and the number of these pairs."""
     walk = Propagation(mdp, None, steps)
     largest, total = np.zeros((mdp.num_states, walk.width)), np.zeros((mdp.num_states, walk.width))
     alone = np.zeros((0, 1))  # under sticky actions a start has no previous action: nodes of their own
     for t, (now, first, _) in enumerate(walk.distributions()):
-        tell(f"step {t} of {steps}")
+        report(f"step {t} of {steps}")
         if first and mdp.is_sticky:
             alone = now.copy()
             continue
@@ -661,7 +661,7 @@ def _period(chain: "csr_matrix") -> int:
     return int(np.gcd.reduce(level[rows] + 1 - level[columns]))
 
 
-def _time(chain: np.ndarray, epsilon: float, tell: Callable[[str], object]) -> tuple[int, float]:
+def _time(chain: np.ndarray, epsilon: float, report: Callable[[str], object]) -> tuple[int, float]:
     """(t_mix, distance there): squares until it is near enough, then bisection by the squares on the way."""
     size = len(chain)
     epsilon += ROUNDING
@@ -676,13 +676,13 @@ def _time(chain: np.ndarray, epsilon: float, tell: Callable[[str], object]) -> t
         return 0, distance(np.eye(size))
     powers = [chain]
     while distance(powers[-1]) > epsilon:
-        tell(f"more than {2 ** (len(powers) - 1):,} steps")
+        report(f"more than {2 ** (len(powers) - 1):,} steps")
         powers.append(powers[-1] @ powers[-1])
         if len(powers) > 60:
             raise UndefinedMeasure("mixing_time: the chain takes more than 2^60 steps")
     steps, power = 0, np.eye(size)  # the largest t that is not near enough, and P^t
     for i in range(len(powers) - 2, -1, -1):
-        tell(f"between {steps + 1:,} and {steps + 2 ** (i + 1):,} steps")
+        report(f"between {steps + 1:,} and {steps + 2 ** (i + 1):,} steps")
         further = power @ powers[i]
         if distance(further) > epsilon:
             steps, power = steps + 2**i, further
@@ -731,8 +731,8 @@ def distribution_mismatch(
             "distribution_mismatch is defined for discounted MDPs without a horizon: give gamma < 1 and no horizon"
         )
     solution = optimal_solution(mdp, solution)
-    best, lacking = discounted_arrivals(mdp, solution.policy, tolerance=tolerance, tell=progress or str)
-    other, missing = discounted_arrivals(mdp, policy, tolerance=tolerance, tell=progress or str)
+    best, lacking = discounted_arrivals(mdp, solution.policy, tolerance=tolerance, report=progress or str)
+    other, missing = discounted_arrivals(mdp, policy, tolerance=tolerance, report=progress or str)
     there = support_with_ends(mdp, solution.policy)
     # All numbers are sums of products, each of at most as many factors as there are steps that count.
     steps = mdp.num_states + 32 / (1 - mdp.gamma)

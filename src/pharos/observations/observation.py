@@ -144,7 +144,7 @@ _BUILT_IN = {
 _registered: dict[str, tuple[Function, object]] = {}
 
 # Options that change what an agent is told, not how
-TELLING = ("motion", "hide", "seen_first", "frames", "irrelevant")
+INFORMATION_OPTIONS = ("motion", "hide", "seen_first", "frames", "irrelevant")
 
 
 def names() -> list[str]:
@@ -159,7 +159,7 @@ def title(name: str, options: Mapping[str, Any], *, whole: bool = False) -> str:
     Args:
         whole: with all options.
     """
-    shown = (*TELLING, *sorted(set(options) - set(TELLING))) if whole else TELLING
+    shown = (*INFORMATION_OPTIONS, *sorted(set(options) - set(INFORMATION_OPTIONS))) if whole else INFORMATION_OPTIONS
     words = (f"{option}={_words(options[option])}" for option in shown if options.get(option))
     return f"{name}({', '.join(words)})".removesuffix("()")
 

@@ -55,15 +55,15 @@ class Vector(Observation):
         self.names = components.names
         self.low = components.low
         self.scale = np.where(components.size > 1, 1 / np.maximum(components.size - 1, 1), 0.0)
-        whose = f"vector of {env.name}"
+        source = f"vector of {env.name}"
         if isinstance(hide, int):
             if not -len(components.names) <= hide < 0:
-                raise ParameterError(f"{whose}: hide is {hide}; expected a name, or -1 to -{len(components.names)}")
+                raise ParameterError(f"{source}: hide is {hide}; expected a name, or -1 to -{len(components.names)}")
             hide = [components.names[hide]]
-        for name in hidden_names(hide, whose, components.variables, components.names):
+        for name in hidden_names(hide, source, components.variables, components.names):
             self.scale[components.variables.get(name) or components.names.index(name)] = 0.0
         few = f"0 to {MOST_IRRELEVANT} entries, so that a policy can be asked about all their values in a state"
-        self.irrelevant = whole_number(irrelevant, f"{whose}: irrelevant", few, least=0, most=MOST_IRRELEVANT)
+        self.irrelevant = whole_number(irrelevant, f"{source}: irrelevant", few, least=0, most=MOST_IRRELEVANT)
         self.names = (*components.names, *(f"irrelevant[{i}]" for i in range(self.irrelevant)))
         self.space = Box(0.0, 1.0, (len(self.names),), np.float32)
 
@@ -108,14 +108,14 @@ class OneHot(Observation):
         self._low = components.low
         self._offset = np.cumsum(components.size) - components.size
         self._first = np.zeros(length, bool)  # entries that start states alone show
-        whose = f"one_hot of {env.name}"
-        for name in hidden_names(seen_first, whose, components.variables, components.names, "seen_first"):
+        source = f"one_hot of {env.name}"
+        for name in hidden_names(seen_first, source, components.variables, components.names, "seen_first"):
             columns = components.variables.get(name) or components.names.index(name)
             for i in np.arange(len(components))[columns].ravel():
                 self._first[self._offset[i] : self._offset[i] + components.size[i]] = True
         starts = env.initial_states() if self._first.any() else []
         if len(starts) > MOST_STARTS:
-            raise ParameterError(f"{whose}: seen_first with {len(starts)} start states; expected at most {MOST_STARTS}")
+            raise ParameterError(f"{source}: seen_first with {len(starts)} start states; expected at most {MOST_STARTS}")
         self._starts = np.array([state for state, _ in starts], np.int64)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:

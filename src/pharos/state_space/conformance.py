@@ -398,14 +398,14 @@ SPRITE_LETTERS = set(".#123456789")
 def check_declarations(env: Environment) -> None:
     """Raise a RuleError if an attribute, the parameters, the variables or the start states break the contract."""
     cls = type(env)
-    whose = cls.__name__
+    source = cls.__name__
     # attributes of the class
     parameters = getattr(cls, "__dataclass_params__", None)
     if parameters is None or not parameters.frozen or "__dataclass_params__" not in vars(cls):
-        raise RuleError(f"{whose} is no frozen dataclass; decorate it with @dataclass(frozen=True, kw_only=True)")
+        raise RuleError(f"{source} is no frozen dataclass; decorate it with @dataclass(frozen=True, kw_only=True)")
     name = getattr(env, "name", None)
     if not isinstance(name, str) or not name:
-        raise RuleError(f"{whose}.name is {name!r}; expected the name that users type, a text")
+        raise RuleError(f"{source}.name is {name!r}; expected the name that users type, a text")
     actions = getattr(env, "actions", None)
     if (
         not isinstance(actions, tuple)
@@ -413,7 +413,7 @@ def check_declarations(env: Environment) -> None:
         or not all(isinstance(action, str) and action for action in actions)
         or len(set(actions)) < len(actions)
     ):
-        raise RuleError(f"{whose}.actions is {actions!r}; expected a tuple of different names, at least one")
+        raise RuleError(f"{source}.actions is {actions!r}; expected a tuple of different names, at least one")
     for attribute in ("version", "max_episode_steps"):
         value = getattr(env, attribute)
         if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
@@ -444,7 +444,7 @@ def check_declarations(env: Environment) -> None:
     except ParameterError as error:
         raise RuleError(str(error)) from error
     except Exception as error:  # of code of the user's own
-        raise RuleError(f"{env}: variables() or initial_state() fails: {_told(error)}") from error
+        raise RuleError(f"{env}: variables() or initial_state() fails: {_message_of(error)}") from error
     if len(env.variables()) != len(components.variables):
         raise RuleError(f"{env}: variables() declares {len(env.variables())} names; expected the same at every call")
     if starts[0] != again_starts[0] or (starts[1] != again_starts[1]).any():
@@ -453,26 +453,26 @@ def check_declarations(env: Environment) -> None:
 
 def check_layers(env: Environment, notes: list[str]) -> None:
     """Raise a RuleError if a layer or the grid breaks the contract; a note if there are no layers."""
-    whose = type(env).__name__
+    source = type(env).__name__
     if not isinstance(env.layers, dict) or not all(isinstance(name, str) for name in env.layers):
-        raise RuleError(f"{whose}.layers is {env.layers!r}; expected a dict of name -> Layer")
+        raise RuleError(f"{source}.layers is {env.layers!r}; expected a dict of name -> Layer")
     if not env.layers:
         notes.append("it declares no layers: it cannot be drawn, and has no image observations")
         return
     for name, layer in env.layers.items():
-        _check_layer(f"{whose}.layers[{name!r}]", name, layer)
+        _check_layer(f"{source}.layers[{name!r}]", name, layer)
     motion = env.motion_layers
     names = set(motion) if isinstance(motion, dict) else set()
     if bool(names) != env.has_motion or names & set(env.layers):
         raise RuleError(
-            f"{whose}.motion_layers is {motion!r}; expected a dict of name -> Layer, with other names than layers, "
+            f"{source}.motion_layers is {motion!r}; expected a dict of name -> Layer, with other names than layers, "
             f"where the class defines draw_motion, and {{}} elsewhere"
         )
     for name, layer in motion.items():
-        _check_layer(f"{whose}.motion_layers[{name!r}]", name, layer)
+        _check_layer(f"{source}.motion_layers[{name!r}]", name, layer)
     for place, look in (("look", env.look), ("look.scenery", env.look.scenery)):
         if look is not None:
-            with _named(f"{whose}.{place}.ground"):
+            with _named(f"{source}.{place}.ground"):
                 ground_of(look.ground)
     try:
         rows, columns = env.grid()
@@ -480,14 +480,14 @@ def check_layers(env: Environment, notes: list[str]) -> None:
     except (TypeError, ValueError, NotImplementedError):
         fits = False
     except Exception as error:  # of code of the user's own
-        raise RuleError(f"{env}: grid() fails: {_told(error)}") from error
+        raise RuleError(f"{env}: grid() fails: {_message_of(error)}") from error
     if not fits:
         raise RuleError(
             f"{env}: it has layers but grid() does not give (rows, columns); expected two integers, at least 1"
         )
 
 
-def _told(error: Exception) -> str:
+def _message_of(error: Exception) -> str:
     """An error of the user's code in a line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
@@ -514,21 +514,21 @@ def _check_layer(where: str, name: object, layer: object) -> None:
 
 
 @contextlib.contextmanager
-def _named(whose: str) -> Iterator[None]:
-    """Context in which an unknown name, such as that of a shape, is a RuleError of `whose`."""
+def _named(source: str) -> Iterator[None]:
+    """Context in which an unknown name, such as the name of a shape, is a RuleError of `source`."""
     try:
         yield
     except UnknownName as error:
-        raise RuleError(f"{whose}: {error}") from None
+        raise RuleError(f"{source}: {error}") from None
 
 
-def _check_sprites(whose: str, sprite: Sequence[Any], num_values: int) -> None:
+def _check_sprites(source: str, sprite: Sequence[Any], num_values: int) -> None:
     """Raise a RuleError if the sprites of a layer are no pixels, or too few or many for its values."""
     sprites = sprite if sprite and isinstance(sprite[0], tuple) else (sprite,)
     for rows in sprites:
         if not rows or len(set(map(len, rows))) != 1 or not rows[0] or set("".join(rows)) - SPRITE_LETTERS:
-            raise RuleError(f"{whose} has {rows!r}; expected rows of equal length of the letters . # 1-9")
+            raise RuleError(f"{source} has {rows!r}; expected rows of equal length of the letters . # 1-9")
     if len(sprites) not in (1, num_values):
         raise RuleError(
-            f"{whose} has {len(sprites)} sprites for {num_values} values; expected one for all, or one for each"
+            f"{source} has {len(sprites)} sprites for {num_values} values; expected one for all, or one for each"
         )

@@ -222,7 +222,7 @@ MASKED = -1e8
 
 
 Net = TypeVar("Net", bound=BatchedNetwork)
-ASKED = (16, 64, 256)  # rows of the blocks in which a policy is asked
+POLICY_BLOCKS = (16, 64, 256)  # rows of the blocks in which a policy is asked
 
 
 class Lane(Generic[Net]):
@@ -451,7 +451,7 @@ class RunPolicy:
         wait(lane.device)
         answers, first = [], 0
         while first < len(observations):
-            size = next((size for size in ASKED if size >= len(observations) - first), ASKED[-1])
+            size = next((size for size in POLICY_BLOCKS if size >= len(observations) - first), POLICY_BLOCKS[-1])
             rows = lane.seen.encoded(observations[first : first + size], self.i)
             block = torch.zeros((1, size, lane.seen.size), device=lane.device)
             block[0, : len(rows)] = rows  # of one of two sizes, as layers keep room for each size

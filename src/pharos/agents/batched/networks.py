@@ -445,7 +445,7 @@ def names_of(name: str) -> list[str]:
     """All names of a parameter in Stable-Baselines3; parameters of shared parts have several."""
     extractors = [name]
     if name.startswith("features_extractor."):
-        extractors += [f"{whose}_{name}" for whose in ("pi", "vf")]
+        extractors += [f"{part}_{name}" for part in ("pi", "vf")]
     return [*extractors, *(each.replace(".layers.0.", ".convolutions.") for each in extractors if ".layers.0." in each)]
 
 

@@ -254,7 +254,7 @@ class PolicyLearner(IdealisedLearner):
         returns = np.zeros((len(self.states), self.mdp.num_actions))
         rows, steps = [], self.rollouts.gradient_steps
         for step in range(0, self.schedule.steps, self.rollouts.steps):
-            self.tell(f"step {step:,} of {self.schedule.steps:,}")
+            self.report(f"step {step:,} of {self.schedule.steps:,}")
             behaviour = softmax(observations.masked(logits))
             policy, memory = behaviour[observations.groups], Memory(self.mdp, self.states)
             played, length = memory.play(self.visits(policy), policy, 1)
@@ -477,10 +477,10 @@ def _setting(
     schedule: Schedule | None,
     horizon: int | None,
     name: str,
-    tell: Callable[[str], object],
+    report: Callable[[str], object],
 ) -> StandardOccupancy:
     episode = representation.episode(mdp, horizon, name)
-    return standard_occupancy(mdp, (schedule or Schedule()).gamma, episode, tell)
+    return standard_occupancy(mdp, (schedule or Schedule()).gamma, episode, report)
 
 
 def _centred(q: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -501,18 +501,18 @@ def _spectral(
     schedule: Schedule | None,
     horizon: int | None,
     function: Callable[[np.ndarray, np.ndarray, np.ndarray], float],
-    tell: Callable[[str], object],
+    report: Callable[[str], object],
 ) -> Spectral:
     """Spectral result of a function of (kernel (C, C), weights (C,), mean values (C, A)) of the observations; values of
     actions that are not available are -inf."""
-    setting = _setting(mdp, representation, schedule, horizon, name, tell)
+    setting = _setting(mdp, representation, schedule, horizon, name, report)
     states = np.flatnonzero(setting.states > 0)
     observations = Grouped(representation.classes, states, mdp.available)
     weights = observations.sums(setting.states[states])
     q = observations.sums(setting.states[states, None] * setting.q[states]) / weights[:, None]
 
     def of(count: int) -> float:
-        tell(f"the spectrum of {min(count, len(observations)):,} observations")
+        report(f"the spectrum of {min(count, len(observations)):,} observations")
         places, share = _drawn(weights, count)
         rows = observations.representatives[places]
         return function(representation.kernel(rows, rows).astype(np.float64), share, q[places])

@@ -457,11 +457,11 @@ class IdealisedLearner:
         progress: Callable[[str], object] | None = None,
     ):
         """progress: called with a line for each phase; an exception of its own ends the learning."""
-        self.tell = progress or str
+        self.report = progress or str
         self.episode = episode = representation.episode(mdp, horizon, self.measure)
         self.schedule, self.representation = schedule or Schedule(), representation
-        solution = solution or value_iteration(mdp, progress=self._tell_sweep)
-        uniform = uniform_value(mdp, progress=self._tell_sweep)
+        solution = solution or value_iteration(mdp, progress=self._report_sweep)
+        uniform = uniform_value(mdp, progress=self._report_sweep)
         self.optimal = solution.value_at_start
         error = max(solution.error_bound, uniform.error_bound)
         self.spread = regret_scale(self.optimal, uniform.value_at_start, error)
@@ -491,7 +491,7 @@ class IdealisedLearner:
         vector = np.full((len(observations), 1), len(observations) ** -0.5)
         rows = []
         for step in range(0, schedule.steps, schedule.period):
-            self.tell(f"step {step:,} of {schedule.steps:,}")
+            self.report(f"step {step:,} of {schedule.steps:,}")
             period, epsilon = min(schedule.period, schedule.steps - step), schedule.epsilon(step)
             greedy = greedy_policy(values, observations.sets)[observations.groups]
             policy = (1 - epsilon) * greedy + (epsilon / actions if observations.sets is None else epsilon * uniform)
@@ -511,7 +511,7 @@ class IdealisedLearner:
     @cached_property
     def weights(self) -> np.ndarray:
         """(C,) weights of observations at the standard occupancy."""
-        standard = standard_occupancy(self.whole, self.schedule.gamma, self.episode, self.tell)
+        standard = standard_occupancy(self.whole, self.schedule.gamma, self.episode, self.report)
         return self.observations.sums(standard.states[self.numbers])
 
     def operators(self) -> tuple[Iterable[KernelOperator], int | None]:
@@ -541,7 +541,7 @@ class IdealisedLearner:
 
     @property
     def is_return(self) -> bool:
-        """Whether a value is the expected return of an episode, so that walks tell it."""
+        """Whether a value is the expected return of an episode, so that walks estimate it."""
         return self.mdp.gamma == 1.0 and self.mdp.horizon == self.episode
 
     def regret(self, value: float) -> float:
@@ -558,10 +558,10 @@ class IdealisedLearner:
         if self.is_return:
             return float((self.visits(policy).executed * self.mdp.rewards).sum())
         table = actions if is_pure else self.everywhere(policy)
-        return evaluate_policy(self.mdp, table, ACCURACY * self.spread, progress=self._tell_sweep).value_at_start
+        return evaluate_policy(self.mdp, table, ACCURACY * self.spread, progress=self._report_sweep).value_at_start
 
-    def _tell_sweep(self, sweeps: int, bound: float) -> None:
-        self.tell(f"sweep {sweeps} of values, error at most {bound:.2g}")
+    def _report_sweep(self, sweeps: int, bound: float) -> None:
+        self.report(f"sweep {sweeps} of values, error at most {bound:.2g}")
 
     def everywhere(self, policy: np.ndarray) -> np.ndarray:
         """(S, A) probabilities of a policy (N, A), uniform in states outside `states`."""

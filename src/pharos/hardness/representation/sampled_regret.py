@@ -290,7 +290,7 @@ class SampledLearner(IdealisedLearner):
         vector, largest_step = np.full((count, 1), count**-0.5), 0.0
         stops = np.unique([*looks, *range(0, schedule.steps, schedule.period)])
         for step, next_stop in zip(stops, [*stops[1:], schedule.steps], strict=True):
-            self.tell(f"step {step:,} of {schedule.steps:,} of a walk")
+            self.report(f"step {step:,} of {schedule.steps:,} of a walk")
             if step in looks:
                 values = np.empty((count, num_actions))
                 kernels.values(kernel, learnt, values)
