@@ -415,12 +415,12 @@ class Networks(ArrayLearner):
         """Write the network, as `Deep` reads it, with the names of parameters in the policy of Stable-Baselines3."""
         import torch
 
-        place = new_agent(folder)
+        target = new_agent(folder)
         parameters = self.parameters(i).items()
         policy = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters}
-        torch.save({"policy": policy}, place / "parameters.pt")
+        torch.save({"policy": policy}, target / "parameters.pt")
         counters = {"num_timesteps": int(self.batch.steps), "episodes": int(self.episodes[i])}
-        (place / "model.json").write_text(json.dumps({"counters": counters, "returns": float(self.returns[i])}))
+        (target / "model.json").write_text(json.dumps({"counters": counters, "returns": float(self.returns[i])}))
 
 
 class Deep:
@@ -453,7 +453,7 @@ class Deep:
     def policy(self, i: int) -> PolicyLike:
         return self.agent
 
-    def greedy_actions(self, places: Sequence[int]) -> None:
+    def greedy_actions(self, indices: Sequence[int]) -> None:
         return None
 
     def learn(self, points: Sequence[int], at_point: AtPoint) -> None:

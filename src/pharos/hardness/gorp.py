@@ -370,9 +370,9 @@ def _by_rows(
     bounds: Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]], m: int, p: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bounds from the probabilities p (n, A^k) that one sample is R and not 0, once for rows that are the same."""
-    rows, place = np.unique(p, axis=0, return_inverse=True)
+    rows, index = np.unique(p, axis=0, return_inverse=True)
     lower, upper = (np.array(each) for each in zip(*(bounds(m, row) for row in rows), strict=True))
-    return lower[place.ravel()], upper[place.ravel()]
+    return lower[index.ravel()], upper[index.ravel()]
 
 
 def _binomial(m: int, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

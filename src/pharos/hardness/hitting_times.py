@@ -451,11 +451,11 @@ def multiplications(layers: np.ndarray) -> float:
 def factors_of(choices: ExpandedMDP, policy: np.ndarray, inner: np.ndarray) -> Factors | None:
     """The factors of 1 - P of a policy on the `inner` nodes; None if it is not proper. Rows are made to sum to 1."""
     first, unknown = _numbered_once(choices.is_restart[inner])
-    place = np.full(len(policy), first.size)  # what leads elsewhere is left out of the equations
-    place[inner] = unknown
+    index = np.full(len(policy), first.size)  # what leads elsewhere is left out of the equations
+    index[inner] = unknown
     solved = inner[first]
     rows = scipy.sparse.csr_matrix(choices.matrix[solved * choices.num_actions + policy[solved]])
-    row, column = np.repeat(np.arange(first.size), np.diff(rows.indptr)), place[rows.indices]
+    row, column = np.repeat(np.arange(first.size), np.diff(rows.indptr)), index[rows.indices]
     data = np.where(row == column, 0.0, rows.data)
     leaving = np.bincount(row, data, first.size)
     if not _all_leave(row[data > 0], column[data > 0], first.size):
@@ -500,13 +500,13 @@ def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[tuple[np.nda
     """
     nodes = matrix.shape[0] // num_actions
     row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-    pairs, place, times = np.unique(
+    pairs, index, times = np.unique(
         (row // num_actions) * np.int64(nodes) + matrix.indices, return_inverse=True, return_counts=True
     )
     least = np.full(len(pairs), np.inf)
-    np.minimum.at(least, place, matrix.data)
+    np.minimum.at(least, index, matrix.data)
     least[times < num_actions] = 0.0
-    rest = matrix.data - least[place]
+    rest = matrix.data - least[index]
     distinct = rest > 8 * hitting.UNIT * matrix.data  # the kernels count as much as rounding of `least`
     if distinct.sum() + np.count_nonzero(least) >= matrix.nnz:  # nothing gained
         least[:] = 0.0

@@ -224,9 +224,9 @@ def _backward(mdp: TabularMDP, policy: TablePolicy | None, steps: int) -> tuple[
         after = mdp.dynamics.expected(values)
         for i, reward in enumerate(distinct):
             s, a = np.nonzero(which == i)
-            place = np.searchsorted(returns, reward + support + SAME / 2) - 1
+            index = np.searchsorted(returns, reward + support + SAME / 2) - 1
             block = np.zeros((len(s), len(returns)))
-            block[:, np.maximum(place, 0)] = after[s, a]
+            block[:, np.maximum(index, 0)] = after[s, a]
             executed[s, a] = block
         if mdp.is_sticky and t == 0:
             choice = chance.first.choice(executed, table.first_value(executed))

@@ -227,10 +227,10 @@ def _outcomes(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, n
     node, prob = np.empty(action.size, np.int64), np.empty(action.size)
     of_live = np.ones(action.size, np.bool_)
     if restart:
-        places = (first[ended][:, None] + np.arange(len(starts))).ravel()
-        of_live[places] = False
-        node[places] = np.tile(np.asarray(mdp.start_states)[starts], len(ended))
-        prob[places] = np.tile(np.asarray(mdp.start_probabilities)[starts], len(ended))
+        indices = (first[ended][:, None] + np.arange(len(starts))).ravel()
+        of_live[indices] = False
+        node[indices] = np.tile(np.asarray(mdp.start_states)[starts], len(ended))
+        prob[indices] = np.tile(np.asarray(mdp.start_probabilities)[starts], len(ended))
     rows = np.repeat(np.arange(num_states * num_actions), np.diff(executed.indptr))
     action[of_live], node[of_live], prob[of_live] = rows % num_actions, executed.indices, executed.data
     return first, action, node, prob

@@ -112,7 +112,7 @@ class GraphLayers(NamedTuple):
 
     Attributes:
         order: (N,) nodes by layer. first: (P + 1,) the beginning of each layer in it.
-        position: (N,) int32, the place of a node in its layer.
+        position: (N,) int32, the index of a node in its layer.
     """
 
     order: np.ndarray

@@ -274,7 +274,9 @@ class Propagation:
         later = self.later.chance.executed(visits, self.later.policy)
         return later + self.first.chance.executed(started[:, None], self.first.policy)
 
-    def discounted(self, tolerance: float, report: Callable[[str], object] = str) -> tuple[np.ndarray, np.ndarray, float]:
+    def discounted(
+        self, tolerance: float, report: Callable[[str], object] = str
+    ) -> tuple[np.ndarray, np.ndarray, float]:
         """((S,), (S, W), bound): discounted visits of the first step, under sticky actions alone; of the others; and a
         bound on the visits that are missing."""
         started, waiting = self.after_the_start()
@@ -358,7 +360,7 @@ def standard_occupancy(
 
 
 def drawn(weights: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
-    """(count,) different places, drawn by nine parts of weights (N,) and one of uniform chance, in random order."""
+    """(count,) different indices, drawn by nine parts of weights (N,) and one of uniform chance, in random order."""
     share = 0.9 * weights / weights.sum() + 0.1 / len(weights)
     return np.random.default_rng(seed).choice(len(weights), count, replace=False, p=share / share.sum())
 
@@ -630,8 +632,8 @@ def mixing_time(
 def _merged(chain: "csr_matrix", underlying: np.ndarray, ended: np.ndarray) -> "csr_matrix":
     """The chain in which an episode that has ended does not remember the previous action."""
     label = np.where(ended[underlying], underlying, len(ended) + np.arange(len(underlying)))
-    _, first, place = np.unique(label, return_index=True, return_inverse=True)
-    membership = scipy.sparse.csr_matrix((np.ones(len(place)), (np.arange(len(place)), place)))
+    _, first, index = np.unique(label, return_index=True, return_inverse=True)
+    membership = scipy.sparse.csr_matrix((np.ones(len(index)), (np.arange(len(index)), index)))
     return scipy.sparse.csr_matrix(chain[first] @ membership)
 
 

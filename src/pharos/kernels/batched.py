@@ -276,10 +276,10 @@ def act(keys, step, scores, actions, log_probabilities):
 
 
 @kernel
-def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
+def sample(keys, step, draw, next_row, filled, gammas, num_steps, memory, batch):
     """Draw a minibatch of each run from its replay memory, uniformly, with returns of `num_steps` steps.
 
-    place: the row that is written next; filled: the number of rows that are; gammas (W,).
+    next_row: the row that is written next; filled: the number of rows that are; gammas (W,).
     memory: (state, next state (W, R, E), action (W, R, E), reward (W, R, E) float32, flags (W, R, E)).
     batch: (state, next state (W, B), action (W, B), reward (W, B) float32, discount (W, B) float32), written here:
     discount is the factor of the value of the next state: gamma^n, 0 if the episode ended there. A return stops at
@@ -288,7 +288,7 @@ def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
     state, next_state, action, reward, flags = memory
     states, next_states, actions, rewards, discounts = batch
     size, copies = state.shape[1], state.shape[2]
-    last = (place - 1) % size
+    last = (next_row - 1) % size
     for i in range(states.shape[0]):
         for b in range(states.shape[1]):
             w = philox(b, draw, step, SAMPLE, keys[i])
@@ -298,7 +298,7 @@ def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
 
 
 @kernel
-def sample_histories(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
+def sample_histories(keys, step, draw, next_row, filled, gammas, num_steps, memory, batch):
     """`sample` from the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
 
     They are read from the rows before; the first state of an episode stands for those before it. Rows that were never
@@ -307,7 +307,7 @@ def sample_histories(keys, step, draw, place, filled, gammas, num_steps, memory,
     state, next_state, action, reward, flags = memory
     states, next_states, actions, rewards, discounts = batch
     size, copies, frames = state.shape[1], state.shape[2], states.shape[2]
-    first, last = (place - filled) % size, (place - 1) % size
+    first, last = (next_row - filled) % size, (next_row - 1) % size
     for i in range(states.shape[0]):
         for b in range(states.shape[1]):
             w = philox(b, draw, step, SAMPLE, keys[i])

@@ -28,7 +28,7 @@ from pharos.kernels.outcomes import expectation, fetch_values, outcome, outcomes
 
 
 def state_at(order, i):
-    """The state at place i of an order; i itself if the order is None."""
+    """The state at index i of an order; i itself if the order is None."""
 
 
 @overload(state_at)
@@ -242,7 +242,7 @@ def _backup_of(transitions, table, palette, gamma, uniform, choice, v, actions, 
 @interpreted_first()
 @kernel(makes_arrays=False)
 def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, actions, order, start, stop):
-    """v[s] = (1 - uniform) q(s, choice) + uniform mean_a q(s, a), in place, for places [start, stop) of the order."""
+    """v[s] = (1 - uniform) q(s, choice) + uniform mean_a q(s, a), in place, for indices [start, stop) of the order."""
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
         if i >= start + AHEAD:
@@ -321,7 +321,7 @@ def _choice_value_of(choice, q, actions, s):
 def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions, q, order, start, stop):
     """v[s, b] = chosen q(s, choice) + previous q(s, b) + uniform mean_a q(s, a), in place.
 
-    v (S + 1, A); q (A,) scratch; for places [start, stop) of the order.
+    v (S + 1, A); q (A,) scratch; for indices [start, stop) of the order.
     """
     chosen_weight, previous_weight, uniform_weight = weights[0], weights[1], weights[2]
     change = 0.0
@@ -449,7 +449,7 @@ def chain_values(successor, reward, gamma, v, order):
     its rewards. order (S,) is scratch. Returns a state on a cycle whose value is infinite (gamma = 1), or -1.
     """
     num_states = len(successor)
-    mark = np.zeros(num_states, np.int64)  # 0 new, i + 1 on the walk at place i, -1 done
+    mark = np.zeros(num_states, np.int64)  # 0 new, i + 1 on the walk at index i, -1 done
     for start in range(num_states):
         if mark[start] != 0:
             continue
@@ -462,7 +462,7 @@ def chain_values(successor, reward, gamma, v, order):
             mark[s] = length
             s = successor[s]
         last = length
-        if s >= 0 and mark[s] > 0:  # a new cycle: places mark[s] - 1 to length - 1
+        if s >= 0 and mark[s] > 0:  # a new cycle: indices mark[s] - 1 to length - 1
             first = mark[s] - 1
             total = 0.0
             factor = 1.0

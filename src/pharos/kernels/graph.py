@@ -300,7 +300,7 @@ def last_gap(next_states, ends, start, order, layer_first, position, current, co
     """Largest k such that some node does not yet reach its whole layer in exactly k steps.
 
     Every edge leads from layer j to layer j + 1 modulo P. order (N,): the nodes by layer, layer_first (P + 1,),
-    position (N,): place of a node in its layer. current, coming: (widest layer, words) uint64 scratch.
+    position (N,): index of a node in its layer. current, coming: (widest layer, words) uint64 scratch.
     Returns (gap, table entries read); the gap is -1 if layers are single nodes, -2 if it is at least P, -3 if
     `max_reads` were not enough.
 
@@ -374,9 +374,9 @@ def search_in_step(
     whereas searches that keep step by their levels read as many as they have targets in different layers. From a node v
     there is another way to target i, of home[v] + away[i] steps.
 
-    order (N,): the nodes by layer, layer_first (P + 1,), position (N,): place of a node in its layer. Target i joins at
+    order (N,): the nodes by layer, layer_first (P + 1,), position (N,): index of a node in its layer. Target i joins at
     tick offset[i], ascending from 0; `layer` is the layer of the first. scratch (2, widest layer, words) uint64; visits
-    (N, words) uint64, zero before: by place in `order`, the targets that a node reaches.
+    (N, words) uint64, zero before: by index in `order`, the targets that a node reaches.
     Returns table entries read. largest[i], `best` before, becomes the largest over all nodes of the lesser of both
     ways to target i, if that is more.
     """
@@ -419,9 +419,9 @@ def search_in_step(
         layer = layer - 1 if layer else num_layers - 1
     # nodes that the searches did not reach have the other way alone: the farthest of them counts
     unseen = np.zeros((farthest + 1, words), np.uint64)
-    for place in range(len(order)):
+    for index in range(len(order)):
         for w in range(words):
-            unseen[home[order[place]], w] |= ~visits[place, w]
+            unseen[home[order[index]], w] |= ~visits[index, w]
     for i in range(num_targets):
         steps = farthest
         while steps > 0 and not unseen[steps, i // 64] >> np.uint64(i % 64) & np.uint64(1):

@@ -8,7 +8,7 @@ of a state. -1 marks a free slot.
 
 In a search by several processes each state has an owner, the process that its hash names, whoever finds it. An owner
 has keys (capacity, W) uint64, states in the order in which it received them, and numbers (capacity,) int64: the number
-of a state, or -1 - place while it waits for one, `place` being the first of the places in the block that lead to
+of a state, or -1 - index while it waits for one, `index` being the first of the indices in the block that lead to
 it. table (slots,) leads from the hash of a state to its entry, a row of keys and numbers.
 
 On disk each entry is a whole state and its index: entries (slots, W + 1) uint64, a mapped file, holds the W words of a
@@ -71,8 +71,8 @@ def entry_at(typing_context, table, slot):
     """table[slot], by an acquiring load: all that another thread wrote before it published the entry is visible."""
 
     def codegen(context, builder, sig, args):
-        place = _entry(context, builder, sig.args[0], *args)
-        value = builder.load_atomic(place, "acquire", sig.args[0].dtype.bitwidth // 8)
+        address = _entry(context, builder, sig.args[0], *args)
+        value = builder.load_atomic(address, "acquire", sig.args[0].dtype.bitwidth // 8)
         return context.cast(builder, value, sig.args[0].dtype, types.int64)
 
     return types.int64(table, types.int64), codegen
@@ -84,9 +84,9 @@ def publish(typing_context, table, slot, index):
     """Set table[slot] = index by a releasing store: threads that read it by `entry_at` see all earlier writes."""
 
     def codegen(context, builder, sig, args):
-        place = _entry(context, builder, sig.args[0], *args[:2])
+        address = _entry(context, builder, sig.args[0], *args[:2])
         value = context.cast(builder, args[2], types.int64, sig.args[0].dtype)
-        builder.store_atomic(value, place, "release", sig.args[0].dtype.bitwidth // 8)
+        builder.store_atomic(value, address, "release", sig.args[0].dtype.bitwidth // 8)
         return context.get_dummy_value()
 
     return types.void(table, types.int64, types.int64), codegen
@@ -289,21 +289,21 @@ def route(keys, indices, size, order, counts):
             owners[j] = int64((low * uint64(size)) >> uint64(_OWNER_BITS))
             counts[owners[j]] += 1
     # counting sort: owner o begins behind all smaller owners
-    place = np.zeros(size, np.int64)
+    next_index = np.zeros(size, np.int64)
     for owner in range(1, size):
-        place[owner] = place[owner - 1] + counts[owner - 1]
+        next_index[owner] = next_index[owner - 1] + counts[owner - 1]
     for j in range(len(keys)):
         if indices[j] < 0:
-            order[place[owners[j]]] = j
-            place[owners[j]] += 1
+            order[next_index[owners[j]]] = j
+            next_index[owners[j]] += 1
 
 
 @kernel
-def claim(table, keys, numbers, count, candidates, places, entries):
+def claim(table, keys, numbers, count, candidates, indices, entries):
     """Find the entry of each candidate that this owner is asked for, and make one for each that is new.
 
-    candidates (N, W), places (N,): states and their places in the block; entries (N,) int64 gets their entries. Of
-    the places that lead to a new state the first is kept, whatever the order in which they come. Returns the number of
+    candidates (N, W), indices (N,): states and their indices in the block; entries (N,) int64 gets their entries. Of
+    the indices that lead to a new state the first is kept, whatever the order in which they come. Returns the number of
     entries.
     """
     capacity, words = table.shape[0], keys.shape[1]
@@ -318,17 +318,17 @@ def claim(table, keys, numbers, count, candidates, places, entries):
                 entry = count
                 for k in range(words):
                     keys[count, k] = candidates[j, k]
-                numbers[count] = -1 - places[j]
+                numbers[count] = -1 - indices[j]
                 table[slot] = count
                 count += 1
                 break
-            # an occupied slot: a match without a number yet keeps the smallest place
+            # an occupied slot: a match without a number yet keeps the smallest index
             equal = True
             for k in range(words):
                 equal = equal and keys[entry, k] == candidates[j, k]
             if equal:
                 if numbers[entry] < 0:
-                    numbers[entry] = max(numbers[entry], -1 - places[j])
+                    numbers[entry] = max(numbers[entry], -1 - indices[j])
                 break
             slot = slot + 1 if slot + 1 < capacity else 0
         entries[j] = entry
@@ -386,20 +386,20 @@ def sort_by_bucket(indices, first, order):
                 size += 1
         return size
     # counting sort by bucket: sizes, then the beginning of each bucket, then the candidates
-    place = np.zeros(BUCKETS + 1, np.int64)
+    next_index = np.zeros(BUCKETS + 1, np.int64)
     for j in range(len(indices)):
         if indices[j] >= 0:
             indices[j] += first
         else:
-            place[-indices[j]] += 1
+            next_index[-indices[j]] += 1
             size += 1
     for bucket in range(BUCKETS):
-        place[bucket + 1] += place[bucket]
+        next_index[bucket + 1] += next_index[bucket]
     for j in range(len(indices)):
         if indices[j] < 0:
             bucket = -1 - indices[j]
-            order[place[bucket]] = j
-            place[bucket] += 1
+            order[next_index[bucket]] = j
+            next_index[bucket] += 1
     return size
 
 

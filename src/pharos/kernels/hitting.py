@@ -525,13 +525,13 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
 
     graph: (outcomes, owner, into, steps from the hub to each node (N,)); chance: (weights, previous actions, actions).
     times (N,): expected steps from each node to the hub, at most; bound (N,): from the hub to each node, at most.
-    scratch: (place (N,) int32, zero before and after; queue, an entry for each node around z; pushed and turns, those
+    scratch: (index (N,) int32, zero before and after; queue, an entry for each node around z; pushed and turns, those
     of `_around`; cost and leak, one for each previously executed action as well, the last for none). x is reached with
     any of those, so c(x) is the largest.
     """
     outcomes, owner, into, steps = graph
     weights, num_previous, num_actions = chance
-    place, queue, pushed, turns, cost, leak = scratch
+    index, queue, pushed, turns, cost, leak = scratch
     first, action, node, prob = outcomes
     none = cost.shape[1] - 1
     now, before, uniform, first_now, first_uniform = weights
@@ -539,7 +539,7 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
     for k in range(begin, end):
         z = targets[k]
         # the nodes around z; at first each of them gives up at once: c = times, l = 1, and 0 at z
-        size, count = _around(z, owner, into, steps, place, (queue, pushed, turns))
+        size, count = _around(z, owner, into, steps, index, (queue, pushed, turns))
         guess = min(bound[z], 1e300)
         for i in range(size):
             cost[i], leak[i] = times[queue[i]], 1.0
@@ -552,7 +552,7 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
                 # expected c and l of the next node: of outcomes of any action, by action, and of all actions
                 always_cost, always_leak, all_cost, all_leak = 1.0, 0.0, 0.0, 0.0
                 for j in range(first[x], first[x + 1]):
-                    p, a = place[node[j]], action[j]
+                    p, a = index[node[j]], action[j]
                     then = a if num_previous > 0 and a >= 0 else none
                     c = prob[j] * (cost[p - 1, then] if p > 0 else times[node[j]])
                     left = prob[j] * (leak[p - 1, then] if p > 0 else 1.0)
@@ -592,14 +592,14 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
                 least = min(least, (bound[queue[i]] + cost[i].max() * UPDATES) / remainder * (1 + 8 * EPSILON))
         new[z] = least
         for i in range(count):
-            place[pushed[i, 0]] = 0
+            index[pushed[i, 0]] = 0
 
 
 @kernel
-def _around(z, owner, into, steps, place, scratch):
+def _around(z, owner, into, steps, index, scratch):
     """Collect nodes on the way to z, those on short ways from the hub first; returns (size, count of `pushed`).
 
-    queue[:size]: the nodes, as many as the queue holds; place[n]: the index of n in it, plus one; -1 while it waits. A
+    queue[:size]: the nodes, as many as the queue holds; index[n]: the index of n in it, plus one; -1 while it waits. A
     node of which z is k steps away, and that lies on a way from the hub to z that is s steps longer than the shortest
     one, comes k + DETOUR s-th: its steps to z count, and those lost. A queue of buckets: `turns` has the first node of
     each of the next TURNS turns, `pushed` are (node, the next of its turn).
@@ -608,7 +608,7 @@ def _around(z, owner, into, steps, place, scratch):
     into_first, into_outcome = into
     turns[:] = -1
     pushed[0, 0], pushed[0, 1], turns[0] = z, -1, 0
-    place[z] = -1
+    index[z] = -1
     size, count, turn, idle = 0, 1, 0, 0
     while idle <= TURNS and size < len(queue):
         # the next node of this turn; the search ends after TURNS turns without any
@@ -622,18 +622,18 @@ def _around(z, owner, into, steps, place, scratch):
         n = pushed[at, 0]
         queue[size] = n
         size += 1
-        place[n] = size
+        index[n] = size
         # push its predecessors, later by DETOUR turns for each step that they lose
         if into_first[n + 1] - into_first[n] > CROWD:
             continue
         for k in range(into_first[n], into_first[n + 1]):
             x = owner[into_outcome[k]]
             lost = 1 + steps[x] - steps[n]
-            if place[x] == 0 and 0 <= lost < (TURNS - 1) // DETOUR and count < len(pushed):
+            if index[x] == 0 and 0 <= lost < (TURNS - 1) // DETOUR and count < len(pushed):
                 then = (turn + 1 + DETOUR * lost) % TURNS
                 pushed[count, 0], pushed[count, 1] = x, turns[then]
                 turns[then] = count
-                place[x] = -1
+                index[x] = -1
                 count += 1
     return size, count
 

@@ -140,17 +140,17 @@ def kernel(function: Callable | None = None, /, *, makes_arrays: bool = True, **
 def _folder() -> Path | None:
     """The folder of the kernels with the texts of today; folders of other texts are deleted after UNUSED_DAYS."""
     named = os.environ.get("NUMBA_CACHE_DIR")
-    place = Path(named).expanduser() if named else folder_of_rules()
-    if place is None:
+    root = Path(named).expanduser() if named else folder_of_rules()
+    if root is None:
         return None
     digest = hashlib.sha256(b"\0".join(path.read_bytes() for path in _TEXTS)).hexdigest()[:16]
-    folder = place / f"kernels-{digest}"
+    folder = root / f"kernels-{digest}"
     with contextlib.suppress(OSError):  # of a folder that can be read alone
         if folder.is_dir():
             os.utime(folder)
         else:
             folder.mkdir(parents=True, exist_ok=True)
-            for other in place.glob("kernels-*"):
+            for other in root.glob("kernels-*"):
                 if other.stat().st_mtime < time.time() - UNUSED_DAYS * 86400:
                     shutil.rmtree(other, ignore_errors=True)
     return folder

@@ -76,8 +76,8 @@ def entries_of_factor(first, columns, limit, starts=None, rows=None):
     total = 0
     for row in range(size):
         marks[row] = row
-        for place in range(first[row], first[row + 1]):
-            column = columns[place]
+        for entry in range(first[row], first[row + 1]):
+            column = columns[entry]
             # row `row` of the factor: the ways up the tree from the entries left of the diagonal
             while column < row and marks[column] != row:
                 if parent[column] < 0:

@@ -137,7 +137,7 @@ def support(transitions, live, policy, weights, reachable):
     num_actions = size_of(transitions)[1]
     width = reachable.shape[1]
     by_action = width > 1
-    alone = np.zeros_like(reachable)  # a row is 1 at one place while its node is looked at
+    alone = np.zeros_like(reachable)  # a row is 1 at one index while its node is looked at
     nodes = np.flatnonzero(reachable.reshape(-1) > 0.0)
     stack = np.empty(reachable.size, np.int64)
     stack[: len(nodes)] = nodes

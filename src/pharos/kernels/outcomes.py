@@ -9,7 +9,7 @@ Kernels take `transitions`, one of three things:
 - a table (S, A) of next states, -1 if the episode ends: an array, or `PackedIndices`;
 - several outcomes, as a tuple (successors (N,), offsets, codes, weights, (S, A), each). The outcomes of (s, a), row =
   s A + a, are successors[row K : (row + 1) K], or successors[offsets[row] : offsets[row + 1]] if there are offsets.
-  Their probabilities are weights[codes[row]], or, without codes, weights at the same places as the successors. Without
+  Their probabilities are weights[codes[row]], or, without codes, weights at the same indices as the successors. Without
   offsets the last ones of a row may have probability 0: they repeat its first successor. each: K, or, so that the
   compiler knows it and unrolls loops (twice as fast), a tuple of K zeros (`each_of`);
 - a pair (`transitions` of the first two kinds, p): with probability p a state stays what it is, else they hold. Staying
@@ -189,25 +189,25 @@ def _outcome(transitions, s, a, k):
     if isinstance(transitions[2], types.NoneType):
 
         def one_by_one(transitions, s, a, k):
-            place, is_padding = _place(transitions, s * transitions[4][1] + a, k)
-            return transitions[0][place], 0.0 if is_padding else transitions[3][place]
+            index, is_padding = _outcome_index(transitions, s * transitions[4][1] + a, k)
+            return transitions[0][index], 0.0 if is_padding else transitions[3][index]
 
         return one_by_one
 
     def by_palette(transitions, s, a, k):
         row = s * transitions[4][1] + a
-        place, _ = _place(transitions, row, k)
-        return transitions[0][place], transitions[3][uint64(transitions[2][uint64(row)]), uint64(k)]
+        index, _ = _outcome_index(transitions, row, k)
+        return transitions[0][index], transitions[3][uint64(transitions[2][uint64(row)]), uint64(k)]
 
     return by_palette
 
 
-def _place(transitions, row, k):
-    """(place of successor k of a row, whether k is padding, so that it repeats the last one)."""
+def _outcome_index(transitions, row, k):
+    """(index of successor k of a row, whether k is padding, so that it repeats the last one)."""
 
 
-@overload(_place)
-def _place_of(transitions, row, k):
+@overload(_outcome_index)
+def _typed_outcome_index(transitions, row, k):
     if isinstance(transitions[1], types.NoneType):
         if isinstance(transitions[5], types.BaseTuple):
             return lambda transitions, row, k: (uint64(row) * uint64(len(transitions[5])) + uint64(k), False)
@@ -217,8 +217,8 @@ def _place_of(transitions, row, k):
 
     def ragged(transitions, row, k):
         first, after = transitions[1][uint64(row)], transitions[1][uint64(row) + uint64(1)]
-        place = first + k
-        return uint64(min(place, after - 1)), place >= after
+        index = first + k
+        return uint64(min(index, after - 1)), index >= after
 
     return ragged
 

@@ -110,9 +110,9 @@ def split(next_states, classes, sizes, count, candidates, n, slots, used, new, c
             h = mixed(h ^ uint64(classes[t] if t >= 0 else -1))
         slot = np.int64(h) & mask
         while True:
-            place = slots[slot]
+            index = slots[slot]
             # a new signature: its group keeps the number of the class, or gets a new one
-            if place < 0:
+            if index < 0:
                 slots[slot] = i
                 used[i] = slot
                 c = classes[s]
@@ -124,7 +124,7 @@ def split(next_states, classes, sizes, count, candidates, n, slots, used, new, c
                     count += 1
                 break
             # a signature in this slot: s joins its group if all classes agree
-            other = candidates[place]
+            other = candidates[index]
             same = classes[other] == classes[s]
             for a in range(num_actions):
                 if not same:
@@ -133,7 +133,7 @@ def split(next_states, classes, sizes, count, candidates, n, slots, used, new, c
                 same = (classes[t] if t >= 0 else -1) == (classes[u] if u >= 0 else -1)
             if same:
                 used[i] = slot
-                new[i] = new[place]
+                new[i] = new[index]
                 break
             slot = (slot + 1) & mask
     # empty the slots, and renumber the states of new groups
@@ -234,7 +234,7 @@ def _have_equal_rows(matrix, num_actions, s, other, classes, mass, keys, mass_of
 def refine(matrix, num_actions, into, classes, layout, slots):
     """Split classes (S,), numbered from 0 without gaps, until nothing splits; returns the number of rounds.
 
-    The last round splits nothing. into: `predecessors`. layout: elements, place, begin, sizes, (S,) each, and slots, a
+    The last round splits nothing. into: `predecessors`. layout: elements, index, begin, sizes, (S,) each, and slots, a
     power of 2 of at least 2 S that are all -1: scratch.
     """
     size, kind = len(classes), classes.dtype
@@ -283,7 +283,7 @@ def _move_to_front(candidates, n, classes, layout, num_candidates, touched):
 
     touched (S,): its first entries are these classes.
     """
-    elements, place, begin, _ = layout
+    elements, index, begin, _ = layout
     num_touched = 0
     for i in range(n):
         s = candidates[i]
@@ -291,10 +291,10 @@ def _move_to_front(candidates, n, classes, layout, num_candidates, touched):
         if num_candidates[c] == 0:
             touched[num_touched] = c
             num_touched += 1
-        front, current = begin[c] + num_candidates[c], place[s]
+        front, current = begin[c] + num_candidates[c], index[s]
         t = elements[front]
         elements[front], elements[current] = s, t
-        place[s], place[t] = front, current
+        index[s], index[t] = front, current
         num_candidates[c] += 1
     return num_touched
 
@@ -341,7 +341,7 @@ def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, num
 
     Group 0 comes last, beside the members that are no candidates.
     """
-    elements, place, begin, sizes = layout
+    elements, index, begin, sizes = layout
     group, ends, _, _, states = groups
     # the beginning of each group, and which one is the largest
     largest, at = 0, begin[c]
@@ -354,7 +354,7 @@ def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, num
     states[:k] = elements[begin[c] : begin[c] + k]
     for j in range(k):
         s = states[j]
-        elements[ends[group[j]]], place[s] = s, ends[group[j]]
+        elements[ends[group[j]]], index[s] = s, ends[group[j]]
         ends[group[j]] += 1
     # new numbers: the largest group keeps c, each other gets the next one
     at = begin[c]
@@ -375,9 +375,9 @@ def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, num
 def _lay_out(classes, layout):
     """Lay the members of each class side by side; returns the number of classes.
 
-    elements[begin[c]:begin[c] + sizes[c]]: the members of class c; s is at place[s].
+    elements[begin[c]:begin[c] + sizes[c]]: the members of class c; s is at index[s].
     """
-    elements, place, begin, sizes = layout
+    elements, index, begin, sizes = layout
     count = 0
     sizes[:] = 0
     for s in range(len(classes)):
@@ -388,8 +388,8 @@ def _lay_out(classes, layout):
         begin[c] = at
         at += sizes[c]
     for s in range(len(classes)):
-        place[s] = begin[classes[s]]
-        elements[place[s]] = s
+        index[s] = begin[classes[s]]
+        elements[index[s]] = s
         begin[classes[s]] += 1
     for c in range(count):
         begin[c] -= sizes[c]

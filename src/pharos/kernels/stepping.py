@@ -120,9 +120,9 @@ def delayed_reward(pending, elapsed, earned, is_last):
     reward of this step.
     """
     # a ring: the reward of D steps ago leaves, the reward of this step comes in
-    place = elapsed % len(pending)
-    total = pending[place]
-    pending[place] = earned
+    slot = elapsed % len(pending)
+    total = pending[slot]
+    pending[slot] = earned
     if is_last:
         for k in range(len(pending)):
             total += pending[k]
@@ -296,20 +296,20 @@ def first_outside(actions, num_actions):
 
 
 @kernel
-def execute_choices(policy, places, numbers, chance, table, palette, states, discount, alive, previous, returns):
+def execute_choices(policy, indices, numbers, chance, table, palette, states, discount, alive, previous, returns):
     """One step of the episodes `alive` (N,): the executed actions become their `previous`, what these pay is added up.
 
-    policy: (M, A), probabilities; places: (N,), rows of the episodes there; numbers: (u, v, w), (N,) each: u chooses,
+    policy: (M, A), probabilities; indices: (N,), rows of the episodes there; numbers: (u, v, w), (N,) each: u chooses,
     v decides between the choice, the previous action and w, a uniform one; chance: (chosen, previous, uniform,
     first_chosen); table, palette: of rewards; states, previous (A if there is none), returns: of all episodes.
     """
     u, v, w = numbers
     num_actions = policy.shape[1]
     for k in range(len(alive)):
-        i, choice, sum_of = alive[k], 0, policy[places[k], 0]
+        i, choice, sum_of = alive[k], 0, policy[indices[k], 0]
         while sum_of < u[k] and choice < num_actions - 1:
             choice += 1
-            sum_of += policy[places[k], choice]
+            sum_of += policy[indices[k], choice]
         b = previous[i]
         if v[k] < (chance[3] if b == num_actions else chance[0]):
             action = choice
@@ -407,7 +407,7 @@ def q_learning(
     schedule,
     q,
     visits,
-    place,
+    cursor,
     sums,
     word,
     noise,
@@ -424,7 +424,7 @@ def q_learning(
     of updates, R = S, or S (A + 1) with rows s (A + 1) + b if the agent observes the previous action b (A: none).
     schedule: (learning rate, exponent of visits or 0, gamma, first epsilon, last epsilon, steps of exploration,
         exponential?, gamma of returns).
-    place: int64 (state or -1, previous action, steps in the episode, steps in all, episodes); sums: float64 (return of
+    cursor: int64 (state or -1, previous action, steps in the episode, steps in all, episodes); sums: float64 (return of
     this episode, its discount, sum of finished returns); word: uint64 (1,).
     noise: standard deviation of the noise of paid rewards; pending: float64 (steps by which they are late,), what
     is due; noise_word: uint64 (1,). Returns are of earned rewards.
@@ -434,16 +434,16 @@ def q_learning(
     observes_previous = len(q) > num_states
     for _ in range(steps):
         # start an episode
-        if place[0] < 0:
-            place[0] = starts[start_by_number(cumulative, uniform_number(word, 0))]
-            place[1] = num_actions
-            place[2] = 0
+        if cursor[0] < 0:
+            cursor[0] = starts[start_by_number(cumulative, uniform_number(word, 0))]
+            cursor[1] = num_actions
+            cursor[2] = 0
             sums[0] = 0.0
             sums[1] = 1.0
-        s, b = place[0], place[1]
+        s, b = cursor[0], cursor[1]
         row = s * (num_actions + 1) + b if observes_previous else s
         # epsilon of this step: linear or exponential from first to last
-        share = min(1.0, place[3] / exploration) if exploration > 0 else 1.0
+        share = min(1.0, cursor[3] / exploration) if exploration > 0 else 1.0
         if exponential > 0.0:
             epsilon = first_epsilon * (last_epsilon / first_epsilon) ** share
         else:
@@ -480,24 +480,24 @@ def q_learning(
         # the reward that the agent gets, late and noisy
         paid_reward = reward
         if len(pending) > 0:
-            paid_reward = delayed_reward(pending, place[2], reward, ended or place[2] + 1 >= limit)
+            paid_reward = delayed_reward(pending, cursor[2], reward, ended or cursor[2] + 1 >= limit)
         if noise > 0.0:
             paid_reward += noise * normal_number(noise_word, 0)
         # update Q of the chosen action, which may not be the executed one
         visits[row, action] += 1
         alpha = rate if exponent == 0.0 else max(rate, visits[row, action] ** -exponent)
         q[row, action] += alpha * (paid_reward + gamma * value - q[row, action])
-        # returns of earned rewards, and the place of the walk
+        # returns of earned rewards, and the cursor of the walk
         sums[0] += sums[1] * reward
         sums[1] *= measure_gamma
-        place[0] = t
-        place[1] = executed
-        place[2] += 1
-        place[3] += 1
-        if ended or place[2] >= limit:
+        cursor[0] = t
+        cursor[1] = executed
+        cursor[2] += 1
+        cursor[3] += 1
+        if ended or cursor[2] >= limit:
             sums[2] += sums[0]
-            place[4] += 1
-            place[0] = -1
+            cursor[4] += 1
+            cursor[0] = -1
 
 
 @kernel(fastmath={"reassoc", "contract"})
@@ -551,7 +551,7 @@ def values(kernel, learned, out):
 
 @kernel
 def learn(
-    outcomes, terminal, group, starts, cumulative, chance, limit, kernel, learned, target, memory, visits, place, word,
+    outcomes, terminal, group, starts, cumulative, chance, limit, kernel, learned, target, memory, visits, cursor, word,
     noise, schedule, largest_step, steps,
 ):  # fmt: skip
     """`steps` steps of an epsilon-greedy walk, with gradient steps on minibatches of its transitions.
@@ -563,7 +563,8 @@ def learn(
     kernel: (K (C, C) or (0, 0), F (C, m), diagonal (C,)); learnt, target: each (q (A, C), weights (A, m)), of which
     target stays as it is. memory: (observations (M,), actions (M,), next observations (M,), -1 for an end, rewards
     (M,)), a ring; visits: (C, A) numbers of choices.
-    place: int64 (state or -1, previous action or -1, steps in the episode, steps in all); word, noise_word: uint64 (1,)
+    cursor: int64 (state or -1, previous action or -1, steps in the episode, steps in all); word, noise_word: uint64
+        (1,)
     noise: (standard deviation of the noise of rewards, its random word); schedule: (gamma, first epsilon, last epsilon,
     steps of exploration, first step of learning, gradient steps in so many steps: two numbers, size of a minibatch).
     largest_step: the largest that does not overshoot; a minibatch takes that, or the largest that it bears itself.
@@ -576,11 +577,11 @@ def learn(
     batch, errors = np.zeros(size, np.int64), np.zeros(size)
     for _ in range(steps):
         # start an episode
-        if place[0] < 0:
-            place[0] = starts[start_by_number(cumulative, uniform_number(word, 0))]
-            place[1] = -1
-            place[2] = 0
-        s, t = place[0], place[3]
+        if cursor[0] < 0:
+            cursor[0] = starts[start_by_number(cumulative, uniform_number(word, 0))]
+            cursor[1] = -1
+            cursor[2] = 0
+        s, t = cursor[0], cursor[3]
         c = group[s]
         # epsilon-greedy action; before learning begins, a uniform one
         share = min(1.0, t / exploration) if exploration > 0 else 1.0
@@ -603,7 +604,7 @@ def learn(
                     if uniform_number(word, 0) * ties < 1.0:
                         action = a
         # one step of the MDP: the outcome by its cumulated probability
-        executed = redrawn_action(action, place[1], chance, num_actions, word, c)
+        executed = redrawn_action(action, cursor[1], chance, num_actions, word, c)
         row = s * num_actions + executed
         k, last = offsets[row], offsets[row + 1] - 1
         if k < last:
@@ -619,11 +620,11 @@ def learn(
         if deviation > 0.0:
             rewards[slot] += deviation * normal_number(noise_word, 0)
         visits[c, action] += 1
-        place[0], place[1] = next_state, executed
-        place[2] += 1
-        place[3] += 1
-        if ended or place[2] >= limit:
-            place[0] = -1
+        cursor[0], cursor[1] = next_state, executed
+        cursor[2] += 1
+        cursor[3] += 1
+        if ended or cursor[2] >= limit:
+            cursor[0] = -1
         if t < begin:
             continue
         # gradient steps that fall due between this step and the next

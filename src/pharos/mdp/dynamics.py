@@ -449,23 +449,23 @@ def swept(
 
     Args:
         threads: each has a part of the states, if that is possible.
-        part: the places [start, stop) of the order that are swept; None: all.
+        part: the range [start, stop) of the order that are swept; None: all.
     """
     rewards, gamma, chance, select = equation
     others = (*rewards.for_kernels, gamma)
     tables = (transitions, *others)
     actions, scratch = bellman.actions_of(num_actions, rewards.is_unrolled), np.empty(num_actions)
-    choice, places = _choice(select), part or (0, rewards.shape[0])
+    choice, bounds = _choice(select), part or (0, rewards.shape[0])
     if choice is None:
         assert isinstance(select, PolicyTable)
         if chance.is_sticky:
             return bellman.sticky_policy_sweep(
-                *tables, chance.for_kernels, select.later, x, actions, scratch, np.empty(num_actions), order, *places
+                *tables, chance.for_kernels, select.later, x, actions, scratch, np.empty(num_actions), order, *bounds
             )
-        return bellman.policy_sweep(*tables, chance.for_kernels, select.later[:, 0], x[:, 0], actions, order, *places)
+        return bellman.policy_sweep(*tables, chance.for_kernels, select.later[:, 0], x[:, 0], actions, order, *bounds)
     if chance.is_sticky:
-        return bellman.sticky_sweep(*tables, chance.for_kernels, choice, x, actions, scratch, order, *places)
-    v, border = x[:, 0], rows_with_room(transitions, *places)
+        return bellman.sticky_sweep(*tables, chance.for_kernels, choice, x, actions, scratch, order, *bounds)
+    v, border = x[:, 0], rows_with_room(transitions, *bounds)
 
     def change_of(low: int, high: int) -> float:
         change = 0.0
@@ -476,7 +476,7 @@ def swept(
             change = float(np.maximum(change, largest))
         return change
 
-    low, high = places
+    low, high = bounds
     cuts = [low + (high - low) * i // threads for i in range(threads + 1)]
     if threads == 1:
         return change_of(*cuts)

@@ -176,11 +176,11 @@ class ExpandedMDP:
         for node, _ in self.starts:
             is_reached[scipy.sparse.csgraph.breadth_first_order(graph, node, return_predecessors=False)] = True
         nodes = np.flatnonzero(is_reached)
-        place = np.full(size, -1)
-        place[nodes] = np.arange(nodes.size)
+        index = np.full(size, -1)
+        index[nodes] = np.arange(nodes.size)
         rows = (nodes[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
         matrix = scipy.sparse.csr_matrix(self.matrix[rows][:, nodes])
-        starts = [(int(place[node]), p) for node, p in self.starts]
+        starts = [(int(index[node]), p) for node, p in self.starts]
         return ExpandedMDP(
             matrix,
             self.underlying[nodes],

@@ -469,8 +469,8 @@ def _joined(outcomes: PaidOutcomes) -> PaidOutcomes:
     key = np.stack([which, states, rewards])[:, order]
     begins = np.flatnonzero(np.append(True, (key[:, 1:] != key[:, :-1]).any(axis=0)))
     first = np.minimum.reduceat(order, begins)
-    place = np.argsort(first)
-    first, sums = first[place], np.add.reduceat(probabilities[order], begins)[place]
+    by_first = np.argsort(first)
+    first, sums = first[by_first], np.add.reduceat(probabilities[order], begins)[by_first]
     return PaidOutcomes(which[first], states[first], rewards[first], sums)
 
 

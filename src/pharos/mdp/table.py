@@ -483,13 +483,13 @@ class OutcomeTable(OutcomeRows, Dynamics):
 
     def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
         """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for the state of the row."""
-        which, places = self.places(self._rows(np.asarray(states)))
-        next_states = number[self.flat[places]]
+        which, entries = self.places(self._rows(np.asarray(states)))
+        next_states = number[self.flat[entries]]
         next_states = np.where(next_states == -2, which // self.num_actions, next_states)
-        return self._of_states(states, places, as_indices(next_states, len(states)))
+        return self._of_states(states, entries, as_indices(next_states, len(states)))
 
-    def _of_states(self, states: States, places: States, successors: Indices) -> "OutcomeTable":
-        """The rows of some states, with other successors (N,); places (N,) of their entries, all and in order."""
+    def _of_states(self, states: States, entries: States, successors: Indices) -> "OutcomeTable":
+        """Rows of some states, with other successors (N,); entries (N,): indices of all their outcomes, in order."""
         arrays: dict[str, Any] = {"successors": successors.reshape(-1, *self.successors.shape[1:])}
         if self.offsets is not None:
             rows = self._rows(np.arange(self.num_states)[states])
@@ -497,7 +497,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
         if self.probabilities is None:
             arrays.update(codes=np.array(np.asarray(self.codes)[states]), palette=self.palette)
         else:
-            probabilities = np.array(self.probabilities.reshape(-1)[places])
+            probabilities = np.array(self.probabilities.reshape(-1)[entries])
             arrays["probabilities"] = probabilities.reshape(arrays["successors"].shape)
         return OutcomeTable(num_actions=self.num_actions, **arrays)
 
@@ -522,11 +522,11 @@ class Matrices(OutcomeTable):
         counts = np.diff(transitions.indptr)
         lacks = 1 - np.asarray(transitions.sum(axis=1)).ravel()
         ending = np.flatnonzero(lacks > rounding_of_sums(int(counts.max(initial=0))))
-        places, offsets = transitions.indptr[ending + 1], transitions.indptr
+        indices, offsets = transitions.indptr[ending + 1], transitions.indptr
         successors, probabilities = transitions.indices, transitions.data
         if len(ending):
-            successors = np.insert(successors, places, -1)
-            probabilities = np.insert(probabilities, places, lacks[ending])
+            successors = np.insert(successors, indices, -1)
+            probabilities = np.insert(probabilities, indices, lacks[ending])
             offsets = offsets + np.searchsorted(ending, np.arange(len(offsets)))
         super().__init__(successors, num_actions, offsets=offsets, probabilities=probabilities)
 

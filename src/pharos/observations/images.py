@@ -306,12 +306,12 @@ class ComplexImage(Frames):
         ground_of(scenery.ground)(ground, scenery.cell, scenery.margin)
         picture = _scaled(ground, height, width)
         layers = self._drawing.layers
-        sprite, place, color, keep = _sprite_tables(layers, scenery, np.diff(top), np.diff(left))
+        sprite, offset, color, keep = _sprite_tables(layers, scenery, np.diff(top), np.diff(left))
         hidden = hidden_names(hide, f"complex_image of {env.name}", layers)
         sprite[[name in hidden for name in layers]] = -1
         if grey:
             picture, color = (values @ np.array(LUMINANCE)[:, None] for values in (picture, color))
-        self._tables = (_bytes(picture), top, left, sprite, place, _bytes(color), keep)
+        self._tables = (_bytes(picture), top, left, sprite, offset, _bytes(color), keep)
         channels = picture.shape[2]
         shape = (channels, height, width) if channels_first else (height, width, channels)
         self.space = Box(0, 255, shape, np.uint8)
@@ -384,7 +384,7 @@ def _area_weights(old: int, new: int) -> np.ndarray:
 def _sprite_tables(
     layers: Mapping[str, Layer], scenery: Scenery, heights: np.ndarray, widths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """sprite, place, color and keep, as `draw_complex` takes them; color still (P, 3) float64."""
+    """sprite, offset, color and keep, as `draw_complex` takes them; color still (P, 3) float64."""
     rows = len(heights)
     sprite = np.full((len(layers), rows, 256), -1, np.int64)
     images: list[np.ndarray] = []
@@ -399,18 +399,18 @@ def _sprite_tables(
             sprite[number, row, 1:] = first + count - 1
             sprite[number, row, 1 : 1 + count] = first + np.arange(count)
         images += [_sprite_image(name, look, value, scenery) for look in looks for value in range(1, count + 1)]
-    place = np.zeros((max(1, len(images)), heights.max() + 1, widths.max() + 1), np.int64)
+    offset = np.zeros((max(1, len(images)), heights.max() + 1, widths.max() + 1), np.int64)
     pixels: list[np.ndarray] = []
     used = 0
     for i, image in enumerate(images):
         for height in np.unique(heights):
             for width in np.unique(widths):
-                place[i, height, width] = used
+                offset[i, height, width] = used
                 pixels.append(_scaled(image, int(height), int(width)).reshape(-1, 4))
                 used += int(height * width)
     table = np.concatenate([np.zeros((1, 4)) if not pixels else np.empty((0, 4)), *pixels])
     keep = 256 - np.rint(table[:, 3] * 256).astype(np.uint16)
-    return sprite, place, table[:, :3], keep
+    return sprite, offset, table[:, :3], keep
 
 
 def _sprite_image(name: str, layer: Layer, value: int, scenery: Scenery) -> np.ndarray:
@@ -425,7 +425,7 @@ def _sprite_image(name: str, layer: Layer, value: int, scenery: Scenery) -> np.n
     return image
 
 
-def _compose(planes, picture, top, left, sprite, place, color, keep, out) -> None:
+def _compose(planes, picture, top, left, sprite, offset, color, keep, out) -> None:
     """Python twin of the kernel for one state: the part of `interaction.draw_complex` after drawing."""
     out[:] = picture
     for layer, plane in enumerate(planes):
@@ -434,7 +434,7 @@ def _compose(planes, picture, top, left, sprite, place, color, keep, out) -> Non
             if number < 0:
                 continue
             height, width = top[row + 1] - top[row], left[column + 1] - left[column]
-            pixels = slice(place[number, height, width], place[number, height, width] + height * width)
+            pixels = slice(offset[number, height, width], offset[number, height, width] + height * width)
             target = out[top[row] : top[row + 1], left[column] : left[column + 1]]
             stays = keep[pixels].reshape(height, width, 1).astype(np.int64)
             target[:] = color[pixels].reshape(height, width, -1) + (target * stays >> 8)

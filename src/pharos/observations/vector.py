@@ -115,7 +115,9 @@ class OneHot(Observation):
                 self._first[self._offset[i] : self._offset[i] + components.size[i]] = True
         starts = env.initial_states() if self._first.any() else []
         if len(starts) > MOST_STARTS:
-            raise ParameterError(f"{source}: seen_first with {len(starts)} start states; expected at most {MOST_STARTS}")
+            raise ParameterError(
+                f"{source}: seen_first with {len(starts)} start states; expected at most {MOST_STARTS}"
+            )
         self._starts = np.array([state for state, _ in starts], np.int64)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:

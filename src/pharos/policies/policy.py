@@ -200,7 +200,7 @@ class QueriedPolicy:
         self.width = 1 if by_state else mdp.num_actions + 1 if sees_previous_action else mdp.policy_width
         self.by_pairs = self.width > 1
         # index + 1 of each row, 0: not queried; pages of zeros take no memory until they are written
-        self._place = np.zeros(mdp.num_states * self.width, np.int32)
+        self._index = np.zeros(mdp.num_states * self.width, np.int32)
         # number of filled entries of the next two arrays, which double when they are full
         self._count = 0
         self._rows, self._answers = np.empty(64, np.int64), np.empty((64, mdp.num_actions))
@@ -216,18 +216,18 @@ class QueriedPolicy:
         return self._answers[: self._count]
 
     def index(self, rows: np.ndarray) -> np.ndarray:
-        """(N,) place of each row in `rows` and `probabilities`; -1 for rows that were not queried."""
-        return self._place[rows] - 1
+        """(N,) index of each row in `rows` and `probabilities`; -1 for rows that were not queried."""
+        return self._index[rows] - 1
 
     def query(self, rows: np.ndarray) -> np.ndarray:
         """(N, A) probabilities of distinct or repeated rows; only new ones are queried."""
-        places = self.places(rows)  # before `probabilities`, which it appends to
-        return self.probabilities[places]
+        indices = self.index_after_query(rows)  # before `probabilities`, which it appends to
+        return self.probabilities[indices]
 
-    def places(self, rows: np.ndarray) -> np.ndarray:
-        """(N,) place of each row in `rows` and `probabilities`; new ones are queried."""
-        places = self.index(rows)
-        if (is_new := places < 0).any():
+    def index_after_query(self, rows: np.ndarray) -> np.ndarray:
+        """(N,) index of each row in `rows` and `probabilities`; new ones are queried."""
+        indices = self.index(rows)
+        if (is_new := indices < 0).any():
             unknown = np.unique(rows[is_new])
             count = self._count + unknown.size
             if count > len(self._rows):
@@ -236,12 +236,12 @@ class QueriedPolicy:
                 self._answers = np.concatenate([self._answers, np.empty((more, self.num_actions))])
             for start in range(0, unknown.size, BATCH):
                 block = unknown[start : start + BATCH]
-                place = slice(self._count + start, self._count + start + len(block))
-                self._rows[place], self._answers[place] = block, self._query(block)
-            self._place[unknown] = np.arange(self._count, count) + 1
+                part = slice(self._count + start, self._count + start + len(block))
+                self._rows[part], self._answers[part] = block, self._query(block)
+            self._index[unknown] = np.arange(self._count, count) + 1
             self._count = count
-            places = self.index(rows)
-        return places
+            indices = self.index(rows)
+        return indices
 
     def _query(self, rows: np.ndarray) -> np.ndarray:
         """(N, A) probabilities in rows that are new."""
@@ -311,7 +311,7 @@ class QueriedPolicy:
         if not always and not (probabilities > 0).all():
             return None
         self._rows, self._answers, self._count = rows.copy(), probabilities, len(rows)
-        self._place[rows] = np.arange(1, self._count + 1)
+        self._index[rows] = np.arange(1, self._count + 1)
         return True
 
     def _arrivals(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -332,12 +332,12 @@ class QueriedPolicy:
             return self._mdp_on(
                 states, starts, lambda next_states, executed, _: self.index(self._arrivals(next_states, executed))
             ), self.probabilities
-        place = np.full(mdp.num_states, -1, np.int64)
-        place[states] = np.arange(states.size)
+        index = np.full(mdp.num_states, -1, np.int64)
+        index[states] = np.arange(states.size)
         policy = np.zeros((states.size, self.width, mdp.num_actions))
         policy[:, :, 0] = 1.0  # arbitrary, in pairs that are not reached
-        policy[place[self.rows // self.width], self.rows % self.width] = self.probabilities
-        return self._mdp_on(states, place[mdp.start_states], lambda next_states, *_: place[next_states]), policy
+        policy[index[self.rows // self.width], self.rows % self.width] = self.probabilities
+        return self._mdp_on(states, index[mdp.start_states], lambda next_states, *_: index[next_states]), policy
 
     def _mdp_on(
         self, states: np.ndarray, starts: np.ndarray, number: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]

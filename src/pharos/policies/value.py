@@ -64,7 +64,7 @@ class QueriedHistories(PolicyAnswers):
         self.by_pairs, self.width = False, 1
         self._histories: list[tuple[int, ...]] = []
         self._number: dict[tuple[int, ...], int] = {}
-        self._place = np.zeros(64, np.int32)
+        self._index = np.zeros(64, np.int32)
 
     def first_rows(self, states: np.ndarray) -> np.ndarray:
         return self._numbers([(int(s),) * self.observer.frames for s in states])
@@ -113,10 +113,10 @@ class QueriedHistories(PolicyAnswers):
         return super().index(rows)
 
     def _make_room(self) -> None:
-        """Grow `_place` to an entry for each numbered history."""
-        if len(self._place) < len(self._histories):
-            more = np.zeros(2 * len(self._histories) - len(self._place), np.int32)
-            self._place = np.concatenate([self._place, more])
+        """Grow `_index` to an entry for each numbered history."""
+        if len(self._index) < len(self._histories):
+            more = np.zeros(2 * len(self._histories) - len(self._index), np.int32)
+            self._index = np.concatenate([self._index, more])
 
     def _query(self, rows: np.ndarray) -> np.ndarray:
         answers = []
@@ -780,7 +780,7 @@ def estimate(
     previous, rows = np.full(episodes, mdp.num_actions), answers.first_rows(states)
     returns, alive = np.zeros(episodes), np.arange(episodes)
     for step in range(steps):
-        places = answers.places(rows)
+        indices = answers.index_after_query(rows)
         numbers = rng.random(alive.size), rng.random(alive.size), rng.integers(mdp.num_actions, size=alive.size)
         if mdp.available is not None and not mdp.chance.is_none:
             sets = mdp.available[states[alive]]
@@ -789,7 +789,7 @@ def estimate(
             can_be = sets[np.arange(alive.size), np.minimum(before, mdp.num_actions - 1)]
             previous[alive] = np.where(can_be, before, mdp.num_actions)
         execute_choices(
-            answers.probabilities, places, numbers, chance, *rewards, states, mdp.gamma**step, alive, previous, returns
+            answers.probabilities, indices, numbers, chance, *rewards, states, mdp.gamma**step, alive, previous, returns
         )
         executed = previous[alive]
         next_states = mdp.dynamics.sample(states[alive], executed, rng)

@@ -246,11 +246,11 @@ class RankedBackup:
             q = equation.rewards.rows(states) + equation.gamma * part.dynamics.expected(x, states)
             for kind, values in enumerate((q, equation.value(q, states))):
                 bits = np.ascontiguousarray(values).view(np.uint64).reshape(len(values), -1)
-                place = (part.start + np.arange(states.start, states.stop, dtype=np.uint64)[:, None]) * np.uint64(
+                position = (part.start + np.arange(states.start, states.stop, dtype=np.uint64)[:, None]) * np.uint64(
                     2 * bits.shape[1]
                 )
-                place = place + np.uint64(2) * np.arange(bits.shape[1], dtype=np.uint64) + np.uint64(kind)
-                total += int(np.add.reduce(_mixed(bits ^ _mixed(place)), axis=None, dtype=np.uint64))
+                position = position + np.uint64(2) * np.arange(bits.shape[1], dtype=np.uint64) + np.uint64(kind)
+                total += int(np.add.reduce(_mixed(bits ^ _mixed(position)), axis=None, dtype=np.uint64))
         totals = self.rank.allgather(np.array([total % 2**64], np.uint64))
         return f"{sum(int(each[0]) for each in totals) % 2**64:016x}"
 

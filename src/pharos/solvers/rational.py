@@ -65,8 +65,8 @@ def fractions_of(choices: "Choices") -> list[Row] | None:
         return None
     rows = []
     for i in range(matrix.shape[0]):
-        places = range(matrix.indptr[i], matrix.indptr[i + 1])
-        row = {int(matrix.indices[k]): Fraction(float(matrix.data[k])) for k in places}
+        entries = range(matrix.indptr[i], matrix.indptr[i + 1])
+        row = {int(matrix.indices[k]): Fraction(float(matrix.data[k])) for k in entries}
         rows.append((Fraction(float(choices.rewards[i])), row))
     return rows
 

@@ -470,9 +470,9 @@ def check_layers(env: Environment, notes: list[str]) -> None:
         )
     for name, layer in motion.items():
         _check_layer(f"{source}.motion_layers[{name!r}]", name, layer)
-    for place, look in (("look", env.look), ("look.scenery", env.look.scenery)):
+    for attribute, look in (("look", env.look), ("look.scenery", env.look.scenery)):
         if look is not None:
-            with _named(f"{source}.{place}.ground"):
+            with _named(f"{source}.{attribute}.ground"):
                 ground_of(look.ground)
     try:
         rows, columns = env.grid()

@@ -342,8 +342,8 @@ class OutcomeParts:
     def _part(self, row: int, first: int, codes: np.ndarray | None, counts: np.ndarray) -> JournalRows:
         entries = int(counts.sum())
         dtype = dtype_of(INDEX_TYPES[self.indices])
-        place = first * dtype.itemsize
-        stored = np.fromfile(self.folder / PARTS[self.indices], dtype, entries, offset=place)
+        first_byte = first * dtype.itemsize
+        stored = np.fromfile(self.folder / PARTS[self.indices], dtype, entries, offset=first_byte)
         successors = np.asarray(from_stored(stored))
         return JournalRows(row, first, counts, codes, successors)
 
@@ -426,10 +426,10 @@ class OutcomeParts:
             for state in states[
                 (states >= row // self.num_actions) & (states < (row + len(counts)) // self.num_actions)
             ]:
-                place = int(state) * self.num_actions - row
-                rows = slice(place, place + self.num_actions)
-                first_outcome = first + int(counts[:place].sum())
-                part = self._part(row + place, first_outcome, None if codes is None else codes[rows], counts[rows])
+                index = int(state) * self.num_actions - row
+                rows = slice(index, index + self.num_actions)
+                first_outcome = first + int(counts[:index].sum())
+                part = self._part(row + index, first_outcome, None if codes is None else codes[rows], counts[rows])
                 ends = np.cumsum(part.counts)[:-1]
                 probabilities = np.split(self.bits(part).view(np.float64), ends)
                 outcomes[int(state)] = list(zip(np.split(part.successors, ends), probabilities, strict=True))

@@ -113,13 +113,13 @@ def mapped(parts: Sequence[Path], dtype: str | np.dtype) -> np.ndarray:
     library = ctypes.CDLL(None, use_errno=True)
     library.mmap.restype = ctypes.c_void_p
     library.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_longlong]
-    place = array.ctypes.data
+    address = array.ctypes.data
     for part, size in zip(parts, sizes, strict=True):  # in the place of what was reserved; goes when `memory` goes
         with open(part, "rb") as file:
-            if library.mmap(place, size, _READ, _SHARED | _FIXED, file.fileno(), 0) != place:
+            if library.mmap(address, size, _READ, _SHARED | _FIXED, file.fileno(), 0) != address:
                 error = ctypes.get_errno()
                 raise OSError(error, os.strerror(error), str(part))
-        place += size
+        address += size
     return array.view(dtype)
 
 

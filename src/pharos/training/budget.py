@@ -390,7 +390,7 @@ class PolicyRecorder:
 
     def check_steps(self, curve: Curve) -> None:
         """Raise ParameterError if a curve ends elsewhere than it begins, and no step was counted."""
-        first, last = (curve.rows[place]["normalized_regret"] for place in (0, -1))
+        first, last = (curve.rows[index]["normalized_regret"] for index in (0, -1))
         if not self.budget.steps and abs(last - first) > TOLERANCE:
             raise not_stepped(self.budget.limit)
 

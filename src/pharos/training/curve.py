@@ -96,7 +96,7 @@ def evaluate_agent(
 
 
 def joint_values(batch: Learner, runs: "Sequence[PreparedRun]") -> dict[int, Evaluation]:
-    """Values of policies by place in the batch, if computing them at once costs less; others are left out.
+    """Values of policies by index in the batch, if computing them at once costs less; others are left out.
 
     These are policies of DQN if nothing is random, and of runs that share a task of few states and see one frame.
     If gains are measured, too, each policy is evaluated alone.
@@ -109,9 +109,9 @@ def joint_values(batch: Learner, runs: "Sequence[PreparedRun]") -> dict[int, Eva
         run = runs[i]
         if i not in values and is_small_table(run.task.mdp) and _frames(run) == 1:
             tasks[id(run.task)].append(i)
-    for places in tasks.values():
-        if len(places) > 1:
-            values |= _values_of_tables(batch, runs[places[0]].task, places)
+    for indices in tasks.values():
+        if len(indices) > 1:
+            values |= _values_of_tables(batch, runs[indices[0]].task, indices)
     return values
 
 
@@ -124,30 +124,30 @@ def _frames(run: "PreparedRun") -> int:
     return 1 if agent_called(run.config.agent).has_table else run.task.observer.frames
 
 
-def _values_of_walks(batch: Learner, runs: "Sequence[PreparedRun]", places: Sequence[int]) -> dict[int, Evaluation]:
-    """Values by place: an episode of T steps costs T calls of the networks of all runs at once, not of each."""
-    if not places:
+def _values_of_walks(batch: Learner, runs: "Sequence[PreparedRun]", indices: Sequence[int]) -> dict[int, Evaluation]:
+    """Values by index: an episode of T steps costs T calls of the networks of all runs at once, not of each."""
+    if not indices:
         return {}
     best_actions = getattr(batch, "best_actions")  # noqa: B009  (which not every learner has)
-    frames = _frames(runs[places[0]])
+    frames = _frames(runs[indices[0]])
     states = np.zeros((len(runs), frames) if frames > 1 else len(runs), np.int64)
 
     def act(now: np.ndarray) -> np.ndarray:
-        states[places] = now
-        return best_actions(states)[places]
+        states[indices] = now
+        return best_actions(states)[indices]
 
-    mdps = [runs[i].task.mdp for i in places]
-    return dict(zip(places, walk_values(mdps, act, frames=frames), strict=True))
+    mdps = [runs[i].task.mdp for i in indices]
+    return dict(zip(indices, walk_values(mdps, act, frames=frames), strict=True))
 
 
-def _values_of_tables(batch: Learner, task: Task, places: Sequence[int]) -> dict[int, Evaluation]:
-    """Values by place, each policy queried once in every state. One that gives no probabilities is left out."""
-    actions = batch.greedy_actions(places)
+def _values_of_tables(batch: Learner, task: Task, indices: Sequence[int]) -> dict[int, Evaluation]:
+    """Values by index, each policy queried once in every state. One that gives no probabilities is left out."""
+    actions = batch.greedy_actions(indices)
     if actions is not None:
         return dict(zip(actions, table_values(task.mdp, list(actions.values())), strict=True))
     mdp, observer = task.mdp, task.observer
-    answers = {i: PolicyAnswers(batch.policy(i), mdp, observer) for i in places}
-    tables: dict[int, list[np.ndarray]] = {i: [] for i in places}
+    answers = {i: PolicyAnswers(batch.policy(i), mdp, observer) for i in indices}
+    tables: dict[int, list[np.ndarray]] = {i: [] for i in indices}
     for first in range(0, mdp.num_states, BLOCK):
         states = np.arange(first, min(first + BLOCK, mdp.num_states))
         context = observer.space.states(states), np.full(len(states), -1), np.zeros(len(states), np.int64)

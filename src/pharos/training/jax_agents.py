@@ -84,14 +84,14 @@ def compiled_curves(
     (number,) = numbers
     ask = jax.jit(jax.vmap(functions[-1], (0, None)))
     everything, answers = env.default_params.observations[:-1], PolicyAnswers(functions[-1], task.mdp, task.observer)
-    places = [point * number // evaluations - 1 for point in range(evaluations + 1)]
+    indices = [point * number // evaluations - 1 for point in range(evaluations + 1)]
     uniform, curves = uniform_choice(task.mdp), []
     for i in range(len(seeds)):
         tables = np.asarray(ask(jax.tree.map(lambda leaf, i=i: leaf[i], snapshots), everything))
-        policies = {place: answers.checked(tables[place], count) for place in sorted(set(places) - {-1})}
+        policies = {index: answers.checked(tables[index], count) for index in sorted(set(indices) - {-1})}
         curve = Curve(task)
-        values = {place: evaluate_agent(policy, task) for place, policy in {-1: uniform, **policies}.items()}
-        for point, place in enumerate(places):
-            curve.add(point * (steps // evaluations), 0, 0.0, None, values[place])
+        values = {index: evaluate_agent(policy, task) for index, policy in {-1: uniform, **policies}.items()}
+        for point, index in enumerate(indices):
+            curve.add(point * (steps // evaluations), 0, 0.0, None, values[index])
         curves.append(curve)
     return curves

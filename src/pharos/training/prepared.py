@@ -92,14 +92,14 @@ class PreparedRun:
     """A run before and while it is trained: a `pharos.agents.LearningRun`, with its curve and its record.
 
     Attributes:
-        place: among the configurations; None for a run of a checkpoint that nobody asks for.
+        index: among the configurations; None for a run of a checkpoint that nobody asks for.
         tasks: that it shares with other runs.
         key: runs with equal keys train together, see `pharos.agents.Agent.prepare`; None: it is alone, has checkpoints
             in its own folder, and holds that.
         error: why it has failed.
     """
 
-    place: int | None
+    index: int | None
     config: RunConfig
     folder: Path | None
     tasks: TaskCache

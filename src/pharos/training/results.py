@@ -362,8 +362,8 @@ class TrainingResult:
     def __repr__(self) -> str:
         config, result = self.config, self.result
         numbers = (f"{name}={result[name]}" for name in ("final_value", "value_optimal", "normalized_regret"))
-        place = f"{config['agent']} on {config['environment']}, steps={config['steps']}"
-        return f"TrainingResult({place}, {', '.join(numbers)}, seconds={self.seconds:.2f})"
+        title = f"{config['agent']} on {config['environment']}, steps={config['steps']}"
+        return f"TrainingResult({title}, {', '.join(numbers)}, seconds={self.seconds:.2f})"
 
 
 def finished_result(folder: Path, config: RunConfig) -> TrainingResult | None:

@@ -157,13 +157,13 @@ def _train(
             f"and a folder (out)"
         )
 
-    def tell(now: TrainingProgress) -> None:
+    def report(now: TrainingProgress) -> None:
         if progress is not None and 0 in now.rows:
             progress(now.rows[0]["step"], config.steps, now.rows[0])
 
     folders, checkpoints = (None, None) if folder is None else ([folder], folder / "checkpoints")
     options = {"raises": True, "tensorboard": tensorboard}
-    (end,) = Training([config], folders, [[0]], checkpoints, tell, tasks, **options).results_in_order()
+    (end,) = Training([config], folders, [[0]], checkpoints, report, tasks, **options).results_in_order()
     assert isinstance(end, TrainingResult)
     return end
 

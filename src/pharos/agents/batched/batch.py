@@ -73,7 +73,7 @@ class Batch:
             [lane.best_actions(states[k * self.width : (k + 1) * self.width]) for k, lane in enumerate(self.lanes)]
         )
 
-    def greedy_actions(self, places: Sequence[int]) -> None:
+    def greedy_actions(self, indices: Sequence[int]) -> None:
         """None: these policies are no tables of states; they are queried about observations."""
 
     def policy(self, i: int) -> RunPolicy:

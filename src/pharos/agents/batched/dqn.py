@@ -64,9 +64,9 @@ class Replay:
         flags: np.ndarray,
     ) -> None:
         """Keep the transitions (W, E) of step `calls`, counted from 0."""
-        place = calls % self.rows
+        row = calls % self.rows
         for array, new in zip(self.memory, (state, next_state, actions, reward, flags), strict=True):
-            array[:, place] = new
+            array[:, row] = new
 
     def sample(self, calls: int, draw: int, gammas: np.ndarray, num_steps: int) -> None:
         """Draw a minibatch for each run that is not idle, after `calls` steps; see `kernels.sample`."""

@@ -20,9 +20,9 @@ from pharos.agents.batched.networks import (
     Values,
     aligned_zeros,
     flat_view,
+    input_indices,
     names_of,
     pad,
-    places_of,
 )
 from pharos.agents.batched.runs import BLOCK, BatchRun, ObservationSource, as_networks_see, is_small, resolved
 from pharos.kernels import batched as kernels
@@ -66,7 +66,7 @@ class ObservationTable:
     several frames are seen single ones are kept, and put together for those who ask.
 
     Attributes:
-        views: of the distinct sources; which: (W,) the place in `views` of each run's.
+        views: of the distinct sources; which: (W,) the index in `views` of each run's.
         frames: k, how many states are seen at once.
         shape: of an observation as the lane's network takes it.
         size: numbers that its first layer takes.
@@ -79,9 +79,9 @@ class ObservationTable:
     def __init__(self, runs: Sequence[BatchRun], device: str = "cpu"):
         self.device, self.is_image = device, runs[0].observe.is_image
         sources = list({id(run.observe): run.observe for run in runs}.values())
-        place = {id(source): i for i, source in enumerate(sources)}
+        index = {id(source): i for i, source in enumerate(sources)}
         self.views = [NetworkView(source) for source in sources]
-        self.which = np.array([place[id(run.observe)] for run in runs])
+        self.which = np.array([index[id(run.observe)] for run in runs])
         self._ends = np.cumsum([0, *(source.num_states for source in sources)])
         self._begins = self._ends[self.which]
         self.shape, self.frames = self.views[0].shape, self.views[0].frames
@@ -151,10 +151,10 @@ class DeviceObservationTable(ObservationTable):
                 f"more than {SHARE_OF_DEVICE:.0%} of what is free; a run alone that is too large trains on cpu"
             )
         table = torch.zeros((total, length), dtype=kind)
-        of_views = [places_of(view.shape, is_small(view.shape, self.is_image)) for view in self.views]
+        of_views = [input_indices(view.shape, is_small(view.shape, self.is_image)) for view in self.views]
         self.size = max(map(len, of_views))
-        places = np.full((len(self.views), self.size), length - 1)
-        for view, own, row, begin in zip(self.views, of_views, places, self._ends, strict=False):
+        indices = np.full((len(self.views), self.size), length - 1)
+        for view, own, row, begin in zip(self.views, of_views, indices, self._ends, strict=False):
             frame, inside = np.divmod(own, view.length)
             row[: len(own)] = np.where(frame < view.frames, frame * length + inside, length - 1)
             for first, block in view.in_blocks():
@@ -163,7 +163,7 @@ class DeviceObservationTable(ObservationTable):
         self._table = table.to(self.device)
         offsets = self._begins[:, None] if self.frames == 1 else self._begins[:, None, None]
         self._offsets = torch.from_numpy(offsets).to(self.device)
-        self._places = torch.from_numpy(places[self.which][:, None]).to(self.device)
+        self._indices = torch.from_numpy(indices[self.which][:, None]).to(self.device)
         self._in_an_observation = [torch.from_numpy(own).to(self.device) for own in of_views]
 
     def at(self, states: PinnedBuffer, out: torch.Tensor) -> torch.Tensor:
@@ -171,7 +171,7 @@ class DeviceObservationTable(ObservationTable):
         assert self._table is not None
         rows = (states.tensor + self._offsets).view(-1)
         raw = self._table.index_select(0, rows).view(*states.tensor.shape[:2], -1)
-        return out.copy_(raw.gather(2, self._places.expand(-1, raw.shape[1], -1)))
+        return out.copy_(raw.gather(2, self._indices.expand(-1, raw.shape[1], -1)))
 
     def encoded(self, observations: np.ndarray, i: int) -> torch.Tensor:
         """See `ObservationTable`; what travels is a 36th of the neighbours of pixels as float32."""
@@ -507,7 +507,7 @@ class BatchedEpisodes:
         for i, run in enumerate(runs):
             parts = (run.mdp.dynamics, run.mdp.reward_table, run.mdp.terminal, run.mdp.start_states)
             by_table.setdefault((*map(id, parts), id(run.outcome_rewards), id(run.staying)), []).append(i)
-        self.worlds = [World(runs[places[0]], places) for places in by_table.values()]
+        self.worlds = [World(runs[indices[0]], indices) for indices in by_table.values()]
         self.keys = keys
         self._chances = np.array([(*run.mdp.chance.triple, run.mdp.chance.first_chosen) for run in runs], np.float64)
         # what is executed is drawn by the sets then, not in the kernel of all

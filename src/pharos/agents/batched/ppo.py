@@ -107,7 +107,7 @@ class PPOLane(Lane[ActorCritics]):
 
     def add_values_of_cut_episodes(self) -> None:
         """Add gamma V(s') to rewards of steps at which the time limit cut an episode off, E steps a run at once."""
-        runs, places = np.nonzero(self.timeouts.reshape(self.width, -1))
+        runs, indices = np.nonzero(self.timeouts.reshape(self.width, -1))
         if not len(runs):
             return
         rank = np.arange(len(runs)) - np.searchsorted(runs, runs)  # of each in its run
@@ -116,11 +116,11 @@ class PPOLane(Lane[ActorCritics]):
         )
         for block in range(int(rank.max()) // self.copies + 1):
             now = rank // self.copies == block
-            i, place, column = runs[now], places[now], rank[now] % self.copies
+            i, index, column = runs[now], indices[now], rank[now] % self.copies
             states = self.worlds.seen.copy()
-            states[i, column] = next_values[i, place]
+            states[i, column] = next_values[i, index]
             value = self.own["gamma"][i] * self.values_of(states)[i, column].astype(np.float64)
-            rewards[i, place] = (rewards[i, place] + value).astype(np.float32)
+            rewards[i, index] = (rewards[i, index] + value).astype(np.float32)
 
     def values_of(self, states: np.ndarray) -> np.ndarray:
         """(W, E) float32 values of states (W, E, *depth)."""

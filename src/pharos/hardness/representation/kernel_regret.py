@@ -513,9 +513,9 @@ def _spectral(
 
     def of(count: int) -> float:
         report(f"the spectrum of {min(count, len(observations)):,} observations")
-        places, share = _drawn(weights, count)
-        rows = observations.representatives[places]
-        return function(representation.kernel(rows, rows).astype(np.float64), share, q[places])
+        indices, share = _drawn(weights, count)
+        rows = observations.representatives[indices]
+        return function(representation.kernel(rows, rows).astype(np.float64), share, q[indices])
 
     value = of(MOST_EIGENVALUES)
     count = min(MOST_EIGENVALUES, len(observations))
@@ -525,14 +525,14 @@ def _spectral(
 
 
 def _drawn(weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(places, their weights): all if there are at most `count`, else drawn evenly along the sum of weights."""
+    """(indices, their weights): all if there are at most `count`, else drawn evenly along the sum of weights."""
     if len(weights) <= count:
         return np.arange(len(weights)), weights / weights.sum()
     order = np.random.default_rng(0).permutation(len(weights))
     edges = np.cumsum(weights[order]) / weights.sum()
     hits = np.minimum(np.searchsorted(edges, (np.arange(count) + 0.5) / count), len(weights) - 1)
-    places, counts = np.unique(order[hits], return_counts=True)
-    return places, counts / count
+    indices, counts = np.unique(order[hits], return_counts=True)
+    return indices, counts / count
 
 
 def _spectrum(kernel: np.ndarray, values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

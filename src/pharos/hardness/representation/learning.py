@@ -579,11 +579,11 @@ def return_on_graph(mdp: TabularMDP, actions: np.ndarray, steps: int) -> float:
     is_last = np.asarray(mdp.terminal)
     jump = np.append(np.where(is_last | (successor < 0), mdp.num_states, successor), mdp.num_states)
     earned = np.append(np.where(is_last, 0.0, reward), 0.0)
-    place, total = mdp.start_states.astype(np.int64), np.zeros(len(mdp.start_states))
+    index, total = mdp.start_states.astype(np.int64), np.zeros(len(mdp.start_states))
     while steps:
         if steps % 2:
-            total += earned[place]
-            place = jump[place]
+            total += earned[index]
+            index = jump[index]
         earned, jump, steps = earned + earned[jump], jump[jump], steps // 2
     return float(mdp.start_probabilities @ total)
 
@@ -668,10 +668,10 @@ class OfPolicies(Generic[Answer]):
         self.function, self.known = function, deque[tuple[np.ndarray, Answer]](maxlen=last)
 
     def __call__(self, policy: np.ndarray) -> Answer:
-        place = next((i for i, (other, _) in enumerate(self.known) if np.array_equal(other, policy)), None)
-        answer = self.function(policy) if place is None else self.known[place][1]
-        if place is not None:
-            del self.known[place]
+        index = next((i for i, (other, _) in enumerate(self.known) if np.array_equal(other, policy)), None)
+        answer = self.function(policy) if index is None else self.known[index][1]
+        if index is not None:
+            del self.known[index]
         self.known.append((policy, answer))
         return answer
 

@@ -321,9 +321,9 @@ def _windows(before: tuple[int, ...], after: tuple[int, ...], layer: Convolution
     offsets = np.arange(layer.size)
     rows, columns = (layer.stride * np.arange(n)[:, None] - layer.padding + offsets for n in after)
     is_inside = [(index >= 0) & (index < n) for index, n in zip((rows, columns), before, strict=True)]
-    places = rows[:, None, :, None] * before[1] + columns[None, :, None, :]
+    indices = rows[:, None, :, None] * before[1] + columns[None, :, None, :]
     inside = is_inside[0][:, None, :, None] & is_inside[1][None, :, None, :]
-    return np.where(inside, places, -1).reshape(math.prod(after), -1)
+    return np.where(inside, indices, -1).reshape(math.prod(after), -1)
 
 
 class _Head:

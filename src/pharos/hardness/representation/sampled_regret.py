@@ -276,7 +276,7 @@ class SampledLearner(IdealisedLearner):
         target = tuple(each.copy() for each in learnt)
         size = min(sampling.buffer_size, schedule.steps)
         memory = *(np.zeros(size, np.int64) for _ in range(3)), np.zeros(size)
-        visits, place = np.zeros((count, num_actions)), np.array([-1, -1, 0, 0], np.int64)
+        visits, cursor = np.zeros((count, num_actions)), np.array([-1, -1, 0, 0], np.int64)
         words = np.random.SeedSequence(seed, spawn_key=(2,)).generate_state(2, np.uint64)
         word, noise = words[:1].copy(), (float(sampling.reward_noise), words[1:].copy())
         numbers = (
@@ -304,6 +304,6 @@ class SampledLearner(IdealisedLearner):
             kernels.learn(
                 *(self.outcomes, np.asarray(mdp.terminal, np.bool_), group),
                 *(np.asarray(mdp.start_states, np.int64), cumulative, (*chance, *sets)),
-                *(self.episode, kernel, learnt, target, memory, visits, place, word, noise, numbers),
+                *(self.episode, kernel, learnt, target, memory, visits, cursor, word, noise, numbers),
                 *(largest_step, int(next_stop - step)),
             )
