@@ -39,6 +39,7 @@ from pharos.agents import (
 )
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
+from pharos.solvers import uniform_policy
 from pharos.system.sources import Source, find, is_reference, load, source_of
 from pharos.system.wording import capped, in_one_line, line_in
 from pharos.system.workers import Terminated, Workers
@@ -64,7 +65,6 @@ from pharos.training import (
     regret,
     run_id,
     train_configs,
-    uniform_policy,
     write_curve,
     write_policy,
     write_record,
@@ -599,4 +599,6 @@ class ExactForm(Form):
     def _regret(self, task: Task) -> float:
         if self.label == "oracle":
             return 0.0
-        return float(regret(evaluate_agent(uniform_policy(task), task).value, task.reference, normalized_by="uniform"))
+        return float(
+            regret(evaluate_agent(uniform_policy(task.mdp), task).value, task.reference, normalized_by="uniform")
+        )
