@@ -286,9 +286,9 @@ def proper_policy(first, node, weight, num_actions, goal, order, count, sure, po
 # Ways back ------------------------------------------------------------------------------------------------------------
 
 
-NONE = 255  # steps of a way back if there is none nearby
+NO_WAY = 255  # steps of a way back if there is none nearby
 # More than the rounding error of a sum of probabilities.
-ROUNDING = 1e-12
+MASS_ROUNDING = 1e-12
 # The distance from 1 to the next float.
 EPSILON = 2.0**-52
 
@@ -335,7 +335,7 @@ def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
     levels[y] = 1
     queue[0] = y
     head, tail = 0, 1
-    while head < tail and tail < ball and levels[queue[head]] < NONE:
+    while head < tail and tail < ball and levels[queue[head]] < NO_WAY:
         n = queue[head]
         head += 1
         for k in range(into_first[n], into_first[n + 1]):
@@ -373,8 +373,8 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
             for j in range(first[x + 1] - first[x]):
                 n = node[first[x] + j]
                 if way is None:
-                    steps[square[i] + j] = levels[n] - 1 if levels[n] > 0 else NONE
-                elif steps[square[i] + j] != NONE:
+                    steps[square[i] + j] = levels[n] - 1 if levels[n] > 0 else NO_WAY
+                elif steps[square[i] + j] != NO_WAY:
                     while n != y:
                         way[at] = via[n]
                         at += 1
@@ -403,7 +403,7 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
             for previous in range(-1, num_previous):
                 total = 0.0
                 for j in range(low, high):
-                    if steps[square[i] + j - low] != NONE:
+                    if steps[square[i] + j - low] != NO_WAY:
                         chance = prob[j] * _execution(action[j], action[i], previous, weights)
                         total += chance * steps[square[i] + j - low]
                 worst = max(worst, total)
@@ -413,14 +413,14 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
             # too many: drop all ways of the greatest length, and try again
             farthest = 0
             for j in range(low, high):
-                if steps[square[i] + j - low] != NONE:
+                if steps[square[i] + j - low] != NO_WAY:
                     farthest = max(farthest, steps[square[i] + j - low])
             for j in range(low, high):
                 if steps[square[i] + j - low] == farthest:
-                    steps[square[i] + j - low] = NONE
+                    steps[square[i] + j - low] = NO_WAY
         if square[i] >= 0:
             for j in range(low, high):
-                if steps[square[i] + j - low] != NONE:
+                if steps[square[i] + j - low] != NO_WAY:
                     length[i] += steps[square[i] + j - low]
     return largest
 
@@ -460,7 +460,7 @@ def attempt_costs(
             at = start[i]
             for j in range(low, high):
                 chance = prob[j] * _execution(action[j], action[i], previous, weights)
-                if square[i] >= 0 and steps[square[i] + j - low] != NONE:
+                if square[i] >= 0 and steps[square[i] + j - low] != NO_WAY:
                     back = 0.0
                     for _ in range(steps[square[i] + j - low]):
                         back += value[way[at]]
@@ -493,7 +493,7 @@ def times_from(hub, first, node, cost, leak):
         done[x] = True
         for i in range(first[x], first[x + 1]):
             y = node[i]
-            remainder = 1 - leak[i] - ROUNDING
+            remainder = 1 - leak[i] - MASS_ROUNDING
             if not done[y] and remainder > 0:
                 candidate = (time + cost[i]) / remainder
                 if candidate < bound[y]:
@@ -509,11 +509,11 @@ def times_from(hub, first, node, cost, leak):
 CROWD = 64
 # Turns that a lost step costs among the nodes on the way to a target, and turns that are kept: ways that lose more
 # steps at once are not gone.
-DETOUR, TURNS = 2, 32
+DETOUR, MOST_TURNS = 2, 32
 # No way from the hub leads to a node.
-LOST = 1 << 30
+NEVER = 1 << 30
 # Part of a bound that a sweep must gain for another one to follow.
-GAIN = 1e-3
+LEAST_GAIN = 1e-3
 # More than the relative rounding of costs and leaks after all sweeps: some units in the last place for each update.
 UPDATES = 1 + 1e-9
 
@@ -584,12 +584,12 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
                     if gain > 0:
                         cost[i, then], leak[i, then] = c, left
                         gained = max(gained, gain)
-            if gained <= GAIN * guess:
+            if gained <= LEAST_GAIN * guess:
                 break
         # the best node x to come from, with the rounding of all sums on top
         least = bound[z]
         for i in range(1, size):
-            remainder = 1 - leak[i].max() * UPDATES - ROUNDING
+            remainder = 1 - leak[i].max() * UPDATES - MASS_ROUNDING
             if remainder > 0:
                 least = min(least, (bound[queue[i]] + cost[i].max() * UPDATES) / remainder * (1 + 8 * EPSILON))
         new[z] = least
@@ -612,15 +612,15 @@ def _around(z, owner, into, steps, index, scratch):
     pushed[0, 0], pushed[0, 1], turns[0] = z, -1, 0
     index[z] = -1
     size, count, turn, idle = 0, 1, 0, 0
-    while idle <= TURNS and size < len(queue):
+    while idle <= MOST_TURNS and size < len(queue):
         # the next node of this turn; the search ends after TURNS turns without any
-        at = turns[turn % TURNS]
+        at = turns[turn % MOST_TURNS]
         if at < 0:
             turn += 1
             idle += 1
             continue
         idle = 0
-        turns[turn % TURNS] = pushed[at, 1]
+        turns[turn % MOST_TURNS] = pushed[at, 1]
         n = pushed[at, 0]
         queue[size] = n
         size += 1
@@ -631,8 +631,8 @@ def _around(z, owner, into, steps, index, scratch):
         for k in range(into_first[n], into_first[n + 1]):
             x = owner[into_outcome[k]]
             lost = 1 + steps[x] - steps[n]
-            if index[x] == 0 and 0 <= lost < (TURNS - 1) // DETOUR and count < len(pushed):
-                then = (turn + 1 + DETOUR * lost) % TURNS
+            if index[x] == 0 and 0 <= lost < (MOST_TURNS - 1) // DETOUR and count < len(pushed):
+                then = (turn + 1 + DETOUR * lost) % MOST_TURNS
                 pushed[count, 0], pushed[count, 1] = x, turns[then]
                 turns[then] = count
                 index[x] = -1
@@ -645,5 +645,5 @@ def steps_from(hub, first, node):
     steps, is_hub = np.empty(len(first) - 1, np.int32), np.zeros(len(first) - 1, np.bool_)
     is_hub[hub] = True
     backward_order(first, node, is_hub, np.empty(len(first) - 1, np.int64), steps)
-    steps[steps < 0] = LOST
+    steps[steps < 0] = NEVER
     return steps

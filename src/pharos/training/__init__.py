@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     )
     from pharos.training.curve import GAIN_TOLERANCE, Curve, Evaluation, RegretCurve, evaluate_agent
     from pharos.training.execution import (
-        ATTEMPTS,
+        GROUP_ATTEMPTS,
         Execution,
         TrainingProgress,
         Work,

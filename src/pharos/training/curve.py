@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from pharos.training.prepared import PreparedRun
 
 
-BLOCK = 4096  # observations that policies are asked about at once
+CURVE_BLOCK = 4096  # observations that policies are asked about at once
 CERTAIN, TIE = 0.999, 1e-9  # probability of a certain choice; difference of equal ones
 
 
@@ -148,8 +148,8 @@ def _values_of_tables(batch: Learner, task: Task, indices: Sequence[int]) -> dic
     mdp, observer = task.mdp, task.observer
     answers = {i: PolicyAnswers(batch.policy(i), mdp, observer) for i in indices}
     tables: dict[int, list[np.ndarray]] = {i: [] for i in indices}
-    for first in range(0, mdp.num_states, BLOCK):
-        states = np.arange(first, min(first + BLOCK, mdp.num_states))
+    for first in range(0, mdp.num_states, CURVE_BLOCK):
+        states = np.arange(first, min(first + CURVE_BLOCK, mdp.num_states))
         context = observer.space.states(states), np.full(len(states), -1), np.zeros(len(states), np.int64)
         observations = observer.observe(*context)
         for i in list(tables):

@@ -33,7 +33,7 @@ from pharos.system.records import flat, read
 from pharos.system.sources import Source, is_reference, resolve, untrusted_code
 from pharos.training.options import ENGINES, OBJECTIVES, Horizon, TrainingOptions
 
-TAIL = 1e-9  # part of a discounted return that is not looked at
+RETURN_TAIL = 1e-9  # part of a discounted return that is not looked at
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ def _range_of_returns(mdp: TabularMDP) -> tuple[float, float]:
     largest = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
     steps, rest = mdp.horizon, 0.0
     if steps is None:  # what is left out of a discounted return is less than rest
-        steps = max(1, math.ceil(math.log(TAIL) / math.log(mdp.gamma))) if mdp.gamma > 0 else 1
+        steps = max(1, math.ceil(math.log(RETURN_TAIL) / math.log(mdp.gamma))) if mdp.gamma > 0 else 1
         rest = largest * mdp.gamma**steps / (1 - mdp.gamma)
     rest += 1e-12 * largest * steps  # rounding
     ends, rewards, terminal = [], mdp.rewards, np.asarray(mdp.terminal)
@@ -296,7 +296,7 @@ def _range_of_returns(mdp: TabularMDP) -> tuple[float, float]:
 
 CELL = ["environment", "instance", "chance", "agent", "observation"]  # columns that tell the cells of a study
 # In the order of run.json
-KEYS = (
+CONFIG_KEYS = (
     *("environment", "parameters", "chance", "observation", "observation_options", "agent", "hyperparameters", "steps"),
     *("seed", "gamma", "horizon", "objective", "evaluation_interval", "engine", "sources"),
 )
@@ -406,7 +406,7 @@ class RunConfig(TrainingOptions):
             del entry["sources"]
         if self.objective is None:
             del entry["objective"]
-        ordered = {name: entry[name] for name in KEYS if name in entry}
+        ordered = {name: entry[name] for name in CONFIG_KEYS if name in entry}
         return {name: dict(value) if isinstance(value, Mapping) else value for name, value in ordered.items()}
 
     @property
