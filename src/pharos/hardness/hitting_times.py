@@ -120,7 +120,7 @@ MOST_WIDTH = 8_000
 FILL_IN = 1 / 30
 # Seconds of a multiplication of a linear solve on a slow core: one that would outlast the budget is not begun.
 SECONDS_EACH = 2e-9
-# Times half of `SWEEPS` that are made in any case.
+# Times half of `SWEEPS_BEFORE_SOLVING` that are made in any case.
 LEAST_ROUNDS = 6
 # They end closer than the tolerance asks for, nearly as close as a linear solve does.
 CLOSER = 1e-3
@@ -290,7 +290,8 @@ class HittingTimes:
     ) -> HittingBounds:
         """Bounds after sweeps, as long as at their rate these meet sooner than a linear solve takes, or nearly so.
 
-        The rate is taken over three times `SWEEPS` / 2 sweeps: moves along the slow mode set single ones back.
+        The rate is taken over three times `SWEEPS_BEFORE_SOLVING` / 2 sweeps: moves along the slow mode set single ones
+        back.
         """
         bounds = self.sweep(j, count, SWEEPS_BEFORE_SOLVING // 2, enough, spending)
         as_long = FILL_IN * int(self._layers(count).max(initial=0)) ** 3 / max(self.support[1].size, 1)
