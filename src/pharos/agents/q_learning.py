@@ -166,7 +166,7 @@ class QLearning:
 
 
 def checked_options(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """All hyperparameters: DEFAULTS with changes. UnknownName, ParameterError: one is unknown or out of range."""
+    """Q_LEARNING_DEFAULTS with changes. UnknownName, ParameterError: one is unknown or out of range."""
     unknown = set(changes) - set(Q_LEARNING_DEFAULTS)
     if unknown:
         raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], Q_LEARNING_DEFAULTS)

@@ -302,7 +302,7 @@ def sample_histories(keys, step, draw, next_row, filled, gammas, num_steps, memo
     """`sample` from the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
 
     They are read from the rows before; the first state of an episode stands for those before it. Rows that were never
-    written have the flag DONE.
+    written have the flag ENDED.
     """
     state, next_state, action, reward, flags = memory
     states, next_states, actions, rewards, discounts = batch

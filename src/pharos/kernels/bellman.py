@@ -130,7 +130,7 @@ def actions_of(num_actions: int, unrolled: bool) -> "tuple[int, ...] | np.ndarra
     """The argument `actions`, A zeros: an array, or, if sweeps are unrolled (`is_unrolled`), a tuple.
 
     The compiler knows a tuple's length and unrolls the loops over actions: sweeps are 3 to 4 times as fast, and each
-    number of actions is compiled by itself (minutes, for more than UNROLLED).
+    number of actions is compiled by itself (minutes, for more than UNROLLED_ACTIONS).
     """
     return (0,) * num_actions if num_actions <= UNROLLED_ACTIONS and unrolled else np.zeros(num_actions, np.int8)
 

@@ -355,9 +355,9 @@ def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
 def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball, levels, queue, via):
     """Shortest ways back to node[i], for outcomes i into nodes low..high, from the other outcomes of its state.
 
-    If `way` is None: steps[square[i] + j] = length of the way from outcome j of the state to node[i]; NONE where the
+    If `way` is None: steps[square[i] + j] = length of the way from outcome j of the state to node[i]; NO_WAY where the
     `ball` nodes nearest to node[i] do not include it. Else way[start[i]] on = the outcomes along the ways whose length
-    is not NONE, one way after another. levels (N,) uint8 is zero before and after.
+    is not NO_WAY, one way after another. levels (N,) uint8 is zero before and after.
     """
     first, _, node, _ = outcomes
     into_first, into_outcome = into
@@ -389,7 +389,7 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
 def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, length):
     """Drop the longest ways back until the expected steps on the way back are at most `limit`, for every outcome.
 
-    steps: NONE if dropped; length[i] becomes the sum of the lengths of the ways that are left. Returns the largest
+    steps: NO_WAY if dropped; length[i] becomes the sum of the lengths of the ways that are left. Returns the largest
     expected number of steps.
     """
     first, action, node, prob = outcomes
@@ -604,7 +604,7 @@ def _around(z, owner, into, steps, index, scratch):
     queue[:size]: the nodes, as many as the queue holds; index[n]: the index of n in it, plus one; -1 while it waits. A
     node of which z is k steps away, and that lies on a way from the hub to z that is s steps longer than the shortest
     one, comes k + DETOUR s-th: its steps to z count, and those lost. A queue of buckets: `turns` has the first node of
-    each of the next TURNS turns, `pushed` are (node, the next of its turn).
+    each of the next MOST_TURNS turns, `pushed` are (node, the next of its turn).
     """
     queue, pushed, turns = scratch
     into_first, into_outcome = into
@@ -613,7 +613,7 @@ def _around(z, owner, into, steps, index, scratch):
     index[z] = -1
     size, count, turn, idle = 0, 1, 0, 0
     while idle <= MOST_TURNS and size < len(queue):
-        # the next node of this turn; the search ends after TURNS turns without any
+        # the next node of this turn; the search ends after MOST_TURNS turns without any
         at = turns[turn % MOST_TURNS]
         if at < 0:
             turn += 1
@@ -641,7 +641,7 @@ def _around(z, owner, into, steps, index, scratch):
 
 
 def steps_from(hub, first, node):
-    """(N,) int32: the fewest steps in which outcomes lead from the hub to each node, LOST if none do."""
+    """(N,) int32: the fewest steps in which outcomes lead from the hub to each node, NEVER if none do."""
     steps, is_hub = np.empty(len(first) - 1, np.int32), np.zeros(len(first) - 1, np.bool_)
     is_hub[hub] = True
     backward_order(first, node, is_hub, np.empty(len(first) - 1, np.int64), steps)

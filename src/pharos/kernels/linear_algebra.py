@@ -104,7 +104,7 @@ def project(features, z, out):
     """out (A, M) float64 = (F' z)', z (C, A) float32."""
     part = np.zeros(out.shape, np.float32)
     out[:] = 0.0
-    # float32 sums of ROWS rows, added up as float64
+    # float32 sums of FLOAT32_ROWS rows, added up as float64
     for first in range(0, len(features), FLOAT32_ROWS):
         part[:] = 0.0
         for s in range(first, min(first + FLOAT32_ROWS, len(features))):

@@ -171,7 +171,7 @@ def representation(
 
 
 def _inputs_digest(inputs: Callable[[np.ndarray], np.ndarray], num_states: int) -> str:
-    """Digest of the network's input in up to SAMPLE states all over the space."""
+    """Digest of the network's input in up to DIGEST_STATES states all over the space."""
     import xxhash
 
     states = np.unique(np.linspace(0, num_states - 1, min(DIGEST_STATES, num_states)).astype(np.int64))

@@ -271,7 +271,7 @@ def number_blocks(file: GrowingFile, dtype: np.dtype, entries: int | None = None
     """Blocks of the numbers in a file: pairs (index of the first one, array), in order.
 
     Args:
-        entries: of a block, at most; None for BLOCK_BYTES.
+        entries: of a block, at most; None for COPIED_BYTES.
     """
     size = file.bytes // dtype.itemsize
     block_size = entries or max(1, COPIED_BYTES // dtype.itemsize)

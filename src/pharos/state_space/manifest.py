@@ -100,7 +100,7 @@ def successors_name(arrays: dict[str, Any], parts: dict[str, str] | None = None)
     """Name of the file of successors, which depends on the width of the indices.
 
     Args:
-        parts: PARTS, if the arrays belong to an unfinished build with chance.
+        parts: PART_NAMES, if the arrays belong to an unfinished build with chance.
     """
     names = parts or {name: name for name in INDEX_TYPES}
     return next((name for name in (SUCCESSORS40, SUCCESSORS64) if names[name] in arrays), SUCCESSORS)

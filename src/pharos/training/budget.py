@@ -58,7 +58,7 @@ NETWORK_POLICY = "network(torch.as_tensor(seen)).argmax(dim=1).numpy()"
 CHECKED = 3
 """First policies of a run that are asked again."""
 MOST_QUERIES, FEW_ANSWERS = 8, 128
-"""Up to AGAIN times, as long as the answers together are FEW: a policy that samples seldom would answer the same by
+"""Up to MOST_QUERIES times, up to FEW_ANSWERS in all: a policy that samples seldom would answer the same by
 chance if there are few observations."""
 INFO = ("action_mask", "prob")
 """Entries of `info` that Gymnasium's own environments give as well; others say what an agent is to find out."""

@@ -56,7 +56,7 @@ class Execution(Generic[R]):
         workers: most processes at a time.
         checkpoints: folder for checkpoints of programs of several runs; None: none are written.
         timeout: seconds for each run, after which it has failed.
-        attempts: ATTEMPTS; 1 for a pool that begins again itself.
+        attempts: GROUP_ATTEMPTS; 1 for a pool that begins again itself.
     Attributes:
         waiting: (the earliest time to begin, runs). running: key of the process -> (runs, when it began).
         lost_servers: how often in a row the process that forks workers was gone.

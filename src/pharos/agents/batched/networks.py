@@ -82,7 +82,7 @@ class Parameters:
         self.length += -(-self.shapes[-1].size // ALIGNED_FLOATS) * ALIGNED_FLOATS
 
     def views(self, rows: Tensor) -> Values:
-        """name -> (W, ...) view of (W, P); all of it under the name ROWS."""
+        """name -> (W, ...) view of (W, P); all of it under the name ALL_PARAMETERS."""
         views = {
             each.name: rows[:, each.offset : each.offset + each.size].view(len(rows), *each.shape)
             for each in self.shapes
