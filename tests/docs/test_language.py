@@ -17,14 +17,14 @@ SOURCE = ROOT / "src" / "pharos"
 
 # Counts per 1,000 words: present limit, aim. A limit is lowered (raised, for you and if) whenever its count allows it.
 LIMITS = {
-    ("guides", "semicolons"): (14.1, 5),
-    ("guides", "that of"): (1.6, 0.5),
-    ("evidence", "semicolons"): (11.2, 5),
-    ("evidence", "that of"): (1.6, 0.5),
+    ("guides", "semicolons"): (1, 5),
+    ("guides", "that of"): (0.2, 0.5),
+    ("evidence", "semicolons"): (4, 5),
+    ("evidence", "that of"): (0.5, 0.5),
     ("docstrings", "where"): (7.3, 2),
     ("docstrings", "that of"): (2.4, 0.5),
 }
-AT_LEAST = {("guides", "you"): (3.4, 6), ("docstrings", "if"): (2.1, 3)}
+AT_LEAST = {("guides", "you"): (11, 6), ("docstrings", "if"): (2.1, 3)}
 SHARED_NAMES = {"functions": (81, 0), "constants": (193, 0)}  # names in two files or more: present limit, aim
 
 PATTERNS = {
