@@ -1,7 +1,7 @@
 """Environments: the contract of a class (`Environment`, `Layer`), the built-in classes, the catalogue of names.
 
-`import pharos` needs the names of the built-in classes alone; a file is loaded when something in it is first used. The
-classes themselves, such as `environments.Breakout`, are those of BUILT_IN.
+`import pharos` needs the names of the built-in classes alone; a file is loaded when something in it is first used.
+BUILT_IN lists the classes, such as `environments.Breakout`.
 """
 
 import importlib

@@ -33,7 +33,7 @@ def make(name: str, **parameters: object) -> Environment:
         name: a class (`"breakout"`), a named instance (`"breakout/12x10x1"`, see `list_environments`), a folder with an
             imported MDP, or where your own class is (`"my_module:MyClass"`, `"folder/my_file.py:MyClass"`), which
             registers it.
-        parameters: of the class; those of a named instance may be overridden.
+        parameters: of the class; they override the parameters of a named instance.
     Raises:
         UnknownName: no such environment or parameter; the nearest name is suggested.
         ParameterError: a parameter is out of range, there is no such module or class, or `name` is no text.
@@ -75,7 +75,7 @@ def list_environments() -> list[str]:
 
 
 def class_called(name: str) -> type[Environment] | None:
-    """The class with this name; None where there is none."""
+    """The class with this name; None if there is none."""
     return _built_in(name) if name in _OWN else _REGISTERED.get(name)
 
 

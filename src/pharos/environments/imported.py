@@ -36,11 +36,11 @@ DIGITS = (
 class ImportedWorld(Environment):
     """The MDP of a folder that `pharos import` or `importers.save` wrote.
 
-    State    its number in the folder; where transitions end an episode without a next state, S is the end.
-    Actions  those of the source by their names, where the import recorded them, else by their numbers.
-    Reward   of the outcome, where the folder knows it; else of the state and action, on average.
-    Ends     in terminal states, and where the source ends.
-    Chance   that of the table.
+    State    its number in the folder; S is the end, if transitions end an episode without a next state.
+    Actions  as in the source; by name if the import recorded the names, otherwise by number.
+    Reward   of the outcome, if the folder has it; otherwise the mean for the state and action.
+    Ends     in terminal states, and on transitions without a next state.
+    Chance   as in the table.
     """
 
     folder: str = ""
@@ -163,7 +163,7 @@ class ImportedWorld(Environment):
 
     @property
     def successors(self) -> np.ndarray:
-        """(S, A, K) int64, where outcomes lead; with a row for the end, where there is one."""
+        """(S, A, K) int64, next states; with a row for the end, if there is one."""
         return self._table[0]
 
     @property
@@ -187,14 +187,14 @@ class ImportedWorld(Environment):
 
     @cached_property
     def available(self) -> np.ndarray:
-        """(S, A) bool, the actions that exist in each state; (1, A), all True, where all do everywhere."""
+        """(S, A) bool, the actions that exist in each state; (1, A), all True, if every action exists everywhere."""
         if not self.has_sets:
             return np.ones((len(self.successors), self.manifest["num_actions"]), np.bool_)
         return self._with_end(np.asarray(self._arrays[mdp_files.AVAILABLE], np.bool_), True)
 
     @property
     def paid(self) -> np.ndarray:
-        """(S, A, K) float64, the reward of each outcome; (S, A, 1) where the folder knows the means alone."""
+        """(S, A, K) float64, the reward of each outcome; (S, A, 1) if the folder has only the means."""
         paid = self._table[2]
         return self.rewards[:, :, None] if paid is None else paid
 
@@ -252,7 +252,7 @@ def outcomes_of(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(rows (N,), successors (N,), probabilities (N,)): the outcomes of row s A + a, in any of the forms of a folder.
 
-    The end of an episode is the successor -1. Raises ValueError where they are no table of an MDP.
+    The end of an episode is the successor -1. Raises ValueError if they are no table of an MDP.
     """
     number = states * actions
     if mdp_files.PAID[0] in arrays:
@@ -282,7 +282,7 @@ def written_out(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """(S, A, K) successors, probabilities that sum to 1, and rewards; impossible outcomes are left out.
 
-    S is the end, where there is one. p (N,): probabilities; outcome_rewards (N,): the reward of each outcome, if known.
+    S is the end, if there is one. p (N,): probabilities; outcome_rewards (N,): the reward of each outcome, if known.
 
     Raises:
         ParameterError: they are more than MOST_ENTRIES numbers. ValueError: they are no table of an MDP.

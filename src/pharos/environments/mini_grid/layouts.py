@@ -361,7 +361,7 @@ def _chain(canvas: Canvas, size: int, rooms: int) -> list[Room]:
 
 
 def _exit(canvas: Canvas, room: Room) -> tuple[int, Place]:
-    """A side of a room other than that of its entry, and a cell there."""
+    """A side of a room other than the side with its entry, and a cell there."""
     sides = [side for side in range(4) if side != room.side]
     side = sides[canvas.integer(0, 3)]
     if side in (RIGHT, LEFT):
@@ -411,7 +411,7 @@ class Recipe(NamedTuple):
 
     Attributes:
         draw: function of the parameters below, by name, that returns the layout.
-        parameters: name -> what it may be; "seed" where something is drawn.
+        parameters: name -> what it may be; "seed" if something is drawn.
         max_steps: the time limit of minigrid, by size and number of rooms.
     """
 

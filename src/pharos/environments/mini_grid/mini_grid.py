@@ -45,7 +45,7 @@ class Level:
 
 
 def level_of(layout: GridLayout) -> Level:
-    """The numbers of a layout; ParameterError where its text is none, or the player can walk out of the grid."""
+    """The numbers of a layout; ParameterError if its text is none, or if the player can walk out of the grid."""
     rows = [re.findall("..", row) for row in layout.rows]
     cells = np.full((len(rows), len(rows[0])), FREE, np.int64)
     starts: list[tuple[int, int, int]] = []
@@ -113,7 +113,7 @@ def _target(target: str | None, doors: list[str], things: list[str]) -> tuple[in
 
 
 def _check_walls(cells: np.ndarray, start: tuple[int, int]) -> None:
-    """ParameterError where the player can come to the border of the grid, through doors of any condition."""
+    """ParameterError if the player can come to the border of the grid, through doors of any condition."""
     region, frontier = {start}, [start]
     while frontier:
         row, column = frontier.pop()
@@ -172,16 +172,16 @@ class MiniGrid(Environment):
              `importers.minigrid` and BRIDGE.
     Ends     with that reward, or in lava.
     Limit    the max_steps of minigrid.
-    Ours     Layouts are those of minigrid 3.2.0 for the same seed, drawn without it. Other sizes, and levels of one's
-             own, are possible.
+    Ours     The layouts equal minigrid 3.2.0 for the same seed, and are drawn without it. Other sizes and other levels
+             are possible.
     Source   Chevalier-Boisvert et al. (2023).
 
     Attributes:
         kind: of the layout: empty, empty_random (start anywhere), four_rooms, door_key, unlock, unlock_pickup,
             key_corridor, lava_gap, lava_crossing, simple_crossing, multi_room, dist_shift. None stands for empty.
         size: cells on a side, walls included: of the grid, of a room (unlock, unlock_pickup, key_corridor), or of the
-            largest room (multi_room, on 25 x 25 cells). The grid of dist_shift is size - 2 high. None: that of
-            minigrid.
+            largest room (multi_room, on 25 x 25 cells). The grid of dist_shift is size - 2 high. None: the
+            size in minigrid.
         seed: of the layout, as given to minigrid's `reset`; None stands for 0.
         rows: of rooms, in key_corridor; None stands for 3.
         rooms: how many, in multi_room; None stands for 6.
@@ -240,7 +240,7 @@ class MiniGrid(Environment):
         _ = self.parsed
 
     def _completed(self, name: str, value: int | None) -> int | None:
-        """The default of the kind in place of None; ParameterError where the kind takes other values, or none."""
+        """The default of the kind in place of None; ParameterError if the kind takes other values, or none."""
         declared = KINDS[str(self.kind)].parameters
         if name not in declared:
             if value is None:
