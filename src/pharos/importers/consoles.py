@@ -37,7 +37,7 @@ class Recording(NamedTuple):
         source: game, package, version and options, for people.
         num_raw_states: states before equal ones were merged.
         layers: number of them at each depth.
-        num_steps: steps that were played, not counting those of an earlier, killed import.
+        num_steps: steps that were played, without the steps of an earlier, killed import.
     """
 
     observations: DistinctRows
@@ -156,7 +156,7 @@ def procgen(  # noqa: PLR0913  (an option each)
 
 
 def building_folder(out: str | os.PathLike) -> Path:
-    """The folder of finished layers within that of an MDP, for `folder=`.
+    """The folder of finished layers within the folder of an MDP, for `folder=`.
 
     Raises:
         ParameterError: the folder of the MDP holds something else.

@@ -36,7 +36,7 @@ class Draw(NamedTuple):
 
     Attributes:
         words: its function and line, for messages. size: number of outcomes.
-        weights: their probabilities; None where they depend on the state.
+        weights: their probabilities; None if they depend on the state.
     """
 
     words: str
@@ -96,7 +96,7 @@ class TracedFunction:
 
 
 def _operations(jaxpr: Traced) -> set[str]:
-    """Names of the operations of a program, those of its branches and loops included."""
+    """Names of the operations of a program, with its branches and loops."""
     names = set[str]()
     for equation in jaxpr.eqns:
         names.add(equation.primitive.name)
@@ -184,7 +184,7 @@ def _replaced(tape: Tape) -> Iterator[None]:
 
 
 def _concretely(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, evaluated at once where nothing is traced: a fixed key makes fixed draws."""
+    """The function, evaluated at once if nothing is traced: a fixed key makes fixed draws."""
 
     @wraps(function)
     def evaluated(*arguments: Traced, **options: object) -> Traced:

@@ -171,8 +171,8 @@ class LayerSearch:
     """States in the order in which they are met first: breadth first, by action.
 
     Attributes:
-        dictionary: a saved state like which those of the frontier are deflated: the first one of the layer before, as
-            random generators of a console are renewed every few hundred frames.
+        dictionary: a saved state; the states of the frontier are deflated with it. It is the first one of the layer
+            before, as random generators of a console are renewed every few hundred frames.
         keys: number of each state by its key.
         sizes: number of states of each depth so far.
         rows, rewards: one array of each expanded layer.

@@ -375,7 +375,7 @@ def digest_of(value: object) -> bytes:
 
 
 class _Feeder:
-    """Writes values canonically: equal bytes for equal values, shared objects by where they were met first."""
+    """Writes values canonically: equal bytes for equal values, shared objects by their first position."""
 
     def __init__(self, put: Callable[[bytes], object], ignore: frozenset[str]):
         self.put, self.ignore = put, ignore
@@ -528,7 +528,7 @@ def _contents(cell: Any) -> Any:
 
 
 def _fields_of(value: object) -> dict[str, Any]:
-    """Attributes of an object: those of its dictionary and of its slots."""
+    """Attributes of an object, from its dictionary and its slots."""
     fields = dict(getattr(value, "__dict__", ()))
     for kind in type(value).__mro__:
         slots = kind.__dict__.get("__slots__", ())

@@ -34,7 +34,7 @@ class NamedCode:
     """A function of the user's own by its name, which any process can import and call.
 
     Attributes:
-        name: module:function or file.py:function. folder: where relative ones are looked for.
+        name: module:function or file.py:function. folder: base of relative paths.
         options: keyword arguments.
     """
 
@@ -114,7 +114,7 @@ class StepTarget:
     """An environment named on the command line, with what is named beside it.
 
     Args:
-        target: gymnasium:ID, gymnax:ID, pgx:ID, module:factory or file.py:factory; jax: before these where the
+        target: gymnasium:ID, gymnax:ID, pgx:ID, module:factory or file.py:factory; jax: before these if the
             factory returns `JaxFunctions`.
         options: of the environment or the factory.
         key, reward: names of functions, see `stepping`. weights: "1,0.5", of a vector of rewards.
@@ -199,7 +199,7 @@ class StepTarget:
             if checkpoint.is_empty:
                 shutil.rmtree(building, ignore_errors=True)
                 with contextlib.suppress(OSError):
-                    folder.rmdir()  # where it is empty
+                    folder.rmdir()  # if it is empty
         return mdp, recording
 
     def _identity(self, options: SteppingOptions, horizon: int | None) -> dict[str, Any]:

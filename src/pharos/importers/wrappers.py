@@ -104,7 +104,7 @@ class Recorder:
 
 
 def as_integer(value: Returned) -> Returned:
-    """A number or an array of one number as an int where it is whole; anything else as it is."""
+    """A number or an array of one number as an int if it is whole; anything else as it is."""
     try:
         return int(value) if int(value) == value else value
     except (TypeError, ValueError, OverflowError):
@@ -183,7 +183,7 @@ class Layers:
 
     Args:
         env: the environment as it was given.
-        copied: whether the environment below is copied as well, where it can be. If not, wrappers that are known to
+        copied: whether the environment below is copied as well, if it can be. Otherwise wrappers that are known to
             change nothing are left out.
     Attributes:
         top: the outermost one that may change something, to be stepped in place of `env`.
@@ -276,7 +276,7 @@ def check_wrappers(env: Stepped, steps: int, outcomes: Iterable[tuple[int, int, 
 
 
 def _copied(chain: list[Stepped], inner: Stepped) -> tuple[list[Stepped], Stepped]:
-    """Copies of wrappers and of the environment below; of the wrappers alone where it cannot be copied."""
+    """Copies of wrappers and of the environment below; of the wrappers alone if it cannot be copied."""
     linked = chain
     if any(above.env is not below for above, below in zip(chain, [*chain, inner][1:], strict=True)):
         linked = [copy.copy(wrapper) for wrapper in chain]
