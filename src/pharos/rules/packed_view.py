@@ -1,6 +1,6 @@
 """Packed states that rules read and write as if they were arrays of integers.
 
-A state of D small integers is stored in a few 64-bit words (rules/layout.py says where each component sits).
+A state of D small integers is stored in a few 64-bit words (rules/layout.py has the position of each component).
 Unpacking 29 components, running a rule and packing them again costs three times the rule itself. So compiled rules get
 a view instead: `state[i]` is a shift and a mask of a word on the stack, which LLVM keeps in a register when there is
 one word.
@@ -18,7 +18,7 @@ from numba import int64, types
 from numba.core import cgutils
 from numba.extending import models, overload, register_model
 
-intrinsic: Any = numba.extending.intrinsic  # whose types would hide those of the functions that it makes
+intrinsic: Any = numba.extending.intrinsic  # whose types would hide the types of the functions that it makes
 
 _WORD = ir.IntType(64)
 _REGISTER_WORDS = 8  # views on more words than this are in memory
@@ -26,7 +26,7 @@ _OFFSET, _MASK, _LOW, _SIZE = range(4)  # columns of the layout's table
 
 
 class PackedView(types.Type):
-    """Numba type of the view on `num_words` words: where they are, the layout's table, and the fault.
+    """Numba type of the view on `num_words` words: their address, the layout's table, and the fault.
 
     Words that are only read are an array on the stack. Words that are written one after the other are a vector, kept in
     a register: through memory each write would wait for the one before it.
@@ -146,7 +146,7 @@ def clear_fault(typing_context, view):
 
 
 def _checked_component(builder, view, index):
-    """The component `index` as in Python (negative from the end); component 0 and a fault where there is none."""
+    """The component `index` as in Python (negative from the end); component 0 and a fault if there is none."""
     checked = cgutils.alloca_once_value(builder, index)
     with builder.if_then(builder.icmp_unsigned(">=", index, view.length), likely=False):
         wrapped = builder.add(index, view.length)
