@@ -74,7 +74,7 @@ class DiscountedVisits:
         return state_losses(world.solutions[OPTIMAL], pairs, first), pairs.sum(axis=1), pairs.argmax(axis=1)
 
     def _table(self, policy: str) -> np.ndarray | None:
-        """The policy as solvers take it; None for the uniform one. Uniform in states where it was not asked."""
+        """The policy as solvers take it; None for the uniform one. Uniform in states in which it was not asked."""
         if policy == UNIFORM:
             return None
         table = np.asarray(self.exploration.solutions[policy].policy)
@@ -95,8 +95,8 @@ class Exploration:
 
     Args:
         mdp: with its chance. A horizon is left out: values are discounted.
-        env: draws the states and names the actions, where it is known.
-        space: gives the values of their variables, where there is one.
+        env: draws the states and names the actions, if it is known.
+        space: gives the values of their variables, if there is one.
         learnt: a policy to set beside the optimal and the uniform one.
         title: for people.
         progress: called with what is done next.
@@ -145,7 +145,7 @@ class Exploration:
         return StateLayers(self.mdp, is_numbered=self.space is not None)
 
     def values(self, name: str, states: np.ndarray) -> np.ndarray:
-        """(N,) values of a policy in states, where there is no action before."""
+        """(N,) values of a policy in states without a previous action."""
         solution = self.solutions[name]
         if not self.mdp.is_sticky:
             return np.asarray(solution.x[states, 0])
@@ -193,7 +193,7 @@ class Exploration:
             previous: the action executed before, under sticky actions; None: there was none.
         Returns:
             state, previous, values (of its variables), labels, terminal, layer, start (probability that an episode
-            starts there), v (policy -> value), the drawing as `Pictures.of` has it, and for each action: `name`, where
+            starts there), v (policy -> value), the drawing as `Pictures.of` has it, and for each action: `name`, if
             actions have other names in other states, else None; `q` and `gap`, of choosing it; `available`, whether it
             is; `best`, whether the gap is a tie; of each policy, `policies` (how often it chooses it) and `q_of` (the
             value of choosing it, and following the policy afterwards); `reward`, expected; `outcomes`: a list of state
@@ -260,7 +260,7 @@ class Exploration:
     def _of_executing(self, state: int, action: int) -> list[tuple[int | None, float, float]]:
         """(state, probability, reward) of possible outcomes of executing an action.
 
-        Outcomes have rewards of their own where the rules are known; else, and with lazy actions, each has the mean.
+        Each outcome has its reward if the rules are known. Otherwise, and with lazy actions, it has the mean.
         """
         env, mdp = self.env, self.mdp
         if env is not None and env.has_chance and not mdp.laziness:
@@ -319,9 +319,9 @@ class Exploration:
         the way, until the end, or until nothing new is left.
 
         Returns:
-            `steps`, a list of state, previous, action, probability (of the outcome), reward, gap (of the action); where
-            it `stops`: state and previous; `why`: "end", "circle", "limit", or "unknown", where the policy was not
-            asked.
+            `steps`, a list of state, previous, action, probability (of the outcome), reward, gap (of the action);
+            `stops`: the last state and previous; `why`: "end", "circle", "limit", or "unknown" (the policy was not
+            asked there).
         Raises:
             ParameterError: there is no such policy or position.
         """
@@ -440,14 +440,14 @@ class Exploration:
 
 
 def number(value: float | np.floating) -> float | None:
-    """A float; None where it is not a number."""
+    """A float; None if it is not a number."""
     return float(value) if np.isfinite(value) else None
 
 
 # Picture --------------------------------------------------------------------------------------------------------------
 
 
-LONGEST = 720  # pixels of the longer side of a drawing, where cells are not the smallest for it
+LONGEST = 720  # pixels of the longer side of a drawing, if cells are not the smallest for it
 
 
 def _states_of(mdp: TabularMDP, space: StateSpace | None) -> States:
@@ -459,11 +459,11 @@ def _states_of(mdp: TabularMDP, space: StateSpace | None) -> States:
 
 
 class Pictures:
-    """Draws the states of an environment; where that is not possible, `fault` says why, in one line.
+    """Draws the states of an environment. If that is not possible, `fault` is the reason, in one line.
 
     Attributes:
-        kit: what all drawings are composed of, for the page; None where the states cannot be drawn.
-        fault: why they cannot; "" where they can.
+        kit: what all drawings are composed of, for the page; None if the states cannot be drawn.
+        fault: why they cannot; "" if they can.
     """
 
     def __init__(self, env: Environment | None, start: State | None):

@@ -1,9 +1,9 @@
 """Opening the explorer: from an environment, a state space, an MDP or the folder of a run to a page in the browser.
 
 `Explorer` is a small local server of the page: one address, one token, GET alone, no files. It listens on the loopback
-interface. A request is answered where its Host header names this server (a page from elsewhere whose name was led here
-by DNS does not) and its path begins with the token, compared in constant time. Answers come from a table of questions;
-no part of a request ever names a file.
+interface. A request is answered if its Host header names this server (a page from elsewhere whose name was led here
+by DNS does not) and if its path begins with the token, compared in constant time. Answers come from a table of
+questions; no part of a request ever names a file.
 """
 
 import contextlib
@@ -287,11 +287,11 @@ def explore(  # noqa: PLR0913
         target: an environment or its name; a state space, or the folder of one; a tabular MDP; or the folder of a
             finished run, whose chance and policy are taken.
         policy: one to set beside the optimal and the uniform policy, as `pharos.evaluate_policy` takes it.
-        gamma: discount; None: that of the MDP where it is below 1, else 0.99. A horizon is left out.
+        gamma: discount; None: the discount of the MDP if it is below 1, else 0.99. A horizon is left out.
         sticky, random, lazy: chance that is added, see `pharos.sticky_actions`.
-        observation: what `policy` sees, where it is no table.
+        observation: what `policy` sees, if it is no table.
         trust: whether code that a run names may be imported.
-        out: write the page with all its data into this file instead, where the space is small enough (10,000 states).
+        out: write the page with all its data into this file instead, if the space is small enough (10,000 states).
         port: of the server; 0: any that is free.
         browser: whether to open the page in the browser.
     Returns:
@@ -419,7 +419,7 @@ def _short(value: object) -> str:
 
 
 def open_browser(url: str) -> bool:
-    """Open a page in the user's browser; False where there is none, or no screen to show it on."""
+    """Open a page in the user's browser; False if there is none, or no screen to show it on."""
     has_screen = bool({"DISPLAY", "WAYLAND_DISPLAY", "BROWSER"} & set(os.environ))
     if sys.platform.startswith("linux") and not has_screen:  # else a browser of the terminal would take it over
         return False

@@ -49,7 +49,7 @@ def quantities(world: Exploration) -> dict[str, str]:
 
 
 def quantity(world: Exploration, name: str, states: np.ndarray) -> np.ndarray:
-    """(N,) a quantity of states, one of `quantities`; NaN where it has none, as most have in terminal states."""
+    """(N,) a quantity of states, one of `quantities`; NaN if it has none, as most have in terminal states."""
     kind, _, policy = name.partition("_")
     if name == "layer":
         layers = world.layers.of(states).astype(np.float64)
@@ -82,11 +82,11 @@ def heat_map(
         x, y: names of axes, across and down.
         what: a quantity, see `quantities`.
         fixed: variable -> value, of the states that count; other variables may have any value.
-        how: what a cell of several states shows: "mean", "least", "most" or "sum". Of actions: the action where all
+        how: what a cell of several states shows: "mean", "least", "most" or "sum". Of actions: the action if all
             states have the same, else -1.
     Returns:
-        `x`, `y`: the axes; `cells`: rows of values, None where there are none; `count`: rows of numbers of states;
-        `state`: rows of the first state of each cell, -1 where there is none; `terminal`: rows of how many are
+        `x`, `y`: the axes; `cells`: rows of values, None if there are none; `count`: rows of numbers of states;
+        `state`: rows of the first state of each cell, -1 if there is none; `terminal`: rows of how many are
         terminal; `low`, `high`: of all cells; `states`: how many count.
     Raises:
         UnknownName: an axis, a variable or a quantity does not exist. ParameterError: `how` is none of these, or the
