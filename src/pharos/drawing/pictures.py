@@ -1,6 +1,6 @@
 """Pictures of states for people: as text, as pixels, written to files, in a window.
 
-Everything is made from what an environment declares: `draw` says what is where (one plane of cells for each layer),
+Everything is made from what an environment declares: `draw` marks the things in one plane of cells for each layer,
 `layers` and `look` say how it looks. As text: one glyph a cell, later layers cover earlier ones. Grounds, by name, lie
 below all things. The look of "asphalt" and "walls" follows the Atari 2600 games (colours of its palette, wide pixels).
 """
@@ -66,7 +66,7 @@ def colored_text(env: Environment, state: Sequence[int]) -> "Text":
 
 
 def planes_of(env: Environment, state: Sequence[int]) -> np.ndarray:
-    """(L, rows, columns) uint8: for each layer, 0 where nothing is, 1, 2, ... where its things are.
+    """(L, rows, columns) uint8: for each layer, 0 in empty cells, 1, 2, ... in cells with its things.
 
     Raises:
         ParameterError: the class declares no `grid` or `draw`, or `state` is none of its states.
@@ -94,7 +94,7 @@ def check_state(env: Environment, state: Sequence[int]) -> None:
 # Pictures -------------------------------------------------------------------------------------------------------------
 
 
-HEIGHT, WIDTH = 720, 960  # pixels that a picture takes at most, where its cells are not smaller than CELLS[0] for it
+HEIGHT, WIDTH = 720, 960  # pixels that a picture takes at most, if its cells are not smaller than CELLS[0] for it
 CELLS = (8, 16, 24, 32, 40, 48, 64)  # pixels of a cell; multiples of 8, so that sprites of 8 x 8 stay sharp
 LEAST_PICTURE = 400  # pixels of the longer side of a picture that a class has of its own
 NIGHT, INK = (16, 18, 24), (226, 228, 232)
@@ -193,7 +193,7 @@ def enlarged(picture: np.ndarray, at_least: int) -> np.ndarray:
 
 
 def fitting_cell(rows: int, columns: int, height: int, width: int) -> int:
-    """Pixels of a cell, the most with which a grid and its margins fit; CELLS[0] where none does."""
+    """Pixels of a cell, the most with which a grid and its margins fit; CELLS[0] if none does."""
     fits = [cell for cell in CELLS if (rows + 1) * cell <= height and (columns + 1) * cell <= width]
     return fits[-1] if fits else CELLS[0]
 
@@ -231,7 +231,7 @@ def episode(
 
 
 def ground_of(ground: str | Ground) -> Ground:
-    """The function that paints a ground; UnknownName where GROUNDS has none of this name."""
+    """The function that paints a ground; UnknownName if GROUNDS has none of this name."""
     if not isinstance(ground, str):
         return ground
     if ground not in GROUNDS:
@@ -240,7 +240,7 @@ def ground_of(ground: str | Ground) -> Ground:
 
 
 def scenery_of(env: Environment) -> Scenery:
-    """The scenery of complex images: that of the class, or square cells on the ground of pictures for people."""
+    """The scenery of complex images: the scenery of the class, or square cells on the ground of pictures for people."""
     return env.look.scenery or Scenery(cell=(16, 16), margin=(0, 0, 0, 0), ground=env.look.ground)
 
 

@@ -158,7 +158,7 @@ def _bar(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
 
 
 def _car(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
-    """A car from above, with its lights on; it goes left where its glyph is "<"."""
+    """A car from above, with its lights on; it goes left if its glyph is "<"."""
     fine = 4
     y, x = _grid(fine * cell)
     if glyph == "<":
@@ -191,7 +191,7 @@ def _lettered(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
 
 
 def _power(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
-    """A block with a power of two, whose exponent in base 36 is the glyph; with the glyph where the cell is small."""
+    """A block with a power of two, whose exponent in base 36 is the glyph; with the glyph if the cell is small."""
     number = str(2 ** int(glyph, 36))
     return _written(color, cell, number if 4 * len(number) < cell else glyph)
 

@@ -56,10 +56,10 @@ def value_map(
 ) -> "Figure":
     """Draw V over the cells of a grid, or over two other variables, with the actions that the policy may take.
 
-    Over row and column, arrows are those of all optimal actions for an optimal solution; for a given policy as long as
-    their probability. Over other variables, letters say which actions the policy may take. A dot stands where every
-    action is as good. Terminal states are grey and outside of the colours' range; the number is the reward of getting
-    there. A frame marks where episodes start.
+    Over row and column, arrows show all optimal actions of an optimal solution; the arrows of a given policy are as
+    long as their probability. Over other variables, letters say which actions the policy may take. A dot means that
+    every action is as good. Terminal states are grey and outside of the colours' range; the number is the reward of
+    getting there. A frame marks where episodes start.
 
     Args:
         space: of any environment.
@@ -68,7 +68,7 @@ def value_map(
         fix: name -> value of every other variable, such as {"passenger": 4}: the slice to draw. What has one value in
             it need not be named.
         rest: "start": variables that `fix` does not name are as in the first start state.
-        axes: where to draw; None for a new figure.
+        axes: matplotlib axes to draw on; None for a new figure.
     Raises:
         ParameterError: states lack these variables, others are not fixed, or values belong to pairs.
     """
@@ -259,7 +259,7 @@ def hardness_plane(
         reports: name of an instance, such as "breakout/12x8x1", to its report. One colour for each class before the
             slash.
         visitation, estimation: names of measures in the reports.
-        axes: where to draw; None for a new figure.
+        axes: matplotlib axes to draw on; None for a new figure.
     Raises:
         ParameterError: no reports, or a report lacks a measure or has no finite value for it.
     """
@@ -367,7 +367,7 @@ def growth(spaces: Mapping[str, "StateSpace"], *, axes: "Axes | None" = None) ->
 
     Args:
         spaces: label -> state space.
-        axes: where to draw; None for a new figure.
+        axes: matplotlib axes to draw on; None for a new figure.
     Raises:
         ParameterError: no space is given.
     """
@@ -405,9 +405,9 @@ def policies(
 ) -> Path:
     """Write an episode of each agent, side by side, with the return so far below.
 
-    All start in the same state and meet the same chance as far as they act alike. For the best policy give that of a
-    discounted solution: with many undiscounted steps to go, a policy that waits is as good as one that goes straight
-    to the goal.
+    All start in the same state and meet the same chance as far as they act alike. For the best policy give the
+    policy of a discounted solution: with many undiscounted steps left, a policy that waits is as good as one that goes
+    straight to the goal.
 
     Args:
         task: environment, chance, and what the agents see.

@@ -1,4 +1,4 @@
-"""Style of all figures, those of studies too: colours, panels, legends, files."""
+"""Style of all figures, also in studies: colours, panels, legends, files."""
 
 import functools
 import io
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 T = TypeVar("T")
 
-# Okabe and Ito's colours, which people tell apart whatever their sight; those of classes stand in their `look`
+# Okabe and Ito's colours, which people distinguish whatever their sight; the colours of classes are in their `look`
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MORE_COLORS = ("#CC79A7", "#E69F00", "#F0E442", "#999999")
 OBSERVATION_COLORS = {TABULAR_OBSERVATION: "#009E73", "vector": "#0072B2", "simple_image": "#D55E00"}
@@ -173,7 +173,7 @@ def thousands(value: float, _: object = None) -> str:
 
 
 def plain_log(side: "Axis") -> None:
-    """Ticks of a logarithmic axis as numbers, with 2 and 5 between powers of ten where there are few of these."""
+    """Ticks of a logarithmic axis as numbers, with 2 and 5 between powers of ten if there are few of these."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     low, high = side.get_view_interval()
