@@ -85,9 +85,9 @@ Outcome = tuple[float, int, float, bool]
 def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
     """Return P[s][a] = [(probability, next state, reward, terminated), ...], as Gymnasium's toy texts have it.
 
-    A state has the actions that are available there. The implicit end becomes one more state S, where there is one.
-    Random actions are written out as outcomes. Each outcome has its own reward where the MDP is of an environment and
-    has its rewards; else the expected one of what is executed.
+    A state has the actions that are available there. The implicit end becomes one more state S, if there is one.
+    Random actions are written out as outcomes. Each outcome has its own reward if the MDP is of an environment and
+    has its rewards; otherwise the expected reward of what is executed.
 
     Raises:
         ParameterError: under sticky actions the state is a pair, which this table has no room for.

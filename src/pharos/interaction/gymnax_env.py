@@ -149,7 +149,7 @@ class GymnaxEnv(environment.Environment):
         outcome = _drawn(params.cumulative[state.index, executed], jax.random.uniform(key_outcome))
         next_index = params.successors[state.index, executed, outcome]
         reward = params.rewards[state.index, executed]
-        if self._reward_noise:  # its key leaves those of the steps what they are
+        if self._reward_noise:  # its key does not change the keys of the steps
             reward += self._reward_noise * jax.random.normal(jax.random.fold_in(key, 3))
         after = EnvState(time=state.time + 1, index=next_index, previous=executed)
         is_over = params.ends[next_index]

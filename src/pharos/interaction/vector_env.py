@@ -2,9 +2,9 @@
 
 `make_vec("breakout", 1024, observation="vector", sticky=0.25)`, or
 `gymnasium.make_vec("pharos/Breakout-v0", num_envs=1024)`. Chance is drawn inside the loop, from one stream of random
-numbers for each environment: the start where there are several, then for each step what is executed under sticky or
-random actions, whether it has an effect under lazy ones, then the outcome where the rules have chance. Where there is
-but one possibility nothing is drawn.
+numbers for each environment: the start, if there are several; then for each step the executed action under sticky or
+random actions, whether it has an effect under lazy ones, and the outcome, if the rules have chance. If there is but one
+possibility, nothing is drawn.
 """
 
 from abc import ABC, abstractmethod
@@ -222,11 +222,15 @@ _MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABL
 class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     """`num_envs` copies of one environment as a Gymnasium vector environment.
 
-    With `space` the built state space is walked as a table, and the rules are not run: `info` has "index" (N,) in place
-    of "state" (N, D). It always has "executed_action" (N,), -1 after a reset; and where the rules have chance "prob"
-    (N,), the probability of the outcome that was drawn, 1 after a reset; and where some actions are not available in
-    some states "action_mask" (N, A) int8, those that are in the state that the step has led to; and where rewards are
-    paid late or with noise "earned_reward" (N,), what the rules pay for the step. Arrays are fresh at every step.
+    With `space` the built state space is walked as a table, and the rules are not run. `info` has
+
+    - "state" (N, D), or "index" (N,) with `space`,
+    - "executed_action" (N,), -1 after a reset,
+    - "prob" (N,), if the rules have chance: the probability of the outcome that was drawn, 1 after a reset,
+    - "action_mask" (N, A) int8, if some actions are not available in some states: the available ones in the new state,
+    - "earned_reward" (N,), if rewards are paid late or with noise: what the rules pay for the step.
+
+    Arrays are fresh at every step.
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
@@ -234,7 +238,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         autoreset_mode: of Gymnasium. NEXT_STEP: the step after the end of an episode resets and ignores its action.
             SAME_STEP: the last step resets too; the last observation is in info["final_obs"]. DISABLED: the caller
             resets with `options={"reset_mask": mask}`.
-        seed: of the first reset, where that is given none.
+        seed: of the first reset, if that is given none.
         max_episode_steps: another name of `time_limit`, as `gymnasium.make_vec` calls it.
         render_mode: None; or "rgb_array": `render()` returns a picture of each environment.
         options: see `Interaction`, and the parameters of the environment, such as `height=12`.
@@ -294,7 +298,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         return self.simulator.action_masks(self.states)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """The picture for people of each environment, (H, W, 3) uint8, where render_mode is "rgb_array"; else None."""
+        """The picture for people of each environment, (H, W, 3) uint8, if render_mode is "rgb_array"; else None."""
         if self.render_mode is None:
             return None
         if self._rng is None:
@@ -310,7 +314,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
 
         Args:
             seed: environment i is seeded with seed + i, or with seed[i].
-            options: {"reset_mask": (N,) bool} resets these environments alone; {"state": (D,) or (N, D)} says where
+            options: {"reset_mask": (N,) bool} resets these environments alone; {"state": (D,) or (N, D)} is where
             they start.
         """
         options = options or {}

@@ -59,7 +59,7 @@ def aliasing_table(
 
 
 def with_aliasing(cells: "pd.DataFrame", counts: "pd.DataFrame") -> "pd.DataFrame":
-    """Cells with `aliasing` beside their regret: the share of states whose observation another state has; NaN where it
+    """Cells with `aliasing` beside their regret: the share of states whose observation another state has; NaN if it
     was not counted, 0 for the number of the state.
     """
     shares = counts[["environment", "instance", "observation", "share"]].rename(columns={"share": "aliasing"})

@@ -53,8 +53,8 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
 
     A row for each run: `id`; `record`, its run.json; and for each column of the curve a list. Among the metadata of
     the file are the specification, its digest, and a digest of each run. What agents learnt stays in the folder: some
-    hundred kilobytes a run, where a row takes two. Files of code are named relative to the specification, or by their
-    name alone where they are elsewhere, with their checksums; nothing tells where they were on this machine.
+    hundred kilobytes a run; a row takes two. Files of code are named relative to the specification, or by their
+    name alone if they are elsewhere, with their checksums; no path of this machine is stored.
 
     Raises:
         ParameterError: no run is finished. OSError: the file cannot be written; an older one then stays as it was.
@@ -112,7 +112,7 @@ def unpack(
     Args:
         file: written by `pack`.
         folder: of the study; studies/NAME in the current directory when not given. Runs that it has stay as they are.
-        into: another study, which gets those of the runs that it has as well; None: the packed one, with the defaults
+        into: another study, which gets the runs that it has as well; None: the packed one, with the defaults
             of hyperparameters that it was packed with.
         trust: whether code that the packed study names may be imported, from beside the file; `into` is read in its
             place.
@@ -141,7 +141,7 @@ def unpack(
 
 
 def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
-    """The study in YAML, its runs, and the digests of both; None in place of digests where an older version packed
+    """The study in YAML, its runs, and the digests of both; None in place of digests if an older version packed
     it."""
     if not file.exists():
         raise ParameterError(f"{file}: no such file")
@@ -218,7 +218,7 @@ def _curve(file: Path, id: str, row: dict[str, list | None], schema: "pa.Schema"
 
 
 def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> bool:
-    """Write a run into the folder; False where a finished one is there already, which stays."""
+    """Write a run into the folder; False if a finished one is there already, which stays."""
     target = place / "partial" / id
     storage.remove_leftovers(target)
     if _worker.read_status(place / "runs" / id) == _worker.FINISHED:

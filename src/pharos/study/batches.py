@@ -1,11 +1,11 @@
 """Runs of a study that are trained as one program: which fit together, what trains them, and the values they share.
 
-A run belongs to a batch where the study says `engine: batched`. Batches are formed when a worker is free, from the
+A run belongs to a batch if the study says `engine: batched`. Batches are formed when a worker is free, from the
 runs that are missing then; a run does not depend on its batch, so neither do results. While a batch is trained, its
 checkpoints are in DIR/batches; a batch that was killed goes on from there with the runs that it had.
 
 Values at the start of each task are solved once for all runs of a study, and kept in the user's cache. A run needs the
-values of the optimal, the uniform and the worst policy only where episodes start; solving a large instance again for
+values of the optimal, the uniform and the worst policy only in start states; solving a large instance again for
 each run would take longer than some training.
 """
 
@@ -44,13 +44,13 @@ def solve(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def stored_values(config: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The stored values for these rules; None where there are none, or where the file was changed."""
+    """The stored values for these rules; None if there are none, or if the file was changed."""
     stored = _cache().get(_dependencies(config))
     return None if stored is None else stored["values"]
 
 
 def has_regret(config: Mapping[str, Any]) -> bool:
-    """Whether a policy may be better than uniform play: False where stored values of the task tell otherwise."""
+    """Whether a policy may be better than uniform play: False if stored values of the task show otherwise."""
     values = stored_values(config)
     return values is None or not math.isnan(ReferenceValues(**values["reference"]).spread())
 
@@ -110,10 +110,10 @@ def train_batch(
 
 
 def batches(runs: Sequence[Run], checkpoints: Path, device: str = "cpu") -> list[list[Run]]:
-    """Return the runs by process, in the order of the first: those of a checkpoint as they were, others by lanes.
+    """Return the runs by process, in the order of the first: the runs of a checkpoint as they were, others by lanes.
 
     Args:
-        checkpoints: folder of those of batches. device: where networks are trained.
+        checkpoints: folder of the batches' checkpoints. device: on which networks are trained.
     """
     shapes, stored = Shapes(device), {id: ids for ids in stored_batches(checkpoints).values() for id in ids}
     keys: list[Hashable | None] = []

@@ -46,9 +46,9 @@ class Run:
     Attributes:
         configuration: what determines its result.
         instance: name of the environment as the specification gives it, such as "frozen_lake/4x4".
-        engine: "batched" where it is trained together with others; a table, too, whose configuration does not say so.
-        family: what it counts as where classes are compared: the class of its environment, unless the study says else.
-        setting: name that tells its cell from that of other blocks, where the study says so: "tuned".
+        engine: "batched" if it is trained together with others; a table, too, whose configuration does not say so.
+        family: what it counts as when classes are compared: the class of its environment, unless the study says else.
+        setting: name that distinguishes its cell from other blocks, if the study has one: "tuned".
         observation: the name of its observation in tables.
     """
 
@@ -191,7 +191,7 @@ class EnvironmentEntry(_Named):
 
     @property
     def counts_as(self) -> str:
-        """Its family; for an imported MDP without one its label; "" where the class of the environment counts."""
+        """Its family; for an imported MDP without one its label; "" if the class of the environment counts."""
         return self.family or (self.label if self.is_imported else "")
 
     @cached_property
@@ -219,9 +219,9 @@ class Hardness(_Part):
 
     @property
     def predictors(self) -> list[str]:
-        """Measures that explain regret in the linear models: the paper's three, or all where none of them is taken.
+        """Measures that explain regret in the linear models: the paper's three, or all if none of them is taken.
 
-        The stationary effective horizon stands for the effective horizon where that is not taken.
+        The stationary effective horizon stands for the effective horizon if that is not taken.
         """
         stand_in = {"effective_horizon": "stationary_effective_horizon"}
         names = [name if name in self.measures else stand_in.get(name) for name in MEASURES]

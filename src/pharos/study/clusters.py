@@ -147,7 +147,7 @@ class RayTasks(Workers):
             key = self.tasks.pop(reference)
             try:
                 *messages, code = self.ray.get(reference)
-            except Exception as error:  # of Ray: `attempt` keeps those of the run itself
+            except Exception as error:  # of Ray: `attempt` keeps errors of the run itself
                 messages, code = [], in_one_line(error)
             for event in (*messages, code):
                 yield key, event

@@ -214,7 +214,7 @@ class StudyExecution(Execution[Run]):
         self.record_result(run, False)
 
     def record_result(self, run: Run, again: bool = False) -> bool:
-        """Read and count the result of a run that is over; False where it has to be executed, a damaged one again."""
+        """Read and count the result of a run that is over; False if it has to be executed, a damaged one again."""
         try:
             record = _worker.read_record(self.folder / "runs" / run.id)
         except FileFormatError as error:
@@ -299,7 +299,7 @@ def prepare_instances(
 ) -> None:
     """Call `prepare` with one config of each instance of the runs, and `tell` with its progress; failures are ignored.
 
-    A process of their own prepares them one after the other; where it dies, another goes on with the next.
+    A separate process prepares them one after the other. If it dies, another goes on with the next.
     """
     instances: dict[str, Run] = {}
     for run in runs:
@@ -347,7 +347,7 @@ def _ask_for_device(device: str, send: Callable[[ParameterError], None]) -> None
 def _prepare_all(
     prepare: Callable[[Mapping[str, Any]], Any], configs: Iterable[Mapping[str, Any]], send: Callable[[str], None]
 ) -> None:
-    """Prepare instances one after the other; send "" after each, and the reason where one waits."""
+    """Prepare instances one after the other; send "" after each, and the reason if one waits."""
     for config in configs:
         with contextlib.suppress(Exception):  # the runs of this instance will fail with the same error, and say so
             unless_locked(prepare, config, send)
@@ -357,7 +357,7 @@ def _prepare_all(
 def unless_locked(
     prepare: Callable[[Mapping[str, Any]], Any], config: Mapping[str, Any], tell: Callable[[str], None]
 ) -> None:
-    """Prepare an instance; where another process is building it, wait for that one."""
+    """Prepare an instance; if another process is building it, wait for that one."""
     while True:
         try:
             prepare(config)

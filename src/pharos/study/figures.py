@@ -1,6 +1,6 @@
 """The figures of a study and its tables in LaTeX.
 
-Curves over steps or scores are numbers: what figures draw, and what the page shows where one points at it. Each figure
+Curves over steps or scores are numbers: what figures draw, and what the page shows when one points at it. Each figure
 is a function of tables: a matplotlib figure without global state, light or dark. Tables are in the paper's layout
 (packages booktabs, multirow), by pandas' Styler.
 """
@@ -52,7 +52,7 @@ class Line:
     Attributes:
         label: in words, `DQN, image`.
         color, dash: `#0072B2`; as matplotlib writes it, such as `--`.
-        x: (T,) where it is known; mean, lower, upper: (T,) the line and the ends of its interval.
+        x: (T,) if it is known; mean, lower, upper: (T,) the line and the ends of its interval.
         runs: name of each run -> (T,) its values.
     """
 
@@ -90,7 +90,7 @@ class Curves:
     draws_runs: bool = False
 
     def to_json(self) -> str:
-        """The curves as the page draws them: numbers of DIGITS digits; runs where there are at most MOST_RUNS."""
+        """The curves as the page draws them: numbers of DIGITS digits; runs if there are at most MOST_RUNS."""
         panels = []
         for panel in self.panels:
             num_runs = sum(len(line.runs) for line in panel.lines)
@@ -142,10 +142,10 @@ def regret_curves(
 
 
 def same_steps(points: "pd.DataFrame") -> tuple[np.ndarray, list[np.ndarray], dict[str, np.ndarray]]:
-    """Steps, for each task the cumulative regret (runs, T) there, and that of each run by its name, of the runs that
-    were evaluated at the same steps.
+    """Steps, for each task the cumulative regret (runs, T) there, and the regret of each run by its name, for the runs
+    that were evaluated at the same steps.
 
-    Where blocks of a study differ in steps, those are the steps that most runs have.
+    If blocks of a study differ in steps, these are the steps that most runs have.
     """
     by_run = points.pivot_table(index=["instance", "chance", "id"], columns="step", values="cumulative_expected_regret")
     present = by_run.notna()
@@ -227,7 +227,7 @@ def class_color(name: str, names: Sequence[str]) -> str:
 
 
 def pairs_of(cells: "pd.DataFrame", agents: Sequence[str]) -> list[tuple[str, str]]:
-    """(agent, image) where some task has cells of the agent with that image and with a vector."""
+    """(agent, image) if some task has cells of the agent with that image and with a vector."""
     pairs = []
     for agent in agents:
         own = cells[cells["agent"] == agent]
@@ -262,7 +262,7 @@ def representations(cells: "pd.DataFrame", *, agent: str = "dqn", image: str = I
 
 
 def agents_against_each_other(cells: "pd.DataFrame", value: str, agents: tuple[str, str]) -> "Figure | None":
-    """The value of one agent against that of another, a point for each task and observation."""
+    """The value of one agent against the value of another, a point for each task and observation."""
     words = [f"{REGRETS.get(value, value)} of {agent_name(agent)}" for agent in agents]
     return _against(cells, "agent", value, agents, words)
 
@@ -270,7 +270,7 @@ def agents_against_each_other(cells: "pd.DataFrame", value: str, agents: tuple[s
 def _against(
     cells: "pd.DataFrame", column: str, value: str, both: tuple[str, str], words: Sequence[str]
 ) -> "Figure | None":
-    """The value with one entry of `column` against that with another; None where no cell has both."""
+    """The value with one entry of `column` against the value with another; None if no cell has both."""
     index = [name for name in CELL if name != column]
     wide = cells.pivot_table(index=index, columns=column, values=value)
     if not {*both} <= {*wide.columns} or not len(wide := wide[list(both)].dropna().reset_index()):
@@ -363,7 +363,7 @@ def tables_of(cells: "pd.DataFrame", measured: "pd.DataFrame", models: Sequence[
 def returns_table(cells: "pd.DataFrame", environment: str) -> str:
     """The returns of one class, a line for each kind of chance.
 
-    As in appendix C where PPO and DQN see images and vectors: IMAGE and MINIMAL (the vector). Else a column for each
+    As in appendix C if PPO and DQN see images and vectors: IMAGE and MINIMAL (the vector). Else a column for each
     agent and observation that there is.
     """
     import pandas as pd
@@ -384,7 +384,7 @@ def returns_table(cells: "pd.DataFrame", environment: str) -> str:
 
 def wide_returns(cells: "pd.DataFrame", environment: str, text: Callable[[Mapping[str, Any]], str]) -> "pd.DataFrame":
     """The text of each cell of a class: a row for each instance and kind of chance, a column for each agent and
-    observation, those of PPO first.
+    observation, PPO first.
     """
     part = cells[cells["environment"] == environment]
     texts = part.assign(text=[text(row) for row in part.to_dict("records")])

@@ -145,7 +145,7 @@ class RunLog:
 
 
 def named(study: Specification) -> Iterator[tuple[Run, str]]:
-    """Yield (run, its name): INSTANCE/CHANCE/AGENT/SEED, and its id where others have the same name."""
+    """Yield (run, its name): INSTANCE/CHANCE/AGENT/SEED, and its id if others have the same name."""
     names = [_name(run) for run in study.runs]
     often = Counter(names)
     for run, name in zip(study.runs, names, strict=True):

@@ -143,7 +143,7 @@ def _spread(groups: list[Any], max_panels: int = MOST_PANELS) -> list[Any]:
 
 
 def _short(environment: str, instance: str, chance: str) -> str:
-    """`taxi: size 7`, with the chance, where there is some, in a line of its own."""
+    """`taxi: size 7`, with the chance, if there is some, in a separate line."""
     inside = instance[instance.find("(") + 1 : -1] if instance.endswith(")") else instance.partition("/")[2] or instance
     first, *others = [part.strip().replace("=", " ").replace("_", " ") for part in inside.split(",")]
     text = f"{in_words(environment)}: {first}"

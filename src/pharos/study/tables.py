@@ -97,11 +97,11 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
 
     Returns:
         Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`,
-        `began` (date; "" where the record does not say);
+        `began` (date; "" if the record does not say);
         the result of the run (`cumulative_regret`, `normalized_regret`, `value_optimal`, ...); `return`, the mean
         return of the training episodes in the last tenth of the run, undiscounted; `exact`, whether every value behind
-        the regret is computed; and `half_width`, by how much `normalized_regret` may at worst be wrong where some are
-        estimated, 0 where none is.
+        the regret is computed; and `half_width`, by how much `normalized_regret` may at worst be wrong if some are
+        estimated, 0 if none is.
     Raises:
         ParameterError: no run is finished.
     """
@@ -144,7 +144,7 @@ def _result_of(record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _began(record: Mapping[str, Any]) -> str:
-    """Date at which a run began: that of its record less the seconds of its program; "" where the record lacks it."""
+    """Date at which a run began: its record's date less the seconds of its program; "" if the record lacks it."""
     try:
         seconds = float(record.get("batch", {}).get("seconds") or record["seconds"])
         began = datetime.strptime(record["written"], DATE).replace(tzinfo=UTC) - timedelta(seconds=seconds)
@@ -164,10 +164,10 @@ def _exactness(curve: "pd.DataFrame", row: Mapping[str, Any]) -> tuple[bool, flo
 
 
 def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.DataFrame":
-    """The means over seeds, a row for each cell; joined with hardness where `measures` (of `hardness_table`) is given.
+    """The means over seeds, a row for each cell; joined with hardness if `measures` (of `hardness_table`) is given.
 
     Returns:
-        Columns of the cell; `seeds`; `steps` (the most, where runs differ); means of `cumulative_regret`,
+        Columns of the cell; `seeds`; `steps` (the most, if runs differ); means of `cumulative_regret`,
         `normalized_regret`, `final_value`, `value_optimal`, `return`; `return_deviation` over seeds (population, as
         0.00 is printed for equal runs; NaN for one seed); `exact`, whether all runs are; the mean of `half_width`; and
         the measures.
@@ -190,7 +190,7 @@ def read_curve(folder: Path, id: str) -> "pd.DataFrame":
     """The curve of one run.
 
     Raises:
-        FileFormatError: it cannot be read, is not that of its record, or has no evaluation.
+        FileFormatError: it cannot be read, does not match its record, or has no evaluation.
     """
     curve = training.read_curve(folder / "runs" / id, columns=POINTS)
     if len(curve) == 0 or any(curve[name].dtype.kind not in "iufb" for name in POINTS):
@@ -228,10 +228,13 @@ def hardness_table(
     Args:
         tasks: (instance, chance) of those that are wanted; None for all.
     Returns:
-        Columns `environment`, `instance`, `chance`; each measure as a number; `num_states`; and `notes`: where a
-        measure is undefined or unknown, where it is the geometric mean of a proven interval (whose ends differ by a
-        factor of at most two), and where it is that of the instance without chance, because the measure does not
-        exist, or cannot be computed within the budget, under this chance.
+        Columns `environment`, `instance`, `chance`; each measure as a number; `num_states`; and `notes`, which name a
+        measure if
+
+        - it is undefined or unknown,
+        - it is the geometric mean of a proven interval (whose ends differ by a factor of at most two),
+        - it belongs to the instance without chance, because the measure does not exist, or cannot be computed within
+          the budget, under this chance.
     Cost: a state space and a report of hardness for each row, each measure at most the budget of the specification;
         `hardness_cost` tells beforehand.
     """
@@ -269,7 +272,7 @@ def hardness_cost(study: Specification, place: Path, tasks: Container[tuple[str,
 
 
 def _row_of_measures(names: Sequence[str], own: Mapping[str, Any], plain: Mapping[str, Any]) -> dict[str, Any]:
-    """The measures of a task as columns: with chance where that is known, else without, which `notes` say."""
+    """The measures of a task as columns: with chance if that is known, else without, which `notes` say."""
     row: dict[str, Any] = {"num_states": own.get("num_states") or plain.get("num_states")}
     notes = []
     for name in names:
@@ -293,7 +296,7 @@ def _usable(measure: dict[str, Any]) -> dict[str, Any]:
 
 
 def _dependencies(study: Specification, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Key of stored measures: what those of a run's task depend on."""
+    """Key of stored measures: what the measures of a run's task depend on."""
     dependencies = {name: config[name] for name in ("environment", "parameters", "chance", "horizon")}
     dependencies["gamma"] = study.hardness.gamma
     if "environment" in config.get("sources", {}):  # a class of the user's own, which may change
@@ -410,15 +413,15 @@ def predict(
         blocks, agents, observations: a part of the study: numbers of blocks from 1, names of agents, and of
             observations without their options; None: all.
         primary: only the predictor that stands for each agent (`pharos.agents.Idealised`) with its table; other
-            columns are NaN, and `estimated_error` is that of this predictor. A small part of the time.
+            columns are NaN, and `estimated_error` belongs to this predictor. A small part of the time.
         progress: called with what is being done.
     Returns:
         Columns `environment`, `instance`, `chance`, `agent`, `observation`; PREDICTORS; `network`; `estimated_error`,
-        that of `kernel_regret` where landmarks stand for the kernel; `curve` and `adam_curve`, the learner's steps and
-        greedy regrets as JSON; `notes`, why a number is missing. The idealised learner has the steps of the run, and of
-        a DQN its discount, exploration and target network; of actor-critics, with the rollouts, steps and discount of
-        the agent, POLICY_PREDICTORS, `policy_curve` and `clipped_curve`, that of the distribution over actions with
-        PPO's clipping, NaN and "" in rows of others.
+        the error of `kernel_regret` if landmarks stand for the kernel; `curve` and `adam_curve`, the learner's steps
+        and greedy regrets as JSON; `notes`, why a number is missing. The idealised learner has the steps of the run,
+        and of a DQN its discount, exploration and target network; of actor-critics, with the rollouts, steps and
+        discount of the agent, POLICY_PREDICTORS, `policy_curve` and `clipped_curve`, the curve of the distribution over
+        actions with PPO's clipping, NaN and "" in rows of others.
     Raises:
         ParameterError: the study has no such cell.
     Cost: measures of hardness are kept beside the state spaces, so that a second call is quick.

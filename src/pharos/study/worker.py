@@ -41,7 +41,7 @@ class HalfAsMany(str):
 
 
 def read_status(folder: Path) -> str | None:
-    """`finished` or `failed`; None where a run has no folder yet, or a damaged record."""
+    """`finished` or `failed`; None if a run has no folder yet, or a damaged record."""
     try:
         record = read_record(folder)
     except FileFormatError:
@@ -50,7 +50,7 @@ def read_status(folder: Path) -> str | None:
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
-    """The record in run.json of a run; None where there is none.
+    """The record in run.json of a run; None if there is none.
 
     Raises:
         FileFormatError: it is not the record of a run that is over. ResultCorrupted: it, or the curve of a finished

@@ -3,7 +3,7 @@
 `import pharos` and a script's first lines need few of the names that a package publishes; the others cost nothing then.
 
 The distribution `pharos-rl` is this project. The distribution `pharos` is Graviti's SDK for pictures, whose files lie
-in the same folder where both are installed; whichever came last has replaced the other's `__init__.py`.
+in the same folder if both are installed. The one installed last has replaced the other's `__init__.py`.
 """
 
 import ast
@@ -52,10 +52,10 @@ FOREIGN_FILE = "__version__.py"
 
 
 def conflict(folder: Path | None = None) -> str | None:
-    """Message about the other project in the same folder, and how to mend it; None where it is not there.
+    """Message about the other project in the same folder, and how to mend it; None if it is not there.
 
     Args:
-        folder: of the package; None: that of pharos.
+        folder: of the package; None: of pharos.
     """
     folder = folder or Path(__file__).parents[1]
     if not (folder / FOREIGN_FILE).exists():

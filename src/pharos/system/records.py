@@ -1,8 +1,8 @@
 """Frozen dataclasses made of keywords or read from JSON.
 
 Options that travel together are declared once, and documented under *Attributes* of the class; Python's keywords, the
-command line and YAML files are read into them. Records are JSON of unknown origin: names and types of entries are those
-of the fields.
+command line and YAML files are read into them. Records are JSON of unknown origin: names and types of entries must be
+the names and types of the fields.
 """
 
 import functools
@@ -62,7 +62,7 @@ def parts(cls: type) -> dict[str, type]:
 
 
 def option_names(cls: type) -> set[str]:
-    """Names of the fields of a dataclass, and of those of its parts."""
+    """Names of the fields of a dataclass, and of the fields of its parts."""
     return {each.name for owner in (cls, *parts(cls).values()) for each in _fields(owner)}
 
 

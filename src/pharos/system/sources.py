@@ -30,7 +30,7 @@ class Source:
 
     Attributes:
         name: "module:Name" or "file.py:Name", without a folder: the same on every machine.
-        file: the file, or that of the module: an absolute path.
+        file: the file, or the file of the module: an absolute path.
         checksum: digest of the file.
     """
 
@@ -75,7 +75,7 @@ class Source:
 
 
 def is_reference(name: object) -> TypeGuard[str]:
-    """Whether a name is that of the user's own code, `module:Name` or `file.py:Name`."""
+    """Whether a name means the user's own code, `module:Name` or `file.py:Name`."""
     return isinstance(name, str) and ":" in name
 
 
@@ -109,7 +109,7 @@ def find(name: str, folder: str | Path | None = None) -> Source:
 
 
 def load(source: Source) -> Any:
-    """Import what a source names; None where it has no such name. A file is executed again only where it has changed.
+    """Import what a source names; None if it has no such name. A file is executed again only if it has changed.
 
     Raises:
         ParameterError: it cannot be imported.
@@ -119,7 +119,7 @@ def load(source: Source) -> Any:
     try:
         module = _module_of_file(source) if source.module is None else _module_called(source)
         target = getattr(module, source.attribute, None) if source.attribute else None
-    except (Exception, SystemExit) as error:  # a script may end where it is loaded
+    except (Exception, SystemExit) as error:  # a script may end while it is loaded
         raise ParameterError(f"{source.name!r}: {_in_a_line(error)}; {_EXPECTED}") from error
     _LOADED[source.name] = (source, target)
     return target
@@ -165,7 +165,7 @@ def resolve(source: Source, *, trust: bool = False, strict: bool = False) -> Any
 
 
 def source_of(value: object, attribute: str | None = None) -> Source | None:
-    """The source by which others can import a class or function; None where they cannot, as in a notebook.
+    """The source by which others can import a class or function; None if they cannot, as in a notebook.
 
     Args:
         attribute: the name in its module; None: its own.
@@ -260,7 +260,7 @@ def _module_called(source: Source) -> ModuleType:
 
 
 def _checksum(file: str | Path) -> str:
-    """The digest of a file; empty where there is none."""
+    """The digest of a file; empty if there is none."""
     from pharos.system.storage import digest_of_file  # which built-in classes do without
 
     return digest_of_file(file) if file and Path(file).is_file() else ""

@@ -56,7 +56,7 @@ _LEFTOVER_SECONDS = 86400.0
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike, *, durable: bool = True, follow: bool = False) -> Iterator[BinaryIO]:
-    """Open a file for writing that takes the place of `path` when the block ends, and never where it raises.
+    """Open a file for writing that takes the place of `path` when the block ends, and never if it raises.
 
     Args:
         path: a symbolic link, a pipe or a device there is replaced, so that a folder of results that somebody else has
@@ -176,7 +176,7 @@ def sync(path: Path) -> None:
 def write_out(descriptor: int, start: int, size: int) -> None:
     """Ask the system to begin writing a part of a file to the disk, so that a later fsync has less to wait for.
 
-    It waits for nothing and promises nothing; where the system knows no such call (it is Linux' own), nothing happens.
+    It waits for nothing and promises nothing. If the system has no such call (only Linux has it), nothing happens.
     """
     call = _sync_file_range()
     if call is not None:
@@ -246,7 +246,7 @@ def _host() -> str:
 
 
 def _is_alive(process: int) -> bool:
-    """Whether a process of this machine is alive; True where that is unknown."""
+    """Whether a process of this machine is alive; True if that is unknown."""
     if os.name == "nt":
         return True
     try:
@@ -269,14 +269,14 @@ def _is_alive(process: int) -> bool:
 def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = "at work") -> Iterator[None]:
     """Hold a folder for this process: by `flock` on its file `lock`, so that a process that is killed holds nothing.
 
-    Where the file system has no such locks (ENOSYS, ENOLCK, EOPNOTSUPP: Lustre without `-o flock`, some network file
+    If the file system has no such locks (ENOSYS, ENOLCK, EOPNOTSUPP: Lustre without `-o flock`, some network file
     systems), the folder is held by a file `lock.claim` that only one process can make. It says who made it. One whose
     process is gone is removed by the next process of the same machine; from another machine nobody can tell, so the
     error names the file.
 
     Args:
         folder: exists.
-        error, activity: raised where another process holds the folder: "another process (process 7) is `activity`
+        error, activity: raised if another process holds the folder: "another process (process 7) is `activity`
             there".
     Raises:
         ParameterError: the folder cannot be written to, or cannot be locked at all.
@@ -332,7 +332,7 @@ def waiting_lock(
 
 
 def _flock(file: TextIO, folder: Path, error: type[PharosError], activity: str) -> bool:
-    """Take the lock; False where the file system has none."""
+    """Take the lock; False if the file system has none."""
     if fcntl is None:
         return False
     try:
@@ -376,7 +376,7 @@ def claim(path: Path, error: type[PharosError], activity: str) -> Iterator[None]
 
 
 def _create(path: Path, text: str) -> bool:
-    """Make a file that is not there; False where it is."""
+    """Make a file that is not there; False if it is."""
     try:
         descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
     except FileExistsError:
@@ -475,7 +475,7 @@ def read_json(path: str | os.PathLike, error: type[PharosError] = FileFormatErro
     """The value that a file of JSON holds.
 
     Args:
-        error, advice: raised where the file is none, in one line that ends with the advice.
+        error, advice: raised if the file is none, in one line that ends with the advice.
     Raises:
         FileNotFoundError: there is no such file.
     """
@@ -544,10 +544,10 @@ class ResultCache:
         return self.folder / f"{xxhash.xxh3_64_hexdigest(json.dumps(dependencies, sort_keys=True).encode())}.json"
 
     def get(self, dependencies: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The entries of a result; None where there is none, or where its file was changed."""
+        """The entries of a result; None if there is none, or if its file was changed."""
         try:
             record = read_json(self.file(dependencies))
-            entries = record.get("task", record)  # where values of 0.1.0 have it
+            entries = record.get("task", record)  # as values of 0.1.0 have it
             is_ours = DIGEST in record and all(entries.get(name) == value for name, value in dependencies.items())
             return record if is_ours and is_intact(record) else None
         except (FileNotFoundError, FileFormatError, AttributeError, TypeError):
@@ -568,8 +568,8 @@ _temporary: list[Path] = []
 def cache_directory() -> Path:
     """The folder of cached state spaces and compiled code: PHAROS_CACHE_DIR, else `pharos` in the user's cache.
 
-    Where there is no such folder and none can be made (no home, or one that cannot be written to, as in containers), it
-    is a temporary one for this process and those that it starts.
+    If there is no such folder and none can be made (no home, or one that cannot be written to, as in containers), it
+    is a temporary one for this process and the processes that it starts.
     """
     if folder := os.environ.get("PHAROS_CACHE_DIR"):
         return Path(folder).expanduser()
@@ -628,6 +628,6 @@ def is_cache_temporary() -> bool:
 
 
 def compiled_folders(cache: Path) -> list[Path]:
-    """Folders for compiled rules in a cache, best first: `compiled-NUMBER` is for where another user has the first."""
+    """Folders for compiled rules in a cache, best first: `compiled-NUMBER` is used if another user has the first."""
     users = [cache / f"compiled-{os.getuid()}"] if hasattr(os, "getuid") else []
     return [cache / "compiled", *users]

@@ -1,4 +1,4 @@
-"""YAML that somebody else may have written: data alone, refused in one line where no file of pharos needs it."""
+"""YAML that somebody else may have written: data alone, and refused in one line if no file of pharos needs it."""
 
 import re
 from pathlib import Path
@@ -64,7 +64,7 @@ def nodes_and_data(text: str, name: str, error: type[PharosError] = ParameterErr
 def _check_nodes(root: "yaml.Node", name: str) -> None:
     """Refuse what no file needs: keys that are no words or repeated, nodes within themselves, millions by aliases.
 
-    A node that aliases share is looked at once; its size counts wherever it stands.
+    A node that aliases share is looked at once; its size counts at each alias.
     """
     sizes: dict[int, int] = {}
 

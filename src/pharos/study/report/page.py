@@ -59,7 +59,7 @@ class ReportTable:
 
 @dataclass(frozen=True)
 class Image:
-    """A figure for light and for dark pages, as data URLs; its name is that of its file.
+    """A figure for light and for dark pages, as data URLs; its name is the name of its file.
 
     `curves` has the numbers of its lines, as JSON: the page draws them anew, to be pointed at. Empty for other figures.
     """
@@ -82,7 +82,7 @@ def render(title: str, description: str, sections: Sequence[Section]) -> str:
 
 
 def image(figures: Figures, name: str, caption: str) -> Image | None:
-    """A figure with its caption; None where it was not drawn."""
+    """A figure with its caption; None if it was not drawn."""
     images = figures.get(name)
     if not images:
         return None

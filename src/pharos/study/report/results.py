@@ -36,8 +36,8 @@ class Results:
         profiles, improvements: performance profiles of agents and observations, and how probable one improves on
             another.
         differences: in normalised regret, of each two agents or observations over all classes.
-        other_winners: tasks on which the highest return is not that of the least regret.
-        comparison, findings: beside the paper; None where the study is not the paper's.
+        other_winners: tasks on which the highest return and the least regret belong to different agents.
+        comparison, findings: beside the paper; None if the study is not the paper's.
     """
 
     study: Specification
@@ -147,7 +147,7 @@ def _listed(runs: "pd.DataFrame") -> str:
 
 
 def observing_agents(runs: "pd.DataFrame") -> list[str]:
-    """The agents of a study that see observations, those of the paper first."""
+    """The agents of a study that see observations, the paper's first."""
     agents = list(dict.fromkeys(runs.loc[runs["observation"] != TABULAR_OBSERVATION, "agent"]))
     return sorted(agents, key=lambda agent: PAPER_AGENTS.index(agent) if agent in PAPER_AGENTS else len(PAPER_AGENTS))
 

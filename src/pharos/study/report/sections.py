@@ -90,7 +90,7 @@ MOST_COMPARED = 6  # agents and observations with a sentence of their own
 def _winner(results: Results) -> list[str]:
     """Sentences on who has the least regret, by how much less than each other one, and how sure that is.
 
-    All are compared on the tasks that all of them have, or, where there is none, each on its own.
+    All are compared on the tasks that all of them have. If there is none, each is averaged over its tasks.
     """
     groups = {
         key: own.groupby(["instance", "chance"])["normalized_regret"].mean().dropna()
@@ -149,7 +149,7 @@ def _other_winners(results: Results) -> list[str]:
 
 
 def _estimated(runs: "pd.DataFrame") -> str | None:
-    """Sentences on the regret that is estimated, and how wrong it may be; None where all regret is exact."""
+    """Sentences on the regret that is estimated, and how wrong it may be; None if all regret is exact."""
     estimates = runs[~runs["exact"].astype(bool)]
     if len(estimates) == 0:
         return None
@@ -219,7 +219,7 @@ def _intervals(rows: "pd.DataFrame", digits: int) -> list[str]:
 
 
 def _profiles(results: Results, figures: Figures) -> Section | None:
-    """Profiles and improvements; None where there is but one agent and observation."""
+    """Profiles and improvements; None if there is but one agent and observation."""
     if len(results.improvements) == 0:
         return None
     shown = results.improvements.assign(interval=_intervals(results.improvements, 2)).drop(columns=["lower", "upper"])
@@ -339,7 +339,7 @@ def _return(row: Mapping[str, Any]) -> str:
 
 
 def _paper_comparison(results: Results) -> Section | None:
-    """Our numbers beside those of the paper; None where no number is in both."""
+    """Our numbers beside the paper's; None if no number is in both."""
     if results.comparison is None:
         return None
     ours = [name for name in results.comparison.regressions.columns if name.startswith("ours_")]
