@@ -146,7 +146,7 @@ def warm(
     """Compile what building, solving, measuring, playing and Q-learning need, and keep it for later processes.
 
     Args:
-        targets: Environments or named instances; small ones of the paper's four classes when not given.
+        targets: Environments or named instances. Default: small ones of the paper's four classes.
     """
     environments = [Target(name).found_environment() for name in targets or ()]
     if not targets:

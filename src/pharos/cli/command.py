@@ -5,7 +5,7 @@
         '''Find the optimal values.
 
         Args:
-            threads: Of a sweep.
+            threads: Use this many threads for a sweep.
         '''
 
 A parameter is an argument, one after `*` is an option; `Annotated[Path, "DIR"]` says what stands for its value in help.
@@ -97,7 +97,7 @@ def _of_fields(cls: "type[DataclassInstance]", values: object, docs: Mapping[str
     """Yield a parameter for each field of a dataclass, and for the fields of nested dataclasses.
 
     Args:
-        values: the defaults. docs: help texts that go before those of the class.
+        values: the defaults. docs: help texts that override the texts of the class.
     """
     texts, declared = meanings(cls), declared_parameters(cls)
     for field in dataclasses.fields(cls):

@@ -23,10 +23,10 @@ def list_(
         str | None, typer.Argument(metavar="[ENVIRONMENT]", show_default=False, autocompletion=complete_target)
     ] = None,
 ) -> Answer:
-    """Show the environments with their parameters and instances; of one of them its rules and parameters in full.
+    """Show the environments with their parameters and instances, or the rules and parameters of one in full.
 
     Args:
-        name: One class, or file.py:Class: its rules and parameters.
+        name: Show the rules and parameters of this class, or of file.py:Class.
     """
     if name is None:
         described = [_overview(name, cls) for name, cls in classes().items()]

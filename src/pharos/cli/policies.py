@@ -52,11 +52,11 @@ def _state(row: dict[str, Any]) -> str:
 
 
 def readable_policy(mdp: "TabularMDP", policy: "np.ndarray", most: int, title: str = "policy") -> PolicyRows:
-    """The actions of a policy where it may get to from the start, terminal states left out; at most so many rows.
+    """The actions of a policy in states that it may reach, without terminal states; at most so many rows.
 
     Args:
-        policy: (S,) actions, or (S, A + 1) by the previous action. With a horizon, it is that of the first step, and
-            states are those that any actions may get to.
+        policy: (S,) actions, or (S, A + 1) by the previous action. With a horizon, it is the policy of the first step,
+            and rows are states that any actions may reach.
     """
     import numpy as np
 

@@ -34,8 +34,8 @@ class Study:
 
     Attributes:
         spec: A YAML file, a study's folder, or a preset: quick, small, classes, paper, hardness-dev, hardness-sealed.
-        out: where results are; studies/NAME when not given.
-        environments: YAML: a list of environments, for studies that have none of their own.
+        out: folder of the results (default: studies/NAME).
+        environments: YAML file with a list of environments, for studies that have none.
     """
 
     spec: Annotated[str, typer.Argument(metavar="SPEC")]
@@ -110,11 +110,11 @@ def run(
     """Execute the runs that are missing. Interrupt it at any time: the same command goes on from there.
 
     Args:
-        on: Where the runs are executed.
-        shards: With --on slurm: jobs of the array; 8 when not given.
+        on: Execute the runs here, on slurm or on ray.
+        shards: With --on slurm: jobs of the array. Default: 8.
         slurm: With --on slurm: timeout_min=600, slurm_partition=cpu, ...
-        address: With --on ray: of the cluster; one is started when not given.
-        log: Write curves there as runs finish; see `study log`.
+        address: With --on ray: address of the cluster. Default: start one.
+        log: Write curves as runs finish; see `study log`.
     """
     from pharos import study
 
@@ -168,8 +168,8 @@ def report(
     """Make the figures and tables of the finished runs: one HTML file, PNG, PDF, CSV and LaTeX.
 
     Args:
-        to: Where to write; DIR/report of the study when not given.
-        predictions: Of `pharos study predict`: what came true of them; again for a study predicted in parts.
+        to: Write to this folder. Default: DIR/report of the study.
+        predictions: Compare with this file of `pharos study predict`. Repeatable, for a study predicted in parts.
     """
     from pharos import study
 
@@ -198,9 +198,9 @@ def log(
     """Write the curves of finished runs, exact values and regret, for TensorBoard or Weights & Biases.
 
     Args:
-        to: Where the curves are looked at.
-        project: Of Weights & Biases; the name of the study when not given.
-        offline: Weights & Biases writes files for `wandb sync`, and sends nothing.
+        to: Program that shows the curves.
+        project: Project of Weights & Biases. Default: the name of the study.
+        offline: Write files for `wandb sync`, and send nothing to Weights & Biases.
     """
     from pharos import study
 
@@ -228,11 +228,11 @@ def predict(
     """Predict the regret of each cell from what its network makes of its states, before any run; hashed and dated.
 
     Args:
-        out: The Parquet file to write.
-        block: Of these blocks alone, from 1; again for another one.
-        agent: Of this agent alone; again for another.
-        observation: Of this observation alone; again for another one.
-        primary: Only the predictor that stands for each agent, in a small part of the time.
+        out: Write to this Parquet file.
+        block: Predict only this block, counted from 1. Repeatable.
+        agent: Predict only this agent. Repeatable.
+        observation: Predict only this observation. Repeatable.
+        primary: Compute only the predictor that stands for each agent, in a small part of the time.
     """
     from pharos import study
     from pharos.agents import primary_predictors
@@ -267,7 +267,7 @@ def pack(source: Results, *, to: Annotated[Path, "FILE"]) -> Answer:
     """Put the finished runs into one Parquet file, to keep, publish or carry; without what the agents learnt.
 
     Args:
-        to: The Parquet file to write.
+        to: Write to this Parquet file.
     """
     from pharos import study
 
@@ -286,9 +286,9 @@ def unpack(
     """Put packed runs into a study's folder; `pharos study run FOLDER` goes on with those that are missing.
 
     Args:
-        file: Written by `pharos study pack`.
-        into: Another study, which gets those of the runs that it has as well.
-        out: Where results are; studies/NAME when not given.
+        file: File from `pharos study pack`.
+        into: Put the runs that another study has as well into that study.
+        out: Folder of the results. Default: studies/NAME.
     """
     from pharos import study
 

@@ -315,7 +315,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         Args:
             seed: environment i is seeded with seed + i, or with seed[i].
             options: {"reset_mask": (N,) bool} resets these environments alone; {"state": (D,) or (N, D)} is where
-            they start.
+                they start.
         """
         options = options or {}
         mask = self._checked_mask(options.get("reset_mask"))
