@@ -16,7 +16,7 @@ from naive import mdp as naive_mdp
 from patience import PATIENCE, wait_for
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, UnknownName
-from pharos.explorer import Exploration, Explorer, Learnt, exploration_of, page, write
+from pharos.explorer import Exploration, Explorer, Learnt, exploration_of, explorer_page, write
 from pharos.explorer.exploration import Pictures
 from pharos.explorer.launch import MOST_CONNECTIONS
 from pharos.explorer.pages import contents, heat_map, quantities, quantity, smaller_instance
@@ -212,7 +212,7 @@ def test_a_page_of_its_own_holds_every_position_and_loads_nothing(lake, tmp_path
 
 def test_a_title_is_text_and_never_markup(lake, tmp_path):
     title = '</script><img src=x onerror="alert(1)">'
-    text = page(Exploration(lake.mdp, title=title), contents(Exploration(lake.mdp, title=title)))
+    text = explorer_page(Exploration(lake.mdp, title=title), contents(Exploration(lake.mdp, title=title)))
     assert "<img src=x" not in text and text.count("</script>") == 2
 
 

@@ -114,7 +114,7 @@ def human(env: Environment, state: Sequence[int], *, cell: int | None = None) ->
         return enlarged(own, LEAST_PICTURE)
     cell = cell or fitting_cell(planes.shape[1], planes.shape[2], HEIGHT, WIDTH)
     canvas = empty_grid(env, cell)
-    court = inside(canvas, (cell // 2,) * 4)
+    court = without_margin(canvas, (cell // 2,) * 4)
     for plane, (name, layer) in zip(planes, env.layers.items(), strict=True):
         for row, column in np.argwhere(plane):
             thing = tile(name, layer, int(plane[row, column]), cell)
@@ -244,7 +244,7 @@ def scenery_of(env: Environment) -> Scenery:
     return env.look.scenery or Scenery(cell=(16, 16), margin=(0, 0, 0, 0), ground=env.look.ground)
 
 
-def inside(picture: np.ndarray, margin: Margin) -> np.ndarray:
+def without_margin(picture: np.ndarray, margin: Margin) -> np.ndarray:
     """The part of a picture that its cells fill; a view."""
     top, right, bottom, left = margin
     return picture[top : len(picture) - bottom, left : picture.shape[1] - right]
@@ -255,14 +255,14 @@ def inside(picture: np.ndarray, margin: Margin) -> np.ndarray:
 
 def _plain(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     """Dark cells with thin lines between them."""
-    court = inside(picture, margin)
+    court = without_margin(picture, margin)
     court[:] = (30, 33, 41)
     court[:: cell[0]] = court[:, :: cell[1]] = (40, 44, 54)
 
 
 def _road(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     """Asphalt, with dashes between the lanes; the first and the last row are pavements."""
-    court, side = inside(picture, margin), cell[0]
+    court, side = without_margin(picture, margin), cell[0]
     court[:] = (52, 54, 60)
     thickness = max(1, side // 16)
     lanes = len(court) // side - 2
@@ -277,12 +277,12 @@ def _court(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     top, _, bottom, _ = margin
     picture[: len(picture) - bottom] = (142, 142, 146)
     picture[: max(1, top // 6)] = (176, 176, 180)
-    inside(picture, margin)[:] = (12, 13, 18)
+    without_margin(picture, margin)[:] = (12, 13, 18)
 
 
 def _tiles(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     """Pale tiles, like a chessboard."""
-    court = inside(picture, margin)
+    court = without_margin(picture, margin)
     rows, columns = (np.arange(n) // side for n, side in zip(court.shape, cell, strict=False))
     odd = ((rows[:, None] + columns) % 2)[..., None]
     court[:] = np.where(odd, (216, 211, 200), (226, 221, 210))
@@ -290,7 +290,7 @@ def _tiles(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
 
 def _ice(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     """Pale blue ice with faint seams and scratches."""
-    court, side = inside(picture, margin), cell[0]
+    court, side = without_margin(picture, margin), cell[0]
     court[:] = (176, 210, 232)
     court[::side] = court[:, ::side] = (150, 190, 218)
     y, x = np.mgrid[: court.shape[0], : court.shape[1]]

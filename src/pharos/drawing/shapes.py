@@ -63,7 +63,7 @@ def sprite_pixels(rows: Sequence[str], color: Color) -> np.ndarray:
     for y, row in enumerate(rows):
         for x, letter in enumerate(row):
             if letter not in ". ":
-                pixels[y, x] = (*shade(color, letter), 1.0)
+                pixels[y, x] = (*letter_color(color, letter), 1.0)
     return pixels
 
 
@@ -74,7 +74,7 @@ def sprite_tile(rows: Sequence[str], color: Color, cell: int) -> np.ndarray:
     return pixels[ys[:, None], xs]
 
 
-def shade(color: Color, letter: str) -> Color:
+def letter_color(color: Color, letter: str) -> Color:
     """The colour of a letter of a sprite: '#' is `color`, '1' nearly white, '5' `color`, '9' nearly black."""
     if not letter.isdigit() or letter == "0":
         return color

@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from pharos.environments.catalog import (
         class_called,
         class_of,
+        class_source,
         classes,
-        imported,
+        import_class,
         instance_name,
         list_environments,
         make,
         named_instances,
         register,
-        source_of,
     )
 
 __all__ = [

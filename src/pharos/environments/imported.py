@@ -76,7 +76,7 @@ class ImportedWorld(Environment):
     @cached_property
     def manifest(self) -> Mapping[str, Any]:
         """Manifest of the folder."""
-        return mdp_files.read_manifest(self.folder)
+        return mdp_files.read_mdp_manifest(self.folder)
 
     @property
     def actions(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -204,7 +204,7 @@ class ImportedWorld(Environment):
 
         Rows of a large recording are read when they are looked at.
         """
-        shown = mdp_files.read_rows(self.folder, self.manifest)
+        shown = mdp_files.read_observations(self.folder, self.manifest)
         if shown is None:
             return None
         if len(shown) != self.manifest["num_states"]:
@@ -232,7 +232,7 @@ class ImportedWorld(Environment):
     def _table(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         states, actions = self.manifest["num_states"], self.manifest["num_actions"]
         try:
-            table = written_out(*outcomes_of(self._arrays, states, actions), states, actions, self._paid)
+            table = written_out(*table_outcomes(self._arrays, states, actions), states, actions, self._paid)
         except (ValueError, IndexError, TypeError, OverflowError) as error:
             raise FileFormatError(f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.AGAIN}") from None
         return table
@@ -247,7 +247,7 @@ def is_name(value: object) -> bool:
     return isinstance(value, str) and value != ""
 
 
-def outcomes_of(
+def table_outcomes(
     arrays: Mapping[str, np.ndarray], states: int, actions: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(rows (N,), successors (N,), probabilities (N,)): the outcomes of row s A + a, in any of the forms of a folder.

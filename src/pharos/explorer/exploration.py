@@ -222,7 +222,9 @@ class Exploration:
         q = {name: self.chosen_values(name, here, previous) for name in self.solutions}
         chances = {name: self.chances(name, here, q[OPTIMAL], previous)[0] for name in self.solutions}
         best = float(q[OPTIMAL].max())
-        answer["v"] = {name: best if name == OPTIMAL else number(chances[name] @ q[name][0]) for name in self.solutions}
+        answer["v"] = {
+            name: best if name == OPTIMAL else float_or_none(chances[name] @ q[name][0]) for name in self.solutions
+        }
         sets = self.available(here)[0]
         for action, executed in enumerate(self._executed(state, previous)):
             gap = best - float(q[OPTIMAL][0, action])
@@ -234,8 +236,8 @@ class Exploration:
                     "name": self.names.action(state, action) if self.names.choices is not None else None,
                     "available": bool(sets[action]),
                     "best": gap <= self.tie_tolerance and bool(sets[action]),
-                    "policies": {name: number(chances[name][action]) for name in self.solutions},
-                    "q_of": {name: number(q[name][0, action]) for name in self.solutions},
+                    "policies": {name: float_or_none(chances[name][action]) for name in self.solutions},
+                    "q_of": {name: float_or_none(q[name][0, action]) for name in self.solutions},
                     "reward": sum(probability * reward for _, _, probability, reward in outcomes),
                     "outcomes": outcomes,
                 }
@@ -398,7 +400,7 @@ class Exploration:
         worst = worst[lost[worst] > self.tie_tolerance * 1e-3]
         best, value = (self.solutions[name].value_at_start for name in (OPTIMAL, policy))
         return {
-            "regret": number(best - value),
+            "regret": float_or_none(best - value),
             "lost": float(lost.sum()),
             "first": None if number_of is None else {"number": number_of, "step": steps[number_of]},
             "worst": [[int(s), float(lost[s]), float(visits[s]), int(actions[s])] for s in worst],
@@ -423,7 +425,7 @@ class Exploration:
             "is_sticky": mdp.is_sticky,
             "starts": [[int(mdp.start_states[i]), float(mdp.start_probabilities[i])] for i in starts],
             "policies": self.policies,
-            "value_at_start": {name: number(each.value_at_start) for name, each in self.solutions.items()},
+            "value_at_start": {name: float_or_none(each.value_at_start) for name, each in self.solutions.items()},
             "error_bound": max(float(each.error_bound) for each in self.solutions.values()),
             "tie_tolerance": self.tie_tolerance,
             "learnt": None if self.learnt is None else {"name": self.learnt.name, "facts": dict(self.learnt.facts)},
@@ -439,7 +441,7 @@ class Exploration:
         }
 
 
-def number(value: float | np.floating) -> float | None:
+def float_or_none(value: float | np.floating) -> float | None:
     """A float; None if it is not a number."""
     return float(value) if np.isfinite(value) else None
 

@@ -25,7 +25,7 @@ from urllib.parse import parse_qs, urlsplit
 from pharos.environments import Environment, class_called, make
 from pharos.errors import ParameterError, PharosError
 from pharos.explorer.exploration import Exploration
-from pharos.explorer.pages import POLICY_OF_SERVER, check_size, heat_map, page, write
+from pharos.explorer.pages import POLICY_OF_SERVER, check_page_size, explorer_page, heat_map, write
 from pharos.explorer.states import Learnt
 from pharos.mdp import TabularMDP
 from pharos.policies import PolicyLike
@@ -67,7 +67,7 @@ class Explorer:
         self.port = int(self._http.server_address[1])
         self.url = f"http://{HOST}:{self.port}/{self.token}/"
         self.hosts = frozenset(f"{name}:{self.port}" for name in NAMES)
-        self._page = page(exploration).encode()
+        self._page = explorer_page(exploration).encode()
         self._thread = threading.Thread(
             target=self._http.serve_forever, args=(0.2,), name="pharos explorer", daemon=True
         )
@@ -352,7 +352,7 @@ def exploration_of(
     title = title or (_title(env) if env is not None else "")
     mdp_with_chance = chance.of(mdp.with_gamma(GAMMA if gamma is None else gamma))
     if in_one_page:
-        check_size(mdp_with_chance, title or str(mdp), env)
+        check_page_size(mdp_with_chance, title or str(mdp), env)
     return Exploration(
         mdp_with_chance,
         env=env,

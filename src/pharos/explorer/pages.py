@@ -22,7 +22,7 @@ import numpy as np
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, PharosError, UnknownName
-from pharos.explorer.exploration import Exploration, number
+from pharos.explorer.exploration import Exploration, float_or_none
 from pharos.explorer.states import OPTIMAL, Axis, axes_of
 from pharos.mdp import TabularMDP
 from pharos.state_space import build
@@ -143,15 +143,15 @@ class _Cells:
         else:
             means = self.sum / np.maximum(self.known, 1)
             shown = {MEAN: means, LEAST: self.least, MOST: self.most, SUM: self.sum}[how]
-        listed = [number(value) if there else None for value, there in zip(shown, is_known, strict=True)]
+        listed = [float_or_none(value) if there else None for value, there in zip(shown, is_known, strict=True)]
         numbers = shown[is_known]
         return {
             "cells": self._rows(listed),
             "count": self._rows(self.count.tolist()),
             "terminal": self._rows(self.terminal.tolist()),
             "state": self._rows(np.where(self.count > 0, self.first, -1).tolist()),
-            "low": number(numbers.min()) if numbers.size else None,
-            "high": number(numbers.max()) if numbers.size else None,
+            "low": float_or_none(numbers.min()) if numbers.size else None,
+            "high": float_or_none(numbers.max()) if numbers.size else None,
             "states": int(self.count.sum()),
         }
 
@@ -217,7 +217,7 @@ def _policy(connect: str) -> str:
 POLICY_OF_SERVER = _policy("'self'") + "; frame-ancestors 'none'"
 
 
-def page(world: Exploration, data: dict[str, Any] | None = None) -> str:
+def explorer_page(world: Exploration, data: dict[str, Any] | None = None) -> str:
     """The page as HTML. `data`: what it holds of its own; None: it asks the server that it came from."""
     parts = {
         "TITLE": html.escape(world.title),
@@ -238,7 +238,7 @@ def contents(world: Exploration) -> dict[str, Any]:
         ParameterError: there are more than MOST_POSITIONS.
     """
     mdp = world.mdp
-    check_size(mdp, world.title, world.env)
+    check_page_size(mdp, world.title, world.env)
     states = np.arange(mdp.num_states)
     before: list[int | None] = [None, *range(mdp.policy_width - 1)]
     positions = {
@@ -246,12 +246,12 @@ def contents(world: Exploration) -> dict[str, Any]:
         for state in range(mdp.num_states)
         for previous in before
     }
-    fields = {name: [number(value) for value in quantity(world, name, states)] for name in quantities(world)}
+    fields = {name: [float_or_none(value) for value in quantity(world, name, states)] for name in quantities(world)}
     wrong = {name: world.wrong(name) for name in world.policies}
     return _shortened({"about": world.about(), "positions": positions, "fields": fields, "wrong": wrong})
 
 
-def check_size(mdp: TabularMDP, title: str, env: Environment | None = None) -> None:
+def check_page_size(mdp: TabularMDP, title: str, env: Environment | None = None) -> None:
     """ParameterError if a page of its own does not hold all positions of an MDP; it names a smaller one of `env`."""
     width = mdp.policy_width
     if mdp.num_states * width > MOST_POSITIONS:
@@ -301,7 +301,7 @@ def write(world: Exploration, path: str | os.PathLike) -> Path:
     Raises:
         ParameterError: the space is too large for that.
     """
-    text = page(world, contents(world))
+    text = explorer_page(world, contents(world))
     if len(text) > MOST_BYTES:
         raise ParameterError(
             f"{world.title}: its page would have {len(text) >> 20} MiB; expected at most {MOST_BYTES >> 20}: choose a "

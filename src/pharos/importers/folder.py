@@ -89,7 +89,7 @@ def save(
     _check_without_chance(mdp)
     check_free(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    rows = distinct_rows.collected(shown) if isinstance(shown, np.ndarray) else shown
+    rows = distinct_rows.collect_rows(shown) if isinstance(shown, np.ndarray) else shown
     arrays = _arrays_of(mdp) | outcome_arrays | ({} if rows is None else {mdp_files.INDEX: _narrow(rows.index)})
     version = mdp_files.PAID_VERSION if outcome_arrays else mdp_files.VERSION
     version = version if mdp.available is None else mdp_files.SETS_VERSION
@@ -297,7 +297,7 @@ def load(folder: str | os.PathLike) -> TabularMDP:
         FileFormatError: there is none, or a file is missing, damaged or changed.
     """
     folder = Path(folder)
-    manifest = mdp_files.read_manifest(folder)
+    manifest = mdp_files.read_mdp_manifest(folder)
     try:
         mdp = _mdp(manifest, mdp_files.read_arrays(folder, manifest))
         residual = mdp.residual.plus(Residual(*mdp_files.residual_of(manifest)))

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, RuleError, StateSpaceTooLarge
 from pharos.importers.files import MINIGRID_STEPS
 from pharos.importers.folder import ImportedOutcomes
-from pharos.importers.wrappers import Layers, as_integer, check_wrappers, first_number, parts_of, reset
+from pharos.importers.wrappers import Layers, as_integer, check_wrappers, first_number, reset, step_parts
 from pharos.mdp import Names, Residual, Rewards, TabularMDP, normalized_rows, rounding_of_mean
 from pharos.system.wording import capped
 
@@ -428,7 +428,7 @@ def _compare_with_steps(env: object, inner: object, rows: list[list[list]]) -> N
         least = np.flatnonzero(tries[state] == tries[state].min())
         action = int(least[rng.integers(len(least))])
         tries[state, action] += 1
-        observation, reward, ended, _ = parts_of(stepped.step(action + first_action))
+        observation, reward, ended, _ = step_parts(stepped.step(action + first_action))
         next_state = _state_number(observation, len(rows), first_state)
         outcome = (next_state, float(reward), bool(ended))
         if outcome not in probabilities[state][action]:

@@ -28,7 +28,7 @@ from pharos.importers.chance import (
     DrawTree,
     RandomNumber,
 )
-from pharos.importers.wrappers import LIBRARIES, SILENT, Stepped, named
+from pharos.importers.wrappers import LIBRARIES, SILENT, Stepped, wrapper_name
 from pharos.system.wording import capped
 
 GENERATORS = (np.random.Generator, np.random.RandomState, np.random.BitGenerator, python_random.Random)
@@ -230,7 +230,7 @@ class EnvironmentSnapshots:
                 try:
                     self._pickler(io.BytesIO()).dump(value)
                 except Exception:
-                    return f"field {name} of {named(each)} ({type(value).__name__}): "
+                    return f"field {name} of {wrapper_name(each)} ({type(value).__name__}): "
         return ""
 
     def _reference(self, value: object) -> object:
@@ -343,7 +343,7 @@ class EnvironmentSnapshots:
     def outside_digest(self) -> bytes:
         """Digest of the objects outside: two processes with the same can restore each other's snapshots."""
         names = [(type(each).__qualname__, getattr(each, "__qualname__", "")) for each in self._outside]
-        return digest_of([*names, *(data for data in self.constants.values())])
+        return snapshot_digest([*names, *(data for data in self.constants.values())])
 
     def adopt(self, env: Stepped) -> str | None:
         """Take the tables of another environment for those that are shared; the name of one that differs, if any."""
@@ -351,7 +351,7 @@ class EnvironmentSnapshots:
         for place, name in self.constants:
             value = vars(chain[place]).get(name) if place < len(chain) else None
             shared = self._outside[self._places[place, name]]
-            if digest_of(value) != digest_of(shared):
+            if snapshot_digest(value) != snapshot_digest(shared):
                 return name
             self._numbers[id(value)] = self._places[place, name]
             self._adopted.append(value)  # so that no other object gets its number
@@ -367,7 +367,7 @@ def field_names(env: Stepped) -> set[str]:
     return names.union(*(_fields_of(value) for _, value in feeder.places.values()))
 
 
-def digest_of(value: object) -> bytes:
+def snapshot_digest(value: object) -> bytes:
     """Digest of any value, as of the field of an environment."""
     hasher = hashlib.blake2b(digest_size=16)
     _Feeder(hasher.update, frozenset()).feed(value)

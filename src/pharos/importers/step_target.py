@@ -49,12 +49,12 @@ class NamedCode:
     @property
     def source(self) -> sources.Source:
         """File and checksum."""
-        return sources.find(self.name, self.folder)
+        return sources.find_source(self.name, self.folder)
 
     @property
     def function(self) -> Callable[..., Any]:
         """The function itself; ParameterError if there is none."""
-        function = sources.load(self.source)
+        function = sources.load_source(self.source)
         if not callable(function):
             raise ParameterError(f"{self.name!r}: is {function!r}; expected a function or a class of that name")
         return function

@@ -20,7 +20,7 @@ from pharos.importers.chance import MOST_OUTCOMES, DrawError, DrawTree, line_of_
 from pharos.importers.fresh_play import FreshPlay
 from pharos.importers.search import Arrival, Expansions, ExpansionsHere, SteppedStates
 from pharos.importers.side_effects import SideEffects
-from pharos.importers.snapshots import EnvironmentSnapshots, bare, chain_of, digest_of, field_names, integers_of
+from pharos.importers.snapshots import EnvironmentSnapshots, bare, chain_of, field_names, integers_of, snapshot_digest
 from pharos.importers.step_spaces import SpaceRecorder, listed_actions_of
 from pharos.importers.step_workers import ExpansionsElsewhere
 from pharos.importers.wrappers import Stepped, reset
@@ -116,7 +116,7 @@ class SteppedEnvironment:
         if self.options.key is None:
             return self.snapshots.digest(env)
         value = self._calling("the key", partial(self.options.key, env))
-        return digest_of(value)
+        return snapshot_digest(value)
 
     def starts(self) -> list[Arrival]:
         """The states in which episodes start, with their probabilities."""

@@ -31,8 +31,8 @@ from pharos.kernels import stepping
 from pharos.kernels.stepping import DISABLED, SAME_STEP, EnvironmentBatch, first_outside
 from pharos.mdp import OutcomeTable, rewards_of_outcomes, rewards_of_staying, whole_number
 from pharos.observations import NO_ACTION, Index, Seen
-from pharos.system.arrays import as_array
-from pharos.system.records import split
+from pharos.system.arrays import as_index_array
+from pharos.system.records import split_options
 from pharos.system.threads import in_blocks
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ class TableStepper(Stepper):
 def _tables(space: "StateSpace") -> tuple[object, object]:
     """(successors, rewards) of executed actions, as `stepping.walk_table` takes them."""
     if not space.has_chance:
-        return as_array(space.successors), np.ascontiguousarray(space.mdp().rewards, np.float64)
+        return as_index_array(space.successors), np.ascontiguousarray(space.mdp().rewards, np.float64)
     dynamics = space.dynamics
     assert isinstance(dynamics, OutcomeTable)
     return dynamics.for_kernels, dynamics.for_kernels_with(rewards_of_outcomes(space))
@@ -261,7 +261,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     ):
         if max_episode_steps is not None:
             options["time_limit"] = None if max_episode_steps == -1 else max_episode_steps
-        interaction, parameters = split(Interaction, options)
+        interaction, parameters = split_options(Interaction, options)
         self.num_envs = whole_number(num_envs, "num_envs", "an integer of at least 1")
         self._mode = _MODES.index(_checked_mode(autoreset_mode))
         self.simulator = simulator = Simulator(environment, interaction, parameters)

@@ -95,7 +95,7 @@ def label_edges(axes: Sequence[Any], below: str, beside: str) -> None:
         axis.set(xlabel=below if i + columns >= len(axes) else "", ylabel="" if i % columns else beside)
 
 
-def agent_name(agent: str) -> str:
+def agent_label(agent: str) -> str:
     """`DQN`; of an algorithm from a module or a file, the name of its class."""
     return agent_called(agent).title
 

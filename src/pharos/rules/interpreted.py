@@ -15,7 +15,7 @@ import numpy as np
 from pharos.environments import Environment
 from pharos.errors import RuleError
 from pharos.kernels.hash_table import COUNT, FIRST, find, insert_missing, pack_rows, slots_of, unpack_rows
-from pharos.rules.layout import Layout, unpack
+from pharos.rules.layout import Layout, unpack_states
 from pharos.system.arrays import SUM_TOLERANCE
 from pharos.system.workers import without_interrupts
 
@@ -298,11 +298,11 @@ class InterpretedRewards:
 
     def block(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
         out = np.zeros((stop - start, self.env.num_actions))
-        rows = list(map(tuple, unpack(self.layout, states[start:stop]).tolist()))
+        rows = list(map(tuple, unpack_states(self.layout, states[start:stop]).tolist()))
         live = np.flatnonzero(~np.asarray(terminal[start:stop])).tolist()
         with np.errstate(all="ignore"):  # what is not finite is reported
             for a in range(self.env.num_actions):
-                next_states = list(map(tuple, unpack(self.layout, states[successors[start:stop, a]]).tolist()))
+                next_states = list(map(tuple, unpack_states(self.layout, states[successors[start:stop, a]]).tolist()))
                 for i in live:
                     out[i, a] = self._reward(rows[i], a, next_states[i])
         return out
@@ -311,9 +311,9 @@ class InterpretedRewards:
         num_actions = self.env.num_actions
         out = np.zeros((stop - start) * num_actions)
         rewards: list[list[float]] = [[] for _ in out]
-        rows = list(map(tuple, unpack(self.layout, states[start:stop]).tolist()))
+        rows = list(map(tuple, unpack_states(self.layout, states[start:stop]).tolist()))
         which, successors, probabilities = outcomes
-        next_states = list(map(tuple, unpack(self.layout, states[successors]).tolist()))
+        next_states = list(map(tuple, unpack_states(self.layout, states[successors]).tolist()))
         ended = np.asarray(terminal[start:stop]).tolist()
         with np.errstate(all="ignore"):  # what is not finite is reported
             for j, (pair, probability) in enumerate(zip(which.tolist(), probabilities.tolist(), strict=True)):
@@ -351,7 +351,7 @@ class InterpretedAges:
 
     def block(self, states, start: int, stop: int) -> np.ndarray:
         return np.array(
-            [self.env.age(tuple(row)) for row in unpack(self.layout, states[start:stop]).tolist()], np.int64
+            [self.env.age(tuple(row)) for row in unpack_states(self.layout, states[start:stop]).tolist()], np.int64
         )
 
 
@@ -365,7 +365,7 @@ def blame(env: Environment, layout: Layout, suspects: np.ndarray, failure: BaseE
 
     It names the first state in which they fail interpreted.
     """
-    rows = unpack(layout, suspects).tolist()
+    rows = unpack_states(layout, suspects).tolist()
     if failure and not rows:  # they were not run yet: it is Numba's, of compiling them
         raise failure
     interpreted_branches(env, rows)

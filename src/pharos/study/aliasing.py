@@ -71,9 +71,9 @@ def with_aliasing(cells: "pd.DataFrame", counts: "pd.DataFrame") -> "pd.DataFram
 def _aliasing_of(folder: Path, config: Mapping[str, Any]) -> Aliasing:
     from pharos.observations import observe
     from pharos.state_space import build
-    from pharos.study.batches import task_of
+    from pharos.study.batches import task_of_config
 
-    task, cache = task_of(config), ResultCache(folder / "aliasing")
+    task, cache = task_of_config(config), ResultCache(folder / "aliasing")
     names = ("environment", "parameters", "observation", "observation_options")
     dependencies = json.loads(json.dumps({**{name: config[name] for name in names}, "version": task.env.version}))
     stored = cache.get(dependencies)

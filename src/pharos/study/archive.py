@@ -12,7 +12,7 @@ import yaml
 from pharos import training
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.study import worker as _worker
-from pharos.study.execution import claim, opened
+from pharos.study.execution import opened, write_specification
 from pharos.study.specification import Source, Specification, parse
 from pharos.system import storage
 from pharos.training import run_id
@@ -64,7 +64,7 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
     study, place = opened(source, folder)
     ids, records, curves = [], [], []
     for run in study.runs:
-        record = _worker.read_record(place / "runs" / run.id)
+        record = _worker.run_record(place / "runs" / run.id)
         if record is not None and record["status"] == _worker.FINISHED:
             ids.append(run.id)
             records.append(json.dumps(_placeless(record, study.folder)))
@@ -133,7 +133,7 @@ def unpack(
         if digests is not None and digests["runs"].get(id) != _digest(id, record, run[2]):
             raise ResultCorrupted(f"{file}: run {id} was changed after it was packed; {_AGAIN}")
         runs.append(run)
-    claim(target, place)
+    write_specification(target, place)
     added = sum(_write(place, *run) for run in runs if run[0] in wanted)
     with contextlib.suppress(OSError):  # others may be at work there
         (place / "partial").rmdir()
@@ -231,7 +231,7 @@ def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> b
         else:
             training.write_table(partial / "curve.parquet", curve)
         storage.replace_json(partial / "run.json", record)
-        _worker.publish(partial, place, id)
+        _worker.publish_run(partial, place, id)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return True

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pharos.training import Task
 
 
-def task_of(config: Mapping[str, Any]) -> "Task":
+def task_of_config(config: Mapping[str, Any]) -> "Task":
     """The task of a run of a study that was read already, so that code which it names is trusted."""
     return RunConfig.from_dict(config).task(trust=True, strict=True)
 
@@ -37,7 +37,7 @@ def solve(config: Mapping[str, Any]) -> dict[str, Any]:
     if values is None:
         from pharos.training import TaskValues  # loads what an MDP needs
 
-        task = task_of(config)
+        task = task_of_config(config)
         values = TaskValues(task.reference, task.return_range).to_dict()
         _cache().put(_dependencies(config), values=values)
     return values
@@ -63,7 +63,7 @@ def _dependencies(config: Mapping[str, Any]) -> dict[str, Any]:
     """Key of stored values: parameters, rules by their code, start states, chance and setting."""
     from pharos.rules import fingerprint_of_rules
 
-    env = task_of(config).env
+    env = task_of_config(config).env
     states, probabilities = start_distribution(env)
     setting = {name: config[name] for name in ("environment", "parameters", "chance", "gamma", "horizon")}
     return json.loads(

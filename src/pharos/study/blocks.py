@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pharos.agents import agent_called, agent_source, hyperparameters
-from pharos.environments import Environment, as_tuples, imported, make, source_of
+from pharos.environments import Environment, as_tuples, class_source, import_class, make
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.observations import OwnObservation, names, own_observation, title
 from pharos.study.regression import MEASURES
@@ -181,7 +181,7 @@ class EnvironmentEntry(_Named):
 
     @cached_property
     def instance(self) -> Environment:
-        name = imported(self.name, self._folder).name if is_reference(self.name) else self.name
+        name = import_class(self.name, self._folder).name if is_reference(self.name) else self.name
         return make(name, **{name: as_tuples(value) for name, value in self.parameters.items()})
 
     @property
@@ -206,15 +206,15 @@ class Hardness(_Part):
     """Measures of hardness that are computed, their discount, and the seconds that each may take for one instance."""
 
     gamma: Gamma = 0.99
-    measures: list[str] = Field(default_factory=lambda: [name for name in MEASURES if name in registered()])
+    measures: list[str] = Field(default_factory=lambda: [name for name in MEASURES if name in registered_names()])
     budget: Annotated[float, BeforeValidator(_number)] = Field(default=60.0, gt=0)
 
     @field_validator("measures")
     @classmethod
     def _known(cls, measures: list[str]) -> list[str]:
         for measure in measures:
-            if measure not in registered():
-                raise UnknownName("measure of hardness", measure, registered())
+            if measure not in registered_names():
+                raise UnknownName("measure of hardness", measure, registered_names())
         return measures
 
     @property
@@ -321,7 +321,7 @@ class Specification(_Part):
             # A run for each observation and seed
             for observation, seed in product(observations, seeds):
                 sources = {
-                    "environment": source_of(type(instance)),
+                    "environment": class_source(type(instance)),
                     "observation": None if observation.own is None else observation.own.source,
                     "agent": agent_from,
                 }
@@ -364,7 +364,7 @@ class Specification(_Part):
         return hyperparameters(agent, environment, observation, own)
 
 
-def registered() -> list[str]:
+def registered_names() -> list[str]:
     """The names of the measures of hardness."""
     from pharos.hardness import measures
 

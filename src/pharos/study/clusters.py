@@ -13,7 +13,7 @@ from typing import Any
 from pharos.errors import MissingExtra, ParameterError
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, part_of
-from pharos.study.execution import Status, StudyExecution, claim, opened, run, shard_of, train
+from pharos.study.execution import Status, StudyExecution, opened, run, shard_of, train_run, write_specification
 from pharos.study.specification import Source, specification
 from pharos.system.records import takes
 from pharos.system.wording import in_one_line
@@ -29,7 +29,7 @@ def submit(
     shards: int,
     cluster: str = "slurm",
     parameters: Mapping[str, Any] | None = None,
-    runner: _worker.Runner = train,
+    runner: _worker.Runner = train_run,
     **options: Any,
 ) -> list[Any]:
     """Submit a study as an array of jobs, each of which executes one of `shards` parts with `workers` processes.
@@ -58,7 +58,7 @@ def submit(
     how = replace(ExecutionOptions(**options), shard=None, workers=options.get("workers") or 1)
     study, place = opened(source, folder)
     place = place.absolute()
-    claim(study, place)
+    write_specification(study, place)
     try:
         executor = submitit.AutoExecutor(folder=str(place / "jobs"), cluster=cluster)
     except RuntimeError as error:  # there is no sbatch here
@@ -93,7 +93,7 @@ def run_on_ray(
     *,
     address: str | None = None,
     progress: Callable[[Status], None] | None = None,
-    runner: _worker.Runner = train,
+    runner: _worker.Runner = train_run,
     batch_runner: _worker.BatchRunner | None = None,
     **options: Any,
 ) -> Status:

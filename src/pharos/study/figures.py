@@ -18,7 +18,7 @@ from pharos.agents import TABULAR_OBSERVATION
 from pharos.environments import classes
 from pharos.plots import (
     DIAGONAL,
-    agent_name,
+    agent_label,
     color_among,
     label_edges,
     legend_below,
@@ -113,10 +113,10 @@ def _short(values: np.ndarray) -> list[float | int | None]:
     return [None if text == "null" else int(float(text)) if float(text).is_integer() else float(text) for text in texts]
 
 
-def label(agent: str, observation: str) -> str:
+def line_label(agent: str, observation: str) -> str:
     """Label of an agent and its observation: `DQN, image`, `tabular Q-learning`."""
     words = OBSERVATIONS.get(observation, observation)
-    return f"{agent_name(agent)}, {words}" if words else agent_name(agent)
+    return f"{agent_label(agent)}, {words}" if words else agent_label(agent)
 
 
 def regret_curves(
@@ -134,7 +134,7 @@ def regret_curves(
             steps, tasks, runs = same_steps(each)
             mean, lower, upper = mean_curve(tasks, resamples=resamples)
             color = observation_color(observation, observations)
-            words, dash = label(agent, observation), LINES.get(agent, ":")
+            words, dash = line_label(agent, observation), LINES.get(agent, ":")
             panel_lines.append(Line(words, color, dash, steps, mean, lower, upper, runs))
         text = name if isinstance(name, str) else ", ".join(map(str, name))
         panels.append(Panel(in_words(text), panel_lines))
@@ -169,7 +169,7 @@ def performance_profiles(profiles: "pd.DataFrame") -> Curves:
         for (agent, observation), line in part.groupby(["agent", "observation"], sort=True):
             color = observation_color(observation, observations)
             values = (line[column].to_numpy(np.float64) for column in ("score", "share", "lower", "upper"))
-            panel_lines.append(Line(label(agent, observation), color, LINES.get(agent, ":"), *values))
+            panel_lines.append(Line(line_label(agent, observation), color, LINES.get(agent, ":"), *values))
         panels.append(Panel(in_words(str(name)), panel_lines))
     return Curves(panels, "score: 1 - normalised regret", "share of runs above it", share=True)
 
@@ -251,7 +251,7 @@ def agents_figure(one: str, two: str) -> str:
 
 def representations(cells: "pd.DataFrame", *, agent: str = "dqn", image: str = IMAGE) -> "Figure | None":
     """Normalised regret with a vector against that with an image, a point for each task. The paper's figure 3."""
-    words = [f"normalised regret of {agent_name(agent)} with {sight}" for sight in ("an image", "a vector")]
+    words = [f"normalised regret of {agent_label(agent)} with {sight}" for sight in ("an image", "a vector")]
     figure = _against(cells[cells["agent"] == agent], "observation", "normalized_regret", (image, VECTOR), words)
     if figure is not None:
         (axis,) = figure.axes
@@ -263,7 +263,7 @@ def representations(cells: "pd.DataFrame", *, agent: str = "dqn", image: str = I
 
 def agents_against_each_other(cells: "pd.DataFrame", value: str, agents: tuple[str, str]) -> "Figure | None":
     """The value of one agent against the value of another, a point for each task and observation."""
-    words = [f"{REGRETS.get(value, value)} of {agent_name(agent)}" for agent in agents]
+    words = [f"{REGRETS.get(value, value)} of {agent_label(agent)}" for agent in agents]
     return _against(cells, "agent", value, agents, words)
 
 
@@ -354,7 +354,7 @@ def tables_of(cells: "pd.DataFrame", measured: "pd.DataFrame", models: Sequence[
         f"returns_{environment}": returns_table(cells, environment)
         for environment in dict.fromkeys(cells["environment"])
     }
-    tables["hardness"] = hardness_table(measured)
+    tables["hardness"] = latex_hardness(measured)
     for each in models:
         tables[f"models_{each.regret}{each.suffix(models[0].agent)}"] = models_table(each)
     return tables
@@ -370,7 +370,7 @@ def returns_table(cells: "pd.DataFrame", environment: str) -> str:
 
     wide = wide_returns(cells, environment, lambda row: _entry(row["return"], row["return_deviation"])).fillna("--")
     keys = list(wide)
-    titles = [(latex_text(agent_name(agent)), latex_text(in_words(name))) for agent, name in keys]
+    titles = [(latex_text(agent_label(agent)), latex_text(in_words(name))) for agent, name in keys]
     if {key for key in keys if key[1] != TABULAR_OBSERVATION} == set(COLUMNS):
         keys, titles = list(COLUMNS), [(TITLES[agent], TITLES[name]) for agent, name in COLUMNS]
     rows = []
@@ -393,7 +393,7 @@ def wide_returns(cells: "pd.DataFrame", environment: str, text: Callable[[Mappin
     return wide.loc[rows, sorted(wide, key=lambda key: (key[0] != PAPER_AGENTS[1], *key))]
 
 
-def hardness_table(measured: "pd.DataFrame") -> str:
+def latex_hardness(measured: "pd.DataFrame") -> str:
     """The measures of each instance under each kind of chance."""
     names = [name for name in measured.columns if name not in ("environment", "instance", "chance", "notes")]
     texts = measured[["instance", "chance"]].map(latex_text)

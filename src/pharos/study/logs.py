@@ -12,10 +12,10 @@ from pharos.errors import FileFormatError, MissingExtra, UnknownName
 from pharos.plots import slug
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
-from pharos.study.figures import label
+from pharos.study.figures import line_label
 from pharos.study.specification import Source
 from pharos.study.status import opened
-from pharos.study.tables import described, read_curve
+from pharos.study.tables import described, run_curve
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,14 +75,14 @@ class RunLog:
         """Write the runs that are finished and not written yet; return how many."""
         written = self.place / self.to / "written"
         number = 0
-        for run, name in named(self.study):
+        for run, name in named_runs(self.study):
             if (written / run.id).exists():
                 continue
             try:
-                record = _worker.read_record(self.place / "runs" / run.id)
+                record = _worker.run_record(self.place / "runs" / run.id)
                 if record is None or record["status"] != _worker.FINISHED:
                     continue
-                curve = read_curve(self.place, run.id)
+                curve = run_curve(self.place, run.id)
             except FileFormatError:  # `status` and `report` tell which, and why
                 continue
             progress(name)
@@ -144,7 +144,7 @@ class RunLog:
         return write
 
 
-def named(study: Specification) -> Iterator[tuple[Run, str]]:
+def named_runs(study: Specification) -> Iterator[tuple[Run, str]]:
     """Yield (run, its name): INSTANCE/CHANCE/AGENT/SEED, and its id if others have the same name."""
     names = [_name(run) for run in study.runs]
     often = Counter(names)
@@ -154,7 +154,7 @@ def named(study: Specification) -> Iterator[tuple[Run, str]]:
 
 def _name(run: Run) -> str:
     columns = described(run)
-    parts = (run.instance, run.chance, label(columns["agent"], columns["observation"]))
+    parts = (run.instance, run.chance, line_label(columns["agent"], columns["observation"]))
     return "/".join((*(slug(part.replace(", ", "-")) for part in parts), f"seed-{columns['seed']}"))
 
 

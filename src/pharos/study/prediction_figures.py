@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.plots import DIAGONAL, agent_name, label_edges, legend_below, observation_color, panels, slug
+from pharos.plots import DIAGONAL, agent_label, label_edges, legend_below, observation_color, panels, slug
 from pharos.system.wording import in_words
 from pharos.training import CELL
 
@@ -63,7 +63,7 @@ def predicted_by_class(part: "pd.DataFrame", predictor: str | None = None) -> "F
         axis.plot([low, high], [low, high], ":", color=DIAGONAL, lw=1.2)
         axis.set_title(in_words(str(name)))
         axis.set(xlim=(low - 0.05, high + 0.05), ylim=(low - 0.05, high + 0.05))
-    label_edges(axes, "predicted regret", f"regret of {agent_name(str(part['agent'].iloc[0]))}")
+    label_edges(axes, "predicted regret", f"regret of {agent_label(str(part['agent'].iloc[0]))}")
     legend_below(figure, axes)
     return figure
 
@@ -93,7 +93,7 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> 
         axis.set(xticks=places, xticklabels=[], ylim=(-0.05, top + 0.08), xlim=(-0.6, len(observations) - 0.4))
     hollow, full = {"facecolors": "none", "edgecolors": DIAGONAL}, {"color": DIAGONAL}
     axes[0].scatter([], [], s=34, lw=1.4, label="predicted", **hollow)
-    axes[0].scatter([], [], s=34, lw=0, label=agent_name(str(part["agent"].iloc[0])), **full)
+    axes[0].scatter([], [], s=34, lw=0, label=agent_label(str(part["agent"].iloc[0])), **full)
     label_edges(axes, "", "regret")
     legend_below(figure, axes)
     return figure
@@ -119,7 +119,7 @@ def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame") -> "Figure | 
         axis.set_title(_short(*map(str, key)), fontsize=8)
         axis.set(ylim=(-0.05, 1.5))
     axes[0].plot([], [], "--", color=DIAGONAL, lw=1.2, label="idealised learner")
-    axes[0].plot([], [], color=DIAGONAL, lw=1.5, label=agent_name(str(part["agent"].iloc[0])))
+    axes[0].plot([], [], color=DIAGONAL, lw=1.5, label=agent_label(str(part["agent"].iloc[0])))
     label_edges(axes, "steps", "regret")
     legend_below(figure, axes)
     return figure

@@ -137,7 +137,7 @@ def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
     errors, damaged, finished = {}, {}, 0
     for run in study.runs:
         try:
-            record = _worker.read_record(place / "runs" / run.id)
+            record = _worker.run_record(place / "runs" / run.id)
         except FileFormatError as error:
             damaged[run.id] = str(error)
             continue
@@ -180,7 +180,7 @@ def _is_alive(record: Mapping[str, Any]) -> bool:
     return time.time() - record["updated"] < 60
 
 
-def claim(study: Specification, folder: Path) -> None:
+def write_specification(study: Specification, folder: Path) -> None:
     """Write the specification into the folder, so that it can be reported on alone; refuse a folder of another
     study."""
     folder.mkdir(parents=True, exist_ok=True)

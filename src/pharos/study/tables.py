@@ -74,10 +74,10 @@ def finished_runs(study: Specification, place: Path) -> FinishedRuns:
     rows, points, damaged = [], [], {}
     for run in study.runs:
         try:
-            record = _worker.read_record(place / "runs" / run.id)
+            record = _worker.run_record(place / "runs" / run.id)
             if record is None or record["status"] != _worker.FINISHED:
                 continue
-            curve = read_curve(place, run.id)
+            curve = run_curve(place, run.id)
             row = {"id": run.id} | row_of(run, record, curve, place / "runs" / run.id)
         except FileFormatError as error:
             damaged[run.id] = str(error)
@@ -186,7 +186,7 @@ def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.D
     return means.merge(measures, on=["environment", "instance", "chance"], how="left")
 
 
-def read_curve(folder: Path, id: str) -> "pd.DataFrame":
+def run_curve(folder: Path, id: str) -> "pd.DataFrame":
     """The curve of one run.
 
     Raises:

@@ -43,13 +43,13 @@ class HalfAsMany(str):
 def read_status(folder: Path) -> str | None:
     """`finished` or `failed`; None if a run has no folder yet, or a damaged record."""
     try:
-        record = read_record(folder)
+        record = run_record(folder)
     except FileFormatError:
         return None
     return None if record is None else str(record["status"])
 
 
-def read_record(folder: Path) -> dict[str, Any] | None:
+def run_record(folder: Path) -> dict[str, Any] | None:
     """The record in run.json of a run; None if there is none.
 
     Raises:
@@ -75,7 +75,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     return record
 
 
-def attempt(
+def attempt_run(
     runner: BatchRunner,
     configs: Sequence[Mapping[str, Any]],
     ids: Sequence[str],
@@ -106,7 +106,7 @@ def attempt(
                 ends[id] = done
             elif read_status(partial) == FINISHED:  # its process was killed before it could publish it
                 training.clear_run(partial)
-                publish(partial, folder, id)
+                publish_run(partial, folder, id)
             else:
                 if partial.exists() and not resume:
                     shutil.rmtree(partial)
@@ -121,7 +121,7 @@ def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, P
     """Call the runner, and put every run into its place, finished or failed; return HalfAsMany by id of the others."""
     began = time.perf_counter()
     first, *others = places = [partial for _, _, partial in todo]
-    with log(first / "log.txt"):
+    with redirected_output(first / "log.txt"):
         try:
             errors = list(runner([config for config, _, _ in todo], places, folder / BATCHES))
         except Exception as error:
@@ -139,7 +139,7 @@ def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, P
         if read_status(place) != FINISHED:
             missing = "the runner returned without a finished run.json and a curve"
             write_failure(place, config, id, reason or missing, seconds)
-        publish(place, folder, id)
+        publish_run(place, folder, id)
     return left
 
 
@@ -157,7 +157,7 @@ def write_failure(folder: Path, config: Mapping[str, Any], id: str, error: str, 
     storage.replace_json(folder / "run.json", storage.sealed(record))
 
 
-def publish(partial: Path, folder: Path, id: str) -> None:
+def publish_run(partial: Path, folder: Path, id: str) -> None:
     """Move a run's folder to its place, on disk before it is there; an earlier failed attempt makes room."""
     for path in partial.rglob("*"):
         if path.is_file():
@@ -184,7 +184,7 @@ def _remove(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def log(path: Path):
+def redirected_output(path: Path):
     """Redirect the output of this process to a file."""
     sys.stdout.flush()
     sys.stderr.flush()
@@ -221,7 +221,7 @@ def main(
     """The body of a worker process; it sends the ids of runs that cannot be trained together, and why."""
     use_one_thread()
     try:
-        ends = attempt(runner, configs, ids, folder, again=again, resume=resume)
+        ends = attempt_run(runner, configs, ids, folder, again=again, resume=resume)
     except OSError as error:  # a full disk, on which not even the log can say so
         sys.exit(f"pharos: run {ids[0]}: {error.strerror or error}")
     for reason in {id(end): end for end in ends if isinstance(end, HalfAsMany)}.values():

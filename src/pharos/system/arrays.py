@@ -119,7 +119,7 @@ def unpacked(entries: np.ndarray) -> np.ndarray:
     return (entries["high"].astype(np.int64) << 32) | entries["low"]
 
 
-def as_array(indices: object) -> Indices:
+def as_index_array(indices: object) -> Indices:
     """Indices as an array of NumPy; `PackedIndices` stay as they are."""
     return indices if isinstance(indices, PackedIndices) else np.asarray(indices)
 
@@ -136,14 +136,14 @@ def read_only(array: T) -> T:
     return view
 
 
-def blocks_of(indices: Indices) -> Iterator[tuple[int, np.ndarray]]:
+def index_blocks(indices: Indices) -> Iterator[tuple[int, np.ndarray]]:
     """(first row, some rows), from the first one on: some million entries at a time, unpacked if they are packed."""
     rows = max(1, _BLOCK * len(indices) // max(1, indices.size))
     for first in range(0, len(indices), rows):
         yield first, np.asarray(indices[first : first + rows])
 
 
-def rows_of(indices: Indices, start: int, stop: int) -> Indices:
+def index_rows(indices: Indices, start: int, stop: int) -> Indices:
     """View of rows [start, stop): nothing is copied."""
     return indices.rows(start, stop) if isinstance(indices, PackedIndices) else indices[start:stop]
 
@@ -155,7 +155,7 @@ def room_for_indices(shape: tuple[int, ...], num_states: int) -> Indices:
 
 def holds_end(indices: Indices) -> bool:
     """Whether an entry is -1."""
-    return any(bool((rows == -1).any()) for _, rows in blocks_of(indices))
+    return any(bool((rows == -1).any()) for _, rows in index_blocks(indices))
 
 
 # Files ----------------------------------------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ class OutcomeRows:
         """
         if (palette is None) != (codes is None) or (palette is None) == (probabilities is None):
             raise ParameterError("outcomes take codes with a palette, or probabilities; found both or neither")
-        self.successors = as_array(successors)
+        self.successors = as_index_array(successors)
         self.offsets, self.codes, self.palette, self.probabilities = (
             None if array is None else np.asarray(array) for array in (offsets, codes, palette, probabilities)
         )

@@ -64,7 +64,7 @@ def is_folder(folder: str | os.PathLike) -> bool:
     return isinstance(manifest, dict) and manifest.get("format") == FORMAT
 
 
-def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
+def read_mdp_manifest(folder: str | os.PathLike) -> dict[str, Any]:
     """Return the manifest of a folder.
 
     Raises:
@@ -134,7 +134,7 @@ def write_rows(folder: Path, rows: DistinctRows) -> dict[str, Any]:
     }
 
 
-def read_rows(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> np.ndarray | DistinctRows | None:
+def read_observations(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> np.ndarray | DistinctRows | None:
     """Return the observations of the states; None if there are none. Chunks are read and checked when they are used.
 
     Raises:

@@ -342,7 +342,7 @@ def _locked(path: Path, file: BinaryIO, what: str) -> Iterator[contextlib.ExitSt
         except OSError as error:
             if not storage.has_no_locks(error):
                 raise
-            claim.enter_context(storage.claim(path.with_name(f"{path.name}.claim"), FolderLocked, f"using {what}"))
+            claim.enter_context(storage.hold_claim(path.with_name(f"{path.name}.claim"), FolderLocked, f"using {what}"))
         yield claim
 
 

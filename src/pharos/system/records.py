@@ -21,7 +21,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 SHOWN = 60  # letters of a wrong entry, in errors
 
 
-def meanings(documented: object) -> dict[str, str]:
+def docstring_entries(documented: object) -> dict[str, str]:
     """Texts by name, of entries such as `height, width: of the grid` in the section Attributes or Args of a docstring;
     also of the classes that a class extends.
     """
@@ -66,7 +66,7 @@ def option_names(cls: type) -> set[str]:
     return {each.name for owner in (cls, *parts(cls).values()) for each in _fields(owner)}
 
 
-def joined(cls: type, options: Mapping[str, Any]) -> dict[str, Any]:
+def nested_options(cls: type, options: Mapping[str, Any]) -> dict[str, Any]:
     """Options of a dataclass, with fields of its parts given by their own names: `sticky=0.1` as `chance=...`."""
     own = dict(options)
     for name, part in parts(cls).items():
@@ -82,7 +82,7 @@ def flat(cls: type[T]) -> type[T]:
 
     @functools.wraps(init)
     def flat_init(self: T, *args: object, **options: object) -> None:
-        init(self, *args, **joined(cls, options))
+        init(self, *args, **nested_options(cls, options))
 
     cls.__init__ = flat_init  # type: ignore[method-assign, assignment]
     for name, part in parts(cls).items():  # type: ignore[arg-type]
@@ -112,17 +112,17 @@ def takes(cls: type, **defaults: object) -> Callable[[F], F]:
     return shown
 
 
-def split(cls: type[T], options: Mapping[str, Any]) -> tuple[T, dict[str, Any]]:
+def split_options(cls: type[T], options: Mapping[str, Any]) -> tuple[T, dict[str, Any]]:
     """An object of the options that are fields of a dataclass or of its parts; and the other options."""
     names = option_names(cls)
     own = {name: value for name, value in options.items() if name in names}
-    return cls(**joined(cls, own)), {name: value for name, value in options.items() if name not in names}
+    return cls(**nested_options(cls, own)), {name: value for name, value in options.items() if name not in names}
 
 
 # Records --------------------------------------------------------------------------------------------------------------
 
 
-def read(cls: type[T], entry: object, whose: str, optional: Collection[str] = ()) -> T:
+def parse_record(cls: type[T], entry: object, whose: str, optional: Collection[str] = ()) -> T:
     """An object of a dataclass from its entries; dataclasses among fields by their `from_dict`, or likewise.
 
     A whole number is a number; no value is converted, so that digests of the entries stay what they are.
@@ -148,7 +148,7 @@ def read(cls: type[T], entry: object, whose: str, optional: Collection[str] = ()
 def _checked(value: object, hint: object, whose: str) -> object:
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if is_dataclass(hint) and isinstance(hint, type) and isinstance(value, Mapping):
-        return getattr(hint, "from_dict", lambda entry: read(hint, entry, whose))(value)
+        return getattr(hint, "from_dict", lambda entry: parse_record(hint, entry, whose))(value)
     kinds = inner if kind is types.UnionType else (int, float) if kind is float else (kind,)
     is_number = isinstance(value, bool) and bool not in kinds  # Python counts truths as numbers
     if kind is not Any and (is_number or not isinstance(value, kinds)):

@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any, TypeGuard
 
 from pharos.errors import FileFormatError, ParameterError, UntrustedCode
-from pharos.system.records import read
+from pharos.system.records import parse_record
 
 # Modules loaded from files, by their path: (digest of the file, module).
 _MODULES: dict[str, tuple[str, ModuleType]] = {}
@@ -45,7 +45,7 @@ class Source:
         Raises:
             FileFormatError: it is damaged.
         """
-        source = read(Source, entry, "the source of a class")
+        source = parse_record(Source, entry, "the source of a class")
         if ":" not in source.name:
             raise FileFormatError(f"the source of a class: name is {source.name!r}; expected module:Name")
         return source
@@ -79,7 +79,7 @@ def is_reference(name: object) -> TypeGuard[str]:
     return isinstance(name, str) and ":" in name
 
 
-def find(name: str, folder: str | Path | None = None) -> Source:
+def find_source(name: str, folder: str | Path | None = None) -> Source:
     """The source of `module:Name` or `file.py:Name`; nothing but the parents of the module is imported.
 
     Args:
@@ -108,7 +108,7 @@ def find(name: str, folder: str | Path | None = None) -> Source:
     return Source(name, origin, _checksum(origin))
 
 
-def load(source: Source) -> Any:
+def load_source(source: Source) -> Any:
     """Import what a source names; None if it has no such name. A file is executed again only if it has changed.
 
     Raises:
@@ -157,11 +157,11 @@ def resolve(source: Source, *, trust: bool = False, strict: bool = False) -> Any
     if not Path(source.file).is_file():
         if source.module is None:
             raise ParameterError(f"{source.name!r}: there is no file {source.file}; {_EXPECTED}")
-        now = find(source.name, folder=Path(sys.prefix))  # installed here, elsewhere than there
+        now = find_source(source.name, folder=Path(sys.prefix))  # installed here, elsewhere than there
     now = Source(source.name, now.file, _checksum(now.file))
     if now.checksum != source.checksum:
         _tell_change(source, now, strict)
-    return load(now)
+    return load_source(now)
 
 
 def source_of(value: object, attribute: str | None = None) -> Source | None:
@@ -181,7 +181,7 @@ def source_of(value: object, attribute: str | None = None) -> Source | None:
     return Source(f"{name}:{attribute}", str(Path(path).resolve()), _checksum(path))
 
 
-def announce(value: object) -> Source:
+def register_source(value: object) -> Source:
     """The source of a class or function that this process has, which `resolve` then finds here.
 
     One of a notebook, of the script itself, or within a function has a name and no file: other processes lack it.

@@ -290,7 +290,7 @@ def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = 
         raise ParameterError(f"{folder}: cannot be written to: {problem.strerror}; choose another folder") from problem
     with file:
         if not _flock(file, folder, error, activity):
-            with claim(folder / CLAIM, error, activity):
+            with hold_claim(folder / CLAIM, error, activity):
                 yield
             return
         if not _is_at(path, file):  # who held it has removed it, and another may hold a new one
@@ -353,7 +353,7 @@ def has_no_locks(problem: OSError) -> bool:
 
 
 @contextlib.contextmanager
-def claim(path: Path, error: type[PharosError], activity: str) -> Iterator[None]:
+def hold_claim(path: Path, error: type[PharosError], activity: str) -> Iterator[None]:
     """Hold the folder of `path` by making that file, which only one process can; see `lock`."""
     folder = path.parent
     mine = f"{_holder()}, {uuid.uuid4().hex}"

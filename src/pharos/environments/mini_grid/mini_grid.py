@@ -86,7 +86,7 @@ def level_of(layout: GridLayout) -> Level:
     )
 
 
-def rows_of(text: object) -> tuple[str, ...]:
+def layout_rows(text: object) -> tuple[str, ...]:
     """The rows of a level as text, in capitals except the player; ParameterError if their lengths differ."""
     rows = tuple(text.upper().replace("VV", "vv").replace("/", " ").split()) if isinstance(text, str) else ()
     if not rows or len(set(map(len, rows))) > 1 or len(rows[0]) % 2 or len(rows[0]) < 6 or len(rows) < 3:
@@ -229,7 +229,7 @@ class MiniGrid(Environment):
             others = [name for name, value in {"kind": self.kind, **options}.items() if value is not None]
             if others:
                 raise ParameterError(f"MiniGrid: level was given with {', '.join(others)}; expected a level alone")
-            store(self, "level", "/".join(rows_of(self.level)))
+            store(self, "level", "/".join(layout_rows(self.level)))
             store(self, "target", None if self.target is None else str(self.target).upper())
         else:
             if self.target is not None:
@@ -265,7 +265,7 @@ class MiniGrid(Environment):
     def layout(self) -> GridLayout:
         """The grid as text, as `level` takes it, and the target."""
         if self.level is not None:
-            return GridLayout(rows_of(self.level), self.target)
+            return GridLayout(layout_rows(self.level), self.target)
         recipe = KINDS[str(self.kind)]
         return recipe.draw(**{name: getattr(self, name) for name in recipe.parameters})
 

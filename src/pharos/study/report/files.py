@@ -10,8 +10,8 @@ from pharos.plots import save_for_page
 from pharos.study.figures import all_curves, all_figures, tables_of
 from pharos.study.prediction_figures import unseen_figures
 from pharos.study.report.model_sections import doubts, judged, unseen_section
-from pharos.study.report.page import render
-from pharos.study.report.results import Results, coefficients, results_of
+from pharos.study.report.page import render_page
+from pharos.study.report.results import Results, coefficients, study_results
 from pharos.study.report.sections import sections_of
 from pharos.study.specification import Source
 from pharos.study.status import opened
@@ -71,7 +71,7 @@ def report(
     tell = progress or (lambda _: None)
     predicted = PredictedCells.of(predictions)
     study, place = opened(source, folder, trust=trust)
-    results = results_of(study, place, tell)
+    results = study_results(study, place, tell)
     target = Path(out) if out is not None else place / "report"
     target.mkdir(parents=True, exist_ok=True)
     for name in ("figures", "tables"):
@@ -101,7 +101,7 @@ def report(
     if judgement is not None:
         models = next((i for i, each in enumerate(sections) if each.title == MODELS), len(sections) - 2)
         sections.insert(models + 1, unseen_section(judgement, results, predicted, figures))
-    page = render(f"Study {study.name}", study.description, sections)
+    page = render_page(f"Study {study.name}", study.description, sections)
     replace_file(target / "report.html", page)
     image_files = [
         target / "figures" / f"{name}.{kind}" for name, images in figures.items() if images for kind in ("png", "pdf")

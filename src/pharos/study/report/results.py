@@ -92,7 +92,7 @@ class Results:
         return any(each.fits for each in self.models)
 
 
-def results_of(study: Specification, place: Path, progress: Callable[[str], None] = lambda _: None) -> Results:
+def study_results(study: Specification, place: Path, progress: Callable[[str], None] = lambda _: None) -> Results:
     """Read the results of a study, and compute the statistics of its report.
 
     Only instances and kinds of chance that have finished runs are measured.
