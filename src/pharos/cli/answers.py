@@ -174,12 +174,12 @@ def progress_line(what: str, *, logged: bool = False) -> Iterator[ProgressLine]:
     if not sys.stderr.isatty():
         with SlowWork(what).watched() as work:
 
-            def tell(text: str) -> None:
+            def report(text: str) -> None:
                 work.text = text
                 if logged:
                     print(f"pharos: {text}", file=sys.stderr, flush=True)
 
-            yield ProgressLine(tell)
+            yield ProgressLine(report)
         return
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 

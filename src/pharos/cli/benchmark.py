@@ -232,8 +232,8 @@ def submit(
     from pharos import benchmark
 
     texts = {"name": name, "author": author, "note": note}
-    with counted_bar("policies") as tell:
-        file = benchmark.submit(folder, out, _loaded(suite, trust), **texts, trust=trust, progress=tell)
+    with counted_bar("policies") as report:
+        file = benchmark.submit(folder, out, _loaded(suite, trust), **texts, trust=trust, progress=report)
     content, size = benchmark.read(file), file.stat().st_size
     if isinstance(content, benchmark.Entry):
         claim, more = content.claim, {"id": content.id, "claim": content.claim}
@@ -272,8 +272,8 @@ def verify(
     for file in files:
         began = time.perf_counter()
         try:
-            with counted_bar(f"verifying {file}") as tell:
-                verdict = benchmark.verify(file, loaded, trust=trust, progress=tell, **vars(limits))
+            with counted_bar(f"verifying {file}") as report:
+                verdict = benchmark.verify(file, loaded, trust=trust, progress=report, **vars(limits))
         except Exception as error:
             if len(files) == 1:
                 raise
@@ -372,8 +372,8 @@ def board(
     from pharos import benchmark
 
     suites = [benchmark.load_suite(each, trust=trust) for each in suite or ()]
-    with counted_bar("verifying") as tell:
-        page = benchmark.board(files, out, suites, title=title, trust=trust, progress=tell, **vars(limits))
+    with counted_bar("verifying") as report:
+        page = benchmark.board(files, out, suites, title=title, trust=trust, progress=report, **vars(limits))
     verified = len(page.verified)
     facts = [("verified", f"{verified:,}"), ("refused", f"{len(page.refused):,}"), *page.refused.items()]
     answer = {"file": out, "verified": verified, "refused": page.refused, "final_scores": page.final_scores}

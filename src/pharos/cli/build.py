@@ -130,9 +130,9 @@ def _counts_of_space(goal: Target, building: Building) -> dict[str, int]:
     manifest = read_manifest(cached_folder(goal.environment))
     if manifest is not None and manifest["complete"]:
         return counts_of(goal.space(building))
-    place = storage.cache_directory()
-    place.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix="count-", dir=place))
+    cache = storage.cache_directory()
+    cache.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix="count-", dir=cache))
     try:
         return counts_of(goal.space(building, temporary))
     finally:

@@ -156,9 +156,9 @@ def warm(
     seconds: dict[str, float] = {}
     watch = Stopwatch()
     compiling.SMALL = 0  # as if all of it were large
-    with progress_line("compiling") as tell:
+    with progress_line("compiling") as report:
         for env in environments:
-            tell(str(env))
+            report(str(env))
             before = watch.compiling
             _use(env, chance)
             seconds[str(env)] = watch.compiling - before

@@ -56,7 +56,7 @@ def _print(diagnosis: "Diagnosis") -> None:
     print_table(
         f"{diagnosis.agent}: {diagnosis.verdict}",
         ("", "what no healthy agent shows", "what to try"),
-        ((str(place), each.wrong, each.advice) for place, each in enumerate(diagnosis.findings, start=1)),
+        ((str(number), each.wrong, each.advice) for number, each in enumerate(diagnosis.findings, start=1)),
     )
     print_table(
         "Nearest known agents",

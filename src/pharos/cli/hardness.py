@@ -115,11 +115,11 @@ def hardness(
         shown = [name for name in names if measures is not None or steps is not None or name != "covering"]
         is_named = measures is not None
         table = _Table(target.title, _setting(mdp, steps, chance), shown, definitions, is_named)
-    with progress_line("measuring") as tell:
+    with progress_line("measuring") as progress:
 
         def show(result: "Result") -> None:
             if table is not None:
-                with tell.away():
+                with progress.away():
                     table.add(result)
 
         report = measure(
@@ -130,7 +130,7 @@ def hardness(
             restart=restart,
             budget=budget,
             keep=not fresh,
-            progress=lambda what, line: tell(f"{what}  {line}".rstrip()),
+            progress=lambda what, line: progress(f"{what}  {line}".rstrip()),
             on_result=show,
             representation=representation,
             schedule=None if representation is None else Schedule(optimizer=optimizer or "gradient"),
@@ -277,7 +277,7 @@ def predict(
 
     if preset not in (None, "common"):
         raise UnknownName("set of hyperparameters", str(preset), ("common",))
-    with progress_line("predicting") as tell:
+    with progress_line("predicting") as report:
         prediction = foretell(
             env,
             [_observation(text) for text in observation or ["vector"]],
@@ -285,7 +285,7 @@ def predict(
             landmarks=landmarks,
             common=preset is not None,
             pilot=pilot,
-            progress=tell,
+            progress=report,
             **{name: getattr(training, name) for name in ("agent", "steps", "hyperparameters", "chance")},
             horizon=horizon or "limit",
         )

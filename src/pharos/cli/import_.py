@@ -209,7 +209,7 @@ def atari(
     """
     from pharos import importers
 
-    with progress_line("importing") as tell, termination():
+    with progress_line("importing") as report, termination():
         mdp, recording = importers.atari(
             game,
             horizon=horizon,
@@ -222,7 +222,7 @@ def atari(
             max_states=max_states,
             workers=workers,
             folder=importers.building_folder(out),
-            progress=tell,
+            progress=report,
         )
         return _recorded_answer(game, mdp, recording, out)
 
@@ -258,7 +258,7 @@ def procgen(
     """
     from pharos import importers
 
-    with progress_line("importing") as tell, termination():
+    with progress_line("importing") as report, termination():
         mdp, recording = importers.procgen(
             game,
             level=level,
@@ -271,7 +271,7 @@ def procgen(
             max_states=max_states,
             workers=workers,
             folder=importers.building_folder(out),
-            progress=tell,
+            progress=report,
         )
         return _recorded_answer(f"{game}, level {level}", mdp, recording, out)
 

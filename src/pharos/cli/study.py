@@ -122,22 +122,22 @@ def run(
         raise UnknownName("place to run on", on, ("local", "slurm", "ray"))
     if log is not None and on == "slurm":
         raise ParameterError("--log goes with --on local or ray; write those of a cluster by `pharos study log`")
-    opened, place = source.opened()
+    opened, directory = source.opened()
     options = vars(execution)
     if on == "slurm":
-        jobs = study.submit(opened, place, shards=shards or 8, parameters=slurm, **options)
+        jobs = study.submit(opened, directory, shards=shards or 8, parameters=slurm, **options)
         names = [str(job.job_id) for job in jobs]
         submitted = f"submitted {len(jobs)} jobs: {', '.join(names)}; `pharos study status` says how far they are"
         return Answer(
             {"jobs": names}, submitted if jobs else "nothing is missing; `pharos study report` shows the results"
         )
-    logs = None if log is None else study.RunLog(opened, place, log)
-    with _progress(logs) as tell, termination():
+    logs = None if log is None else study.RunLog(opened, directory, log)
+    with _progress(logs) as report, termination():
         if on == "ray":
-            end = study.run_on_ray(opened, place, address=address, progress=tell, **options)
+            end = study.run_on_ray(opened, directory, address=address, progress=report, **options)
         else:
             try:
-                end = study.run(opened, place, foretold=_say, progress=tell, **options)
+                end = study.run(opened, directory, foretold=_say, progress=report, **options)
             except AllRunsFailed as error:  # the answer says of each why
                 end = error.outcome
     if logs is not None:
@@ -173,10 +173,10 @@ def report(
     """
     from pharos import study
 
-    foretold = [study.read_predictions(each) for each in predictions or ()]
-    with progress_line("report") as tell:
-        opened, place = source.opened()
-        written = study.report(opened, place, out=to, progress=tell, predictions=foretold)
+    predicted = [study.read_predictions(each) for each in predictions or ()]
+    with progress_line("report") as report:
+        opened, directory = source.opened()
+        written = study.report(opened, directory, out=to, progress=report, predictions=predicted)
 
     def text() -> None:
         for note in written.notes:
@@ -206,13 +206,17 @@ def log(
 
     if to == "tensorboard" and (project is not None or offline):
         raise ParameterError("--project and --offline are of Weights & Biases; expected them with --to wandb")
-    with progress_line("log") as tell:
-        opened, place = source.opened()
-        number = study.RunLog(opened, place, to, project=project, offline=offline).update(tell)
-    how = f"tensorboard --logdir {place / to}" if to == "tensorboard" else f"wandb sync {place / to}/offline-run-*"
+    with progress_line("log") as report:
+        opened, directory = source.opened()
+        number = study.RunLog(opened, directory, to, project=project, offline=offline).update(report)
+    how = (
+        f"tensorboard --logdir {directory / to}"
+        if to == "tensorboard"
+        else f"wandb sync {directory / to}/offline-run-*"
+    )
     remedy = f"; `{how}` {'shows' if to == 'tensorboard' else 'sends'} them" if to == "tensorboard" or offline else ""
-    answer = {"to": to, "folder": str(place / to), "added": number}
-    return Answer(answer, f"{place / to}: {pluralize(number, 'run')} added{remedy}")
+    answer = {"to": to, "folder": str(directory / to), "added": number}
+    return Answer(answer, f"{directory / to}: {pluralize(number, 'run')} added{remedy}")
 
 
 @app.command("predict")
@@ -237,16 +241,16 @@ def predict(
     from pharos import study
     from pharos.agents import primary_predictors
 
-    opened, place = source.opened()
-    with progress_line("predicting", logged=True) as tell:
+    opened, directory = source.opened()
+    with progress_line("predicting", logged=True) as report:
         predictions = study.predict(
             opened,
-            place,
+            directory,
             blocks=block or None,
             agents=agent or None,
             observations=observation or None,
             primary=primary,
-            progress=tell,
+            progress=report,
         )
     record = study.write_predictions(opened, predictions, out)
     columns = predictions.columns.intersection(["kernel_regret", *primary_predictors().values()])
@@ -320,7 +324,7 @@ def _progress(logs: "RunLog | None") -> "Iterator[Callable[[Status], None]]":
     with progress_bar("runs", 1) as show:
         latest = time.monotonic()
 
-        def tell(status: "Status") -> None:
+        def report(status: "Status") -> None:
             nonlocal latest
             show(status.finished + status.failed, str(status), status.total)
             if time.monotonic() - latest > LINE_SECONDS:
@@ -330,7 +334,7 @@ def _progress(logs: "RunLog | None") -> "Iterator[Callable[[Status], None]]":
                     logs.update()
                 latest = time.monotonic()
 
-        yield tell
+        yield report
 
 
 def _steps(study: "Specification") -> int:

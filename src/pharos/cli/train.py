@@ -181,7 +181,7 @@ def _telling_of_many(show: Callable[[int, str], None]) -> "Callable[[TrainingPro
     """Return the callback of `train_many`, which shows the mean regret of the policies, and the pace."""
     began: list[tuple[float, int]] = []
 
-    def tell(now: "TrainingProgress") -> None:
+    def report(now: "TrainingProgress") -> None:
         if not began:
             began.append((time.perf_counter(), now.done))
         elapsed, before = time.perf_counter() - began[0][0], began[0][1]
@@ -190,7 +190,7 @@ def _telling_of_many(show: Callable[[int, str], None]) -> "Callable[[TrainingPro
         text = f"mean regret {sum(regrets) / len(regrets):.4g}" if regrets else "finished before"
         show(now.done, f"{text}{pace}{f', {now.failed} failed' if now.failed else ''}")
 
-    return tell
+    return report
 
 
 def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, object]]:
@@ -247,11 +247,11 @@ def _plot(out: Path | None) -> Path | None:
 def _telling(show: Callable[[int, str], None]) -> Callable[[int, int, Any], None]:
     """Return the callback of `train`, which shows the value of the policy, beside the bar."""
 
-    def tell(done: int, _steps: int, row: Mapping[str, Any]) -> None:
+    def report(done: int, _steps: int, row: Mapping[str, Any]) -> None:
         episodes = pluralize(row["episodes"], "episode")
         show(done, f"value {row['value']:.4g}, regret {row['expected_regret']:.4g}, {episodes}")
 
-    return tell
+    return report
 
 
 # Tune -----------------------------------------------------------------------------------------------------------------

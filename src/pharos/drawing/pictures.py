@@ -118,8 +118,8 @@ def human(env: Environment, state: Sequence[int], *, cell: int | None = None) ->
     for plane, (name, layer) in zip(planes, env.layers.items(), strict=True):
         for row, column in np.argwhere(plane):
             thing = tile(name, layer, int(plane[row, column]), cell)
-            place = court[row * cell : (row + 1) * cell, column * cell : (column + 1) * cell]
-            place += (thing[..., :3] - place) * thing[..., 3:]
+            area = court[row * cell : (row + 1) * cell, column * cell : (column + 1) * cell]
+            area += (thing[..., :3] - area) * thing[..., 3:]
     return np.rint(canvas).astype(np.uint8)
 
 

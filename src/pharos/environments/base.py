@@ -214,9 +214,9 @@ def _valued_cells(env: Grid, name: str, value: object) -> tuple[tuple[Cell, floa
     try:
         if isinstance(value, str):
             texts = [part.split(":") for part in value.split(";") if part.strip()]
-            pairs = [(place, float(number)) for place, number in texts]
+            pairs = [(cell, float(number)) for cell, number in texts]
         else:
-            pairs = [(place, number) for place, number in _items(value)]
+            pairs = [(cell, number) for cell, number in _items(value)]
     except (TypeError, ValueError):
         pairs = [(None, None)]
     if not all(is_real(number) for _, number in pairs):
@@ -224,15 +224,15 @@ def _valued_cells(env: Grid, name: str, value: object) -> tuple[tuple[Cell, floa
             f"{type(env).__name__}: {name}={value!r}; expected ((row, column), value) pairs, "
             f"or text such as '2,2:0.1; 0,3:0.5'"
         )
-    return tuple((_cell(env, name, place), float(number)) for place, number in pairs)
+    return tuple((_cell(env, name, cell), float(number)) for cell, number in pairs)
 
 
 def _cells(env: Grid, name: str, value: object) -> tuple[Cell, ...]:
     """Cells, from pairs (row, column) or text such as "0,1; 2,3"."""
-    places = [part for part in value.split(";") if part.strip()] if isinstance(value, str) else value
-    if not isinstance(places, Iterable):
+    parts = [part for part in value.split(";") if part.strip()] if isinstance(value, str) else value
+    if not isinstance(parts, Iterable):
         raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected cells, such as '0,1; 2,3'")
-    return tuple(_cell(env, name, place) for place in places)
+    return tuple(_cell(env, name, part) for part in parts)
 
 
 def _items(value: object) -> Iterable[Any]:

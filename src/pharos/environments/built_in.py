@@ -88,12 +88,12 @@ BUILT_IN = (  # in the order in which they are listed
 _CALLBACKS: list[Callable[[type["Environment"]], None]] = []
 
 
-def on_registration(hear: Callable[[type["Environment"]], None]) -> None:
+def on_registration(callback: Callable[[type["Environment"]], None]) -> None:
     """Call `hear` with every user class that is registered from now on."""
-    _CALLBACKS.append(hear)
+    _CALLBACKS.append(callback)
 
 
 def notify(cls: type["Environment"]) -> None:
     """Call the functions of `on_registration` with a class that has just been registered."""
-    for hear in _CALLBACKS:
-        hear(cls)
+    for callback in _CALLBACKS:
+        callback(cls)

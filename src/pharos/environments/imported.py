@@ -305,16 +305,16 @@ def written_out(
             f"{MOST_ENTRIES:,} numbers in all: it can be solved and measured, but not stepped"
         )
     # Tables with K columns, filled up with probability 0
-    place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    index = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     table = np.zeros((count * actions, most), np.int64)
     chances = np.zeros((count * actions, most))
-    table[rows, place] = np.where(successors == -1, states, successors)
-    chances[rows, place] = p / np.bincount(rows, p, minlength=states * actions)[rows]
+    table[rows, index] = np.where(successors == -1, states, successors)
+    chances[rows, index] = p / np.bincount(rows, p, minlength=states * actions)[rows]
     if has_end:
         table[states * actions :], chances[states * actions :, 0] = states, 1.0
     shape = (count, actions, most)
     if outcome_rewards is None:
         return table.reshape(shape), chances.reshape(shape), None
     rewards = np.zeros((count * actions, most))
-    rewards[rows, place] = payments
+    rewards[rows, index] = payments
     return table.reshape(shape), chances.reshape(shape), rewards.reshape(shape)

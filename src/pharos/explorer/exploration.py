@@ -254,8 +254,8 @@ class Exploration:
         merged: dict[tuple[int | None, int | None, float], float] = {}
         for action in np.flatnonzero(executed).tolist():
             for after, probability, reward in self._of_executing(state, action):
-                place = (after, action if self.mdp.is_sticky else None, reward)
-                merged[place] = merged.get(place, 0.0) + float(executed[action]) * probability
+                key = (after, action if self.mdp.is_sticky else None, reward)
+                merged[key] = merged.get(key, 0.0) + float(executed[action]) * probability
         listed = [[after, previous, probability, reward] for (after, previous, reward), probability in merged.items()]
         return sorted(listed, key=lambda each: (-each[2], -1 if each[0] is None else each[0]))
 

@@ -163,16 +163,16 @@ class _Http(ThreadingHTTPServer):
     owner: Explorer
 
     def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]):
-        self.places = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        self.connections = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self.incomplete: dict[socket.socket, None] = {}  # whose requests have not arrived, the oldest first
         super().__init__(address, handler)
 
     def process_request(self, request: Request, client_address: Address) -> None:
         """Give the connection a thread; if there is none left, the one that has waited longest for a request ends."""
-        if not self.places.acquire(blocking=False):
+        if not self.connections.acquire(blocking=False):
             with contextlib.suppress(StopIteration, OSError):  # of those that send a byte now and then
                 next(iter(list(self.incomplete))).shutdown(socket.SHUT_RDWR)
-            if not self.places.acquire(timeout=FREE_SECONDS):
+            if not self.connections.acquire(timeout=FREE_SECONDS):
                 self.shutdown_request(request)
                 return
         super().process_request(request, client_address)
@@ -181,7 +181,7 @@ class _Http(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self.places.release()
+            self.connections.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
         """A browser that went away in the middle of an answer is no error."""

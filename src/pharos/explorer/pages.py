@@ -108,10 +108,10 @@ def heat_map(
         states = np.flatnonzero(world.states.matching(slices, block))
         if not states.size:
             continue
-        places = [axis.places(world.states.column(axis.variable, block)[states]) for axis in (down, across)]
+        indices = [axis.indices(world.states.column(axis.variable, block)[states]) for axis in (down, across)]
         here = start + states
         terminal = world.mdp.terminal[here]
-        cells.add(places[0] * across.count + places[1], here, quantity(world, what, here), terminal)
+        cells.add(indices[0] * across.count + indices[1], here, quantity(world, what, here), terminal)
     return {"x": asdict(across), "y": asdict(down), "what": what, "how": how} | cells.answer(what, how)
 
 
@@ -124,17 +124,17 @@ class _Cells:
         self.sum, self.least, self.most = np.zeros(size), np.full(size, np.inf), np.full(size, -np.inf)
         self.first = np.full(size, np.iinfo(np.int64).max)
 
-    def add(self, places: np.ndarray, states: np.ndarray, values: np.ndarray, terminal: np.ndarray) -> None:
+    def add(self, indices: np.ndarray, states: np.ndarray, values: np.ndarray, terminal: np.ndarray) -> None:
         size = len(self.count)
-        self.count += np.bincount(places, minlength=size)
-        self.terminal += np.bincount(places[terminal], minlength=size)
-        np.minimum.at(self.first, places, states)
+        self.count += np.bincount(indices, minlength=size)
+        self.terminal += np.bincount(indices[terminal], minlength=size)
+        np.minimum.at(self.first, indices, states)
         is_known = ~np.isnan(values)
-        places, values = places[is_known], values[is_known]
-        self.known += np.bincount(places, minlength=size)
-        self.sum += np.bincount(places, values, minlength=size)
-        np.minimum.at(self.least, places, values)
-        np.maximum.at(self.most, places, values)
+        indices, values = indices[is_known], values[is_known]
+        self.known += np.bincount(indices, minlength=size)
+        self.sum += np.bincount(indices, values, minlength=size)
+        np.minimum.at(self.least, indices, values)
+        np.maximum.at(self.most, indices, values)
 
     def answer(self, what: str, how: str) -> dict[str, Any]:
         is_known = self.known > 0
@@ -242,7 +242,7 @@ def contents(world: Exploration) -> dict[str, Any]:
     states = np.arange(mdp.num_states)
     before: list[int | None] = [None, *range(mdp.policy_width - 1)]
     positions = {
-        _place(state, previous): world.position(state, previous)
+        _state_key(state, previous): world.position(state, previous)
         for state in range(mdp.num_states)
         for previous in before
     }
@@ -312,7 +312,7 @@ def write(world: Exploration, path: str | os.PathLike) -> Path:
     return path
 
 
-def _place(state: int, previous: int | None) -> str:
+def _state_key(state: int, previous: int | None) -> str:
     return f"{state}" if previous is None else f"{state},{previous}"
 
 

@@ -159,7 +159,7 @@ class Axis:
     divisor: int = 1
     modulus: int = 0
 
-    def places(self, values: np.ndarray) -> np.ndarray:
+    def indices(self, values: np.ndarray) -> np.ndarray:
         """(N,) the intervals of values of the variable."""
         part = (values - self.origin) // self.divisor
         return (part % self.modulus if self.modulus else part) // self.width

@@ -258,7 +258,7 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
     _check_without_chance(mdp)
     if mdp.folder is not None and is_folder(mdp.folder):
         return make("imported", folder=os.fspath(mdp.folder))
-    place = storage.cache_directory() / "imported"
+    imported = storage.cache_directory() / "imported"
     parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
     shape = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon]
     contents: list[Any] = [*shape, str(mdp.chance), sorted(parts.items())]
@@ -268,7 +268,7 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
         contents += [names, digests, mdp.names.actions]
     contents += [*mdp.residual] if any(mdp.residual) else []
     contents += [mdp_files.ROUNDING, mdp.reward_table.rounding] if mdp.reward_table.rounding else []
-    folder = place / storage.digest_of_json(contents)
+    folder = imported / storage.digest_of_json(contents)
     return make("imported", folder=os.fspath(folder if is_folder(folder) else save(mdp, folder)))
 
 

@@ -800,10 +800,10 @@ class _Driver:
     def key(self) -> bytes:
         """Key of the state: equal for equal states, and for no others."""
         flat: list[Any] = []
-        places: dict[int, int] = {}
+        indices: dict[int, int] = {}
         for name, value in self._attributes():
             flat.append(name)
-            self._flatten(value, flat, places)
+            self._flatten(value, flat, indices)
         return repr(flat).encode()
 
     def _attributes(self) -> Iterator[tuple[str, Any]]:
@@ -813,7 +813,7 @@ class _Driver:
             if name not in _NOT_STATE:
                 yield name, attributes[name]
 
-    def _flatten(self, value: object, flat: list[Any], places: dict[int, int]) -> None:
+    def _flatten(self, value: object, flat: list[Any], indices: dict[int, int]) -> None:
         if isinstance(value, np.ndarray | np.generic):
             value = value.tolist()
         if value is None or isinstance(value, bool | int | float | str):
@@ -823,19 +823,19 @@ class _Driver:
         elif isinstance(value, tuple | list):  # MiniGrid writes positions as either
             flat.append(("list", len(value)))
             for item in value:
-                self._flatten(item, flat, places)
+                self._flatten(item, flat, indices)
         elif isinstance(value, dict):
             flat.append(("dict", len(value)))
             for name, item in value.items():
-                self._flatten(name, flat, places)
-                self._flatten(item, flat, places)
+                self._flatten(name, flat, indices)
+                self._flatten(item, flat, indices)
         elif value is self.env or callable(value) or isinstance(value, self.fixed_types):
             flat.append(type(value).__name__)
-        elif id(value) in places:
-            flat.append(("again", places[id(value)]))
+        elif id(value) in indices:
+            flat.append(("again", indices[id(value)]))
         elif hasattr(value, "__dict__"):  # grids, rooms, doors, keys, ...
-            places[id(value)] = len(places)
+            indices[id(value)] = len(indices)
             flat.append(type(value).__name__)
-            self._flatten(vars(value), flat, places)
+            self._flatten(vars(value), flat, indices)
         else:
             raise RuleError(f"{self.name}: keeps a {type(value).__name__}, which cannot be told apart from others")

@@ -49,8 +49,9 @@ class Stepper(ABC):
     Kernels get Setting and Batch as plain tuples: named ones cost Numba a microsecond a call more.
 
     Attributes:
-        name: of a place, in `info`.
-        current, final: the places (N, ...) now, and at the ends of episodes that a step ended.
+        name: of a position in `info`: "state" or "index".
+        current, final: the positions (N, ...), states or their indices: now, and at the ends of episodes that a step
+            ended.
         final_elapsed: (N,) steps of the episode after the last step.
     """
 
@@ -64,19 +65,19 @@ class Stepper(ABC):
     def restart(self, mask: np.ndarray, rng: np.ndarray, state: object) -> None:
         """Begin episodes in the environments of mask (N,): in `state`, or in drawn start states."""
         if state is not None:
-            self.current[mask] = self.places(_states_of(self.simulator, state, len(mask))[mask])
+            self.current[mask] = self.positions(_states_of(self.simulator, state, len(mask))[mask])
             return
         numbers = np.zeros(len(mask), np.int64)
         stepping.draw_starts(self.simulator.start_cumulative, rng, mask, numbers)
         self.current[mask] = self.starts[numbers[mask]]
 
     @abstractmethod
-    def places(self, states: np.ndarray) -> np.ndarray:
-        """Places of states (N, D)."""
+    def positions(self, states: np.ndarray) -> np.ndarray:
+        """Positions of states (N, D)."""
 
     @abstractmethod
-    def states(self, places: np.ndarray) -> np.ndarray:
-        """States (n, D) of places (n, ...)."""
+    def states(self, positions: np.ndarray) -> np.ndarray:
+        """States (n, D) of positions (n, ...)."""
 
     def vectors(self) -> np.ndarray:
         """Buffer for vector observations of the next step; empty if the compiled step does not write them."""
@@ -86,12 +87,12 @@ class Stepper(ABC):
     def step(self, batch: EnvironmentBatch) -> None:
         """Advance every environment."""
 
-    def seen(self, places: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        """Observations of places (n, ...)."""
-        return self.simulator.context(self.states(places), previous, elapsed)
+    def seen(self, positions: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+        """Observations of positions (n, ...)."""
+        return self.simulator.context(self.states(positions), previous, elapsed)
 
     def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        """Observations of the current places."""
+        """Observations of the current positions."""
         return self.seen(self.current, previous, elapsed)
 
 
@@ -120,11 +121,11 @@ class RulesStepper(Stepper):
         self.__dict__.update(state)
         self._step_many = self.simulator.rules.step_many
 
-    def places(self, states: np.ndarray) -> np.ndarray:
+    def positions(self, states: np.ndarray) -> np.ndarray:
         return states
 
-    def states(self, places: np.ndarray) -> np.ndarray:
-        return places
+    def states(self, positions: np.ndarray) -> np.ndarray:
+        return positions
 
     def restart(self, mask: np.ndarray, rng: np.ndarray, state: object) -> None:
         self._vector = self._vector[:0]
@@ -162,7 +163,7 @@ class TableStepper(Stepper):
     def __init__(self, simulator: Simulator, space: "StateSpace", num_envs: int, mode: int):
         super().__init__(simulator, np.zeros(num_envs, np.int64))
         self.space = space
-        self.starts = self.places(simulator.start_states)
+        self.starts = self.positions(simulator.start_states)
         self._transitions, self._rewards = _tables(space)
         self._staying = rewards_of_staying(space).array if simulator.lazy else np.empty((0, 0))
         self._setting = tuple(simulator.setting(mode, np.zeros((2, 0), np.int64), np.zeros(0), self.starts))
@@ -173,11 +174,11 @@ class TableStepper(Stepper):
         if context.is_plain and not self._is_index and one * space.num_states <= LARGEST_TABLE:
             self._table = context.observation(space.states())
 
-    def places(self, states: np.ndarray) -> np.ndarray:
+    def positions(self, states: np.ndarray) -> np.ndarray:
         return self.space.indices(states)
 
-    def states(self, places: np.ndarray) -> np.ndarray:
-        return self.space.states(places)
+    def states(self, positions: np.ndarray) -> np.ndarray:
+        return self.space.states(positions)
 
     def step(self, batch: EnvironmentBatch) -> None:
         self.final_elapsed[:] = batch.elapsed + 1
@@ -189,12 +190,12 @@ class TableStepper(Stepper):
 
         in_blocks(run, len(self.current), BLOCK)
 
-    def seen(self, places: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+    def seen(self, positions: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
         if self._is_index:
-            return places.copy()
+            return positions.copy()
         if self._table is not None:
-            return self._table.take(places, axis=0)
-        return super().seen(places, previous, elapsed)
+            return self._table.take(positions, axis=0)
+        return super().seen(positions, previous, elapsed)
 
 
 def _tables(space: "StateSpace") -> tuple[object, object]:
@@ -390,17 +391,17 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     def _add_final(self, info: dict[str, Any], done: np.ndarray) -> None:
         """Add terminal observations and infos, as Gymnasium's own vector environments do."""
         rows, executed = np.flatnonzero(done), info["executed_action"]
-        context, places = (executed[rows], self._stepper.final_elapsed[rows]), self._stepper.final[rows]
+        context, positions = (executed[rows], self._stepper.final_elapsed[rows]), self._stepper.final[rows]
         if self._frame_stack is None:
-            last = self._stepper.seen(places, *context)
+            last = self._stepper.seen(positions, *context)
         else:
-            last = self._frame_stack.terminal(rows, self._stepper.states(places), *context)
+            last = self._frame_stack.terminal(rows, self._stepper.states(positions), *context)
         final = np.full(self.num_envs, None, object)
         for row, observation in zip(rows, _rows_of(last, len(rows)), strict=True):
             final[row] = observation
         name = self._stepper.name
         state = np.zeros_like(self._stepper.final)
-        state[rows] = places
+        state[rows] = positions
         info["final_obs"], info["_final_obs"] = final, done
         info["final_info"] = {
             name: state,

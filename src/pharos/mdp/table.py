@@ -482,7 +482,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
 
     def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
         """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for where it came from."""
-        which, places = self.places(self._rows(np.asarray(states)))
+        which, places = self.entry_indices(self._rows(np.asarray(states)))
         next_states = number[self.flat[places]]
         next_states = np.where(next_states == -2, which // self.num_actions, next_states)
         return self._of_states(states, places, as_indices(next_states, len(states)))

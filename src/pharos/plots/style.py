@@ -134,8 +134,8 @@ def save(figure: "Figure", path: str | os.PathLike, *, follow: bool = True) -> P
     return path
 
 
-def save_for_page(draw: Callable[[], "Figure | None"], place: Path) -> dict[str, bytes] | None:
-    """Draw a figure into place.png and place.pdf; return its PNG for light and for dark pages, None without a figure.
+def save_for_page(draw: Callable[[], "Figure | None"], path: Path) -> dict[str, bytes] | None:
+    """Draw a figure into FILE.png and FILE.pdf; return its PNG for light and for dark pages, None without a figure.
 
     Args:
         draw: called under the style of either page.
@@ -149,9 +149,9 @@ def save_for_page(draw: Callable[[], "Figure | None"], place: Path) -> dict[str,
                 return None
             images[theme] = file_of(figure, "png", PAGE_DPI)
             if theme == "light":
-                place.parent.mkdir(parents=True, exist_ok=True)
-                replace_file(place.with_suffix(".png"), images[theme])
-                replace_file(place.with_suffix(".pdf"), file_of(figure, "pdf"))
+                path.parent.mkdir(parents=True, exist_ok=True)
+                replace_file(path.with_suffix(".png"), images[theme])
+                replace_file(path.with_suffix(".pdf"), file_of(figure, "pdf"))
     return images
 
 

@@ -184,8 +184,10 @@ def explore_kernel(
             if n > 0:
                 progress[COUNT] = count
                 begin = first + waiting
-                batch, places = keys[buffer], slots[buffer]
-                expand(parameters, layout, states, begin, n, batch, places, terminal, begin - base, table, progress)
+                batch, slots_of_batch = keys[buffer], slots[buffer]
+                expand(
+                    parameters, layout, states, begin, n, batch, slots_of_batch, terminal, begin - base, table, progress
+                )
                 if progress[FAULT]:
                     return
             buffer = 1 - buffer
@@ -243,8 +245,8 @@ def expand_and_find_kernel(
             n = max(0, min(BATCH, stop - batch))
             if n > 0:
                 part = keys[(batch - base) * A : (batch - base + n) * A]
-                places, row = slots[buffer], batch - base
-                expand(parameters, layout, states, batch, n, part, places, terminal, row, table, progress)
+                slots_of_batch, row = slots[buffer], batch - base
+                expand(parameters, layout, states, batch, n, part, slots_of_batch, terminal, row, table, progress)
                 if progress[FAULT]:
                     return
             buffer = 1 - buffer

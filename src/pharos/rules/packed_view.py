@@ -164,11 +164,11 @@ def _note_fault(builder, view, component):
 
 def _column(builder, view, index, column):
     """One entry of the layout's row of a component."""
-    place = builder.add(builder.shl(index, ir.Constant(_WORD, 2)), ir.Constant(_WORD, column))
-    return builder.load(builder.gep(view.fields, [place]))
+    address = builder.add(builder.shl(index, ir.Constant(_WORD, 2)), ir.Constant(_WORD, column))
+    return builder.load(builder.gep(view.fields, [address]))
 
 
-def _place(builder, view, view_type, index):
+def _word_and_shift(builder, view, view_type, index):
     """The word of a component and its shift there."""
     offset = _column(builder, view, index, _OFFSET)
     if view_type.num_words == 1:
@@ -181,7 +181,7 @@ def _get_component(typing_context, view, index):
     def codegen(context, builder, sig, args):
         view = _view(context, builder, sig, args)
         index = _checked_component(builder, view, args[1])
-        word, shift = _place(builder, view, sig.args[0], index)
+        word, shift = _word_and_shift(builder, view, sig.args[0], index)
         field = builder.and_(_load_word(builder, view, sig.args[0], word), _column(builder, view, index, _MASK))
         return builder.add(_column(builder, view, index, _LOW), builder.lshr(field, shift))
 
@@ -193,7 +193,7 @@ def _set_component(typing_context, view, index, value):
     def codegen(context, builder, sig, args):
         view = _view(context, builder, sig, args)
         index = _checked_component(builder, view, args[1])
-        word, shift = _place(builder, view, sig.args[0], index)
+        word, shift = _word_and_shift(builder, view, sig.args[0], index)
         mask = _column(builder, view, index, _MASK)
         offset = builder.sub(args[2], _column(builder, view, index, _LOW))
         # a value out of range becomes the lowest one, and a fault
@@ -204,12 +204,12 @@ def _set_component(typing_context, view, index, value):
             builder.store(ir.Constant(_WORD, 0), harmless)
         # replace the bits of the component in its word
         field = builder.shl(builder.load(harmless), shift)
-        place = view.words
+        address = view.words
         if sig.args[0].in_register:
             field, mask = (_in_lane(builder, sig.args[0].num_words, word, bits) for bits in (field, mask))
         else:
-            place = builder.gep(view.words, [ir.Constant(_WORD, 0), word])
-        builder.store(builder.or_(builder.and_(builder.load(place), builder.not_(mask)), field), place)
+            address = builder.gep(view.words, [ir.Constant(_WORD, 0), word])
+        builder.store(builder.or_(builder.and_(builder.load(address), builder.not_(mask)), field), address)
         return context.get_dummy_value()
 
     return types.void(view, types.int64, types.int64), codegen

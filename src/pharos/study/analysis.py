@@ -208,8 +208,8 @@ def compare(cells: "pd.DataFrame", runs: Sequence[Run], models: Sequence[Models]
         for row in returns.itertuples()
     ]
     nothing = (float("nan"),) * 3
-    for place, column in enumerate(("ours", "our_deviation", "our_steps")):
-        returns[column] = [ours.get(key, nothing)[place] for key in keys]
+    for index, column in enumerate(("ours", "our_deviation", "our_steps")):
+        returns[column] = [ours.get(key, nothing)[index] for key in keys]
     returns["difference"] = returns["ours"] - returns["mean"]
     return PaperComparison(returns, _regressions(cells, models))
 

@@ -61,16 +61,16 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
     """
     import pyarrow as pa
 
-    study, place = opened(source, folder)
+    study, directory = opened(source, folder)
     ids, records, curves = [], [], []
     for run in study.runs:
-        record = _worker.run_record(place / "runs" / run.id)
+        record = _worker.run_record(directory / "runs" / run.id)
         if record is not None and record["status"] == _worker.FINISHED:
             ids.append(run.id)
             records.append(json.dumps(_placeless(record, study.folder)))
-            curves.append(training.read_curve_table(place / "runs" / run.id, CURVE_COLUMNS))
+            curves.append(training.read_curve_table(directory / "runs" / run.id, CURVE_COLUMNS))
     if not ids:
-        raise ParameterError(f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first")
+        raise ParameterError(f"{directory}: no run of {study.name!r} is finished; execute `pharos study run` first")
     columns: dict[str, Any] = {"id": pa.array(ids), "record": pa.array(records)}
     for field in pa.unify_schemas([curve.schema for curve in curves]):
         lists = [curve.column(field.name).to_pylist() if field.name in curve.column_names else None for curve in curves]
@@ -124,7 +124,7 @@ def unpack(
     """
     file = Path(file)
     text, table, digests = _read(file)
-    target, place = opened(_study(file, text, table, trust) if into is None else into, folder, trust=trust or None)
+    target, directory = opened(_study(file, text, table, trust) if into is None else into, folder, trust=trust or None)
     wanted = {run.id for run in target.runs}
     runs = []
     for row in _rows(file, table):
@@ -133,11 +133,11 @@ def unpack(
         if digests is not None and digests["runs"].get(id) != _digest(id, record, run[2]):
             raise ResultCorrupted(f"{file}: run {id} was changed after it was packed; {_AGAIN}")
         runs.append(run)
-    write_specification(target, place)
-    added = sum(_write(place, *run) for run in runs if run[0] in wanted)
+    write_specification(target, directory)
+    added = sum(_write(directory, *run) for run in runs if run[0] in wanted)
     with contextlib.suppress(OSError):  # others may be at work there
-        (place / "partial").rmdir()
-    return place, added
+        (directory / "partial").rmdir()
+    return directory, added
 
 
 def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
@@ -217,11 +217,11 @@ def _curve(file: Path, id: str, row: dict[str, list | None], schema: "pa.Schema"
         raise FileFormatError(f"{file}: the curve of run {id} cannot be read: {error}; {_AGAIN}") from None
 
 
-def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> bool:
+def _write(directory: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> bool:
     """Write a run into the folder; False if a finished one is there already, which stays."""
-    target = place / "partial" / id
+    target = directory / "partial" / id
     storage.remove_leftovers(target)
-    if _worker.read_status(place / "runs" / id) == _worker.FINISHED:
+    if _worker.read_status(directory / "runs" / id) == _worker.FINISHED:
         return False
     partial = storage.temporary_path(target)
     partial.mkdir(parents=True)
@@ -231,7 +231,7 @@ def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> b
         else:
             training.write_table(partial / "curve.parquet", curve)
         storage.replace_json(partial / "run.json", record)
-        _worker.publish_run(partial, place, id)
+        _worker.publish_run(partial, directory, id)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return True

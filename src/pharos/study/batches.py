@@ -95,17 +95,17 @@ def train_batch(
     tasks = TaskCache(values, trust=True, strict=True, device=device)
     errors: list[str | None] = [None] * len(configs)
 
-    def tell(message: tuple[Any, ...]) -> None:
+    def on_message(message: tuple[Any, ...]) -> None:
         match message:
-            case "end", place, FailedRun() as end:
-                errors[place] = end.error
-            case "halve", places, reason:
+            case "end", index, FailedRun() as end:
+                errors[index] = end.error
+            case "halve", indices, reason:
                 reason_of_all = HalfAsMany(reason)
-                for place in places:
-                    errors[place] = reason_of_all
+                for index in indices:
+                    errors[index] = reason_of_all
 
     runs = [PreparedRun(i, RunConfig.from_dict(config), folders[i], tasks) for i, config in enumerate(configs)]
-    train_group(runs, checkpoints, tell, is_single=len(runs) == 1, raises=len(runs) == 1)
+    train_group(runs, checkpoints, on_message, is_single=len(runs) == 1, raises=len(runs) == 1)
     return errors
 
 

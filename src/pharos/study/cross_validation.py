@@ -94,21 +94,21 @@ def _lines(counts: Counts, products: np.ndarray, targets: np.ndarray) -> np.ndar
 
 
 def permuted_classes(
-    x: np.ndarray, y: np.ndarray, classes: np.ndarray, places: Sequence[object], permutations: int, seed: int
+    x: np.ndarray, y: np.ndarray, classes: np.ndarray, positions: Sequence[object], permutations: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """((1 + R,) R2, (1 + R,) rho) of left-out classes if each class has the predictors of another one.
 
-    First as it is, then for R permutations of classes. Only places that all classes have are looked at; NaN if
+    First as it is, then for R permutations of classes. Only positions that all classes have are looked at; NaN if
     there are fewer than three.
 
     Args:
-        places: (N,) what a row is within its class, such as (its first instance, plain, vector). A row gets the
-            predictors of the row at the same place of the other class.
+        positions: (N,) what a row is within its class, such as (its first instance, plain, vector). A row gets the
+            predictors of the row at the same position of the other class.
     """
     number = classes.max() + 1
-    keys = {place: i for i, place in enumerate(dict.fromkeys(places))}
+    keys = {position: i for i, position in enumerate(dict.fromkeys(positions))}
     row_at = np.full((number, len(keys)), -1)
-    row_at[classes, [keys[each] for each in places]] = np.arange(len(y))
+    row_at[classes, [keys[each] for each in positions]] = np.arange(len(y))
     row_at = row_at[:, (row_at >= 0).all(axis=0)]
     if row_at.shape[1] < 3 or np.ptp(y[row_at]) == 0:
         return np.full(1 + permutations, np.nan), np.full(1 + permutations, np.nan)

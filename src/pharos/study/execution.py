@@ -295,9 +295,9 @@ def prepare_instance(config: Mapping[str, Any]) -> None:
 
 
 def prepare_instances(
-    prepare: Callable[[Mapping[str, Any]], Any], runs: Iterable[Run], tell: Callable[[str], Any]
+    prepare: Callable[[Mapping[str, Any]], Any], runs: Iterable[Run], progress: Callable[[str], Any]
 ) -> None:
-    """Call `prepare` with one config of each instance of the runs, and `tell` with its progress; failures are ignored.
+    """Call `prepare` with one config of each instance of the runs, and `progress` with a text; failures are ignored.
 
     A separate process prepares them one after the other. If it dies, another goes on with the next.
     """
@@ -313,7 +313,7 @@ def prepare_instances(
                 definitions = [prepare, *(each for run in todo for each in run.configuration.definitions)]
                 workers.start("", _prepare_all, (prepare, [run.config for run in todo]), definitions)
             number, run = len(instances) - len(todo) + 1, todo[0]
-            tell(f"preparing {run.instance}, {run.chance} ({number} of {len(instances)}){waits_for}")
+            progress(f"preparing {run.instance}, {run.chance} ({number} of {len(instances)}){waits_for}")
             for _, message in workers.events(POLL_SECONDS):
                 waits_for = f"; {message}" if isinstance(message, str) and message else ""
                 if not waits_for and todo:  # one is prepared, or its process has died
@@ -355,7 +355,7 @@ def _prepare_all(
 
 
 def unless_locked(
-    prepare: Callable[[Mapping[str, Any]], Any], config: Mapping[str, Any], tell: Callable[[str], None]
+    prepare: Callable[[Mapping[str, Any]], Any], config: Mapping[str, Any], on_wait: Callable[[str], None]
 ) -> None:
     """Prepare an instance; if another process is building it, wait for that one."""
     while True:
@@ -363,5 +363,5 @@ def unless_locked(
             prepare(config)
             return
         except StateSpaceLocked as error:
-            tell(str(error))
+            on_wait(str(error))
             time.sleep(POLL_SECONDS)

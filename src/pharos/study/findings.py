@@ -197,14 +197,16 @@ def _tasks(fit: Fit) -> _Tasks:
     observations = sorted(set(fit.observations)) or [""]
     rows = {key: row for row, key in enumerate(zip(names, fit.observations or [""] * len(names), strict=True))}
     complete = [name for name in dict.fromkeys(names) if all((name, each) in rows for each in observations)]
-    places = np.array([[rows[name, each] for each in observations] for name in complete], int).reshape(
+    row_numbers = np.array([[rows[name, each] for each in observations] for name in complete], int).reshape(
         -1, len(observations)
     )
     columns = [str(name) for name in fit.coefficients.index]
     of_task = [i for i, name in enumerate(columns) if not name.startswith("C(observation)")]
     of_class = [i for i in of_task if not columns[i].startswith("np.log(")]
-    first = places[:, 0]
-    return _Tasks(tuple(complete), fit.actual[places], fit.design[first][:, of_task], fit.design[first][:, of_class])
+    first = row_numbers[:, 0]
+    return _Tasks(
+        tuple(complete), fit.actual[row_numbers], fit.design[first][:, of_task], fit.design[first][:, of_class]
+    )
 
 
 def _rest(design: np.ndarray, values: np.ndarray) -> float:

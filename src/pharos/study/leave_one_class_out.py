@@ -225,7 +225,7 @@ class Cells:
         return Cells(frame, x[usable], y[usable], *numbers)
 
     @property
-    def places(self) -> list[tuple[int, str, str]]:
+    def positions(self) -> list[tuple[int, str, str]]:
         """(Position of the instance in its class, chance, observation) of each row."""
         position: dict[int, int] = {}
         counts: dict[int, int] = {}
@@ -275,7 +275,7 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
     noise = _noise(cells, outcome)
     floors, p = [np.nan, np.nan], np.nan
     if permutations and x.shape[1] and count >= 3:
-        shuffled = cross_validation.permuted_classes(x, y, classes, cells.places, permutations, seed)
+        shuffled = cross_validation.permuted_classes(x, y, classes, cells.positions, permutations, seed)
         floors = [float(percentiles(each[1:], 95)[0]) for each in shuffled]
         p = permutation_p_value(shuffled[1][0], shuffled[1][1:])
     return {

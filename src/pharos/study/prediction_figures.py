@@ -82,7 +82,7 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> 
     top = max(1.0, part[[predictor, "greedy"]].max().max())
     for axis, (key, rows) in zip(axes, groups, strict=True):
         rows = rows.set_index("observation").reindex(observations)
-        places = np.arange(len(observations))
+        ticks = np.arange(len(observations))
         for i, observation in enumerate(observations):
             color = observation_color(observation, observations)
             pair = rows[[predictor, "greedy"]].iloc[i].to_numpy(float)
@@ -90,7 +90,7 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> 
             axis.scatter([i], pair[:1], s=34, facecolors="none", edgecolors=color, lw=1.4)
             axis.scatter([i], pair[1:], s=34, color=color, lw=0, label=observation)
         axis.set_title(_short(*map(str, key)), fontsize=8)
-        axis.set(xticks=places, xticklabels=[], ylim=(-0.05, top + 0.08), xlim=(-0.6, len(observations) - 0.4))
+        axis.set(xticks=ticks, xticklabels=[], ylim=(-0.05, top + 0.08), xlim=(-0.6, len(observations) - 0.4))
     hollow, full = {"facecolors": "none", "edgecolors": DIAGONAL}, {"color": DIAGONAL}
     axes[0].scatter([], [], s=34, lw=1.4, label="predicted", **hollow)
     axes[0].scatter([], [], s=34, lw=0, label=agent_label(str(part["agent"].iloc[0])), **full)

@@ -86,7 +86,7 @@ def _place_beside(file: Path, date: str) -> Path:
     """`predictions.2026-11-23T034702Z.parquet`, or with a number if that is taken."""
     name = f"{file.stem}.{date.replace(':', '')}"
     names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
-    return next(place for each in names if not (place := file.with_name(each + file.suffix)).exists())
+    return next(path for each in names if not (path := file.with_name(each + file.suffix)).exists())
 
 
 def read_predictions(file: str | os.PathLike) -> "tuple[pd.DataFrame, dict[str, str]]":

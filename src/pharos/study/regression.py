@@ -161,10 +161,10 @@ def _errors_without_the_task(design: np.ndarray, residuals: np.ndarray, tasks: S
     """
     basis, _ = np.linalg.qr(design)
     errors = np.empty(len(residuals))
-    places: dict[Any, list[int]] = {}
+    rows_by_task: dict[Any, list[int]] = {}
     for row, task in enumerate(tasks or range(len(residuals))):
-        places.setdefault(task, []).append(row)
-    for rows in places.values():
+        rows_by_task.setdefault(task, []).append(row)
+    for rows in rows_by_task.values():
         remainder = np.eye(len(rows)) - basis[rows] @ basis[rows].T
         if len(rows) == 1:
             remainder = np.maximum(remainder, 1e-12)

@@ -63,7 +63,7 @@ class FinishedRuns:
     damaged: Mapping[str, str]
 
 
-def finished_runs(study: Specification, place: Path) -> FinishedRuns:
+def finished_runs(study: Specification, directory: Path) -> FinishedRuns:
     """Read every finished run of a study once; one that cannot be read is named and left out.
 
     Raises:
@@ -74,11 +74,11 @@ def finished_runs(study: Specification, place: Path) -> FinishedRuns:
     rows, points, damaged = [], [], {}
     for run in study.runs:
         try:
-            record = _worker.run_record(place / "runs" / run.id)
+            record = _worker.run_record(directory / "runs" / run.id)
             if record is None or record["status"] != _worker.FINISHED:
                 continue
-            curve = run_curve(place, run.id)
-            row = {"id": run.id} | row_of(run, record, curve, place / "runs" / run.id)
+            curve = run_curve(directory, run.id)
+            row = {"id": run.id} | row_of(run, record, curve, directory / "runs" / run.id)
         except FileFormatError as error:
             damaged[run.id] = str(error)
             continue
@@ -86,7 +86,7 @@ def finished_runs(study: Specification, place: Path) -> FinishedRuns:
         points.append(curve.assign(id=run.id, **described(run)))
     if not rows:
         raise ParameterError(
-            f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first"
+            f"{directory}: no run of {study.name!r} is finished; execute `pharos study run` first"
             + (f" ({len(damaged)} damaged: {next(iter(damaged.values()))})" if damaged else "")
         )
     return FinishedRuns(pd.DataFrame(rows), pd.concat(points, ignore_index=True), damaged)
@@ -240,7 +240,7 @@ def hardness_table(
     """
     import pandas as pd
 
-    study, place = opened(source, folder)
+    study, directory = opened(source, folder)
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     for run in study.runs:
         key = (run.instance, run.chance)
@@ -249,14 +249,14 @@ def hardness_table(
         if progress is not None:
             progress(f"hardness of {run.instance}, {run.chance}")
         plain = {**run.config, "chance": PLAIN}
-        own = _measured(study, place, run.config)
-        without = _measured(study, place, plain) if run.chance != "plain" else own
+        own = _measured(study, directory, run.config)
+        without = _measured(study, directory, plain) if run.chance != "plain" else own
         rows[key] = {"environment": run.cell["environment"], "instance": run.instance, "chance": run.chance}
         rows[key] |= _row_of_measures(study.hardness.measures, own, without)
     return pd.DataFrame(list(rows.values()))
 
 
-def hardness_cost(study: Specification, place: Path, tasks: Container[tuple[str, str]]) -> tuple[int, float]:
+def hardness_cost(study: Specification, directory: Path, tasks: Container[tuple[str, str]]) -> tuple[int, float]:
     """(number of tasks that `hardness_table` has to measure, the seconds that this takes at most).
 
     Building the state spaces comes on top.
@@ -265,7 +265,7 @@ def hardness_cost(study: Specification, place: Path, tasks: Container[tuple[str,
     for run in study.runs:
         if (run.instance, run.chance) in tasks:
             for config in (run.config, {**run.config, "chance": PLAIN}):
-                cache, dependencies = ResultCache(place / "hardness"), _dependencies(study, config)
+                cache, dependencies = ResultCache(directory / "hardness"), _dependencies(study, config)
                 stored = (cache.get(dependencies) or {"measures": {}})["measures"]
                 missing[cache.file(dependencies)] = sum(name not in stored for name in study.hardness.measures)
     return sum(number > 0 for number in missing.values()), sum(missing.values()) * study.hardness.budget
@@ -304,8 +304,8 @@ def _dependencies(study: Specification, config: Mapping[str, Any]) -> dict[str, 
     return dependencies
 
 
-def _measured(study: Specification, place: Path, config: Mapping[str, Any]) -> dict[str, Any]:
-    cache, dependencies = ResultCache(place / "hardness"), _dependencies(study, config)
+def _measured(study: Specification, directory: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+    cache, dependencies = ResultCache(directory / "hardness"), _dependencies(study, config)
     stored = cache.get(dependencies) or {"measures": {}, "num_states": None}
     missing = [name for name in study.hardness.measures if name not in stored["measures"]]
     if missing:
@@ -389,8 +389,8 @@ def _key(parameters: Mapping[str, Any]) -> str:
 def paper_instance(environment: str, parameters: Mapping[str, Any]) -> int | None:
     """The number of the instance among the blocks of its class in the paper's appendix C, counted from 1; None if not
     there."""
-    place = _paper_instances().get((environment, _key(parameters)))
-    return None if place is None else place[1]
+    entry = _paper_instances().get((environment, _key(parameters)))
+    return None if entry is None else entry[1]
 
 
 # Regret of each cell, predicted before its runs by measures of representations ----------------------------------------

@@ -120,26 +120,26 @@ def attempt_run(
 def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, Path]], folder: Path) -> dict[str, str]:
     """Call the runner, and put every run into its place, finished or failed; return HalfAsMany by id of the others."""
     began = time.perf_counter()
-    first, *others = places = [partial for _, _, partial in todo]
+    first, *others = partials = [partial for _, _, partial in todo]
     with redirected_output(first / "log.txt"):
         try:
-            errors = list(runner([config for config, _, _ in todo], places, folder / BATCHES))
+            errors = list(runner([config for config, _, _ in todo], partials, folder / BATCHES))
         except Exception as error:
             traceback.print_exc()
             errors = [in_one_line(error)] * len(todo)
     left: dict[str, str] = {
         id: reason for (_, id, _), reason in zip(todo, errors, strict=True) if isinstance(reason, HalfAsMany)
     }
-    for place in others:
-        shutil.copyfile(first / "log.txt", place / "log.txt")
+    for partial in others:
+        shutil.copyfile(first / "log.txt", partial / "log.txt")
     seconds = (time.perf_counter() - began) / len(todo)
-    for (config, id, place), reason in zip(todo, errors, strict=True):
+    for (config, id, partial), reason in zip(todo, errors, strict=True):
         if id in left:
             continue
-        if read_status(place) != FINISHED:
+        if read_status(partial) != FINISHED:
             missing = "the runner returned without a finished run.json and a curve"
-            write_failure(place, config, id, reason or missing, seconds)
-        publish_run(place, folder, id)
+            write_failure(partial, config, id, reason or missing, seconds)
+        publish_run(partial, folder, id)
     return left
 
 
@@ -164,15 +164,15 @@ def publish_run(partial: Path, folder: Path, id: str) -> None:
             storage.sync(path)
     runs = storage.inside(folder, "runs")
     runs.mkdir(parents=True, exist_ok=True)
-    place = runs / id
-    if place.exists():
+    target = runs / id
+    if target.exists():
         old = folder / "partial" / f"{id}.failed"
         _remove(old)
-        os.rename(place, old)
-        os.rename(partial, place)
+        os.rename(target, old)
+        os.rename(partial, target)
         _remove(old)
     else:
-        os.rename(partial, place)
+        os.rename(partial, target)
     storage.sync(runs)
 
 

@@ -248,8 +248,8 @@ class OutcomeRows:
         """(R,) positions of the first outcomes of some rows among the successors."""
         return rows * self.num_outcomes if self.offsets is None else self.offsets[rows].astype(np.int64)
 
-    def places(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(index in `rows`, place among the successors) of all entries of some rows."""
+    def entry_indices(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(index in `rows`, index among the successors) of all entries of some rows."""
         first = self.begins(rows)
         counts = self.begins(rows + 1) - first
         which = np.repeat(np.arange(len(rows)), counts)
@@ -263,11 +263,11 @@ class OutcomeRows:
             vectors = probabilities.reshape(-1, self.num_outcomes)[rows] if codes is None else palette[codes]
             which, k = np.nonzero(vectors)
             return which, self.successors.reshape(-1, self.num_outcomes)[rows][which, k], vectors[which, k]
-        which, places = self.places(rows)
+        which, indices = self.entry_indices(rows)
         if codes is None:
-            return which, self.flat[places], probabilities[places]
+            return which, self.flat[indices], probabilities[indices]
         first = np.searchsorted(which, np.arange(len(rows)))
-        return which, self.flat[places], palette[codes[which], np.arange(len(which)) - first[which]]
+        return which, self.flat[indices], palette[codes[which], np.arange(len(which)) - first[which]]
 
     def of_states(self, states: np.ndarray, num_actions: int) -> dict[int, OutcomesOfState]:
         """The outcomes of some states."""
@@ -357,7 +357,7 @@ class OutcomeCheck:
                 self._refuse("successors", f"{pair} has padding that does not repeat its first outcome")
         return counts, first
 
-    def _sizes(self, probabilities: np.ndarray, name: str, whose: Callable[[int], str]) -> np.ndarray:
+    def _sizes(self, probabilities: np.ndarray, name: str, source: Callable[[int], str]) -> np.ndarray:
         """(R,) how many of the probabilities (R, K) of each row are not 0; they come first and sum to 1."""
         with np.errstate(invalid="ignore", over="ignore"):
             possible = probabilities > 0
@@ -368,7 +368,7 @@ class OutcomeCheck:
             row = int((~good).argmax())
             shown = ", ".join(map(str, probabilities[row, :8].tolist())) + (", ..." if self.most > 8 else "")
             expected = "expected positive ones that sum to 1, then 0"
-            self._refuse(name, f"{whose(row)} has the probabilities {shown}; {expected}")
+            self._refuse(name, f"{source(row)} has the probabilities {shown}; {expected}")
         return np.asarray(possible.sum(axis=1))
 
     def _check_range(self, next_states: np.ndarray, rows: np.ndarray) -> None:

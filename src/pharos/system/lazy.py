@@ -24,7 +24,7 @@ def attributes(package: str) -> Callable[[str], object]:
     """
 
     @functools.cache
-    def places() -> dict[str, tuple[str, str]]:
+    def origins() -> dict[str, tuple[str, str]]:
         module = sys.modules[package]
         tree = ast.parse(module.__loader__.get_source(package))  # type: ignore[union-attr]  # also inside of a zip
         blocks = [node for node in tree.body if isinstance(node, ast.If)]
@@ -32,9 +32,9 @@ def attributes(package: str) -> Callable[[str], object]:
         return {alias.asname or alias.name: (str(node.module), alias.name) for node in imports for alias in node.names}
 
     def attribute(name: str) -> object:
-        if name.startswith("__") or name not in places():
+        if name.startswith("__") or name not in origins():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module, name_there = places()[name]
+        module, name_there = origins()[name]
         if module == package:
             return importlib.import_module(f"{package}.{name_there}")
         value = getattr(importlib.import_module(module), name_there)

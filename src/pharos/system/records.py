@@ -122,7 +122,7 @@ def split_options(cls: type[T], options: Mapping[str, Any]) -> tuple[T, dict[str
 # Records --------------------------------------------------------------------------------------------------------------
 
 
-def parse_record(cls: type[T], entry: object, whose: str, optional: Collection[str] = ()) -> T:
+def parse_record(cls: type[T], entry: object, source: str, optional: Collection[str] = ()) -> T:
     """An object of a dataclass from its entries; dataclasses among fields by their `from_dict`, or likewise.
 
     A whole number is a number; no value is converted, so that digests of the entries stay what they are.
@@ -135,25 +135,25 @@ def parse_record(cls: type[T], entry: object, whose: str, optional: Collection[s
     """
     names = [each.name for each in _fields(cls)]
     if not isinstance(entry, Mapping):
-        raise FileFormatError(f"{whose} is {repr(entry)[:SHOWN]}; expected {', '.join(names)}")
+        raise FileFormatError(f"{source} is {repr(entry)[:SHOWN]}; expected {', '.join(names)}")
     missing = [name for name in names if name not in entry and name not in optional]
     unknown = [name for name in entry if name not in names]
     if missing or unknown:
         wrong = f"lacks {', '.join(missing)}" if missing else f"has the unknown entry {str(unknown[0])[:SHOWN]!r}"
-        raise FileFormatError(f"{whose} {wrong}; expected {', '.join(names)}")
+        raise FileFormatError(f"{source} {wrong}; expected {', '.join(names)}")
     hints = get_type_hints(cls)
-    return cls(**{name: _checked(value, hints[name], f"{whose}: {name}") for name, value in entry.items()})
+    return cls(**{name: _checked(value, hints[name], f"{source}: {name}") for name, value in entry.items()})
 
 
-def _checked(value: object, hint: object, whose: str) -> object:
+def _checked(value: object, hint: object, source: str) -> object:
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if is_dataclass(hint) and isinstance(hint, type) and isinstance(value, Mapping):
-        return getattr(hint, "from_dict", lambda entry: parse_record(hint, entry, whose))(value)
+        return getattr(hint, "from_dict", lambda entry: parse_record(hint, entry, source))(value)
     kinds = inner if kind is types.UnionType else (int, float) if kind is float else (kind,)
     is_number = isinstance(value, bool) and bool not in kinds  # Python counts truths as numbers
     if kind is not Any and (is_number or not isinstance(value, kinds)):
         expected = getattr(hint, "__name__", hint) if not inner or kind is types.UnionType else "an object"
-        raise FileFormatError(f"{whose} is {repr(value)[:SHOWN]}; expected {expected}")
+        raise FileFormatError(f"{source} is {repr(value)[:SHOWN]}; expected {expected}")
     if isinstance(value, Mapping) and kind is Mapping and inner[1] is not Any:
-        return {name: _checked(each, inner[1], f"{whose}: {name}") for name, each in value.items()}
+        return {name: _checked(each, inner[1], f"{source}: {name}") for name, each in value.items()}
     return value

@@ -124,12 +124,12 @@ class _Writer:
 
 def inside(root: Path, *names: str) -> Path:
     """The path of a folder within a folder of results; a symbolic link on the way below `root` is removed."""
-    place = root
+    path = root
     for name in names:
-        place = place / name
-        if place.is_symlink():
-            place.unlink()
-    return place
+        path = path / name
+        if path.is_symlink():
+            path.unlink()
+    return path
 
 
 def own_file(path: str, flags: int) -> int:
@@ -312,7 +312,7 @@ def _is_at(path: Path, file: TextIO) -> bool:
 
 
 def waiting_lock(
-    folder: Path, error: type[PharosError], activity: str, tell: Callable[[str], Any]
+    folder: Path, error: type[PharosError], activity: str, on_wait: Callable[[str], Any]
 ) -> contextlib.ExitStack:
     """Hold a folder as `lock` does, waiting while another process holds it; `tell` is called once, with a line.
 
@@ -326,7 +326,7 @@ def waiting_lock(
             return held
         except error:
             if not is_announced:
-                tell(f"{folder}: another process is {activity} there; waiting until it is done")
+                on_wait(f"{folder}: another process is {activity} there; waiting until it is done")
                 is_announced = True
             time.sleep(WAITING_SECONDS)
 
@@ -574,21 +574,21 @@ def cache_directory() -> Path:
     if folder := os.environ.get("PHAROS_CACHE_DIR"):
         return Path(folder).expanduser()
     try:
-        place, problem = _of_user(), ""
+        directory, problem = _of_user(), ""
     except RuntimeError:
-        place, problem = None, "there is no home directory"
-    if place is not None:
-        problem = _problem_of(place)
-    if place is None or problem:
-        place = temporary_folder("pharos-")
-        os.environ["PHAROS_CACHE_DIR"] = str(place)
+        directory, problem = None, "there is no home directory"
+    if directory is not None:
+        problem = _problem_of(directory)
+    if directory is None or problem:
+        directory = temporary_folder("pharos-")
+        os.environ["PHAROS_CACHE_DIR"] = str(directory)
         warnings.warn(
             f"{problem}; state spaces and compiled code go to a temporary folder and are deleted on exit: "
             f"to keep them set PHAROS_CACHE_DIR",
             RuntimeWarning,
             stacklevel=2,
         )
-    return place
+    return directory
 
 
 def _of_user() -> Path:
@@ -600,12 +600,12 @@ def _of_user() -> Path:
 
 
 @cache
-def _problem_of(place: Path) -> str:
+def _problem_of(folder: Path) -> str:
     try:
-        place.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        return f"the cache {place} cannot be made ({error.strerror})"
-    return "" if os.access(place, os.W_OK | os.X_OK) else f"the cache {place} cannot be written to"
+        return f"the cache {folder} cannot be made ({error.strerror})"
+    return "" if os.access(folder, os.W_OK | os.X_OK) else f"the cache {folder} cannot be written to"
 
 
 def temporary_folder(prefix: str) -> Path:

@@ -51,8 +51,8 @@ def nodes_and_data(text: str, name: str, error: type[PharosError] = ParameterErr
         return root, yaml.load(text, Loader)
     except yaml.YAMLError as problem:
         mark = getattr(problem, "problem_mark", None)
-        place = f"{name}:{mark.line + 1}" if mark is not None else name
-        raise error(f"{place}: {getattr(problem, 'problem', None) or 'this is no YAML'}") from problem
+        position = f"{name}:{mark.line + 1}" if mark is not None else name
+        raise error(f"{position}: {getattr(problem, 'problem', None) or 'this is no YAML'}") from problem
     except RecursionError:
         raise error(f"{name}: is nested too deeply; expected a mapping with names") from None
     except ParameterError as problem:

@@ -68,11 +68,11 @@ def report(
     """
     from pharos.study.predictions import PredictedCells
 
-    tell = progress or (lambda _: None)
+    report_progress = progress or (lambda _: None)
     predicted = PredictedCells.of(predictions)
-    study, place = opened(source, folder, trust=trust)
-    results = study_results(study, place, tell)
-    target = Path(out) if out is not None else place / "report"
+    study, directory = opened(source, folder, trust=trust)
+    results = study_results(study, directory, report_progress)
+    target = Path(out) if out is not None else directory / "report"
     target.mkdir(parents=True, exist_ok=True)
     for name in ("figures", "tables"):
         inside(target, name)
@@ -80,12 +80,12 @@ def report(
     figures: dict[str, dict[str, bytes] | None] = {}
     curves = all_curves(results.points, results.profiles)
     for name, draw in all_figures(curves, results.cells, results.models, results.agents).items():
-        tell(f"drawing {name}")
+        report_progress(f"drawing {name}")
         images = figures[name] = save_for_page(draw, target / "figures" / name)
         if images and name in curves:
             images["curves"] = curves[name].to_json().encode()
     # Predictors on classes left out, with their figures and tables
-    tell("leaving out classes")
+    report_progress("leaving out classes")
     judgement, outcomes = judged(results, predicted)
     more = {"outcomes": outcomes}
     if predicted is not None:
@@ -96,7 +96,7 @@ def report(
         more["predictions" if predicted is not None else "unseen_classes"] = judgement
     tables = _write_tables(target / "tables", results, more)
     # The page
-    tell("drawing instances")
+    report_progress("drawing instances")
     sections = sections_of(results, figures)
     if judgement is not None:
         models = next((i for i, each in enumerate(sections) if each.title == MODELS), len(sections) - 2)

@@ -106,7 +106,7 @@ def data_table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> R
         columns.append(Column(in_words(str(name)), kind))
         digits_of.append(0 if is_number and _is_whole(data[name].to_numpy(float)) else digits)
     rows = [
-        [_cell(value, places) for value, places in zip(line, digits_of, strict=True)]
+        [_cell(value, digits) for value, digits in zip(line, digits_of, strict=True)]
         for line in data.itertuples(index=False)
     ]
     return ReportTable(caption, columns, rows)
