@@ -51,7 +51,7 @@ def empirical_ntk(
         networks: how many; the standard error falls with the square root.
         seed: of PyTorch's random numbers, which are left as they were.
     Returns:
-        (N, M) float32; symmetric where `others` is None.
+        (N, M) float32; symmetric if `others` is None.
     Raises:
         MissingExtra: PyTorch is not installed. ParameterError: no network, or none was asked for; its outputs are not
             (N, A), or its gradients are not finite.
