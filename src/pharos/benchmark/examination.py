@@ -17,7 +17,7 @@ from pharos.agents import CLASS, agents, algorithm, form_of, generator_of, is_kn
 from pharos.benchmark.suite import BenchmarkTask, Protocol
 from pharos.errors import ParameterError, UnknownName
 from pharos.policies import PolicyLike, SB3Model
-from pharos.system.sources import find, load
+from pharos.system.sources import find_source, load_source
 from pharos.training import (
     BudgetSpent,
     CountedEnv,
@@ -288,7 +288,7 @@ def learner_of(agent: str | Callable[..., Any], hyperparameters: Mapping[str, An
     setting = dict(hyperparameters or {})
     code: Any = agent
     if isinstance(agent, str) and not is_known(agent):
-        code = load(find(agent))
+        code = load_source(find_source(agent))
     if not isinstance(code, str):
         form = form_of(str(agent), code)
         if form not in (CLASS, "generator"):
@@ -305,7 +305,7 @@ def learner_of(agent: str | Callable[..., Any], hyperparameters: Mapping[str, An
 def _file_of(agent: str | Callable[..., Any]) -> str | None:
     """The file with the code of an agent of the user's own."""
     if isinstance(agent, str):
-        return None if is_known(agent) else find(agent).file
+        return None if is_known(agent) else find_source(agent).file
     return getattr(getattr(agent, "__code__", None), "co_filename", None)
 
 

@@ -67,7 +67,7 @@ from pharos.benchmark.diagnosis import (
 from pharos.benchmark.latex import latex_of
 from pharos.benchmark.properties import known_properties, purpose_of
 from pharos.benchmark.suite import BenchmarkTask, Ladder, Suite
-from pharos.plots import agent_name
+from pharos.plots import agent_label
 from pharos.system import storage
 from pharos.system.wording import pluralize
 
@@ -371,7 +371,7 @@ def _residuals(contents: Contents) -> Element:
         row: list[str | Element] = [_task(task), *first, f"{own.value - expected:+.2f}", *last]
         lists[not is_own(contents, task, own.value)].append(row)
     heads = ["task", "observed", "predicted", "residual", "at the end", *(["shipped"] if is_beside else [])]
-    names = f"{' and '.join(agent_name(name) for name in SHIPPED[contents.predictor])} of pharos"
+    names = f"{' and '.join(agent_label(name) for name in SHIPPED[contents.predictor])} of pharos"
     captions = (
         f"Worse than theory, and by more than {OWN:g} than {names} (the worse of two): look for a bug here.",
         f"Theory is too hopeful: {names} fares alike.",

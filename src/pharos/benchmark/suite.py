@@ -25,7 +25,7 @@ import numpy as np
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
 from pharos.mdp import ChanceSetting, TabularMDP
 from pharos.system import storage
-from pharos.system.records import read
+from pharos.system.records import parse_record
 from pharos.system.sources import is_reference, untrusted_code
 from pharos.system.storage import check_name
 from pharos.training import Task
@@ -234,13 +234,13 @@ def suite_of(entry: object, whose: str) -> Suite:
     for each in _list(entry["ladders"], f"{whose}: ladders"):
         of = f"{whose}: ladder {each.get('axis')}"
         tasks = _tasks(each.get("tasks"), str(each.get("axis")), of)
-        ladders.append(replace(read(Ladder, {**each, "tasks": ()}, of, ("measure",)), tasks=tasks))
+        ladders.append(replace(parse_record(Ladder, {**each, "tasks": ()}, of, ("measure",)), tasks=tasks))
     settings = entry["hyperparameters"]
     if not isinstance(settings, dict) or not all(isinstance(each, dict) for each in settings.values()):
         raise FileFormatError(f"{whose}: hyperparameters are {str(settings)[:60]}; expected some of each baseline")
     suite = Suite(
         str(entry["name"]),
-        read(Protocol, entry["protocol"], f"{whose}: protocol"),
+        parse_record(Protocol, entry["protocol"], f"{whose}: protocol"),
         _tasks(entry["core"], CORE, f"{whose}: core"),
         tuple(ladders),
         str(entry["digest"]),
@@ -270,7 +270,7 @@ def _tasks(entries: object, axis: str, whose: str) -> tuple[BenchmarkTask, ...]:
     optional = [each.name for each in fields(BenchmarkTask) if each.name not in ("name", "environment", "digest")]
     try:
         return tuple(
-            read(BenchmarkTask, {**each, "axis": axis}, f"{whose}: task {str(each.get('name'))[:60]}", optional)
+            parse_record(BenchmarkTask, {**each, "axis": axis}, f"{whose}: task {str(each.get('name'))[:60]}", optional)
             for each in _list(entries, whose)
         )
     except ParameterError as error:  # of a name

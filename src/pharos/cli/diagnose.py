@@ -27,10 +27,10 @@ def diagnose(
     """Train an agent on twelve small worlds, and say what is wrong with it, by which number, and what to try.
 
     Args:
-        hyperparameters: A hyperparameter of the agent.
-        seeds: Of each world, from 0 on.
-        steps: Of each run; the table of known faults has 4,000.
-        out: Write the page there, as Markdown.
+        hyperparameters: Set a hyperparameter of the agent.
+        seeds: Number of seeds of each world, from 0 on.
+        steps: Training steps of each run; the table of known faults has 4,000.
+        out: Write the page to this file, as Markdown.
     """
     from pharos import benchmark
 
@@ -56,7 +56,7 @@ def _print(diagnosis: "Diagnosis") -> None:
     print_table(
         f"{diagnosis.agent}: {diagnosis.verdict}",
         ("", "what no healthy agent shows", "what to try"),
-        ((str(place), each.wrong, each.advice) for place, each in enumerate(diagnosis.findings, start=1)),
+        ((str(number), each.wrong, each.advice) for number, each in enumerate(diagnosis.findings, start=1)),
     )
     print_table(
         "Nearest known agents",

@@ -2,7 +2,7 @@
 
 Common arguments: transitions: see kernels/outcomes.py. Node n = s W + b is the state s after the executed action b; W =
 A under sticky actions, else 1. A choice a of a node executes a, its b or any action, as the weights (chosen, previous,
-uniform) have it, and an executed action e leads from s to nodes t W + e, or t where W is 1. With first_chosen and the
+uniform) have it, and an executed action e leads from s to nodes t W + e, or t if W is 1. With first_chosen and the
 sets of available actions behind the weights, a b that is not available counts as none, and a uniform action is one that
 is. allowed (N, A) bool: the choices that count; count (N,) integers: how many a node has.
 
@@ -62,11 +62,11 @@ def number_components(transitions, weights, allowed, count, component, path, wai
     num_states, num_actions = size_of(transitions)
     num_nodes = len(component)
     width = num_nodes // num_states
-    action = np.empty(num_nodes, np.int32)  # of the nodes on the path, where to go on looking
+    action = np.empty(num_nodes, np.int32)  # of the nodes on the path: the action to go on with
     branch = np.empty(num_nodes, np.int32)
     is_root = np.empty(num_nodes, np.bool_)  # whether a node of the path is the first one seen of its component
     component[:] = 0
-    number, last = 1, num_nodes  # numbers of nodes on the way go up from 1, those of finished components down from N
+    number, last = 1, num_nodes  # numbers of nodes on the way go up from 1, numbers of finished components down from N
     tail = 0
     for start in range(num_nodes):
         depth = -1

@@ -1,7 +1,7 @@
 """Distributions of states under a policy, moved one step forward.
 
 transitions: see kernels/outcomes.py; live (S,) bool: states in which episodes go on; now, after (S, W) float64:
-the distribution over states, W = 1, or over pairs (state, previously executed action), W = A; that of the first step
+the distribution over states, W = 1, or over pairs (state, previously executed action), W = A; the one of the first step
 has W = 1. policy (S, B, A) probabilities, B = 1 or, for policies that look at the previous action, A; weights: (chosen,
 previous, uniform), with sets behind, see kernels/bellman.py.
 """
@@ -137,7 +137,7 @@ def support(transitions, live, policy, weights, reachable):
     num_actions = size_of(transitions)[1]
     width = reachable.shape[1]
     by_action = width > 1
-    alone = np.zeros_like(reachable)  # a row is 1 at one place while its node is looked at
+    alone = np.zeros_like(reachable)  # a row is 1 at one index while its node is looked at
     nodes = np.flatnonzero(reachable.reshape(-1) > 0.0)
     stack = np.empty(reachable.size, np.int64)
     stack[: len(nodes)] = nodes

@@ -6,10 +6,10 @@ be written to here, nor returned.
 
 Kernels take `transitions`, one of three things:
 
-- a table (S, A) of next states, -1 where the episode ends: an array, or `PackedIndices`;
+- a table (S, A) of next states, -1 if the episode ends: an array, or `PackedIndices`;
 - several outcomes, as a tuple (successors (N,), offsets, codes, weights, (S, A), each). The outcomes of (s, a), row =
-  s A + a, are successors[row K : (row + 1) K], or successors[offsets[row] : offsets[row + 1]] where there are offsets.
-  Their probabilities are weights[codes[row]], or, without codes, weights at the same places as the successors. Without
+  s A + a, are successors[row K : (row + 1) K], or successors[offsets[row] : offsets[row + 1]] if there are offsets.
+  Their probabilities are weights[codes[row]], or, without codes, weights at the same indices as the successors. Without
   offsets the last ones of a row may have probability 0: they repeat its first successor. each: K, or, so that the
   compiler knows it and unrolls loops (twice as fast), a tuple of K zeros (`each_of`);
 - a pair (`transitions` of the first two kinds, p): with probability p a state stays what it is, else they hold. Staying
@@ -18,10 +18,10 @@ Kernels take `transitions`, one of three things:
 `outcomes_of` and `outcome` give them one by one, `expectation` adds up values. Loops over tables cost nothing more:
 their indices are unsigned, as signed ones would be checked at each read for counting from the end.
 
-State spaces store the possible outcomes, row after row, and their probabilities as codes of a palette. Row s A + a is
-that of action a in state s. Probabilities are compared as their bits, uint64: 0 is an impossible outcome. The palette
-(capacity, K) uint64 has the distinct rows of probabilities, the possible ones in their order, then zeros, numbered in
-the order in which they appear; a table of slots finds them by their hash. K is the most outcomes of a row.
+State spaces store the possible outcomes, row after row, and their probabilities as codes of a palette. Row s A + a
+belongs to action a in state s. Probabilities are compared as their bits, uint64: 0 is an impossible outcome. The
+palette (capacity, K) uint64 has the distinct rows of probabilities, the possible ones in their order, then zeros,
+numbered in the order in which they appear; a table of slots finds them by their hash. K is the most outcomes of a row.
 """
 
 import operator
@@ -125,12 +125,12 @@ def each_of(num_outcomes, unrolled):
 
 
 def _is_lazy(transitions):
-    """Whether the type is that of a pair (transitions, probability of staying)."""
+    """Whether the type is a pair (transitions, probability of staying)."""
     return isinstance(transitions, types.BaseTuple) and len(transitions) == 2
 
 
 def is_table(transitions):
-    """Whether the type is that of a table of next states."""
+    """Whether the type is a table of next states."""
     return isinstance(transitions, types.Array | PackedIndicesType)
 
 
@@ -189,25 +189,25 @@ def _outcome(transitions, s, a, k):
     if isinstance(transitions[2], types.NoneType):
 
         def one_by_one(transitions, s, a, k):
-            place, is_padding = _place(transitions, s * transitions[4][1] + a, k)
-            return transitions[0][place], 0.0 if is_padding else transitions[3][place]
+            index, is_padding = _outcome_index(transitions, s * transitions[4][1] + a, k)
+            return transitions[0][index], 0.0 if is_padding else transitions[3][index]
 
         return one_by_one
 
     def by_palette(transitions, s, a, k):
         row = s * transitions[4][1] + a
-        place, _ = _place(transitions, row, k)
-        return transitions[0][place], transitions[3][uint64(transitions[2][uint64(row)]), uint64(k)]
+        index, _ = _outcome_index(transitions, row, k)
+        return transitions[0][index], transitions[3][uint64(transitions[2][uint64(row)]), uint64(k)]
 
     return by_palette
 
 
-def _place(transitions, row, k):
-    """(place of successor k of a row, whether k is padding, so that it repeats the last one)."""
+def _outcome_index(transitions, row, k):
+    """(index of successor k of a row, whether k is padding, so that it repeats the last one)."""
 
 
-@overload(_place)
-def _place_of(transitions, row, k):
+@overload(_outcome_index)
+def _typed_outcome_index(transitions, row, k):
     if isinstance(transitions[1], types.NoneType):
         if isinstance(transitions[5], types.BaseTuple):
             return lambda transitions, row, k: (uint64(row) * uint64(len(transitions[5])) + uint64(k), False)
@@ -217,8 +217,8 @@ def _place_of(transitions, row, k):
 
     def ragged(transitions, row, k):
         first, after = transitions[1][uint64(row)], transitions[1][uint64(row) + uint64(1)]
-        place = first + k
-        return uint64(min(place, after - 1)), place >= after
+        index = first + k
+        return uint64(min(index, after - 1)), index >= after
 
     return ragged
 
@@ -249,7 +249,7 @@ def _expectation(transitions, v, s, a):
 
 
 def _value(v, s, a):
-    """v[s], or v[s, a] where v depends on the executed action."""
+    """v[s], or v[s, a] if v depends on the executed action."""
 
 
 @overload(_value, jit_options={"forceinline": True})
@@ -336,7 +336,7 @@ def largest(transitions, x, states, sign, out):
 @interpreted_first("states")
 @kernel
 def mark_arrivals(transitions, states, out):
-    """out[t, a] = True where executing a in one of `states` may lead to t."""
+    """out[t, a] = True if executing a in one of `states` may lead to t."""
     for s in states:
         for a in range(out.shape[1]):
             for k in outcomes_of(transitions, s, a):
@@ -431,7 +431,7 @@ def encode(bits, counts, first_row, first, palette, size, table, codes):
     """codes[r] = the palette's code of row r's probabilities, for the rows from `first_row` on; new ones are entered.
 
     bits (N,): of the probabilities; those of row `first_row` begin at `first`. Returns (row, first, size) of the first
-    row that finds the palette full; row is len(counts) where there is none.
+    row that finds the palette full; row is len(counts) if there is none.
     """
     capacity, num_outcomes = palette.shape
     slots = table.shape[0]

@@ -1,6 +1,6 @@
 """Checks of arguments: each error names the argument, the value found, and the first entry that is wrong.
 
-`require_mdp` suggests what to write where a function gets something that an MDP can be made of; the others check the
+`require_mdp` suggests what to write if a function gets something that an MDP can be made of; the others check the
 parts of a TabularMDP.
 """
 
@@ -50,7 +50,7 @@ def _remedy(value: object) -> str:
 
 
 def as_array(value: object, name: str, dtype: npt.DTypeLike | None = None) -> np.ndarray:
-    """The argument `name` as an array; ParameterError where it is none, such as lists of several lengths."""
+    """The argument `name` as an array; ParameterError if it is none, such as lists of several lengths."""
     try:
         return np.asarray(value, dtype)
     except (ValueError, TypeError) as error:

@@ -153,7 +153,7 @@ def from_matrices(
         ends: whether a row that sums to less than 1 - 1e-6 ends the episode with the rest; or (S, A) probabilities
             of ending, which are then part of the sums of rows.
         available: (S, A) bool, the actions that exist in each state; None: all but those that R (S, A) pays -inf, and
-            those whose row is empty (in a state where not all rows are, and unless `ends` says what that means).
+            those whose row is empty (in a state in which not all rows are, and unless `ends` says what that means).
     Raises:
         ParameterError: shapes do not fit, or a probability or reward is out of range; or a row does not sum to 1:
             the message names the first one, and the likely reason; or a state that is not terminal has no available

@@ -109,7 +109,7 @@ def by_rows(value: object, name: str, axes: str | None) -> "csr_matrix":
     """(S A, S) CSR float64 with rows s A + a: a copy of an array, a list of matrices, or a sparse matrix.
 
     Args:
-        axes: "SAS", "ASS", or None: a list has one matrix an action, an array is (S, A, S), and where both orders fit
+        axes: "SAS", "ASS", or None: a list has one matrix an action, an array is (S, A, S), and if both orders fit
             it must be said.
     """
     from scipy import sparse

@@ -36,7 +36,7 @@ def observation_classes(
 ) -> np.ndarray:
     """Number the different observations of a state space.
 
-    Observations count as equal where their digests of 128 bits are: of 10^9 different ones two are taken for one with a
+    Observations count as equal if their digests of 128 bits are: of 10^9 different ones two are taken for one with a
     probability below 10^-20.
 
     Returns:
@@ -67,7 +67,7 @@ def history_aliasing(
     """Count the states that an observation of k frames does not tell apart, over all histories that play can have.
 
     A history is what the last k states of an episode can be; at its start the first state stands k times. A state
-    shares an observation where some history that ends in it gives the same frames as one that ends in another state.
+    shares an observation if some history that ends in it gives the same frames as one that ends in another state.
     `num_observations` are the different stacks of frames.
 
     Raises:

@@ -52,7 +52,7 @@ class DeepPolicy:
     Args:
         deterministic: the most probable action of a distribution, instead of the distribution.
         masked: whether the model was trained under action masks (MaskablePPO), which come with the observations then.
-        imposed: whether masks may be those of the batched engine, of whose networks the model itself knows nothing.
+        imposed: whether masks may be the masks of the batched engine, of whose networks the model itself knows nothing.
     Raises:
         ParameterError: the policy has a memory, so that its probabilities do not belong to observations; it needs masks
             and there are none, or takes none; or the VecNormalize that it was trained behind is missing.
@@ -109,7 +109,7 @@ def restricted(logits: np.ndarray, masks: np.ndarray) -> np.ndarray:
 class RecurrentDeepPolicy:
     """The policy of a model with an LSTM, of sb3-contrib: a `RecurrentPolicy`, the distribution itself.
 
-    Its state is that of the actor: hidden and cell states, (n, layers, size) float32 each.
+    Its state is the actor's: hidden and cell states, (n, layers, size) float32 each.
     """
 
     def __init__(self, model: RecurrentModel):
@@ -229,7 +229,7 @@ def memory_error(policy: object) -> ParameterError:
 
 
 def _as_policy_sees(observations: Observations, space: "Space") -> Observations:
-    """Images moved to channel first where Stable-Baselines3 has done so with those of the environment."""
+    """Images moved to channel first if Stable-Baselines3 has done so with the environment's."""
     if isinstance(observations, dict):
         from gymnasium.spaces import Dict
 
@@ -245,7 +245,7 @@ def _channel_first(observations: np.ndarray, space: "Space") -> np.ndarray:
 
 
 def check_observation(policy: object, space: "Space", name: object) -> None:
-    """ParameterError where a model was trained on observations of another kind or size, or with other numbers."""
+    """ParameterError if a model was trained on observations of another kind or size, or with other numbers."""
     model, name = getattr(policy, "model", policy), getattr(name, "name", name)
     normalizer = _normalizer(model)
     own = model if normalizer is None or not normalizer.norm_obs else normalizer.venv

@@ -25,7 +25,7 @@ _ENDLESS, _LOOK = 10_000, 64
 def shrinking(change: float, before: float, sweeps: int, gamma: float) -> float:
     """The factor, at most gamma, by which a sweep shrinks the largest change.
 
-    It is that of the last half of the sweeps: changes often shrink by much more than gamma in each.
+    It is the mean over the last half of the sweeps: changes often shrink by much more than gamma in each.
 
     Args:
         change: by the last of `sweeps` sweeps. before: by the one after half of them.
@@ -74,7 +74,7 @@ class Convergence:
         return bound <= self.tolerance
 
     def is_endless(self) -> bool:
-        """Whether 10,000 further sweeps would not suffice: near gamma = 1 on cycles, or where rounding moves values.
+        """Whether 10,000 further sweeps would not suffice: near gamma = 1 on cycles, or if rounding moves values.
 
         To be called after every sweep.
         """
@@ -104,7 +104,7 @@ def operations(mdp: TabularMDP, sweeps: float) -> float:
 
 
 def imprecise(mdp: TabularMDP, bound: float, tolerance: float, is_single: bool = False) -> PrecisionError:
-    """PrecisionError that 64-bit floats, or 32-bit ones where values are stored so, do not reach the tolerance."""
+    """PrecisionError that 64-bit floats, or 32-bit ones if values are stored so, do not reach the tolerance."""
     bits, end, advice = (32, "3.4e38", "use float64, ") if is_single else (64, "1.8e308", "")
     if not math.isfinite(bound):
         return PrecisionError(

@@ -1,6 +1,6 @@
-"""Total and average rewards in rational numbers, where floats are too short to tell or to hold a value.
+"""Total and average rewards in rational numbers, if floats are too short to tell or to hold a value.
 
-The numbers are those of the floats, rows divided by their exact sums. Policy iteration keeps an action unless another
+The numbers are the floats, rows divided by their exact sums. Policy iteration keeps an action unless another
 one is better, and begins with a policy that ends almost surely. So a policy that does not, later on, stays in a
 component in which no residual is negative and one is positive: the value is infinite. There is no other way to fail.
 """
@@ -59,14 +59,14 @@ def rational_values(
 
 
 def fractions_of(choices: "Choices") -> list[Row] | None:
-    """The rows as rational numbers, those of floats; None if they are too many."""
+    """The rows as rational numbers, equal to the floats; None if they are too many."""
     matrix = choices.matrix
     if matrix.nnz > MOST_ENTRIES:
         return None
     rows = []
     for i in range(matrix.shape[0]):
-        places = range(matrix.indptr[i], matrix.indptr[i + 1])
-        row = {int(matrix.indices[k]): Fraction(float(matrix.data[k])) for k in places}
+        entries = range(matrix.indptr[i], matrix.indptr[i + 1])
+        row = {int(matrix.indices[k]): Fraction(float(matrix.data[k])) for k in entries}
         rows.append((Fraction(float(choices.rewards[i])), row))
     return rows
 
@@ -123,7 +123,7 @@ def _too_many(count: int) -> PrecisionError:
 def eliminated(rows: list[Row], count: int, most: int) -> tuple[list[Fraction] | None, int]:
     """(x = r + P x by elimination without subtraction of probabilities; entries that it filled in).
 
-    x is None where some nodes never end, and where it would fill in more entries than `most`.
+    x is None if some nodes never end, or if it would fill in more entries than `most`.
     Source: Grassmann, Taksar and Heyman (1985).
     """
     rewards = [row[0] for row in rows]

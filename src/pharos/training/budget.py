@@ -59,7 +59,7 @@ CHECKED = 3
 """First policies of a run that are asked again."""
 AGAIN, FEW = 8, 128
 """Up to AGAIN times, as long as the answers together are FEW: a policy that samples seldom would answer the same by
-chance where there are few observations."""
+chance if there are few observations."""
 INFO = ("action_mask", "prob")
 """Entries of `info` that Gymnasium's own environments give as well; others say what an agent is to find out."""
 SEVERAL = (
@@ -127,7 +127,7 @@ class StepBudget:
 class CountedEnv(gymnasium.Wrapper):
     """The environment of a task, whose steps count against a budget.
 
-    Without a seed in its first `reset` it has that of the run, as its action space has, so that a run is the same
+    Without a seed in its first `reset` it has the seed of the run, as its action space has, so that a run is the same
     again. `copy()` gives another one with the same budget, for vector environments:
     `gymnasium.vector.SyncVectorEnv([env.copy] * 8)`.
 
@@ -135,7 +135,8 @@ class CountedEnv(gymnasium.Wrapper):
     pickled, nor be used in another process than the one that made it: nobody would count there.
 
     `info` has nothing of what an agent is to learn: neither the state nor its index, neither the executed action nor
-    what was earned without noise; INFO is what is left. Episodes begin where the task says: `reset` takes no options.
+    what was earned without noise; INFO is what is left. Episodes begin in the start states of the task: `reset` takes
+    no options.
     """
 
     def __init__(self, task: Task, budget: StepBudget, seed: int):
@@ -261,7 +262,7 @@ class Snapshots:
         return np.concatenate(tables)
 
     def _observations(self) -> Iterator[tuple[int, Any]]:
-        """Blocks of observations of all states, kept where they are small."""
+        """Blocks of observations of all states, kept if they are small."""
         if self._kept is not None:
             yield from self._kept
             return
@@ -389,7 +390,7 @@ class PolicyRecorder:
 
     def check_steps(self, curve: Curve) -> None:
         """Raise ParameterError if a curve ends elsewhere than it begins, and no step was counted."""
-        first, last = (curve.rows[place]["normalized_regret"] for place in (0, -1))
+        first, last = (curve.rows[index]["normalized_regret"] for index in (0, -1))
         if not self.budget.steps and abs(last - first) > TOLERANCE:
             raise not_stepped(self.budget.limit)
 
@@ -438,7 +439,7 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
     """Train with a generator, and evaluate the policy in force at each evaluation point, and uniform play before.
 
     Returns:
-        A row before the first step, that of uniform play, and one for each point; and the number of counted steps.
+        A row before the first step, for uniform play, and one for each point; and the number of counted steps.
     Raises:
         ParameterError: it is no generator of policies; or it has a second policy, or ends with another one than uniform
             play, when no step was counted; or whatever its code raises.

@@ -73,7 +73,7 @@ class Batch:
             [lane.best_actions(states[k * self.width : (k + 1) * self.width]) for k, lane in enumerate(self.lanes)]
         )
 
-    def greedy_actions(self, places: Sequence[int]) -> None:
+    def greedy_actions(self, indices: Sequence[int]) -> None:
         """None: these policies are no tables of states; they are queried about observations."""
 
     def policy(self, i: int) -> RunPolicy:
@@ -102,7 +102,7 @@ def make_batch(agent: str, runs: Sequence[BatchRun], *, device: str = "cpu", thr
     """A batch of runs of one group.
 
     Args:
-        device: of torch, where networks are; episodes and replay memories stay on the processor.
+        device: of torch, for the networks; episodes and replay memories stay on the processor.
         threads: of torch; None for one, as studies use processes.
     Raises:
         ParameterError: the engine lacks a hyperparameter, or the runs are of several groups.

@@ -17,18 +17,18 @@ def step_of_adam(parameters, gradients, means, squares, plans, length, size: tl.
     if step != 0.0:
         scale, first = tl.load(plans + run * 5), tl.load(plans + run * 5 + 1)
         second, eps = tl.load(plans + run * 5 + 2), tl.load(plans + run * 5 + 4)
-        place = tl.program_id(1) * size + tl.arange(0, size)
-        inside = place < length
-        place += run * length
-        gradient = scale * tl.load(gradients + place, mask=inside, other=0.0)
-        mean = tl.load(means + place, mask=inside, other=0.0)
-        square = tl.load(squares + place, mask=inside, other=0.0)
+        index = tl.program_id(1) * size + tl.arange(0, size)
+        inside = index < length
+        index += run * length
+        gradient = scale * tl.load(gradients + index, mask=inside, other=0.0)
+        mean = tl.load(means + index, mask=inside, other=0.0)
+        square = tl.load(squares + index, mask=inside, other=0.0)
         mean += (gradient - mean) * first
         square += (gradient * gradient - square) * second
-        tl.store(means + place, mean, mask=inside)
-        tl.store(squares + place, square, mask=inside)
-        old = tl.load(parameters + place, mask=inside, other=0.0)
-        tl.store(parameters + place, old - step * mean / (tl.sqrt(square) + eps), mask=inside)
+        tl.store(means + index, mean, mask=inside)
+        tl.store(squares + index, square, mask=inside)
+        old = tl.load(parameters + index, mask=inside, other=0.0)
+        tl.store(parameters + index, old - step * mean / (tl.sqrt(square) + eps), mask=inside)
 
 
 def adam(state: Sequence[Tensor], plans: Tensor) -> None:
