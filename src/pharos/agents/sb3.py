@@ -37,7 +37,7 @@ from pharos.agents.agent import (
 from pharos.environments import Environment
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.policies import PolicyLike, deep_policy
-from pharos.system.sources import find, is_reference, load
+from pharos.system.sources import find_source, is_reference, load_source
 
 if TYPE_CHECKING:
     from stable_baselines3.common.buffers import ReplayBuffer
@@ -83,7 +83,7 @@ def algorithm(agent: str | Callable[..., Any]) -> type:
     if not colon:
         raise UnknownName("agent", agent, agents())
     if not is_known(path):
-        return _class(agent, load(find(path)))
+        return _class(agent, load_source(find_source(path)))
     try:
         target = getattr(importlib.import_module(module), name)
         from stable_baselines3.common.base_class import BaseAlgorithm

@@ -16,7 +16,7 @@ from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.interaction.simulator import FrameStack, Interaction, RewardChannel, SimulatedEnv, Simulator, Stream
 from pharos.observations import NO_ACTION, Index, Seen
-from pharos.system.records import split
+from pharos.system.records import split_options
 
 if TYPE_CHECKING:
     from pharos.drawing import Window
@@ -51,7 +51,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "ansi"], "render_fps": 15}
 
     def __init__(self, environment: Environment | str, *, render_mode: str | None = None, **options: Any):
-        interaction, parameters = split(Interaction, options)
+        interaction, parameters = split_options(Interaction, options)
         self.simulator = simulator = Simulator(environment, interaction, parameters)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ParameterError(
@@ -114,7 +114,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         return np.asarray(self.simulator.action_masks(self._started()[None])[0])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; `options={"state": ...}` sets its state (D integers)."""
+        """Start an episode; `options={"state": ...}` is the start state (D integers)."""
         super().reset(seed=seed)
         simulator = self.simulator
         if self._reward_channel is not None:

@@ -149,7 +149,7 @@ class GymnaxEnv(environment.Environment):
         outcome = _first_above(params.cumulative[state.index, executed], jax.random.uniform(key_outcome))
         next_index = params.successors[state.index, executed, outcome]
         reward = params.rewards[state.index, executed]
-        if self._reward_noise:  # its key leaves the keys of the steps unchanged
+        if self._reward_noise:  # its key does not change the keys of the steps
             reward += self._reward_noise * jax.random.normal(jax.random.fold_in(key, 3))
         after = EnvState(time=state.time + 1, index=next_index, previous=executed)
         is_over = params.ends[next_index]
@@ -223,11 +223,11 @@ def _padded_outcomes(mdp: TabularMDP) -> tuple[np.ndarray, np.ndarray]:
     which = np.asarray(outcomes.which)
     order = np.argsort(which, kind="stable")
     which = which[order]
-    column = np.arange(len(which)) - np.searchsorted(which, which)
-    pairs, width = num_states * num_actions, int(column.max(initial=0)) + 1
+    index = np.arange(len(which)) - np.searchsorted(which, which)
+    pairs, width = num_states * num_actions, int(index.max(initial=0)) + 1
     successors, cumulative = np.full((pairs, width), num_states), np.zeros((pairs, width))
-    successors[which, column] = np.asarray(outcomes.states)[order]
-    cumulative[which, column] = np.asarray(outcomes.probabilities)[order]
+    successors[which, index] = np.asarray(outcomes.states)[order]
+    cumulative[which, index] = np.asarray(outcomes.probabilities)[order]
     counts = np.bincount(which, minlength=pairs)
     cumulative = np.cumsum(cumulative, axis=1)
     cumulative[np.arange(width) >= counts[:, None] - 1] = 1.0

@@ -22,7 +22,7 @@ class SB3VecEnv(VecEnv):
     Discrete observations such as "index" come as (N,) int64.
 
     Attributes:
-        earned: (N,) float32, what the rules paid for the last step; if rewards are paid late or with noise, that is
+        earned: (N,) float32, what the rules paid for the last step. If rewards are paid late or with noise, that is
             not what `step` returned.
     """
 

@@ -351,8 +351,7 @@ class RewardChannel:
     z are independent standard normal numbers. So the sum of what is paid in an episode has the mean of what was earned,
     however the episode ended. If it is broken off by a reset, what was not paid yet is lost.
 
-    Noise is drawn from streams of its own, seeded as the streams of the steps are, so that steps stay what they are
-    without.
+    Noise is drawn from separate streams, seeded as the streams of the steps, so that noise does not change the steps.
 
     Attributes:
         earned: (N,) of the last step.

@@ -2,9 +2,9 @@
 
 `make_vec("breakout", 1024, observation="vector", sticky=0.25)`, or
 `gymnasium.make_vec("pharos/Breakout-v0", num_envs=1024)`. Chance is drawn inside the loop, from one stream of random
-numbers for each environment: the start if there are several, then for each step what is executed under sticky or
-random actions, whether it has an effect under lazy ones, then the outcome if the rules have chance. If there is
-but one possibility nothing is drawn.
+numbers for each environment: the start, if there are several; then for each step the executed action under sticky or
+random actions, whether it has an effect under lazy ones, and the outcome, if the rules have chance. If there is but one
+possibility, nothing is drawn.
 """
 
 from abc import ABC, abstractmethod
@@ -31,8 +31,8 @@ from pharos.kernels import stepping
 from pharos.kernels.stepping import DISABLED, SAME_STEP, EnvironmentBatch, first_outside
 from pharos.mdp import OutcomeTable, rewards_of_outcomes, rewards_of_staying, whole_number
 from pharos.observations import NO_ACTION, Index, Seen
-from pharos.system.arrays import as_array
-from pharos.system.records import split
+from pharos.system.arrays import as_index_array
+from pharos.system.records import split_options
 from pharos.system.threads import in_blocks
 
 if TYPE_CHECKING:
@@ -49,8 +49,9 @@ class Stepper(ABC):
     Kernels get Setting and Batch as plain tuples: named ones cost Numba a microsecond a call more.
 
     Attributes:
-        name: of a position, in `info`: a state, or its index in a state space.
-        current, final: the positions (N, ...) now, and at the ends of episodes that a step ended.
+        name: of a position in `info`: "state" or "index".
+        current, final: the positions (N, ...), states or their indices: now, and at the ends of episodes that a step
+            ended.
         final_elapsed: (N,) steps of the episode after the last step.
     """
 
@@ -200,7 +201,7 @@ class TableStepper(Stepper):
 def _tables(space: "StateSpace") -> tuple[object, object]:
     """(successors, rewards) of executed actions, as `stepping.walk_table` takes them."""
     if not space.has_chance:
-        return as_array(space.successors), np.ascontiguousarray(space.mdp().rewards, np.float64)
+        return as_index_array(space.successors), np.ascontiguousarray(space.mdp().rewards, np.float64)
     dynamics = space.dynamics
     assert isinstance(dynamics, OutcomeTable)
     return dynamics.for_kernels, dynamics.for_kernels_with(rewards_of_outcomes(space))
@@ -222,11 +223,15 @@ _MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABL
 class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     """`num_envs` copies of one environment as a Gymnasium vector environment.
 
-    With `space` the built state space is walked as a table, and the rules are not run: `info` has "index" (N,) in place
-    of "state" (N, D). It always has "executed_action" (N,), -1 after a reset; and if the rules have chance "prob"
-    (N,), the probability of the outcome that was drawn, 1 after a reset; and if some actions are not available in
-    some states "action_mask" (N, A) int8, the available ones in the state that the step has led to; and if rewards are
-    paid late or with noise "earned_reward" (N,), what the rules pay for the step. Arrays are fresh at every step.
+    With `space` the built state space is walked as a table, and the rules are not run. `info` has
+
+    - "state" (N, D), or "index" (N,) with `space`,
+    - "executed_action" (N,), -1 after a reset,
+    - "prob" (N,), if the rules have chance: the probability of the outcome that was drawn, 1 after a reset,
+    - "action_mask" (N, A) int8, if some actions are not available in some states: the available ones in the new state,
+    - "earned_reward" (N,), if rewards are paid late or with noise: what the rules pay for the step.
+
+    Arrays are fresh at every step.
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
@@ -257,7 +262,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     ):
         if max_episode_steps is not None:
             options["time_limit"] = None if max_episode_steps == -1 else max_episode_steps
-        interaction, parameters = split(Interaction, options)
+        interaction, parameters = split_options(Interaction, options)
         self.num_envs = whole_number(num_envs, "num_envs", "an integer of at least 1")
         self._mode = _MODES.index(_checked_mode(autoreset_mode))
         self.simulator = simulator = Simulator(environment, interaction, parameters)
@@ -310,8 +315,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
 
         Args:
             seed: environment i is seeded with seed + i, or with seed[i].
-            options: {"reset_mask": (N,) bool} resets these environments alone; {"state": (D,) or (N, D)} sets the
-            states in which they start.
+            options: {"reset_mask": (N,) bool} resets these environments alone; {"state": (D,) or (N, D)} is where
+                they start.
         """
         options = options or {}
         mask = self._checked_mask(options.get("reset_mask"))

@@ -27,11 +27,11 @@ from pharos.system.arrays import (
     OutcomeRows,
     PackedIndices,
     WrongOutcomes,
-    blocks_of,
     holds_end,
+    index_blocks,
+    index_rows,
     read_only,
     rounding_of_sums,
-    rows_of,
 )
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Table(Dynamics):
         if isinstance(self.next_states, PackedIndices) and isinstance(states, slice) and states == slice(None):
             rows = self.next_states
             out = np.empty((*rows.shape, *x.shape[2:]), x.dtype)
-            for first, table in blocks_of(rows):  # no more of them is unpacked at a time
+            for first, table in index_blocks(rows):  # no more of them is unpacked at a time
                 out[first : first + len(table)] = self._expected(x, table)
             return out
         return self._expected(x, self.next_states[states])
@@ -93,8 +93,8 @@ class Table(Dynamics):
         return self.next_states[states, actions]
 
     def part(self, start: int, stop: int) -> tuple["Table", np.ndarray]:
-        rows = rows_of(self.next_states, start, stop)
-        local, halo = part_with_halo(partial(blocks_of, rows), rows.shape, start, stop)
+        rows = index_rows(self.next_states, start, stop)
+        local, halo = part_with_halo(partial(index_blocks, rows), rows.shape, start, stop)
         return Table(local), halo
 
     def _restricted_to(self, states: np.ndarray) -> "Table":
@@ -462,8 +462,8 @@ class OutcomeTable(OutcomeRows, Dynamics):
 
     def part(self, start: int, stop: int) -> tuple["OutcomeTable", np.ndarray]:
         first, last = self.begins(np.array([start, stop]) * self.num_actions).tolist()
-        entries = rows_of(self.flat, first, last)
-        local, halo = part_with_halo(partial(blocks_of, entries), entries.shape, start, stop)
+        entries = index_rows(self.flat, first, last)
+        local, halo = part_with_halo(partial(index_blocks, entries), entries.shape, start, stop)
         return self._of_states(slice(start, stop), slice(first, last), local), halo
 
     def _restricted_to(self, states: np.ndarray) -> "OutcomeTable":
@@ -487,7 +487,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
 
     def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
         """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for the state of the row."""
-        which, entries = self.places(self._rows(np.asarray(states)))
+        which, entries = self.entry_indices(self._rows(np.asarray(states)))
         next_states = number[self.flat[entries]]
         next_states = np.where(next_states == -2, which // self.num_actions, next_states)
         return self._of_states(states, entries, as_indices(next_states, len(states)))

@@ -282,8 +282,8 @@ def imported(path: str, folder: str | Path | None = None) -> OwnObservation:
     Raises:
         ParameterError: no such module, file or name, or it is no observation.
     """
-    source = sources.find(path, folder)
-    return _observation(source, sources.load(source))
+    source = sources.find_source(path, folder)
+    return _observation(source, sources.load_source(source))
 
 
 def observation_of(source: Source, *, trust: bool = False, strict: bool = False) -> OwnObservation:

@@ -40,7 +40,7 @@ from pharos.policies.policy import (
     masks_for,
 )
 from pharos.solvers import Solution
-from pharos.system.arrays import as_array
+from pharos.system.arrays import as_index_array
 
 # Histories whose frames are drawn at once
 HISTORY_BATCH = 512
@@ -720,7 +720,7 @@ def walk_values(
     Cost: the longest episode times a call of `act`.
     """
     worlds = {
-        id(mdp): (as_array(mdp.dynamics.deterministic_table()), np.asarray(mdp.terminal), mdp.reward_table)
+        id(mdp): (as_index_array(mdp.dynamics.deterministic_table()), np.asarray(mdp.terminal), mdp.reward_table)
         for mdp in mdps
     }
     indices = {key: np.array([i for i, mdp in enumerate(mdps) if id(mdp) == key]) for key in worlds}

@@ -37,7 +37,7 @@ CompiledRules = dict[str, Function]
 Constructor = Callable[..., tuple[object, ...]]
 """The class of `self` in compiled rules, a named tuple."""
 RULES = ("transition", "is_terminal", "reward", "draw")
-_COLOURS = re.compile("\x1b\\[[0-9;]*m")  # Numba writes them where colorama is installed
+_COLOURS = re.compile("\x1b\\[[0-9;]*m")  # Numba writes them if colorama is installed
 _HERE = Path(__file__).parent
 _KERNELS = _HERE.parent / "kernels"
 _MACHINERY = (
@@ -47,7 +47,7 @@ _MACHINERY = (
 
 
 def rules_of_class(cls: type[Environment]) -> tuple[str, ...]:
-    """Names of the rules of a class: those of every class, and the optional ones that it defines."""
+    """Names of the rules of a class: the rules of every class, and the optional ones that it defines."""
     optional = {
         "probability": cls.takes_outcomes(),
         "age": cls.age is not Environment.age,
@@ -346,7 +346,7 @@ def function_text(function: object, numbers: dict[object, int]) -> str:
 
 
 def value_text(value: object, names: set[str], numbers: dict[object, int]) -> str:
-    """A text of a value; of a module or a class, by those of its attributes that are among `names`."""
+    """A text of a value; of a module or a class, by its attributes that are among `names`."""
     value = plain_function(value)
     home = getattr(value, "__module__", None) or ""
     if isinstance(value, types.ModuleType):

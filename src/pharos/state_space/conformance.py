@@ -24,7 +24,7 @@ import numpy as np
 from pharos.drawing import ground_of, shape_of
 from pharos.environments import Environment, Layer, State, classes, start_distribution
 from pharos.errors import ParameterError, RuleError, UnknownName
-from pharos.rules import mentioned_names, mutable_attributes, pack, unpack
+from pharos.rules import mentioned_names, mutable_attributes, pack_states, unpack_states
 from pharos.state_space.guarded_rules import SUM_TOLERANCE, InterpretedCheck
 
 if TYPE_CHECKING:
@@ -231,7 +231,7 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
         notes.append(not_compiled(reason))
         return False
     num_states, branches = len(states), env.num_actions * env.outcomes
-    packed = pack(layout, np.array(states, np.int64))
+    packed = pack_states(layout, np.array(states, np.int64))
     keys = np.zeros((num_states * branches, layout.num_words), np.uint64)
     terminal = np.zeros(num_states, np.uint8)
     probabilities = np.ones((num_states, branches))
@@ -256,7 +256,7 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
                 f"{check.terminal[states[i]]} interpreted; expected the same"
             )
     # probability and next state of each branch
-    next_states = unpack(layout, keys)
+    next_states = unpack_states(layout, keys)
     for j in range(len(keys)):
         i, branch = divmod(j, branches)
         if not terminal[i]:

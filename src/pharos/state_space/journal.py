@@ -24,7 +24,7 @@ import numpy as np
 
 from pharos.errors import DiskFull
 from pharos.kernels import outcomes as kernels
-from pharos.rules import pack
+from pharos.rules import pack_states
 from pharos.state_space.manifest import (
     ARRAYS,
     CODES,
@@ -121,7 +121,7 @@ class Journal:
         for name in names:
             self._files[name] = GrowingFile(self.path / name, arrays.get(name))
         if manifest is None:
-            states = pack(self.plan.layout, np.array(self.plan.starts[0], np.int64))
+            states = pack_states(self.plan.layout, np.array(self.plan.starts[0], np.int64))
             position = Position(count=len(states), level_end=len(states))
             self._files[STATES].append(states)
         else:

@@ -19,7 +19,7 @@ from pharos.errors import (
     StateSpaceIncomplete,
     StateSpaceMismatch,
 )
-from pharos.rules import Layout, pack, rules_of, unpack
+from pharos.rules import Layout, pack_states, rules_of, unpack_states
 from pharos.state_space.manifest import (
     BUILD_AGAIN,
     CHECKSUM_BYTES,
@@ -204,7 +204,7 @@ class StateSpace:
 
     def states(self, indices: "slice | Sequence[int] | np.ndarray" = slice(None)) -> np.ndarray:
         """States (N, D) int64 with these indices (an array of integers or a slice)."""
-        return unpack(self.layout, np.atleast_2d(self.packed_states[indices]))
+        return unpack_states(self.layout, np.atleast_2d(self.packed_states[indices]))
 
     def column(self, variable: int, block: slice = slice(None)) -> np.ndarray:
         """(N,) int64, the values of one component in a block of states."""
@@ -242,7 +242,7 @@ class StateSpace:
             raise ParameterError(f"{self}: a state consists of integers; found {states.dtype}")
         out = np.empty(len(states), np.int64)
         inside = (states >= self.layout.low) & (states < self.layout.low + self.layout.size)
-        keys = pack(self.layout, np.where(inside, states, self.layout.low))
+        keys = pack_states(self.layout, np.where(inside, states, self.layout.low))
         find_states(self._table, self.packed_states, keys, out)
         wrong = np.flatnonzero((out < 0) | ~inside.all(axis=1))
         if wrong.size:

@@ -21,7 +21,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError, StateSpaceCorrupted, StateSpaceError, StateSpaceMismatch
-from pharos.rules import Layout, unpack
+from pharos.rules import Layout, unpack_states
 from pharos.state_space.manifest import (
     BUILD_AGAIN,
     CODES,
@@ -170,10 +170,10 @@ def check_rules(
     """Raise StateSpaceMismatch if the rules of `env` disagree with the stored transitions of 64 states."""
     indices = states_to_check(len(successors))
     _check_range(folder / SUCCESSORS, successors[indices], len(states), indices)
-    next_states = unpack(layout, states[successors[indices].ravel()]).tolist()
+    next_states = unpack_states(layout, states[successors[indices].ravel()]).tolist()
     check_states(folder / STATES, layout, states[indices])
     check_states(folder / STATES, layout, states[successors[indices].ravel()])
-    for n, (i, row) in enumerate(zip(indices.tolist(), unpack(layout, states[indices]).tolist(), strict=True)):
+    for n, (i, row) in enumerate(zip(indices.tolist(), unpack_states(layout, states[indices]).tolist(), strict=True)):
         state = tuple(row)
         stored = [tuple(row) for row in next_states[n * env.num_actions : (n + 1) * env.num_actions]]
         try:
@@ -335,7 +335,7 @@ def check_outcome_rules(
         outcomes: of the states that are compared.
     """
     for i, of_actions in outcomes.items():
-        state = tuple(unpack(layout, states[i : i + 1])[0].tolist())
+        state = tuple(unpack_states(layout, states[i : i + 1])[0].tolist())
         try:
             ended = bool(env.is_terminal(state))
             expected = [_outcomes_by_rules(env, state, a, ended) for a in range(env.num_actions)]
@@ -345,7 +345,7 @@ def check_outcome_rules(
                 f"build in another folder"
             ) from error
         for action, (successors, probabilities) in enumerate(of_actions):
-            next_states = [tuple(row) for row in unpack(layout, states[successors]).tolist()]
+            next_states = [tuple(row) for row in unpack_states(layout, states[successors]).tolist()]
             wanted, p = expected[action]
             agree = next_states == wanted and np.abs(probabilities - p).max() <= SUM_TOLERANCE
             if not agree or ended != bool(bits[i // 8] >> (i % 8) & 1):

@@ -124,16 +124,16 @@ def _announce(name: str) -> None:
 
 
 def _name_of(function: Callable) -> str:
-    """A kernel's name, and that of the class of environments for whose rules it is made."""
+    """A kernel's name, and the name of the class of environments for whose rules it is made."""
     owner = re.fullmatch(r"(\w+)_[0-9a-f]{20}\.\w+", function.__qualname__)
     return f"{function.__name__} for {owner[1]}" if owner else function.__name__
 
 
 @cache
 def private_folder(cache_directory: Path) -> Path | None:
-    """The folder of compiled code, which is this user's and which nobody else can write to; None where there is none.
+    """The folder of compiled code, which is this user's and which nobody else can write to; None if there is none.
 
-    It is `compiled`, or, where several users share the cache, `compiled-` and the user's number. A warning says what is
+    It is `compiled`, or, if several users share the cache, `compiled-` and the user's number. A warning says what is
     wrong with a folder that is refused.
     """
     problems = []
@@ -154,7 +154,7 @@ def private_folder(cache_directory: Path) -> Path | None:
 
 
 def _problem_of(folder: Path) -> str:
-    """Make the folder where it is missing. Returns the reason against its use, "" where there is none."""
+    """Make the folder if it is missing. Returns the reason against its use, "" if there is none."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):

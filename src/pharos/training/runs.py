@@ -19,7 +19,7 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.observations import own_observation
-from pharos.system.records import split, takes
+from pharos.system.records import split_options, takes
 from pharos.training.execution import ProgressCallback, Training, TrainingProgress, train_configs
 from pharos.training.options import TrainingOptions
 from pharos.training.prepared import FailedRun, TaskCache
@@ -175,7 +175,7 @@ def _runs(
     environment: Environment | str, options: Mapping[str, Any], seeds: Sequence[int]
 ) -> tuple[Task, list[RunConfig]]:
     """The task, and the configuration of a run with each of the seeds; `options` as `train` takes them."""
-    training, parameters = split(TrainingOptions, options)
+    training, parameters = split_options(TrainingOptions, options)
     agent, hyperparameters, table = training.agent, training.hyperparameters, options.get("hyperparameters")
     name = agent_called(agent).observation(training.observation)
     task = Task.of(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pharos.agents import agent_called, agent_source, is_known
-from pharos.environments import Environment, as_tuples, class_called, class_of, make, source_of
+from pharos.environments import Environment, as_tuples, class_called, class_of, class_source, make
 from pharos.errors import DivergenceError, FileFormatError, ParameterError, UnknownName
 from pharos.mdp import (
     ChanceSetting,
@@ -29,7 +29,7 @@ from pharos.policies import Observer, ReachableRows, endless_value, reachable_ro
 from pharos.regret import ReferenceValues
 from pharos.solvers import GainInterval, Solution, average_reward, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
-from pharos.system.records import flat, read
+from pharos.system.records import flat, parse_record
 from pharos.system.sources import Source, is_reference, resolve, untrusted_code
 from pharos.training.options import ENGINES, OBJECTIVES, Horizon, TrainingOptions
 
@@ -360,7 +360,7 @@ class RunConfig(TrainingOptions):
         """
         observation = task.observation
         sources = {
-            "environment": source_of(type(task.env)),
+            "environment": class_source(type(task.env)),
             "observation": observation.source if isinstance(observation, OwnObservation) else None,
             "agent": agent_source(agent),
         }
@@ -392,7 +392,9 @@ class RunConfig(TrainingOptions):
             FileFormatError: an entry is missing, unknown or of another type.
         """
         try:
-            return read(RunConfig, entry, "the configuration of a run", optional=("engine", "sources", "objective"))
+            return parse_record(
+                RunConfig, entry, "the configuration of a run", optional=("engine", "sources", "objective")
+            )
         except ParameterError as error:
             raise FileFormatError(f"the configuration of a run is damaged: {error}") from error
 
