@@ -56,7 +56,7 @@ def diagnose(
                 timeout=timeout,
                 tell=lambda done, text: show(int(1000 * done), text),
             )
-        if page is not None:
+        if out is not None and page is not None:
             page.write((diagnosis.to_html() if out.suffix in HTML else str(diagnosis)).encode(errors="replace"))
     answer = {**diagnosis.to_dict(), "seconds": time.perf_counter() - began, "file": out}
     return Answer(answer, lambda: _print(diagnosis))
@@ -64,11 +64,12 @@ def diagnose(
 
 def _print(diagnosis: "Diagnosis") -> None:
     scores = ", ".join(f"{name} {score:.2f}" for name, score in diagnosis.scores.items())
-    print_table(
-        f"{diagnosis.agent}: {diagnosis.verdict}",
-        ("", "what no healthy agent shows", "what to try"),
-        ((str(place), each.wrong, each.advice) for place, each in enumerate(diagnosis.findings, start=1)),
-    )
+    title, rows = f"{diagnosis.agent}: {diagnosis.verdict}", enumerate(diagnosis.findings, start=1)
+    if diagnosis.findings:
+        columns = "", "what no healthy agent shows", "what to try"
+        print_table(title, columns, ((str(place), each.wrong, each.advice) for place, each in rows))
+    else:
+        print(title)
     text = f"Scores, 1 optimal and 0 as uniform play: {scores}"
     if not diagnosis.likeness:
         print(text)
