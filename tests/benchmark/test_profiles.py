@@ -254,6 +254,7 @@ def test_a_run_of_a_shipped_agent_shows_no_symptom():
         assert readings_of(results) == []
         said = diagnosis_of_results(contents_of(results))
         assert said.kind == name and not said.readings and set(said.scores) == set(half)
+        assert said.is_healthy and said.verdict == "Nothing is wrong that these results and checks can see."
 
 
 def test_groups_of_tasks_that_lose_alone_are_named():
@@ -309,7 +310,7 @@ def test_the_table_of_pharos_is_diagnosed_and_its_discount_read_from_its_values(
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["DQN", "PPO"])
-def test_models_of_stable_baselines3_are_asked_for_values(name):
+def test_values_of_models_of_stable_baselines3_are_those_of_their_networks(name):
     import stable_baselines3
     import torch
 

@@ -328,6 +328,8 @@ def learner_of(agent: str | Callable[..., Any], hyperparameters: Mapping[str, An
             raise ParameterError(f"agent {agent!r} is in JAX; expected a generator: learn(env, steps, seed)")
         if form != CLASS:
             return partial(generator_of(code), **setting)
+    elif code in agents() and agents()[code].has_table:
+        raise ParameterError(f"agent {code!r} is a table, which sees no observation; expected an agent with a network")
     defaults = dict(agents()[code].defaults) if isinstance(code, str) and code in agents() else {}
     algorithm(code)
     return partial(_model_learner, code, {**defaults, **setting})
