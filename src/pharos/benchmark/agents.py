@@ -39,7 +39,8 @@ from pharos.agents import (
 )
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
-from pharos.system.sources import Source, find, is_reference, load, source_of
+from pharos.solvers import uniform_policy
+from pharos.system.sources import Source, find_source, is_reference, load_source, source_of
 from pharos.system.wording import capped, in_one_line, line_in
 from pharos.system.workers import Terminated, Workers
 from pharos.training import (
@@ -64,7 +65,6 @@ from pharos.training import (
     regret,
     run_id,
     train_configs,
-    uniform_policy,
     write_curve,
     write_policy,
     write_record,
@@ -202,8 +202,8 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
     if agent.endswith(".py"):
         raise ParameterError(f"agent {agent!r}: expected what in the file, such as {agent}:learn")
     if is_reference(agent) and not is_known(agent):
-        source = find(agent)
-        code = load(source)
+        source = find_source(agent)
+        code = load_source(source)
         if form_of(agent, code) != CLASS:
             return _function(code, source, setting)
         check_hyperparameters(code, setting)
@@ -252,7 +252,8 @@ class TrainedForm(Form):
             failures = f", {now.failed} failed" if now.failed else ""
             settings.tell(now.done / now.total, f"{now.finished} of {len(jobs)} runs{failures}")
 
-        tasks = TaskCache(trust=True)  # the user has named the code
+        stored = {config.id: job.task.stored_values for config, job in zip(configs, jobs, strict=True)}
+        tasks = TaskCache(lambda config: stored[config.id], trust=True)  # the user has named the code
         options: dict[str, Any] = {"progress": progress, "tasks": tasks, "workers": settings.workers}
         train_configs(configs, folders, checkpoints=settings.checkpoints, seconds=seconds, **options)
 
@@ -278,7 +279,7 @@ def _train_alone(label: str, entry: dict[str, Any], checkpoints: Path, jobs: Seq
     _seed(job.seed)
     config = RunConfig.from_dict(entry)
     try:
-        tasks = TaskCache(trust=True)  # the user has named the code
+        tasks = TaskCache(lambda _: job.task.stored_values, trust=True)  # the user has named the code
         (end,) = train_configs([config], [job.folder], checkpoints=checkpoints, tasks=tasks)
         send((job.folder, end.error if isinstance(end, FailedRun) else None))
     except Terminated:
@@ -441,7 +442,7 @@ def _send_end(send: Send, label: str, job: Job, *ended: Any) -> None:
 def _loaded(code: Source | bytes) -> Any:
     if isinstance(code, Source):
         sys.path.append(str(Path(code.file).parent))  # for imports within functions, and files of Numba's cache
-        return load(code)
+        return load_source(code)
     import cloudpickle
 
     return cloudpickle.loads(code)
@@ -597,6 +598,8 @@ class ExactForm(Form):
         return RunResult(np.full(protocol.evaluations, self.regrets[job.task.name]), True, 0)
 
     def _regret(self, task: Task) -> float:
-        if self.label == "oracle":
-            return 0.0
-        return float(regret(evaluate_agent(uniform_policy(task), task).value, task.reference, normalized_by="uniform"))
+        if self.label == "oracle" or task.values is not None:  # U of a large task is stored
+            return float(self.label != "oracle")
+        return float(
+            regret(evaluate_agent(uniform_policy(task.mdp), task).value, task.reference, normalized_by="uniform")
+        )

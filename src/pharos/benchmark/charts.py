@@ -376,7 +376,7 @@ def ends(interval: ConfidenceInterval) -> tuple[float, float]:
 def frontier_text(frontier: ConfidenceInterval, unit: str = "", interval: bool = True) -> str:
     """A frontier in words: `9.4 bits (8.3 to 10.8)`, `beyond 24 bits (19 or more)`, `below 4 bits`."""
     if np.isnan(frontier.value):
-        return "no frontier of one rung"
+        return "no frontier"
     side = {"above": "beyond ", "below": "below ", "": ""}[frontier.censored]
     text = f"{side}{frontier.value:.3g}{' ' if unit else ''}{unit}"
     low, high = ends(frontier)

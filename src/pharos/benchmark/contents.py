@@ -26,13 +26,14 @@ from pharos.benchmark.results import FILE, AgentResults, baselines
 from pharos.benchmark.scores import BenchmarkScore, ConfidenceInterval, as_one_run, run_regrets, run_scores, score
 from pharos.benchmark.suite import BenchmarkTask, Suite
 from pharos.errors import ParameterError
-from pharos.plots import agent_name
+from pharos.plots import agent_label
 from pharos.system import storage
 from pharos.system.wording import pluralize
 
 BESIDE = ("dqn", "ppo", "q_learning")
 LEARNERS = ("dqn", "ppo")  # idealised, with networks
 RESIDUAL = 0.2
+NO_LADDERS = " The ladders were not run, so there are no frontiers."
 LATE = 0.2  # of an agent that learns late, by which the final score exceeds the mean one, with its whole interval
 ENDS_WORSE = 0.05  # the same of one that ends worse than it was, by which the final score is lower
 MOST = 5  # reasons of failures on the page
@@ -44,6 +45,10 @@ PHRASES = {
     "representation": "copes with representations that cost",
     "memory": "remembers",
     "scale": "scales to",
+    "exploration_free": "explores free ways of",
+    "exploration_costly": "explores costly ways of",
+    "large_rewards": "stands rewards larger by",
+    "small_rewards": "stands rewards smaller by",
 }
 PREDICTORS = {
     "dqn": "the idealised DQN",
@@ -108,7 +113,7 @@ def contents_of(
     own = results_of(results)
     suite = suite_of_results(own, suite)
     if beside is None:
-        beside = [name for name in BESIDE if name in baselines(suite.name) and name != own.agent]
+        beside = [f"{suite.name}/{name}" for name in BESIDE if name in baselines(suite.name) and name != own.agent]
     if predictor not in (None, "none", *PREDICTORS):
         raise ParameterError(f"predictor {predictor}; expected one of {', '.join(PREDICTORS)}, none")
     others = [results_of(each) for each in beside]
@@ -135,7 +140,7 @@ def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:
 
     The agent that the report is about, and those of a file or a module, have the label that they ran with.
     """
-    name = label if is_first or ":" in label else agent_name(label)
+    name = label if is_first or ":" in label else agent_label(label)
     yield name
     if not isinstance(source, AgentResults) and Path(source).exists():
         path = Path(source).resolve()
@@ -183,7 +188,7 @@ def _core_sentence(contents: Contents) -> str:
     parts = [f"Core score {number(contents.agent.score.core)} on {pluralize(len(names), 'task')}"]
     parts += [f"{word} {listed(texts)}" for word, texts in groups.items() if texts]
     worst = f"worst on {listed(names[:3])}" if len(names) > 3 else ""
-    return "; ".join(filter(None, (", ".join(parts), worst))) + ". The ladders were not run, so there are no frontiers."
+    return "; ".join(filter(None, (", ".join(parts), worst))) + "." + NO_LADDERS * bool(contents.suite.ladders)
 
 
 def _split(text: str) -> tuple[str, str]:

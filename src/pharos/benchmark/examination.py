@@ -18,7 +18,7 @@ from pharos.benchmark.suite import BenchmarkTask, Protocol
 from pharos.errors import ParameterError, TimeLimit, UnknownName
 from pharos.policies import PolicyLike, SB3Model
 from pharos.system.interrupts import time_limit
-from pharos.system.sources import find, load
+from pharos.system.sources import find_source, load_source
 from pharos.system.workers import Terminated
 from pharos.training import (
     BudgetSpent,
@@ -321,7 +321,7 @@ def learner_of(agent: str | Callable[..., Any], hyperparameters: Mapping[str, An
     setting = dict(hyperparameters or {})
     code: Any = agent
     if isinstance(agent, str) and not is_known(agent):
-        code = load(find(agent))
+        code = load_source(find_source(agent))
     if not isinstance(code, str):
         form = form_of(str(agent), code)
         if form not in (CLASS, "generator"):
@@ -338,7 +338,7 @@ def learner_of(agent: str | Callable[..., Any], hyperparameters: Mapping[str, An
 def _file_of(agent: str | Callable[..., Any]) -> str | None:
     """The file with the code of an agent of the user's own."""
     if isinstance(agent, str):
-        return None if is_known(agent) else find(agent).file
+        return None if is_known(agent) else find_source(agent).file
     return getattr(getattr(agent, "__code__", None), "co_filename", None)
 
 

@@ -71,7 +71,7 @@ from pharos.benchmark.diagnosis import (
 from pharos.benchmark.latex import latex_of
 from pharos.benchmark.properties import known_properties, purpose_of
 from pharos.benchmark.suite import BenchmarkTask, Ladder, Suite
-from pharos.plots import agent_name
+from pharos.plots import agent_label
 from pharos.system import storage
 from pharos.system.wording import pluralize
 
@@ -176,7 +176,8 @@ def _learning(contents: Contents) -> Element | None:
 
 
 def _ladders(contents: Contents) -> Element | None:
-    ladders = [ladder for ladder in contents.suite.ladders if ladder.axis in contents.agent.score.axes]
+    axes = contents.agent.score.axes
+    ladders = [ladder for ladder in contents.suite.ladders if ladder.axis in axes and not ladder.pairs]
     if not ladders:
         return None
     is_predicted = any(contents.predicted(task) is not None for ladder in ladders for task in ladder.tasks)
@@ -199,6 +200,24 @@ def _ladder(contents: Contents, ladder: Ladder) -> Element:
     levels = [task.level or 0.0 for task in ladder.tasks]
     theory = [contents.predicted(task) for task in ladder.tasks]
     return ladder_panel(levels, lines, theory, frontier, ladder.unit, title)
+
+
+def _pairs(contents: Contents) -> Element | None:
+    rows: list[list[str | Element]] = []
+    for ladder in contents.suite.ladders:
+        for pair in ladder.pairs:
+            regrets = [[regret_of(each, task) for task in pair] for each in contents.agents]
+            cells = ["–" if a is None or b is None else f"{a.value:.2f}, {b.value:.2f}" for a, b in regrets]
+            rows.append([ladder.axis, pair[0].name, pair[1].name, *cells])
+    if not rows:
+        return None
+    heads = ["axis", "first", "second", *(each.name for each in contents.agents)]
+    return section(
+        "Pairs",
+        "One world in two ways, and the regret in both. The score of the axis is 1 less what the second task costs, so "
+        "an agent that fails both loses nothing: read it only if the first is learnt.",
+        html_table(heads, rows, numeric=range(3, len(heads))),
+    )
 
 
 def _core(contents: Contents) -> Element | None:
@@ -343,10 +362,12 @@ def _words(contents: Contents) -> Element | None:
     )
 
 
-def _residuals(contents: Contents) -> Element:
+def _residuals(contents: Contents) -> Element | None:
     title = "Residuals: worse than theory says"
     if contents.predictor == "none":
         return section(title, "No idealised learner is known for this kind of agent.")
+    if all(contents.predicted(task) is None for task in contents.suite.tasks):
+        return None
     rows = residuals(contents)
     means = PREDICTORS[contents.predictor]
     text = (
@@ -367,7 +388,7 @@ def _residuals(contents: Contents) -> Element:
         row: list[str | Element] = [_task(task), *first, f"{own.value - expected:+.2f}", *last]
         lists[not is_own(contents, task, own.value)].append(row)
     heads = ["task", "observed", "predicted", "residual", "at the end", *(["shipped"] if is_beside else [])]
-    names = f"{' and '.join(agent_name(name) for name in SHIPPED[contents.predictor])} of pharos"
+    names = f"{' and '.join(agent_label(name) for name in SHIPPED[contents.predictor])} of pharos"
     captions = (
         f"Worse than theory, and by more than {OWN:g} than {names} (the worse of two): look for a bug here.",
         f"Theory is too hopeful: {names} fares alike.",
@@ -416,6 +437,7 @@ SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
     _axes,
     _learning,
     _ladders,
+    _pairs,
     _words,
     _policies,
     _core,

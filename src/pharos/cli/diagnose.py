@@ -33,12 +33,12 @@ def diagnose(
     """Train an agent on twelve small worlds, and say what is wrong with it, by which number, what to try.
 
     Args:
-        results: In place of an agent: the folder of a finished `benchmark run`; nothing is trained.
-        hyperparameters: A hyperparameter of the agent.
-        seeds: Of each world, from 0 on.
-        steps: Of each run; the table of known faults has 4,000.
-        timeout: Seconds after which a run is ended, and the command with it.
-        out: Write the page there: FILE.md or FILE.html, which loads nothing.
+        results: Read the folder of a finished `benchmark run` in place of an agent. Nothing is trained.
+        hyperparameters: Set a hyperparameter of the agent.
+        seeds: Number of seeds of each world, from 0 on.
+        steps: Training steps of each run; the table of known faults has 4,000.
+        timeout: End the command if a run takes more than this many seconds.
+        out: Write the page to FILE.md or FILE.html, which loads nothing.
     """
     from pharos import benchmark
 
@@ -67,7 +67,7 @@ def _print(diagnosis: "Diagnosis") -> None:
     title, rows = f"{diagnosis.agent}: {diagnosis.verdict}", enumerate(diagnosis.findings, start=1)
     if diagnosis.findings:
         columns = "", "what no healthy agent shows", "what to try"
-        print_table(title, columns, ((str(place), each.wrong, each.advice) for place, each in rows))
+        print_table(title, columns, ((str(number), each.wrong, each.advice) for number, each in rows))
     else:
         print(title)
     if not diagnosis.likeness:
