@@ -50,6 +50,7 @@ from pharos.benchmark.diagnosis import (
     SHIPPED,
     fall_everywhere,
     falls,
+    gaps,
     groups_of,
     is_own,
     lowest_rungs,
@@ -272,6 +273,19 @@ def _policies(contents: Contents) -> Element | None:
     )
 
 
+def _gaps(contents: Contents) -> Element | None:
+    rows = gaps(contents)
+    if not rows:
+        return None
+    heads = ["generator", "training levels", "score on these", "on held-out levels", "gap"]
+    heads += [f"gap of {each.name}" for each in contents.beside]
+    return _section(
+        "Levels seen and held out",
+        "The gap is the normalised regret on held-out levels less that on the levels of training, by seed.",
+        _table(heads, rows, numeric=range(1, len(heads))),
+    )
+
+
 def _groups(contents: Contents) -> Element | None:
     if (near := nearest(contents)) is None:
         return None
@@ -423,6 +437,7 @@ SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
     _learning,
     _ladders,
     _words,
+    _gaps,
     _policies,
     _core,
     _groups,
