@@ -91,7 +91,7 @@ def _write(folder: Path, world: str, options: dict[str, Any], train: int, held_o
 
 def _cropped(images: np.ndarray) -> np.ndarray:
     """(S, C, H, W) images of a level without the rows and columns around it that are empty in all of them."""
-    shown: np.ndarray = images.any(axis=(0, 1))
+    shown = np.asarray(images.any(axis=(0, 1)))
     rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
     return images[:, :, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
 
