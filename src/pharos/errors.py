@@ -3,7 +3,7 @@
     PharosError
     ├── ParameterError (ValueError)     a parameter, name or option is wrong: nothing was computed  (exit code 2)
     │   ├── UnknownName                 no such environment, measure, observation, agent ...: nearest match suggested
-    │   └── UntrustedCode               a file names code of somebody else, which is executed only where it is trusted
+    │   └── UntrustedCode               a file names code of somebody else, which is executed only if it is trusted
     ├── RuleError                       an environment's rules broke their contract, for a named state and action
     ├── StateSpaceError                 something is wrong with a folder that holds a state space
     │   ├── StateSpaceTooLarge          more states than `max_states`
@@ -61,7 +61,7 @@ class UnknownName(ParameterError):
 
 
 class UntrustedCode(ParameterError):
-    """A file names code, a module or a Python file, which is executed only where it is trusted."""
+    """A file names code, a module or a Python file, which is executed only if it is trusted."""
 
 
 class RuleError(PharosError):

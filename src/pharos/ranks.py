@@ -6,7 +6,7 @@ run ranks as threads.
 
 Halos are borders of ranges of rows, one range for each rank: the rows of other ranks that a rank reads. Their values
 come in messages from those ranks alone that have some of them. They travel while the ranks compute: the values of the
-high rows of a range, all but the lowest eighth, may be sent before those of the low ones are known.
+high rows of a range, all but the lowest eighth, may be sent before the values of the low rows are known.
 """
 
 import ctypes
@@ -189,7 +189,7 @@ class Halo:
         self.low = int(lows[rank.rank])
         if not any((rows >= self.low).any() for rows in self.wanted):
             self.low = int(cuts[rank.rank + 1] - cuts[rank.rank])
-        self._low_borders = np.searchsorted(rows, cuts[:-1] + lows)  # where the high rows of each rank begin in `rows`
+        self._low_borders = np.searchsorted(rows, cuts[:-1] + lows)  # index of each rank's first high row in `rows`
         self._received: np.ndarray | None = None
 
     def __len__(self) -> int:
@@ -205,7 +205,8 @@ class Halo:
     # While messages travel: receive, then send all or high and low ones, then finish --------------------------------
 
     def receive(self, like: np.ndarray, in_two: bool = False) -> None:
-        """Begin to receive values of the halo, rows like those of `like`; in one message from each rank, or in two."""
+        """Begin to receive values of the halo, rows like the rows of `like`; in one message from each rank, or in
+        two."""
         received = self._received
         if received is None or received.dtype != like.dtype or received.shape[1:] != like.shape[1:]:
             self._received = received = np.empty((len(self), *like.shape[1:]), like.dtype)
@@ -224,11 +225,11 @@ class Halo:
         self._send(values, self.low, len(values))
 
     def send_low(self, values: np.ndarray) -> None:
-        """Begin to send the values of the low rows that others read, after those of the high ones."""
+        """Begin to send the values of the low rows that others read, after the high ones."""
         self._send(values, 0, self.low)
 
     def finish(self, into: np.ndarray) -> None:
-        """Wait for the values (H, ...) of the halo, where some are to be received, and write them to `into`."""
+        """Wait for the values (H, ...) of the halo, if some are to be received, and write them to `into`."""
         self._rank.finish()
         if self._received is not None:
             into[...] = self._received
@@ -268,7 +269,7 @@ def check_processes(processes: int | str) -> None:
 
 
 def check_ranks(num_states: int, ranks: int) -> None:
-    """Raise a ParameterError where there are more ranks than states."""
+    """Raise a ParameterError if there are more ranks than states."""
     if ranks > max(num_states, 1):
         raise ParameterError(f"{ranks} processes for {num_states} states; expected at most one for each state")
 
@@ -344,7 +345,7 @@ def _end_with_parent() -> None:
 
 
 def launched() -> tuple[int, int]:
-    """(rank, size) of this process among those that a launcher has started; (0, 1) where none has.
+    """(rank, size) of this process among the processes that a launcher has started; (0, 1) if none has.
 
     MPI is not loaded.
     """

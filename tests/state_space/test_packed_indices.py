@@ -30,7 +30,7 @@ from pharos.state_space import manifest as manifests
 from pharos.state_space import manifest as writing
 from pharos.state_space import search
 from pharos.system import arrays, memory
-from pharos.system.arrays import INT40, PACKED, PackedIndices, blocks_of, holds_end
+from pharos.system.arrays import INT40, PACKED, PackedIndices, holds_end, index_blocks
 from rank_threads import threads
 from strategies import deterministic_mdps, examples, outcome_mdps
 from worlds import ChanceWorld
@@ -73,7 +73,7 @@ def test_it_reads_like_an_array_of_64_bits(plain, data):
     assert np.asarray(indices, np.float64).dtype == np.float64
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(arrays, "_BLOCK", data.draw(st.integers(1, 7)))
-        parts = list(blocks_of(indices))
+        parts = list(index_blocks(indices))
     assert [first for first, _ in parts] == np.cumsum([0, *(len(part) for _, part in parts)])[:-1].tolist()
     assert (np.concatenate([part for _, part in parts]) == plain).all()
     indices[low:high] = plain[low:high] // 2

@@ -24,7 +24,7 @@ from pharos.agents.agent import POLICY, Learner, LearningRun, read_policy_table
 from pharos.agents.sb3 import DeepAgent, is_known
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.policies import PolicyLike
-from pharos.system.sources import Source, announce, announced, find, load
+from pharos.system.sources import Source, announced, find_source, load_source, register_source
 
 CLASS, GENERATOR, COMPILED = "class", "generator", "jax"
 STEPPED = ("act", "observe", "policy")
@@ -114,14 +114,14 @@ def agent_source(
         ParameterError: it cannot be imported, or is no agent.
     """
     if not isinstance(agent, str):
-        source = announce(agent)
+        source = register_source(agent)
         form_of(source.name, agent)
         return source
     if is_known(agent):
         return None
-    source = announced(agent) or find(agent, folder)
+    source = announced(agent) or find_source(agent, folder)
     if check:
-        form_of(source.name, load(source))
+        form_of(source.name, load_source(source))
     return source
 
 
@@ -138,7 +138,7 @@ class OwnAgent(DeepAgent):
     def library_default(self, name: str) -> object:
         source = agent_source(self.name)
         assert source is not None
-        code = load(source)
+        code = load_source(source)
         if form_of(self.name, code) == CLASS:
             return super().library_default(name)
         parameter = inspect.signature(code).parameters.get(name)

@@ -39,7 +39,8 @@ from pharos.agents import (
 )
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
-from pharos.system.sources import Source, find, is_reference, load, source_of
+from pharos.solvers import uniform_policy
+from pharos.system.sources import Source, find_source, is_reference, load_source, source_of
 from pharos.system.wording import capped, in_one_line, line_in
 from pharos.system.workers import Terminated, Workers
 from pharos.training import (
@@ -64,7 +65,6 @@ from pharos.training import (
     regret,
     run_id,
     train_configs,
-    uniform_policy,
     write_curve,
     write_policy,
     write_record,
@@ -202,8 +202,8 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
     if agent.endswith(".py"):
         raise ParameterError(f"agent {agent!r}: expected what in the file, such as {agent}:learn")
     if is_reference(agent) and not is_known(agent):
-        source = find(agent)
-        code = load(source)
+        source = find_source(agent)
+        code = load_source(source)
         if form_of(agent, code) != CLASS:
             return _function(code, source, setting)
         check_hyperparameters(code, setting)
@@ -442,7 +442,7 @@ def _send_end(send: Send, label: str, job: Job, *ended: Any) -> None:
 def _loaded(code: Source | bytes) -> Any:
     if isinstance(code, Source):
         sys.path.append(str(Path(code.file).parent))  # for imports within functions, and files of Numba's cache
-        return load(code)
+        return load_source(code)
     import cloudpickle
 
     return cloudpickle.loads(code)
@@ -600,4 +600,6 @@ class ExactForm(Form):
     def _regret(self, task: Task) -> float:
         if self.label == "oracle" or task.values is not None:  # U of a large task is stored
             return float(self.label != "oracle")
-        return float(regret(evaluate_agent(uniform_policy(task), task).value, task.reference, normalized_by="uniform"))
+        return float(
+            regret(evaluate_agent(uniform_policy(task.mdp), task).value, task.reference, normalized_by="uniform")
+        )

@@ -26,7 +26,7 @@ from pharos.benchmark.results import FILE, AgentResults, baselines
 from pharos.benchmark.scores import BenchmarkScore, ConfidenceInterval, as_one_run, run_regrets, run_scores, score
 from pharos.benchmark.suite import BenchmarkTask, Suite
 from pharos.errors import ParameterError
-from pharos.plots import agent_name
+from pharos.plots import agent_label
 from pharos.system import storage
 from pharos.system.wording import pluralize
 
@@ -45,6 +45,10 @@ PHRASES = {
     "representation": "copes with representations that cost",
     "memory": "remembers",
     "scale": "scales to",
+    "exploration_free": "explores free ways of",
+    "exploration_costly": "explores costly ways of",
+    "large_rewards": "stands rewards larger by",
+    "small_rewards": "stands rewards smaller by",
 }
 PREDICTORS = {
     "dqn": "the idealised DQN",
@@ -136,7 +140,7 @@ def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:
 
     The agent that the report is about, and those of a file or a module, have the label that they ran with.
     """
-    name = label if is_first or ":" in label else agent_name(label)
+    name = label if is_first or ":" in label else agent_label(label)
     yield name
     if not isinstance(source, AgentResults) and Path(source).exists():
         path = Path(source).resolve()

@@ -120,7 +120,7 @@ def overlap(env: Environment) -> float:
     from pharos import importers
 
     folder = env.parameters["folder"]
-    mdp, shown = importers.load(folder), mdp_files.read_rows(folder, mdp_files.read_manifest(folder))
+    mdp, shown = importers.load(folder), mdp_files.read_observations(folder, mdp_files.read_mdp_manifest(folder))
     assert shown is not None
     if isinstance(shown, DistinctRows):
         which = shown.index

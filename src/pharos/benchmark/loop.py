@@ -23,7 +23,7 @@ from pharos.errors import AllRunsFailed, FolderLocked, ParameterError
 from pharos.observations import own_observation
 from pharos.policies import PolicyLike
 from pharos.system import storage
-from pharos.system.records import split, takes
+from pharos.system.records import split_options, takes
 from pharos.system.wording import in_one_line
 from pharos.training import (
     BudgetSpent,
@@ -213,7 +213,7 @@ class LoopRun:
         out: str | os.PathLike | None = None,
         **options: Any,
     ):
-        training, parameters = split(TrainingOptions, {**options, "steps": steps})
+        training, parameters = split_options(TrainingOptions, {**options, "steps": steps})
         self.task = Task.of(
             environment,
             parameters,

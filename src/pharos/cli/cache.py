@@ -146,7 +146,7 @@ def warm(
     """Compile what building, solving, measuring, playing and Q-learning need, and keep it for later processes.
 
     Args:
-        targets: Environments or named instances; small ones of the paper's four classes when not given.
+        targets: Environments or named instances. Default: small ones of the paper's four classes.
     """
     environments = [Target(name).found_environment() for name in targets or ()]
     if not targets:
@@ -156,9 +156,9 @@ def warm(
     seconds: dict[str, float] = {}
     watch = Stopwatch()
     compiling.SMALL = 0  # as if all of it were large
-    with progress_line("compiling") as tell:
+    with progress_line("compiling") as report:
         for env in environments:
-            tell(str(env))
+            report(str(env))
             before = watch.compiling
             _use(env, chance)
             seconds[str(env)] = watch.compiling - before

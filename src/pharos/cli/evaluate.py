@@ -1,6 +1,6 @@
-"""pharos solve: optimal values, beside those of the uniformly random policy.
+"""pharos solve: optimal values, beside the values of the uniformly random policy.
 
-pharos evaluate: the exact value of a policy, between those of the best and the worst.
+pharos evaluate: the exact value of a policy, between the best and the worst value.
 """
 
 import math
@@ -57,13 +57,13 @@ def solve(
     """Find the optimal values and policy, with a proven error bound. With --processes the same command resumes.
 
     Args:
-        reach: Instead of values, probabilities and costs of reaching terminal, a label, an expression such as
-            'x=3 & !done', or states such as 5,7.
-        out: FILE.npz for the arrays v and policy, FILE.npy for the policy alone.
-        values: Folder for the values, in place of memory where that has no room; a solve that was ended goes on.
-        print_policy: Print the action of each state that the policy gets to; with --reach of the least cost, or where
-            the target may be missed, of the largest probability.
-        policy_rows: States of the policy that are printed, at most.
+        reach: Compute probabilities and costs of reaching terminal, a label, an expression such as 'x=3 & !done', or
+            states such as 5,7, instead of values.
+        out: Write the arrays v and policy to FILE.npz, or the policy alone to FILE.npy.
+        values: Keep the values in this folder if memory has no room for them; an interrupted solve resumes.
+        print_policy: Print the action of each state that the policy reaches; with --reach for the least cost, or for
+            the largest probability if the target may be missed.
+        policy_rows: Print at most this many states of the policy.
     """
     ranks, processes = building.ranks, building.processes
     with termination():
@@ -94,7 +94,7 @@ def solve(
         report("value of the uniform policy")
         try:
             uniform = solution_by(uniform_value, "uniform", "uniform policy, ")
-        except DivergenceError:  # it may go on for ever where the optimal policy ends
+        except DivergenceError:  # it may go on for ever although the optimal policy ends
             uniform = None
     if solution is None:  # a rank of MPI that is not the first
         return None
@@ -309,7 +309,7 @@ def evaluate(
     building: Building,
     trust: Trust = False,
 ) -> Answer:
-    """Evaluate a policy exactly, and say where it stands: regret 0 is optimal, 1 is as bad as playing at random.
+    """Evaluate a policy exactly, and report its regret: 0 is optimal, 1 is as bad as playing at random.
 
     What a run has learnt is evaluated in the run's own setting (discount, horizon, chance) but for what options say.
     Only a policy that sees several frames and reaches more than 100,000 histories is estimated, from 2,000 episodes.
@@ -445,7 +445,7 @@ def _worth(solution: "Solution") -> Worth:
 
 
 def _worth_of_named(mdp: "TabularMDP", name: str, tolerance: float) -> Worth:
-    """Worth of one of POLICIES; all but the best may go on for ever, where the total reward has no limit."""
+    """Worth of one of POLICIES; all but the best may go on for ever, if the total reward has no limit."""
     from pharos.policies import endless_value
 
     began = time.perf_counter()
@@ -491,7 +491,7 @@ def _sees_frames(goal: Target, decisions: Given) -> bool:
 
 
 def _worth_over_histories(goal: Target, mdp: "TabularMDP", decisions: Given, chance: "ChanceSetting") -> Worth:
-    """Value of a policy that sees several frames: exact where it reaches few histories, else estimated."""
+    """Value of a policy that sees several frames: exact if it reaches few histories, else estimated."""
     from pharos.training import Task, evaluate_agent
 
     began = time.perf_counter()

@@ -45,8 +45,8 @@ def observations(
     """Count the states that share their observation with another state, and bound what that costs.
 
     Args:
-        observation: This one alone, or your own; may be given several times.
-        option: Option of the observations that were named.
+        observation: Count only for this observation, or for your own. Repeatable.
+        option: Option of the observations that you name.
         budget: Seconds to bound what one observation costs; 0: do not.
     """
     if option and not observation:

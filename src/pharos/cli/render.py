@@ -48,13 +48,13 @@ def render(
     Args:
         observation: How to draw: human, text, simple_image, complex_image, or your own.
         option: Option of the observation, such as size=natural.
-        out: FILE.png, FILE.gif or FILE.txt; the terminal when not given.
-        state: Number of a state, or its values 2,3,1; the start when not given.
+        out: Write to FILE.png, FILE.gif or FILE.txt. Default: draw in the terminal.
+        state: Number of a state, or its values 2,3,1. Default: the start.
         steps: Play this many steps from the state.
-        policy: optimal, uniform, or auto: optimal where that is quick to find.
+        policy: optimal, uniform, or auto: optimal if that is quick to find.
         gamma: Discount of the optimal policy.
-        seed: Of the uniform policy, and of chance in the rules.
-        fps: Frames a second of a GIF.
+        seed: Seed of the uniform policy, and of chance in the rules.
+        fps: Frames per second of a GIF.
     """
     from pharos import drawing, observations
     from pharos.system import storage
@@ -116,7 +116,7 @@ def _captions(env: "Environment", played: Sequence[tuple]) -> list[str]:
 
 
 def find_state(target: Target, env: "Environment", text: str | None) -> "State":
-    """The state that `--state` names: its number in the state space, or its values; the start state when not given."""
+    """The state that `--state` names: its number in the state space, or its values; by default the start state."""
     from pharos.drawing import check_state
 
     if text is None:
@@ -134,7 +134,7 @@ def find_state(target: Target, env: "Environment", text: str | None) -> "State":
 def find_policy(
     target: Target, env: "Environment", name: str, gamma: float, seed: int
 ) -> tuple[str, Callable[["State"], int]]:
-    """The name and the function of a policy; "auto" is optimal where the state space is small, else uniform."""
+    """The name and the function of a policy; "auto" is optimal if the state space is small, else uniform."""
     if name == "auto":
         try:
             return "optimal", _optimal(target, gamma, AUTOMATIC_STATES)
@@ -169,8 +169,8 @@ def play(target: Target, *, state: str | None = None, seed: Seed | None = None) 
     """Play with the keyboard, in the terminal; one key is one step.
 
     Args:
-        state: Number of a state, or its values 2,3,1; the start when not given.
-        seed: Of chance in the rules; another game each time without it.
+        state: Number of a state, or its values 2,3,1. Default: the start.
+        seed: Seed of chance in the rules. Default: another game each time.
     """
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise PharosError("play needs a terminal for the keyboard and the picture; it cannot run in a pipe")

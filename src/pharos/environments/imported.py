@@ -36,11 +36,11 @@ DIGITS = (
 class ImportedWorld(Environment):
     """The MDP of a folder that `pharos import` or `importers.save` wrote.
 
-    State    its number in the folder; where transitions end an episode without a next state, S is the end.
-    Actions  those of the source by their names, where the import recorded them, else by their numbers.
-    Reward   of the outcome, where the folder knows it; else of the state and action, on average.
-    Ends     in terminal states, and where the source ends.
-    Chance   that of the table.
+    State    its number in the folder; S is the end, if transitions end an episode without a next state.
+    Actions  as in the source; by name if the import recorded the names, otherwise by number.
+    Reward   of the outcome, if the folder has it; otherwise the mean for the state and action.
+    Ends     in terminal states, and on transitions without a next state.
+    Chance   as in the table.
     """
 
     folder: str = ""
@@ -76,7 +76,7 @@ class ImportedWorld(Environment):
     @cached_property
     def manifest(self) -> Mapping[str, Any]:
         """Manifest of the folder."""
-        return mdp_files.read_manifest(self.folder)
+        return mdp_files.read_mdp_manifest(self.folder)
 
     @property
     def actions(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -163,7 +163,7 @@ class ImportedWorld(Environment):
 
     @property
     def successors(self) -> np.ndarray:
-        """(S, A, K) int64, where outcomes lead; with a row for the end, where there is one."""
+        """(S, A, K) int64, next states; with a row for the end, if there is one."""
         return self._table[0]
 
     @property
@@ -187,14 +187,14 @@ class ImportedWorld(Environment):
 
     @cached_property
     def available(self) -> np.ndarray:
-        """(S, A) bool, the actions that exist in each state; (1, A), all True, where all do everywhere."""
+        """(S, A) bool, the actions that exist in each state; (1, A), all True, if every action exists everywhere."""
         if not self.has_sets:
             return np.ones((len(self.successors), self.manifest["num_actions"]), np.bool_)
         return self._with_end(np.asarray(self._arrays[mdp_files.AVAILABLE], np.bool_), True)
 
     @property
     def paid(self) -> np.ndarray:
-        """(S, A, K) float64, the reward of each outcome; (S, A, 1) where the folder knows the means alone."""
+        """(S, A, K) float64, the reward of each outcome; (S, A, 1) if the folder has only the means."""
         paid = self._table[2]
         return self.rewards[:, :, None] if paid is None else paid
 
@@ -204,7 +204,7 @@ class ImportedWorld(Environment):
 
         Rows of a large recording are read when they are looked at.
         """
-        shown = mdp_files.read_rows(self.folder, self.manifest)
+        shown = mdp_files.read_observations(self.folder, self.manifest)
         if shown is None:
             return None
         if len(shown) != self.manifest["num_states"]:
@@ -232,7 +232,7 @@ class ImportedWorld(Environment):
     def _table(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         states, actions = self.manifest["num_states"], self.manifest["num_actions"]
         try:
-            table = written_out(*outcomes_of(self._arrays, states, actions), states, actions, self._paid)
+            table = written_out(*table_outcomes(self._arrays, states, actions), states, actions, self._paid)
         except (ValueError, IndexError, TypeError, OverflowError) as error:
             raise FileFormatError(f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.AGAIN}") from None
         return table
@@ -247,12 +247,12 @@ def is_name(value: object) -> bool:
     return isinstance(value, str) and value != ""
 
 
-def outcomes_of(
+def table_outcomes(
     arrays: Mapping[str, np.ndarray], states: int, actions: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(rows (N,), successors (N,), probabilities (N,)): the outcomes of row s A + a, in any of the forms of a folder.
 
-    The end of an episode is the successor -1. Raises ValueError where they are no table of an MDP.
+    The end of an episode is the successor -1. Raises ValueError if they are no table of an MDP.
     """
     number = states * actions
     if mdp_files.PAID[0] in arrays:
@@ -282,7 +282,7 @@ def written_out(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """(S, A, K) successors, probabilities that sum to 1, and rewards; impossible outcomes are left out.
 
-    S is the end, where there is one. p (N,): probabilities; outcome_rewards (N,): the reward of each outcome, if known.
+    S is the end, if there is one. p (N,): probabilities; outcome_rewards (N,): the reward of each outcome, if known.
 
     Raises:
         ParameterError: they are more than MOST_ENTRIES numbers. ValueError: they are no table of an MDP.
@@ -305,16 +305,16 @@ def written_out(
             f"{MOST_ENTRIES:,} numbers in all: it can be solved and measured, but not stepped"
         )
     # Tables with K columns, filled up with probability 0
-    place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    index = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     table = np.zeros((count * actions, most), np.int64)
     chances = np.zeros((count * actions, most))
-    table[rows, place] = np.where(successors == -1, states, successors)
-    chances[rows, place] = p / np.bincount(rows, p, minlength=states * actions)[rows]
+    table[rows, index] = np.where(successors == -1, states, successors)
+    chances[rows, index] = p / np.bincount(rows, p, minlength=states * actions)[rows]
     if has_end:
         table[states * actions :], chances[states * actions :, 0] = states, 1.0
     shape = (count, actions, most)
     if outcome_rewards is None:
         return table.reshape(shape), chances.reshape(shape), None
     rewards = np.zeros((count * actions, most))
-    rewards[rows, place] = payments
+    rewards[rows, index] = payments
     return table.reshape(shape), chances.reshape(shape), rewards.reshape(shape)

@@ -34,7 +34,7 @@ LARGEST = 1e150
 
 
 def steps_of(name: str, mdp: TabularMDP, horizon: int | None) -> int:
-    """T: the argument, else the horizon of the MDP; UndefinedMeasure where there is neither."""
+    """T: the argument, else the horizon of the MDP; UndefinedMeasure if there is neither."""
     steps = mdp.horizon if horizon is None else horizon
     if steps is None:
         raise UndefinedMeasure(f"{name} is defined for episodes of T steps: give a horizon")
@@ -42,7 +42,7 @@ def steps_of(name: str, mdp: TabularMDP, horizon: int | None) -> int:
 
 
 def check_returns(name: str, mdp: TabularMDP, steps: int) -> None:
-    """PrecisionError where returns of so many steps may have squares that 64-bit floats do not hold."""
+    """PrecisionError if returns of so many steps may have squares that 64-bit floats do not hold."""
     if not steps * max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest)) <= LARGEST:
         raise PrecisionError(
             f"{name}: returns of {steps} steps may pass {LARGEST:g}, and 64-bit floats do not hold their squares; "
@@ -54,16 +54,16 @@ class FiniteHorizonValues:
     """Values at every step t = 1, ..., T (index t - 1) of optimal, worst and exploring play, on the nodes of an MDP.
 
     Attributes:
-        choices: the MDP written out; rewards (N, A); table (N, A) where each choice has one outcome, else None.
+        choices: the MDP written out; rewards (N, A); table (N, A) if each choice has one outcome, else None.
         best, worst, explored: (T, N, A) action values; explored_value (T, N), clipped to [worst, best].
         optimal: (T, N, A) bool.
-        sets: (N, A) bool, the available actions; None: all are everywhere. All are where an episode is over.
+        sets: (N, A) bool, the available actions; None: all are everywhere. All are if an episode is over.
         first: (N,) bool, the start nodes. num_visitable: states (pairs under sticky actions) that can be visited.
     """
 
-    def __init__(self, mdp: TabularMDP, steps: int, tell: Callable[[str], object] = str):
-        """tell: called with a line for each step."""
-        self.tell = tell
+    def __init__(self, mdp: TabularMDP, steps: int, report: Callable[[str], object] = str):
+        """report: called with a line for each step."""
+        self.report = report
         size = (mdp.num_states + 1) * mdp.policy_width
         needed = 40 * steps * size * mdp.num_actions
         if needed > MEMORY:
@@ -85,7 +85,7 @@ class FiniteHorizonValues:
         self.explored_value = np.empty(shape[:2])
         self.best[-1] = self.worst[-1] = self.explored[-1] = self.rewards
         for t in range(steps - 1, -1, -1):
-            tell(f"values of step {t} of {steps}")
+            report(f"values of step {t} of {steps}")
             if t < steps - 1:
                 self.best[t] = self.backup(self.best[t + 1].max(axis=1))
                 self.worst[t] = self.backup(self.worst[t + 1].min(axis=1))
@@ -182,14 +182,14 @@ def return_distribution(
 
     Args:
         policy: as for `evaluate_policy`; None: uniform.
-        horizon: T; None: that of the MDP.
+        horizon: T; None: the MDP's.
     Raises:
         UndefinedMeasure: there is no horizon, or there are so many different returns that a table of states by returns
             does not fit into 8 GiB.
         ParameterError: the policy or the horizon is wrong.
     Exactness: exact; returns within 1e-9 of each other count as one. Of general MDPs the reward r(s, a) is paid as it
-        is, even where it is an expectation.
-    Cost: T passes over S A K, where K returns are possible; two tables of S A K.
+        is, even if it is an expectation.
+    Cost: T passes over S A K, if K returns are possible; two tables of S A K.
     Source: Bellemare, Dabney and Rowland (2023), "Distributional reinforcement learning", chapter 2.
     """
     steps = steps_of("return_distribution", mdp, horizon)
@@ -224,9 +224,9 @@ def _backward(mdp: TabularMDP, policy: TablePolicy | None, steps: int) -> tuple[
         after = mdp.dynamics.expected(values)
         for i, reward in enumerate(distinct):
             s, a = np.nonzero(which == i)
-            place = np.searchsorted(returns, reward + support + SAME / 2) - 1
+            index = np.searchsorted(returns, reward + support + SAME / 2) - 1
             block = np.zeros((len(s), len(returns)))
-            block[:, np.maximum(place, 0)] = after[s, a]
+            block[:, np.maximum(index, 0)] = after[s, a]
             executed[s, a] = block
         if mdp.is_sticky and t == 0:
             choice = chance.first.choice(executed, table.first_value(executed))

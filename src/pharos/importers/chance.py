@@ -36,7 +36,7 @@ class DrawError(RuleError):
 
 
 def line_of_code(frame: FrameType | None = None) -> str:
-    """The innermost line of the environment's code that is running, file and number; "" where there is none."""
+    """The innermost line of the environment's code that is running, file and number; "" if there is none."""
     frame = frame or sys._getframe(1)
     while frame is not None:
         path = frame.f_code.co_filename.replace("\\", "/")
@@ -47,7 +47,7 @@ def line_of_code(frame: FrameType | None = None) -> str:
 
 
 def placed(text: str, line: str) -> str:
-    """A text with a line of code behind it, where there is one."""
+    """A text with a line of code behind it, if there is one."""
     return f"{text} ({line})" if line else text
 
 
@@ -58,7 +58,7 @@ class DrawTree:
         most: runs of one step; more are an error.
     Attributes:
         probability: of the run that goes on, as an exact fraction.
-        sampler: draws one outcome at random in place of enumerating, where it is set.
+        sampler: draws one outcome at random in place of enumerating, if it is set.
         refusal: of the last draw that was refused, which the environment's code may have caught.
     """
 
@@ -116,7 +116,8 @@ class DrawTree:
         self._depth, self.probability = 0, ONE
 
     def draw(self, weights: Sequence[Fraction], *, are_positive: bool = False) -> int:
-        """Index of the outcome that this run has; weights are probabilities that sum to 1, those of 0 never drawn."""
+        """Index of the outcome that this run has; weights are probabilities that sum to 1; a weight of 0 is never
+        drawn."""
         live: Sequence[int] = range(len(weights))
         if not are_positive:
             live = [i for i, weight in enumerate(weights) if weight > 0]

@@ -32,7 +32,7 @@ class ImportedOutcomes(NamedTuple):
     """Outcomes of each state and action: next state, probability and reward.
 
     Attributes:
-        offsets: (S A + 1,) where the outcomes of row s A + a begin. next_states: (N,), -1 for the end of the episode.
+        offsets: (S A + 1,) index of the first outcome of row s A + a. next_states: (N,), -1 for the end of the episode.
         probabilities, rewards: (N,).
     """
 
@@ -64,16 +64,16 @@ def save(
     """Write an MDP without chance into a folder.
 
     Args:
-        folder: made where it is not there; an MDP that lies there is replaced, file by file and the manifest last.
-            Where another process writes it at the moment, that one is waited for, with a warning.
-        source: where the MDP comes from, for people.
+        folder: made if it does not exist. An MDP in it is replaced, file by file and the manifest last. If another
+            process is writing it, `save` warns and waits for that process.
+        source: origin of the MDP, for people.
         actions: names of the actions; None: those of `mdp.names`, else their numbers. Labels, variables and names of
             choices of `mdp.names` are kept as well.
-        time_limit: steps after which training cuts an episode off where the MDP has no horizon; None: 1,000.
+        time_limit: steps after which training cuts an episode off if the MDP has no horizon; None: 1,000.
         observations: what the source shows of each state, which agents may see as the observation "recorded". Equal
             ones are stored once, and all are deflated.
         observed: what they are: "image", (S, H, W, 3) uint8; "grid", (S, columns, rows, C) uint8 codes of things;
-            "vector", (S, N) numbers; None: "image" where they are (S, H, W, 3), else "vector".
+            "vector", (S, N) numbers; None: "image" if they are (S, H, W, 3), else "vector".
         outcomes: of all states and actions, with the reward of each, which episodes are paid then; None: they are paid
             the mean reward.
     Raises:
@@ -89,7 +89,7 @@ def save(
     _check_without_chance(mdp)
     check_free(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    rows = distinct_rows.collected(shown) if isinstance(shown, np.ndarray) else shown
+    rows = distinct_rows.collect_rows(shown) if isinstance(shown, np.ndarray) else shown
     arrays = _arrays_of(mdp) | outcome_arrays | ({} if rows is None else {mdp_files.INDEX: _narrow(rows.index)})
     version = mdp_files.PAID_VERSION if outcome_arrays else mdp_files.VERSION
     version = version if mdp.available is None else mdp_files.SETS_VERSION
@@ -247,8 +247,8 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
     """Return the environment whose rules are the table of an imported MDP: to train on, to step and to draw.
 
     Args:
-        mdp: a folder that `save` wrote; or an MDP without sticky, random or lazy actions, which is kept in the user's
-            cache where it has no such folder. Its discount is left to the task.
+        mdp: a folder that `save` wrote; or an MDP without sticky, random or lazy actions, which is stored in the user's
+            cache if it has no such folder. Its discount is left to the task.
     Raises:
         FileFormatError: the folder holds none, or was changed. ParameterError: the MDP has sticky, random or lazy
             actions.
@@ -258,7 +258,7 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
     _check_without_chance(mdp)
     if mdp.folder is not None and is_folder(mdp.folder):
         return make("imported", folder=os.fspath(mdp.folder))
-    place = storage.cache_directory() / "imported"
+    imported = storage.cache_directory() / "imported"
     parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
     shape = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon]
     contents: list[Any] = [*shape, str(mdp.chance), sorted(parts.items())]
@@ -268,7 +268,7 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
         contents += [names, digests, mdp.names.actions]
     contents += [*mdp.residual] if any(mdp.residual) else []
     contents += [mdp_files.ROUNDING, mdp.reward_table.rounding] if mdp.reward_table.rounding else []
-    folder = place / storage.digest_of_json(contents)
+    folder = imported / storage.digest_of_json(contents)
     return make("imported", folder=os.fspath(folder if is_folder(folder) else save(mdp, folder)))
 
 
@@ -297,7 +297,7 @@ def load(folder: str | os.PathLike) -> TabularMDP:
         FileFormatError: there is none, or a file is missing, damaged or changed.
     """
     folder = Path(folder)
-    manifest = mdp_files.read_manifest(folder)
+    manifest = mdp_files.read_mdp_manifest(folder)
     try:
         mdp = _mdp(manifest, mdp_files.read_arrays(folder, manifest))
         residual = mdp.residual.plus(Residual(*mdp_files.residual_of(manifest)))

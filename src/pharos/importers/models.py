@@ -83,7 +83,7 @@ def storm(
     Args:
         path: a model in PRISM's language (.prism, .nm, .pm), in JANI (.jani), or an explicit one (.drn).
         constants: values of its undefined constants, such as "N=3,K=2".
-        reward: name of a reward structure; None: the only one, where there is no target. State rewards are paid with
+        reward: name of a reward structure; None: the only one, if there is no target. State rewards are paid with
             every action there; the MDP pays rewards of transitions on average.
         target: a label or an expression, such as "finished & !agree", whose states end the episode; without a reward
             structure, reaching one pays 1, so that the optimal value at gamma 1 is the maximal probability of reaching
@@ -116,7 +116,7 @@ def storm_recording(
 ) -> tuple[TabularMDP, ImportedOutcomes | None]:
     """Return the MDP of `storm`, and its outcomes with the reward of each, for `importers.save(..., outcomes=)`.
 
-    The outcomes are None where no choice pays different rewards, so that the MDP says it all.
+    The outcomes are None if no choice pays different rewards: the MDP then says it all.
 
     Args, errors: as of `storm`.
     """
@@ -328,7 +328,7 @@ class Query(NamedTuple):
     """States of a target or a property, and what it asks.
 
     Attributes:
-        text: the property. goal, failed: (S,) bool, where it has come true, and where it cannot any more.
+        text: the property. goal, failed: (S,) bool, whether it has come true, and whether it no longer can.
         reward: name of its reward structure, "" for the only one, STEPS for steps; None: probabilities.
         answer, of_starts: as of `Question`. is_total: whether rewards are added up for ever.
     """

@@ -29,7 +29,7 @@ class StepCheckpoint:
     """The finished part of an exploration.
 
     Args:
-        folder: made where it is not there; the caller holds its lock.
+        folder: made if it does not exist; the caller holds its lock.
         identity: what decides about the states, as JSON.
         seconds: between two writes, at least.
     """
@@ -40,7 +40,7 @@ class StepCheckpoint:
         self._due = time.monotonic() + seconds
 
     def resume(self, search: BreadthFirst) -> tuple[SteppedStates, dict[int, Any]]:
-        """(states so far, the saved states of those that are not expanded); a new beginning where there are none.
+        """(states so far, the saved states that are not expanded yet); a new beginning if there are none.
 
         Raises:
             ParameterError: the folder holds a part of another import.

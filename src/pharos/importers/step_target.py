@@ -34,7 +34,7 @@ class NamedCode:
     """A function of the user's own by its name, which any process can import and call.
 
     Attributes:
-        name: module:function or file.py:function. folder: where relative ones are looked for.
+        name: module:function or file.py:function. folder: base of relative paths.
         options: keyword arguments.
     """
 
@@ -49,12 +49,12 @@ class NamedCode:
     @property
     def source(self) -> sources.Source:
         """File and checksum."""
-        return sources.find(self.name, self.folder)
+        return sources.find_source(self.name, self.folder)
 
     @property
     def function(self) -> Callable[..., Any]:
         """The function itself; ParameterError if there is none."""
-        function = sources.load(self.source)
+        function = sources.load_source(self.source)
         if not callable(function):
             raise ParameterError(f"{self.name!r}: is {function!r}; expected a function or a class of that name")
         return function
@@ -114,7 +114,7 @@ class StepTarget:
     """An environment named on the command line, with what is named beside it.
 
     Args:
-        target: gymnasium:ID, gymnax:ID, pgx:ID, module:factory or file.py:factory; jax: before these where the
+        target: gymnasium:ID, gymnax:ID, pgx:ID, module:factory or file.py:factory; jax: before these if the
             factory returns `JaxFunctions`.
         options: of the environment or the factory.
         key, reward: names of functions, see `stepping`. weights: "1,0.5", of a vector of rewards.
@@ -199,7 +199,7 @@ class StepTarget:
             if checkpoint.is_empty:
                 shutil.rmtree(building, ignore_errors=True)
                 with contextlib.suppress(OSError):
-                    folder.rmdir()  # where it is empty
+                    folder.rmdir()  # if it is empty
         return mdp, recording
 
     def _identity(self, options: SteppingOptions, horizon: int | None) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Processes that expand the states of one environment together.
 
-Each process makes the environment for itself. States travel between them in memory as pickles of this program's own;
-the order of results is that of the states, so that the MDP is the same with any number of processes.
+Each process makes the environment for itself. States travel between them in memory as pickles of this program.
+Results keep the order of the states, so that the MDP is the same with any number of processes.
 """
 
 import pickle  # noqa: TID251  (the error of a factory that no other process can import)

@@ -33,13 +33,13 @@ MOST_STATES = 100_000
 
 
 class StepRecording(NamedTuple):
-    """Observations, names and notes beside the MDP of `stepping`; `arguments()` are those of `importers.save`.
+    """Observations, names and notes beside the MDP of `stepping`; `arguments()` are arguments of `importers.save`.
 
     Attributes:
         observations: what the environment shows of each state: images (S, H, W, 3) uint8, or vectors (S, N) as
-            Gymnasium flattens its space; None where it cannot be flattened.
+            Gymnasium flattens its space; None if it cannot be flattened.
         observed: "image", "vector" or None.
-        outcomes: each outcome with its reward; None where the MDP says it all.
+        outcomes: each outcome with its reward; None if the MDP says it all.
         actions: names of the actions; None: numbers.
         time_limit: of the environment's TimeLimit, in steps; None: it has none.
         depths: (S,) the least number of steps to each state.

@@ -76,21 +76,21 @@ class Recorder:
     def reset(self, *, seed: int | None = None, options: object = None) -> Returned:
         answer = _reset(self.env, seed, options)
         self.observation = first_of(answer)
-        self.calls.append(Call(None, None, state_of(self.env)))
+        self.calls.append(Call(None, None, table_state(self.env)))
         return answer
 
     def step(self, action: object) -> Returned:
-        if self.script is not None and state_of(self.env) is not None:
+        if self.script is not None and table_state(self.env) is not None:
             self.env.unwrapped.s = self.script[0]
-        before = state_of(self.env)
+        before = table_state(self.env)
         answer = self.env.step(action)
         if self.script is not None:
             _, next_state, reward, ended = self.script
             if before is not None:
                 self.env.unwrapped.s = next_state
             answer = (next_state + first_number(self.env, "observation"), reward, ended, *answer[3:])
-        self.observation, reward, ended, truncated = parts_of(answer)
-        self.calls.append(Call(as_integer(action), before, state_of(self.env), float(reward), ended, truncated))
+        self.observation, reward, ended, truncated = step_parts(answer)
+        self.calls.append(Call(as_integer(action), before, table_state(self.env), float(reward), ended, truncated))
         return answer
 
     def __getattr__(self, name: str) -> Returned:
@@ -104,7 +104,7 @@ class Recorder:
 
 
 def as_integer(value: Returned) -> Returned:
-    """A number or an array of one number as an int where it is whole; anything else as it is."""
+    """A number or an array of one number as an int if it is whole; anything else as it is."""
     try:
         return int(value) if int(value) == value else value
     except (TypeError, ValueError, OverflowError):
@@ -117,7 +117,7 @@ def first_number(env: Stepped, kind: str) -> int:
     return number if isinstance(number, int) else 0
 
 
-def state_of(env: Stepped) -> int | None:
+def table_state(env: Stepped) -> int | None:
     """Number of the state that an environment with a table keeps in `s`; None if there is none."""
     value = as_integer(getattr(getattr(env, "unwrapped", env), "s", None))
     return value if isinstance(value, int) else None
@@ -140,7 +140,7 @@ def first_of(answer: Returned) -> Returned:
     return answer[0] if isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], dict) else answer
 
 
-def parts_of(answer: Sequence[Returned]) -> tuple[Returned, float, bool, bool]:
+def step_parts(answer: Sequence[Returned]) -> tuple[Returned, float, bool, bool]:
     """(observation, reward, terminated, truncated) of what `step` returned, with four parts (old gym's) or five."""
     observation, reward, ended, *rest = answer
     return observation, reward, bool(ended), bool(rest[0]) if len(rest) > 1 else False
@@ -156,13 +156,13 @@ def wrappers_of(env: Stepped) -> list[Stepped]:
     while env is not inner:
         below = getattr(env, "env", None)
         if below is None or len(chain) > 100:
-            raise ParameterError(f"{named(env)}: has no attribute env, the environment that it wraps; {OWN}")
+            raise ParameterError(f"{wrapper_name(env)}: has no attribute env, the environment that it wraps; {OWN}")
         chain.append(env)
         env = below
     return chain
 
 
-def named(env: object) -> str:
+def wrapper_name(env: object) -> str:
     """Name of the class of an environment or wrapper."""
     return type(env).__name__
 
@@ -183,7 +183,7 @@ class Layers:
 
     Args:
         env: the environment as it was given.
-        copied: whether the environment below is copied as well, where it can be. If not, wrappers that are known to
+        copied: whether the environment below is copied as well, if it can be. Otherwise wrappers that are known to
             change nothing are left out.
     Attributes:
         top: the outermost one that may change something, to be stepped in place of `env`.
@@ -200,7 +200,7 @@ class Layers:
         while chain and changes_nothing(chain[0]):  # a time limit would hide what happens later
             del chain[0]
         if copied:
-            loud = [wrapper for wrapper in chain if named(wrapper) not in SILENT or not changes_nothing(wrapper)]
+            loud = [wrapper for wrapper in chain if wrapper_name(wrapper) not in SILENT or not changes_nothing(wrapper)]
             chain, inner = _copied(loud, inner)
         else:
             chain = [copy.copy(wrapper) for wrapper in chain if not changes_nothing(wrapper)]
@@ -217,7 +217,7 @@ class Layers:
             self.suspects.append((wrapper, self.top, below))
             own, others = (getattr(getattr(each, "action_space", None), "n", None) for each in (wrapper, below))
             if own != others:
-                raise ParameterError(f"{named(wrapper)}: has {own} actions, the environment {others}; {OWN}")
+                raise ParameterError(f"{wrapper_name(wrapper)}: has {own} actions, the environment {others}; {OWN}")
 
     def reset(self, seed: int | None = None) -> Returned:
         """First observation of an episode; ParameterError if a wrapper changes how it begins."""
@@ -225,7 +225,7 @@ class Layers:
 
     def step(self, action: int) -> tuple[Returned, float, bool, bool]:
         """(observation, reward, terminated, truncated); ParameterError if a wrapper changes any but the observation."""
-        return self._checked(lambda: parts_of(self.top.step(action)))
+        return self._checked(lambda: step_parts(self.top.step(action)))
 
     def _checked(self, call: Callable[[], Returned]) -> Returned:
         for _, above, below in self.suspects:
@@ -239,7 +239,7 @@ class Layers:
         except PharosError:
             raise
         except Exception as error:  # of code of the caller's
-            names = ", ".join(named(wrapper) for wrapper, *_ in self.suspects)
+            names = ", ".join(wrapper_name(wrapper) for wrapper, *_ in self.suspects)
             reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
             raise ParameterError(f"{names}: cannot be compared with the environment below: {reason}; {OWN}") from error
         for wrapper, above, below in self.suspects:
@@ -276,7 +276,7 @@ def check_wrappers(env: Stepped, steps: int, outcomes: Iterable[tuple[int, int, 
 
 
 def _copied(chain: list[Stepped], inner: Stepped) -> tuple[list[Stepped], Stepped]:
-    """Copies of wrappers and of the environment below; of the wrappers alone where it cannot be copied."""
+    """Copies of wrappers and of the environment below; of the wrappers alone if it cannot be copied."""
     linked = chain
     if any(above.env is not below for above, below in zip(chain, [*chain, inner][1:], strict=True)):
         linked = [copy.copy(wrapper) for wrapper in chain]
@@ -289,7 +289,7 @@ def _copied(chain: list[Stepped], inner: Stepped) -> tuple[list[Stepped], Steppe
 
 
 def _path(wrapper: object) -> str:
-    return f"{type(wrapper).__module__}:{named(wrapper)}"
+    return f"{type(wrapper).__module__}:{wrapper_name(wrapper)}"
 
 
 def _refuse_known(wrapper: Stepped) -> None:
@@ -323,7 +323,7 @@ ENDING = f"{OWN}, and give a time limit as horizon=; other ends need a table P o
 
 def _compare(wrapper: object, above: list[Call], below: list[Call]) -> None:
     """ParameterError if calls above a wrapper are not those below it."""
-    name = named(wrapper)
+    name = wrapper_name(wrapper)
     if [call.action is None for call in above] != [call.action is None for call in below]:
         what = "reset" if above and above[0].action is None else "step"
         raise ParameterError(f"{name}: makes {len(below)} calls of the environment in one {what}; {OWN}")

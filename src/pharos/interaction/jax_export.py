@@ -30,7 +30,7 @@ def to_gymnax(
     `step`.
 
     Its tables are in `env.default_params`. What is executed and what follows is drawn as the MDP says: sticky, random
-    and lazy actions, chance of the rules. The mean reward of what is executed is paid. Where some actions are not
+    and lazy actions, chance of the rules. The mean reward of what is executed is paid. If some actions are not
     available in some states, a choice of one acts as the first available action, as in `GymEnv`;
     `env.action_mask(state)` and `info["action_mask"]` say which are.
 
@@ -38,7 +38,7 @@ def to_gymnax(
         source: a built space; or an MDP, with its chance.
         observation, observation_options: what is seen, as `pharos.observe` takes it; or an array (S, ...). Of an MDP
             that was not made from a space only an array.
-        time_limit: steps of an episode; None: those of the MDP's horizon, else of the environment.
+        time_limit: steps of an episode; None: the MDP's horizon, else the limit of the environment.
         joined_ends: whether `step` returns one `done` in place of terminated and truncated, as before gymnax 1.0 and
             as rejax 0.1 expects.
         reward_noise: standard deviation of what is added to each reward.

@@ -1,8 +1,8 @@
 """Kernels run by Python for little work, which is done long before a kernel is compiled, with the same results.
 
 `interpreted_first` makes a kernel count the entries that its calls read. As long as they are few, and the kernel is not
-compiled, Python runs its text, and that of the functions it calls: the same operations on the same numbers, so the same
-bits. (NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64; few entries do not come that far.)
+compiled, Python runs its text, and the text of the functions it calls: the same operations on the same numbers, so the
+same bits. (NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64; few entries do not come that far.)
 """
 
 from collections.abc import Callable
@@ -62,12 +62,12 @@ def interpreted_first(*counted: str) -> Callable:
     def decorate(kernel: CPUDispatcher) -> CPUDispatcher:
         compiled = kernel._compile_for_args  # asked for the function to call with types that are not compiled yet
         names = kernel.py_func.__code__.co_varnames
-        places = [names.index(name) for name in counted]
+        indices = [names.index(name) for name in counted]
         count = 0
 
         def compiled_or_interpreted(*arguments: object) -> object:
             nonlocal count
-            read = [arguments[i] for i in places] or [each for each in arguments if not isinstance(each, int)]
+            read = [arguments[i] for i in indices] or [each for each in arguments if not isinstance(each, int)]
             count += sum(map(_entries, read))
             is_small = count < compiling.SMALL // LOADING or (
                 count < COMPILING * compiling.SMALL and not is_on_disk(kernel)

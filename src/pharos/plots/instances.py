@@ -56,10 +56,10 @@ def value_map(
 ) -> "Figure":
     """Draw V over the cells of a grid, or over two other variables, with the actions that the policy may take.
 
-    Over row and column, arrows are those of all optimal actions for an optimal solution; for a given policy as long as
-    their probability. Over other variables, letters say which actions the policy may take. A dot stands where every
-    action is as good. Terminal states are grey and outside of the colours' range; the number is the reward of getting
-    there. A frame marks where episodes start.
+    Over row and column, arrows show all optimal actions of an optimal solution; the arrows of a given policy are as
+    long as their probability. Over other variables, letters say which actions the policy may take. A dot means that
+    every action is as good. Terminal states are grey and outside of the colours' range; the number is the reward of
+    getting there. A frame marks where episodes start.
 
     Args:
         space: of any environment.
@@ -68,7 +68,7 @@ def value_map(
         fix: name -> value of every other variable, such as {"passenger": 4}: the slice to draw. What has one value in
             it need not be named.
         rest: "start": variables that `fix` does not name are as in the first start state.
-        axes: where to draw; None for a new figure.
+        axes: matplotlib axes to draw on; None for a new figure.
     Raises:
         ParameterError: states lack these variables, others are not fixed, or values belong to pairs.
     """
@@ -76,17 +76,17 @@ def value_map(
         raise ParameterError(
             "values under sticky actions belong to pairs (state, previous action); expected one a state"
         )
-    shown, place = _cells(space, over, fix or {}, rest)
+    shown, cells = _cells(space, over, fix or {}, rest)
     from matplotlib.patches import Rectangle
 
     assert space.environment is not None
     # Values as an image over the two variables
-    first, size = _extent(space, over, place)
-    place = place - first
+    first, size = _extent(space, over, cells)
+    cells = cells - first
     mdp = solution.mdp
     terminal = np.asarray(mdp.terminal)
     values = np.full(size, np.nan)
-    values[place[:, 0], place[:, 1]] = np.where(terminal[shown], np.nan, solution.v[shown])
+    values[cells[:, 0], cells[:, 1]] = np.where(terminal[shown], np.nan, solution.v[shown])
     drawn, axis = single(axes, (max(3.2, 0.62 * min(size[1], 30) + 1.2), max(2.8, 0.62 * min(size[0], 24) + 0.6)))
     axis.set_facecolor("#c9ccd1")
     image = axis.imshow(values, cmap="cividis")
@@ -95,7 +95,7 @@ def value_map(
     lengths, letters = _lengths(solution), _letters(space.environment.actions)
     draws_actions = over == CELLS or max(size) <= MOST_LETTERS
     low, high = _range_of(values)
-    for s, (row, column) in zip(shown, place, strict=True):
+    for s, (row, column) in zip(shown, cells, strict=True):
         value = values[row, column]
         dark = np.isnan(value) or (high > low and (value - low) / (high - low) > 0.5)
         color = "#101216" if dark else "#f4f5f7"
@@ -112,7 +112,7 @@ def value_map(
             text = "".join(letters[int(action)] for action in np.flatnonzero(lengths[s] > 0.02))
             axis.text(column, row, text, ha="center", va="center", color=color, fontsize=7)
     # Frames around start states
-    for row, column in place[np.isin(shown, mdp.start_states)]:
+    for row, column in cells[np.isin(shown, mdp.start_states)]:
         axis.add_patch(
             Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="#D55E00", linewidth=1.6)
         )
@@ -159,18 +159,18 @@ def _letters(actions: Sequence[str]) -> list[str]:
 
 def _ticks(count: int, first: int) -> tuple[list[int], list[str]]:
     """(positions, labels) of ticks: at most a dozen values of a variable."""
-    places = list(range(0, count, -(-count // 12)))
-    return places, [str(first + place) for place in places]
+    indices = list(range(0, count, -(-count // 12)))
+    return indices, [str(first + index) for index in indices]
 
 
-def _extent(space: "StateSpace", over: tuple[str, str], place: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
+def _extent(space: "StateSpace", over: tuple[str, str], cells: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
     """(the values in the first row and column, the number of rows and columns)."""
     assert space.environment is not None
     if over == CELLS:
         components = space.environment.components
         which = [components.names.index(name) for name in CELLS]
         return components.low[which], tuple(components.size[which].tolist())
-    low, high = place.min(axis=0), place.max(axis=0)
+    low, high = cells.min(axis=0), cells.max(axis=0)
     return low, (int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1)
 
 
@@ -259,7 +259,7 @@ def hardness_plane(
         reports: name of an instance, such as "breakout/12x8x1", to its report. One colour for each class before the
             slash.
         visitation, estimation: names of measures in the reports.
-        axes: where to draw; None for a new figure.
+        axes: matplotlib axes to draw on; None for a new figure.
     Raises:
         ParameterError: no reports, or a report lacks a measure or has no finite value for it.
     """
@@ -308,8 +308,8 @@ def _label(axis: Any, points: Mapping[str, tuple[float, float]]) -> None:
                 edge = x + 6 if right else x - 6 - width
                 boxes[right, dy] = (edge, y + dy, edge + width, y + dy + height)
         cost = {
-            place: sum(_overlap(box, other) for other in obstacles) + 2 * abs(place[1] + 3)
-            for place, box in boxes.items()
+            offset: sum(_overlap(box, other) for other in obstacles) + 2 * abs(offset[1] + 3)
+            for offset, box in boxes.items()
         }
         right, dy = min(cost, key=cost.__getitem__)
         obstacles.append(boxes[right, dy])
@@ -367,7 +367,7 @@ def growth(spaces: Mapping[str, "StateSpace"], *, axes: "Axes | None" = None) ->
 
     Args:
         spaces: label -> state space.
-        axes: where to draw; None for a new figure.
+        axes: matplotlib axes to draw on; None for a new figure.
     Raises:
         ParameterError: no space is given.
     """
@@ -405,9 +405,9 @@ def policies(
 ) -> Path:
     """Write an episode of each agent, side by side, with the return so far below.
 
-    All start in the same state and meet the same chance as far as they act alike. For the best policy give that of a
-    discounted solution: with many undiscounted steps to go, a policy that waits is as good as one that goes straight
-    to the goal.
+    All start in the same state and meet the same chance as far as they act alike. For the best policy give the
+    policy of a discounted solution: with many undiscounted steps left, a policy that waits is as good as one that goes
+    straight to the goal.
 
     Args:
         task: environment, chance, and what the agents see.

@@ -2,8 +2,8 @@
 
 Sweeps go in place and in reverse order of discovery: breadth-first search numbers a state before those that it leads
 to, so a sweep from the last state to the first carries values back along whole paths. 20 to 40 sweeps solve games that
-take a thousand plain ones. Where no state can be visited twice, and gamma is 1 or the states have an age, one pass is
-enough. Where sweeps are slow, because gamma is near 1, solving strongly connected components one after another or
+take a thousand plain ones. If no state can be visited twice, and gamma is 1 or the states have an age, one pass is
+enough. If sweeps are slow, because gamma is near 1, solving strongly connected components one after another or
 policy iteration gives a better x to go on from.
 
 The bound. Let T be the backup, a contraction with factor rho, x* its fixed point, and let one sweep in place change
@@ -19,14 +19,14 @@ Values of 32 bits. Backups are computed in 64 bits, and what is stored is the ne
 backup it is off by at most s = 2^-24 |v| + 2^-150. That is one more rounding of a new entry, so e becomes e + s; and d,
 which sweeps tell of the backups before they are stored, becomes d + s: D <= (rho (d + s) + e + s) / (1 - rho).
 
-Values component by component: where play cannot come back to a state, the states that it leads to are solved first.
+Values component by component: if play cannot come back to a state, the states that it leads to are solved first.
 
 A strongly connected component needs the values of those that it leads to, and no others. Sweeps over all states
 go on over those that are long settled, and a component settles only after those behind it; one after another, from the
 last to the first, each is swept until it is settled, and states without a cycle once.
 
-Its result is a better x to go on sweeping from, like that of policy_iteration.py: the bound of `fixed_point` comes
-from the next sweep over all states, and nothing has to be proven of components.
+Its result is a better x to go on sweeping from, like the result of policy_iteration.py: the bound of `fixed_point`
+comes from the next sweep over all states, and nothing has to be proven of components.
 Source: Dai, Mausam, Weld and Goldsmith (2011), "Topological value iteration algorithms".
 """
 
@@ -39,7 +39,15 @@ from numpy.typing import DTypeLike
 
 from pharos.errors import PrecisionError
 from pharos.mdp import BellmanEquation, Part, PolicyTable, Selection, TabularMDP
-from pharos.solvers.convergence import SETTLED, SETTLING, Convergence, imprecise, operations, shrinking, sweeps_left
+from pharos.solvers.convergence import (
+    SETTLED,
+    SETTLING,
+    Convergence,
+    operations,
+    precision_error,
+    shrinking,
+    sweeps_left,
+)
 from pharos.solvers.policy_iteration import PolicyIteration
 from pharos.system.memory import SHARE_OF_VALUES, available_memory, large_zeros
 
@@ -69,7 +77,7 @@ class FixedPoint(NamedTuple):
 
 
 class Backup(Generic[M]):
-    """The Bellman backup T of an MDP under a selection of actions: the best, the worst, or those of a policy.
+    """The Bellman backup T of an MDP under a selection of actions: the best, the worst, or the actions of a policy.
 
     Attributes:
         dtype: that values are stored in; backups are computed in 64 bits.
@@ -96,7 +104,7 @@ class Backup(Generic[M]):
         self._exact_to = 2.0**53 * mdp.reward_table.unit if is_sum and is_pure and mdp.reward_table.unit else -1.0
 
     def factor_of(self, mass: float) -> float:
-        """Contraction factor, where the probabilities of choosing sum to at most `mass`."""
+        """Contraction factor, if the probabilities of choosing sum to at most `mass`."""
         chance, dynamics = self.mdp.chance, self.mdp.dynamics
         executed = chance.chosen * mass + chance.previous + chance.uniform
         is_exact = mass == 1.0 and dynamics.mass == 1.0 and chance.is_none
@@ -108,7 +116,7 @@ class Backup(Generic[M]):
         return SETTLING + math.ceil(1 / (1 - self.factor))
 
     def zeros(self) -> np.ndarray:
-        """(S + 1, W); mapped from a file where memory has little room for it."""
+        """(S + 1, W); mapped from a file if memory has little room for it."""
         return large_zeros((self.mdp.num_states + 1, self.mdp.width), self.dtype, share=SHARE_OF_VALUES)
 
     def __call__(self, x: np.ndarray, out: np.ndarray) -> np.ndarray:
@@ -118,9 +126,9 @@ class Backup(Generic[M]):
         return out
 
     def sweep(self, x: np.ndarray, part: tuple[int, int] | None = None) -> float:
-        """Set x to T x in place, from the last state to the first where possible; return the largest change.
+        """Set x to T x in place, from the last state to the first if possible; return the largest change.
 
-        part: the range of states [start, stop) alone, where transitions are in arrays.
+        part: the range of states [start, stop) alone, if transitions are in arrays.
         """
         options = {} if part is None else {"part": part}
         with np.errstate(over="ignore", invalid="ignore"):  # the bound of values beyond floats is infinite
@@ -135,14 +143,14 @@ class Backup(Generic[M]):
     def rounding_of(self, rewards: Numbers, largest: Numbers) -> Numbers:
         """A bound on the rounding error of a backup in 64 bits of rewards up to `rewards`, entries up to `largest`.
 
-        Rewards that are means have errors of their own, which any choice between them passes on once. 0 where whole
+        Rewards that are means have errors of their own, which any choice between them passes on once. 0 if whole
         numbers are added up, and 53 bits hold them.
         """
         bound = self.operations * (_UNIT * (rewards + largest) + 2.0**-1074) + self.rounding_of_rewards
         return bound * np.logical_not(rewards + largest <= self._exact_to)
 
     def stored(self, largest: float) -> float:
-        """A bound on the error of storing a backup, where the result is at most `largest`: 0 in 64 bits."""
+        """A bound on the error of storing a backup, if the result is at most `largest`: 0 in 64 bits."""
         return _UNIT32 * (1 + 4 * _UNIT32) * largest + 2 * _LEAST32 if self.is_single else 0.0
 
     def size(self, largest: float) -> float:
@@ -150,8 +158,8 @@ class Backup(Generic[M]):
         return largest * (1 + 4 * _UNIT32) + 4 * _LEAST32 if self.is_single else largest
 
     def changed(self, change: float, largest: float) -> float:
-        """A bound on the change of stored entries of at most `largest`; `change` is that of a sweep, which compares
-        backups before they are stored, and which some dynamics compute in 32 bits.
+        """A bound on the change of stored entries of at most `largest`; `change` is the change of a sweep, which
+        compares backups before they are stored, and which some dynamics compute in 32 bits.
         """
         if not self.is_single:
             return change
@@ -172,7 +180,7 @@ def fixed_point(
     """Sweep until the proven bound is at most the tolerance; at gamma = 1 no state may be visited twice.
 
     Args:
-        x: (S + 1, W) of the backup's dtype, where to sweep, from any finite values; None: from zeros.
+        x: (S + 1, W) of the backup's dtype, to sweep in, from any finite values; None: from zeros.
     Raises:
         PrecisionError: floats cannot reach the tolerance.
     """
@@ -187,13 +195,13 @@ def fixed_point(
     components, better = ComponentSolver(mdp, select), PolicyIteration(mdp, select, convergence.tick)
     while True:
         change = backup.sweep(x)
-        largest += change  # at most that: the entries are read where it matters, which costs a third of a sweep
+        largest += change  # at most that: the entries are read if it matters, which costs a third of a sweep
         if better.is_exact or not rho * change > max(backup.rounding(largest + change), tolerance * (1 - rho)):
             largest = largest_of(x)
         rounding = backup.rounding(largest + change)
         if convergence.is_met(backup.bound(change, rounding)):
             return FixedPoint(x, convergence.bound, convergence.sweeps)
-        # x is exact up to rounding, also where values are infinite; or sweeps move rounding errors about
+        # x is exact up to rounding, also if values are infinite; or sweeps move rounding errors about
         convergence.check(rho * change > rounding, SETTLING if better.is_exact else math.inf)
         if components.is_worth_it(convergence.sweeps, change, tolerance) and components.improve(x, tolerance):
             largest = largest_of(x)
@@ -203,7 +211,7 @@ def fixed_point(
 
 
 def _in_single(backup: Backup[TabularMDP], convergence: Convergence, x: np.ndarray) -> FixedPoint:
-    """Fixed point in values of 32 bits, by sweeps alone; where these would not end, in 64 bits, rounded to 32 bits at
+    """Fixed point in values of 32 bits, by sweeps alone; if these would not end, in 64 bits, rounded to 32 bits at
     last: near gamma = 1 rounding to 32 bits adds up over 1 / (1 - gamma) sweeps."""
     tolerance = convergence.tolerance
     while True:
@@ -219,7 +227,7 @@ def _in_single(backup: Backup[TabularMDP], convergence: Convergence, x: np.ndarr
                 x[:] = result.x
             bound = (result.bound + backup.stored(largest_of(result.x))) * MARGIN
             if not bound <= tolerance:
-                raise imprecise(backup.mdp, bound, tolerance, is_single=True)
+                raise precision_error(backup.mdp, bound, tolerance, is_single=True)
             return FixedPoint(x, bound, convergence.sweeps + result.sweeps)
         convergence.check(shift != 0.0, backup.patience)
 
@@ -227,7 +235,7 @@ def _in_single(backup: Backup[TabularMDP], convergence: Convergence, x: np.ndarr
 def backward_induction(
     mdp: TabularMDP, select: Selection, horizon: int, keep_all: bool = False
 ) -> tuple[FixedPoint, np.ndarray, np.ndarray | None]:
-    """(values with `horizon` steps to go, x with one step less, all steps (T + 1, S + 1, W) where they are kept).
+    """(values with `horizon` steps to go, x with one step less, all steps (T + 1, S + 1, W) if they are kept).
 
     Raises:
         PrecisionError: values are too large for 64-bit floats.
@@ -261,7 +269,7 @@ def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np
             residual = np.abs(reward + mdp.gamma * x[successor, 0] - x[:-1, 0]).max(initial=0.0)
         bound = (float(residual) + rounding) / (1 - mdp.gamma)
     if not math.isfinite(bound):
-        raise imprecise(mdp, bound, 0.0)
+        raise precision_error(mdp, bound, 0.0)
     return bound * MARGIN
 
 
@@ -278,10 +286,10 @@ def within_residual(mdp: TabularMDP, bound: float, x: np.ndarray) -> float:
 
 
 def largest_of(x: np.ndarray) -> float:
-    """max |x|; NaN where an entry is NaN."""
+    """max |x|; NaN if an entry is NaN."""
     flat = x.reshape(-1)  # one long row: faster
     largest = 0.0
-    for start in range(0, flat.size, _BLOCK):  # each is read once, which counts where x is in a file
+    for start in range(0, flat.size, _BLOCK):  # each is read once, which counts if x is in a file
         block = flat[start : start + _BLOCK]
         largest = float(np.maximum(largest, np.maximum(block.max(), -block.min())))
     return largest
@@ -290,9 +298,9 @@ def largest_of(x: np.ndarray) -> float:
 def _in_one_pass(
     backup: Backup[TabularMDP], tolerance: float, progress: Callable[[int, float], None] | None, x: np.ndarray | None
 ) -> FixedPoint:
-    """Fixed point where no state can be visited again: each is backed up once, after all states that it leads to.
+    """Fixed point if no state can be visited again: each is backed up once, after all states that it leads to.
 
-    Rounding adds up along the way: that of a state n steps before the end is at most e (1 + rho + ... + rho^n).
+    Rounding adds up along the way: the rounding of a state n steps before the end is at most e (1 + rho + ... + rho^n).
     """
     mdp, rho = backup.mdp, backup.factor
     order = mdp.order()
@@ -305,7 +313,7 @@ def _in_one_pass(
     if progress is not None:
         progress(1, bound)
     if not bound <= tolerance:
-        raise imprecise(mdp, bound, tolerance, backup.is_single)
+        raise precision_error(mdp, bound, tolerance, backup.is_single)
     return FixedPoint(x, bound, 1)
 
 

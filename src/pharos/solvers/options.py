@@ -26,15 +26,15 @@ class Solving:
             S, A): row t has t steps to go.
         progress: called after each sweep with its number and the bound so far, and as often while equations are solved.
         values: a file (.npy) that holds the values while they are computed, in place of memory, and afterwards; what
-            it holds already is where the sweeps begin, so that a solve that was killed goes on. Large ones that memory
-            has room for are swept there, and copied to the file every ten minutes and in the end, whatever ends it.
-            None: memory, or where that has little room a file without a name.
+            it holds already is what the sweeps begin with, so that a solve that was killed goes on. Large ones that
+            memory has room for are swept there, and copied to the file every ten minutes and in the end, whatever ends
+            it. None: memory, or, if that has little room, a file without a name.
         processes: 1; or "mpi": those that `mpiexec` has started, all of which make this call, and sweep a range of the
             states each; the first gets the Solution, the others None. Values depend on it within the tolerance; those
             of a horizon do not.
-        checkpoint: a folder for the values so far, once a minute, so that the same call goes on where one was killed,
+        checkpoint: a folder for the values so far, once a minute, so that the same call goes on after one was killed,
             with any number of processes.
-        threads: threads of a sweep. Beyond one, last digits may differ, within the error. They share the states where
+        threads: threads of a sweep. Beyond one, last digits may differ, within the error. They share the states if
             no action is sticky and transitions are in arrays.
         dtype: type of the stored values: float64; or float32, half the memory, and a bound that counts it. So a
             tolerance below 1.2e-7 max |V| / (1 - gamma) is out of reach. For one process, and no horizon.

@@ -73,7 +73,7 @@ class SolverCheckpoint:
         self.numbers = (0.0, 0.0)
 
     def start(self, backup: "RankedBackup") -> int:
-        """Set the values to those of the file, where there is one. Returns the sweeps that they took."""
+        """Set the values to the file's, if there is one. Returns the sweeps that they took."""
         if self._folder is None:
             return 0
         name = storage.digest_of_json([self._question, backup.mdp.num_states, backup.mdp.width, backup.fingerprint()])
@@ -120,7 +120,7 @@ class SolverCheckpoint:
                 self._path.unlink(missing_ok=True)
 
     def _read(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray | None]:
-        """(header, values) of the file; zeros and None where there is none, or not a whole one."""
+        """(header, values) of the file; zeros and None if there is none, or not a whole one."""
         nothing = np.zeros(_HEADER), None
         assert self._path is not None
         try:
@@ -154,8 +154,8 @@ class RankedBackup:
     """One rank's part of the Bellman backup T of an MDP under a selection of actions.
 
     Attributes:
-        part: the states of this rank. backup: T on them; its factor and its rounding are those of the whole MDP.
-        x: (n + H + 1, W) values, see mdp/reachability.py. previous: those before the last sweep of a horizon.
+        part: the states of this rank. backup: T on them; its factor and its rounding belong to the whole MDP.
+        x: (n + H + 1, W) values, see mdp/reachability.py. previous: the values before the last sweep of a horizon.
         first: (R, 2) runs of its states that sweeps of a horizon begin with: those that others read, short gaps filled.
     """
 
@@ -228,7 +228,7 @@ class RankedBackup:
         return whole if is_first else None
 
     def scatter(self, whole: np.ndarray | None) -> None:
-        """Set the values of all ranks, halos included, to those of the first rank, (S + 1, W)."""
+        """Set the values of all ranks, halos included, to the values of the first rank, (S + 1, W)."""
         self.rank.scatter_rows(whole, self.cuts, self.x)
         self._halo.receive(self.x)
         self._halo.send(self.x)
@@ -239,28 +239,28 @@ class RankedBackup:
         part, equation = self.part, self.backup.equation
         x = self.part.zeros()
         numbers = np.concatenate([np.arange(part.start, part.stop), part.halo])
-        x[:-1] = (_mixed(numbers)[:, None] >> np.uint64(12)) * 2.0**-52
+        x[:-1] = (_mixed_numbers(numbers)[:, None] >> np.uint64(12)) * 2.0**-52
         total = 0
         for start in range(0, len(part), _BLOCK):
             states = slice(start, min(start + _BLOCK, len(part)))
             q = equation.rewards.rows(states) + equation.gamma * part.dynamics.expected(x, states)
             for kind, values in enumerate((q, equation.value(q, states))):
                 bits = np.ascontiguousarray(values).view(np.uint64).reshape(len(values), -1)
-                place = (part.start + np.arange(states.start, states.stop, dtype=np.uint64)[:, None]) * np.uint64(
+                position = (part.start + np.arange(states.start, states.stop, dtype=np.uint64)[:, None]) * np.uint64(
                     2 * bits.shape[1]
                 )
-                place = place + np.uint64(2) * np.arange(bits.shape[1], dtype=np.uint64) + np.uint64(kind)
-                total += int(np.add.reduce(_mixed(bits ^ _mixed(place)), axis=None, dtype=np.uint64))
+                position = position + np.uint64(2) * np.arange(bits.shape[1], dtype=np.uint64) + np.uint64(kind)
+                total += int(np.add.reduce(_mixed_numbers(bits ^ _mixed_numbers(position)), axis=None, dtype=np.uint64))
         totals = self.rank.allgather(np.array([total % 2**64], np.uint64))
         return f"{sum(int(each[0]) for each in totals) % 2**64:016x}"
 
 
 def _larger(one: float, other: float) -> float:
-    """The larger of two numbers; NaN where one is NaN."""
+    """The larger of two numbers; NaN if one is NaN."""
     return float(np.maximum(one, other))
 
 
-def _mixed(numbers: np.ndarray) -> np.ndarray:
+def _mixed_numbers(numbers: np.ndarray) -> np.ndarray:
     """Whole numbers as uint64, mixed by splitmix64."""
     with np.errstate(over="ignore"):
         z = numbers.astype(np.uint64) + np.uint64(_MIX[0])

@@ -65,7 +65,7 @@ class InterpretedCheck:
         self.drawings: dict[State, np.ndarray] = {}
 
     def expand(self, state: State) -> list[State]:
-        """The successors of `state` in the order of actions and outcomes, checked; none where it is terminal."""
+        """The successors of `state` in the order of actions and outcomes, checked; none if it is terminal."""
         self.terminal[state] = self._is_terminal(state)
         if self.terminal[state]:
             return []
@@ -195,7 +195,7 @@ class InterpretedCheck:
         return float(answers[0])
 
     def _check_age(self, state: State, action: int, outcome: int, successor: State) -> None:
-        """Raise a RuleError where a successor is not older."""
+        """Raise a RuleError if a successor is not older."""
         before, after = self._age(state), self._age(successor)
         if after <= before:
             raise RuleError(
@@ -271,7 +271,7 @@ class InterpretedCheck:
         return f"{self.env}: {rule}{branch} in state {self.text(state)}"
 
     def text(self, state: State) -> str:
-        """Text of a state, with the names of its components where they are few."""
+        """Text of a state, with the names of its components if they are few."""
         if len(state) > 8:
             return str(state)
         return "(" + ", ".join(f"{n}={v}" for n, v in zip(self.components.names, state, strict=True)) + ")"

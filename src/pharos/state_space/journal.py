@@ -4,9 +4,9 @@ Data first, then the manifest that describes it: whatever kills the process, the
 command goes on from there.
 
 Chance. During the build, possible outcomes are appended one after another, with a code for each state and action. The
-code's vector in the palette has the number of outcomes and their probabilities. Where there are more vectors than
+code's vector in the palette has the number of outcomes and their probabilities. If there are more vectors than
 codes, the probabilities are spelled out, once and for all. `OutcomeParts` makes the files of the finished build from
-these: rows are padded to equal length where little of that would be padding, and codes take one byte where that
+these: rows are padded to equal length if little of that would be padding, and codes take one byte if that
 suffices.
 """
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from pharos.errors import DiskFull
 from pharos.kernels import outcomes as kernels
-from pharos.rules import pack
+from pharos.rules import pack_states
 from pharos.state_space.manifest import (
     ARRAYS,
     CODES,
@@ -121,7 +121,7 @@ class Journal:
         for name in names:
             self._files[name] = GrowingFile(self.path / name, arrays.get(name))
         if manifest is None:
-            states = pack(self.plan.layout, np.array(self.plan.starts[0], np.int64))
+            states = pack_states(self.plan.layout, np.array(self.plan.starts[0], np.int64))
             position = Position(count=len(states), level_end=len(states))
             self._files[STATES].append(states)
         else:
@@ -194,7 +194,7 @@ class Journal:
         narrow, self._indices = self._successors_name, SUCCESSORS40
         old = self._files[narrow]
         self._files[self._successors_name] = GrowingFile(self.path / self._successors_name)
-        for _, entries in blocks_of(old, np.dtype("<i4")):
+        for _, entries in number_blocks(old, np.dtype("<i4")):
             self._append_successors(entries)
         self._written = self._entries(position)
         self.commit(complete=False)
@@ -217,7 +217,7 @@ class Journal:
         """Commit the written data: data first, then the manifest that describes it.
 
         Args:
-            written: entries of the manifest; None for those of the thread that writes.
+            written: entries of the manifest; None for the entries of the thread that writes.
         """
         written = written or self._written
         if written is None:
@@ -257,7 +257,7 @@ class Journal:
         return {**position.to_dict(), "arrays": arrays}
 
     def _check_rules(self, position: Position) -> None:
-        """Raise StateSpaceMismatch where the stored transitions are those of other rules."""
+        """Raise StateSpaceMismatch if the stored transitions come from other rules."""
         if position.first == 0:
             return
         shape = (position.first, self.plan.env.num_actions)
@@ -267,7 +267,7 @@ class Journal:
         check_rules(self.path, self.plan.env, self.plan.layout, self.stored_states(position.count), successors, bits)
 
 
-def blocks_of(file: GrowingFile, dtype: np.dtype, entries: int | None = None) -> Iterator[tuple[int, np.ndarray]]:
+def number_blocks(file: GrowingFile, dtype: np.dtype, entries: int | None = None) -> Iterator[tuple[int, np.ndarray]]:
     """Blocks of the numbers in a file: pairs (index of the first one, array), in order.
 
     Args:
@@ -292,7 +292,7 @@ ENTRIES = 1 << 18  # of rows of K, as many as are copied at a time
 class JournalRows(NamedTuple):
     """Rows of outcomes: number of the first row, number of its first outcome; then R rows of N outcomes in all.
 
-    counts (R,); codes (R,), None where probabilities are spelled out; successors (N,).
+    counts (R,); codes (R,), None if probabilities are spelled out; successors (N,).
     """
 
     row: int
@@ -307,9 +307,9 @@ class OutcomeParts:
     """The outcomes in the files of an unfinished build.
 
     Attributes:
-        folder: where they are. rows: how many, A for each state. most_declared: the most outcomes that a row may have.
+        folder: that holds them. rows: how many, A for each state. most_declared: the most outcomes that a row may have.
         indices: the file of the finished build that its successors will be in, of INDEX_TYPES.
-        palette: (P, K) uint64, bits of the vectors; None where probabilities are spelled out.
+        palette: (P, K) uint64, bits of the vectors; None if probabilities are spelled out.
     """
 
     folder: Path
@@ -342,8 +342,8 @@ class OutcomeParts:
     def _part(self, row: int, first: int, codes: np.ndarray | None, counts: np.ndarray) -> JournalRows:
         entries = int(counts.sum())
         dtype = dtype_of(INDEX_TYPES[self.indices])
-        place = first * dtype.itemsize
-        stored = np.fromfile(self.folder / PARTS[self.indices], dtype, entries, offset=place)
+        first_byte = first * dtype.itemsize
+        stored = np.fromfile(self.folder / PARTS[self.indices], dtype, entries, offset=first_byte)
         successors = np.asarray(from_stored(stored))
         return JournalRows(row, first, counts, codes, successors)
 
@@ -426,10 +426,10 @@ class OutcomeParts:
             for state in states[
                 (states >= row // self.num_actions) & (states < (row + len(counts)) // self.num_actions)
             ]:
-                place = int(state) * self.num_actions - row
-                rows = slice(place, place + self.num_actions)
-                first_outcome = first + int(counts[:place].sum())
-                part = self._part(row + place, first_outcome, None if codes is None else codes[rows], counts[rows])
+                index = int(state) * self.num_actions - row
+                rows = slice(index, index + self.num_actions)
+                first_outcome = first + int(counts[:index].sum())
+                part = self._part(row + index, first_outcome, None if codes is None else codes[rows], counts[rows])
                 ends = np.cumsum(part.counts)[:-1]
                 probabilities = np.split(self.bits(part).view(np.float64), ends)
                 outcomes[int(state)] = list(zip(np.split(part.successors, ends), probabilities, strict=True))
@@ -444,7 +444,7 @@ def _padded(values: np.ndarray, counts: np.ndarray, most: int, *, fill_with_firs
 
 
 def _link(source: Path, target: Path) -> None:
-    """Give a file another name; copy it where the file system has no hard links."""
+    """Give a file another name; copy it if the file system has no hard links."""
     if target.is_symlink():
         target.unlink()
     try:
@@ -465,7 +465,7 @@ class OutcomeJournal(Journal):
     """The files of one build with chance; see `Journal`.
 
     Attributes:
-        palette: (capacity, K) uint64, the bits of the vectors found; None where probabilities are spelled out.
+        palette: (capacity, K) uint64, the bits of the vectors found; None if probabilities are spelled out.
     """
 
     def __init__(self, path: Path, plan: Plan):
@@ -493,7 +493,7 @@ class OutcomeJournal(Journal):
         return {**dtypes, PARTS[CODES]: "<u2", PARTS[PALETTE]: "<f8", TERMINAL: "|u1"}
 
     def _check_rules(self, position: Position) -> None:
-        """Load the palette of the build; StateSpaceMismatch where stored outcomes are those of other rules."""
+        """Load the palette of the build; StateSpaceMismatch if stored outcomes come from other rules."""
         if self.palette is not None:
             vectors = np.fromfile(self.path / PARTS[PALETTE], "<u8").reshape(-1, self._most)
             self._vectors = len(vectors)
@@ -549,7 +549,7 @@ class OutcomeJournal(Journal):
         self._written = self._entries(at)
 
     def _encoded(self, bits: np.ndarray, counts: np.ndarray) -> np.ndarray | None:
-        """Codes (rows,) uint16 of the rows' probabilities in the palette; None where there are more vectors than codes.
+        """Codes (rows,) uint16 of the rows' probabilities in the palette; None if there are more vectors than codes.
 
         bits: of the probabilities of all outcomes; counts (rows,): outcomes of each row.
         """
@@ -612,7 +612,7 @@ class OutcomeJournal(Journal):
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove the files of a build in progress that are left where a process completed it and was killed then."""
+    """Remove the files of a build in progress that are left if a process completed it and was killed then."""
     for name in PARTS.values():
         with contextlib.suppress(OSError):
             (folder / name).unlink(missing_ok=True)

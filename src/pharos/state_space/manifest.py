@@ -62,7 +62,7 @@ AGAIN = "delete the folder and build again"
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """The manifest of a folder; None where there is none.
+    """The manifest of a folder; None if there is none.
 
     Raises:
         StateSpaceCorrupted: it is nonsense. StateSpaceMismatch: it is of another version of the format.
@@ -87,9 +87,9 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
                 f"{folder}: format version {manifest['format_version']}; this pharos reads versions {FORMAT_VERSION} "
                 f"to {INT40_VERSION}: build again"
             )
-        if digest_of(manifest) != manifest["digest"]:
+        if manifest_digest(manifest) != manifest["digest"]:
             raise ValueError("it was changed after it was written")
-        _check(manifest)
+        _check_space(manifest)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise StateSpaceCorrupted(f"{path}: {reason}; {AGAIN}") from None
@@ -100,7 +100,7 @@ def successors_name(arrays: dict[str, Any], parts: dict[str, str] | None = None)
     """Name of the file of successors, which depends on the width of the indices.
 
     Args:
-        parts: PARTS, where the arrays are those of an unfinished build with chance.
+        parts: PARTS, if the arrays belong to an unfinished build with chance.
     """
     names = parts or {name: name for name in INDEX_TYPES}
     return next((name for name in (SUCCESSORS40, SUCCESSORS64) if names[name] in arrays), SUCCESSORS)
@@ -112,14 +112,14 @@ def has_chance(manifest: dict[str, Any]) -> bool:
     return version == OUTCOMES_VERSION or (version == INT40_VERSION and "outcomes" in manifest)
 
 
-def digest_of(manifest: dict[str, Any]) -> str:
+def manifest_digest(manifest: dict[str, Any]) -> str:
     """SHA-256 of a manifest without its own digest."""
     content = {key: value for key, value in manifest.items() if key != "digest"}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
-    """Raise StateSpaceCorrupted where a file is missing or shorter than its committed length."""
+    """Raise StateSpaceCorrupted if a file is missing or shorter than its committed length."""
     for name, entry in manifest["arrays"].items():
         path = folder / name
         length = path.stat().st_size if path.is_file() else None
@@ -133,8 +133,8 @@ def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
 # Checks of a manifest -------------------------------------------------------------------------------------------------
 
 
-def _check(manifest: dict[str, Any]) -> None:
-    """Raise a ValueError where a manifest, whoever wrote it, describes no possible state space."""
+def _check_space(manifest: dict[str, Any]) -> None:
+    """Raise a ValueError if a manifest, whoever wrote it, describes no possible state space."""
     for name in ("num_states", "num_actions"):
         _whole(manifest[name], name, 1)
     for name in ("num_terminal_states", "num_expanded", "level_end"):
@@ -152,7 +152,7 @@ def _check(manifest: dict[str, Any]) -> None:
 
 
 def _check_layout(layout: dict[str, Any]) -> None:
-    """Raise a ValueError where components do not fit into the words of a state."""
+    """Raise a ValueError if components do not fit into the words of a state."""
     words = _whole(layout["num_words"], "num_words", 1)
     columns = [layout[name] for name in ("names", "low", "size", "bits", "word", "shift")]
     if not all(isinstance(column, list) and len(column) == len(columns[0]) for column in columns):
@@ -278,7 +278,7 @@ class Plan:
 
     Attributes:
         env: the environment.
-        layout: where its components sit in packed states.
+        layout: positions of its components in packed states.
         starts: its start states and their probabilities.
         identity: the entries of the manifest by which state spaces differ; hashed into the cache's folder names.
         fingerprint: of its rules.
@@ -318,7 +318,7 @@ class Plan:
 
     @cached_property
     def branches(self) -> int:
-        """Number of branches of a state: the number of actions, times that of outcomes."""
+        """Number of branches of a state: the number of actions, times the number of outcomes."""
         return self.env.num_actions * int(self.env.outcomes)
 
     @property
@@ -382,7 +382,7 @@ class GrowingFile:
             )
 
     def append(self, rows: np.ndarray) -> None:
-        """Append the bytes of an array; DiskFull where the disk has no room, and ever after: a file has no gaps."""
+        """Append the bytes of an array; DiskFull if the disk has no room, and ever after: a file has no gaps."""
         if self._failure:
             raise self._failure
         data = np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data
@@ -439,14 +439,14 @@ def cannot_write(path: Path, error: OSError) -> DiskFull:
     )
 
 
-def lock(folder: Path) -> contextlib.AbstractContextManager[None]:
-    """Hold the folder for this process; StateSpaceLocked where another one builds there. See `storage.lock`."""
+def lock_build(folder: Path) -> contextlib.AbstractContextManager[None]:
+    """Hold the folder for this process; StateSpaceLocked if another one builds there. See `storage.lock`."""
     return storage.lock(folder, StateSpaceLocked, "building")
 
 
 def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     """Replace the manifest in one step: it is the commit point of everything else in the folder."""
-    manifest = {**manifest, "digest": digest_of(json.loads(json.dumps(manifest)))}
+    manifest = {**manifest, "digest": manifest_digest(json.loads(json.dumps(manifest)))}
     path = folder / MANIFEST
     try:
         storage.replace_file(path, json.dumps(manifest, indent=1))

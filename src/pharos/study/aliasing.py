@@ -59,7 +59,7 @@ def aliasing_table(
 
 
 def with_aliasing(cells: "pd.DataFrame", counts: "pd.DataFrame") -> "pd.DataFrame":
-    """Cells with `aliasing` beside their regret: the share of states whose observation another state has; NaN where it
+    """Cells with `aliasing` beside their regret: the share of states whose observation another state has; NaN if it
     was not counted, 0 for the number of the state.
     """
     shares = counts[["environment", "instance", "observation", "share"]].rename(columns={"share": "aliasing"})
@@ -71,9 +71,9 @@ def with_aliasing(cells: "pd.DataFrame", counts: "pd.DataFrame") -> "pd.DataFram
 def _aliasing_of(folder: Path, config: Mapping[str, Any]) -> Aliasing:
     from pharos.observations import observe
     from pharos.state_space import build
-    from pharos.study.batches import task_of
+    from pharos.study.batches import task_of_config
 
-    task, cache = task_of(config), ResultCache(folder / "aliasing")
+    task, cache = task_of_config(config), ResultCache(folder / "aliasing")
     names = ("environment", "parameters", "observation", "observation_options")
     dependencies = json.loads(json.dumps({**{name: config[name] for name in names}, "version": task.env.version}))
     stored = cache.get(dependencies)

@@ -12,7 +12,7 @@ import yaml
 from pharos import training
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.study import worker as _worker
-from pharos.study.execution import claim, opened
+from pharos.study.execution import opened, write_specification
 from pharos.study.specification import Source, Specification, parse
 from pharos.system import storage
 from pharos.training import run_id
@@ -53,24 +53,24 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
 
     A row for each run: `id`; `record`, its run.json; and for each column of the curve a list. Among the metadata of
     the file are the specification, its digest, and a digest of each run. What agents learnt stays in the folder: some
-    hundred kilobytes a run, where a row takes two. Files of code are named relative to the specification, or by their
-    name alone where they are elsewhere, with their checksums; nothing tells where they were on this machine.
+    hundred kilobytes a run; a row takes two. Files of code are named relative to the specification, or by their
+    name alone if they are elsewhere, with their checksums; no path of this machine is stored.
 
     Raises:
         ParameterError: no run is finished. OSError: the file cannot be written; an older one then stays as it was.
     """
     import pyarrow as pa
 
-    study, place = opened(source, folder)
+    study, directory = opened(source, folder)
     ids, records, curves = [], [], []
     for run in study.runs:
-        record = _worker.read_record(place / "runs" / run.id)
+        record = _worker.run_record(directory / "runs" / run.id)
         if record is not None and record["status"] == _worker.FINISHED:
             ids.append(run.id)
             records.append(json.dumps(_placeless(record, study.folder)))
-            curves.append(training.read_curve_table(place / "runs" / run.id, CURVE_COLUMNS))
+            curves.append(training.read_curve_table(directory / "runs" / run.id, CURVE_COLUMNS))
     if not ids:
-        raise ParameterError(f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first")
+        raise ParameterError(f"{directory}: no run of {study.name!r} is finished; execute `pharos study run` first")
     columns: dict[str, Any] = {"id": pa.array(ids), "record": pa.array(records)}
     for field in pa.unify_schemas([curve.schema for curve in curves]):
         lists = [curve.column(field.name).to_pylist() if field.name in curve.column_names else None for curve in curves]
@@ -112,7 +112,7 @@ def unpack(
     Args:
         file: written by `pack`.
         folder: of the study; studies/NAME in the current directory when not given. Runs that it has stay as they are.
-        into: another study, which gets those of the runs that it has as well; None: the packed one, with the defaults
+        into: another study, which gets the runs that it has as well; None: the packed one, with the defaults
             of hyperparameters that it was packed with.
         trust: whether code that the packed study names may be imported, from beside the file; `into` is read in its
             place.
@@ -124,7 +124,7 @@ def unpack(
     """
     file = Path(file)
     text, table, digests = _read(file)
-    target, place = opened(_study(file, text, table, trust) if into is None else into, folder, trust=trust or None)
+    target, directory = opened(_study(file, text, table, trust) if into is None else into, folder, trust=trust or None)
     wanted = {run.id for run in target.runs}
     runs = []
     for row in _rows(file, table):
@@ -133,15 +133,15 @@ def unpack(
         if digests is not None and digests["runs"].get(id) != _digest(id, record, run[2]):
             raise ResultCorrupted(f"{file}: run {id} was changed after it was packed; {_AGAIN}")
         runs.append(run)
-    claim(target, place)
-    added = sum(_write(place, *run) for run in runs if run[0] in wanted)
+    write_specification(target, directory)
+    added = sum(_write(directory, *run) for run in runs if run[0] in wanted)
     with contextlib.suppress(OSError):  # others may be at work there
-        (place / "partial").rmdir()
-    return place, added
+        (directory / "partial").rmdir()
+    return directory, added
 
 
 def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
-    """The study in YAML, its runs, and the digests of both; None in place of digests where an older version packed
+    """The study in YAML, its runs, and the digests of both; None in place of digests if an older version packed
     it."""
     if not file.exists():
         raise ParameterError(f"{file}: no such file")
@@ -217,11 +217,11 @@ def _curve(file: Path, id: str, row: dict[str, list | None], schema: "pa.Schema"
         raise FileFormatError(f"{file}: the curve of run {id} cannot be read: {error}; {_AGAIN}") from None
 
 
-def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> bool:
-    """Write a run into the folder; False where a finished one is there already, which stays."""
-    target = place / "partial" / id
+def _write(directory: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> bool:
+    """Write a run into the folder; False if a finished one is there already, which stays."""
+    target = directory / "partial" / id
     storage.remove_leftovers(target)
-    if _worker.read_status(place / "runs" / id) == _worker.FINISHED:
+    if _worker.read_status(directory / "runs" / id) == _worker.FINISHED:
         return False
     partial = storage.temporary_path(target)
     partial.mkdir(parents=True)
@@ -231,7 +231,7 @@ def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> b
         else:
             training.write_table(partial / "curve.parquet", curve)
         storage.replace_json(partial / "run.json", record)
-        _worker.publish(partial, place, id)
+        _worker.publish_run(partial, directory, id)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return True

@@ -106,8 +106,9 @@ def regret_differences(runs: "pd.DataFrame") -> "pd.DataFrame":
         runs: as from `table`.
     Returns:
         Columns DIFFERENCE_COLUMNS; `ours` and `theirs` are pairs (agent, observation), `difference` is the regret of
-        the first less that of the second, with Student's 95 % interval over runs within tasks; `p_value` is that of
-        Welch's t, and `adjusted` the same after Holm's correction for the number of rows. NaN if a task has one run.
+        the first less the regret of the second, with Student's 95 % interval over runs within tasks; `p_value` belongs
+        to Welch's t, and `adjusted` is the same after Holm's correction for the number of rows. NaN if a task has one
+        run.
     """
     import pandas as pd
 

@@ -1,7 +1,7 @@
 """The files of imported MDPs: a manifest with checksums and a digest, and plain .npy arrays. Knows nothing of MDPs.
 
 FOLDER/manifest.json     what is there, written last
-FOLDER/NAME.npy          an array of COMMON, and those of one of the forms below
+FOLDER/NAME.npy          an array of COMMON, or of one of the forms below
 FOLDER/outcome_*.npy     in format version 3: outcomes, with the reward of each
 FOLDER/label_states.npy, variable_values.npy, choice_names.npy   optional: names of states and actions, in any version
 FOLDER/available.npy     in format version 5: the actions that exist in each state; other files as in version 1 or 3
@@ -37,7 +37,7 @@ VERSIONS = (VERSION, OBSERVED_VERSION, PAID_VERSION, SETS_VERSION, CHUNKS_VERSIO
 COMMON = ("rewards", "terminal", "start_states", "start_probabilities")
 TABLE = ("next_states",)
 MATRIX = ("transitions_data", "transitions_indices", "transitions_indptr")
-OUTCOMES = ("successors",)  # and, where they are: offsets; probabilities, or codes and palette
+OUTCOMES = ("successors",)  # and, if there are any: offsets; probabilities, or codes and palette
 OBSERVATIONS = "observations"
 INDEX, CHUNKS, ROWS = "observation_index", "observations.bin", "observation_rows"
 """The row of each state, an array; the chunks of distinct rows, a file; what is in them, an entry of the manifest."""
@@ -64,7 +64,7 @@ def is_folder(folder: str | os.PathLike) -> bool:
     return isinstance(manifest, dict) and manifest.get("format") == FORMAT
 
 
-def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
+def read_mdp_manifest(folder: str | os.PathLike) -> dict[str, Any]:
     """Return the manifest of a folder.
 
     Raises:
@@ -95,7 +95,7 @@ def read_arrays(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> dict[
     """Return the arrays of the MDP by their names, compared with their checksums.
 
     Raises:
-        FileFormatError: one is missing, damaged or changed. ValueError: they are not those of an MDP.
+        FileFormatError: one is missing, damaged or changed. ValueError: they make no MDP.
     """
     checksums = manifest["arrays"]
     kind = TABLE if TABLE[0] in checksums else MATRIX
@@ -134,7 +134,7 @@ def write_rows(folder: Path, rows: DistinctRows) -> dict[str, Any]:
     }
 
 
-def read_rows(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> np.ndarray | DistinctRows | None:
+def read_observations(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> np.ndarray | DistinctRows | None:
     """Return the observations of the states; None if there are none. Chunks are read and checked when they are used.
 
     Raises:
@@ -226,7 +226,7 @@ def read_names(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> dict[s
 
     Returns:
         `labels`, `variables`, `booleans` (of the variables), `choices`: lists of names; and under LABELS (S, labels)
-        bool, VARIABLES (S, variables) integers and CHOICES (S, A) integers, where there are names of this kind.
+        bool, VARIABLES (S, variables) integers and CHOICES (S, A) integers, if there are names of this kind.
     Raises:
         FileFormatError: an array is missing, damaged, changed, or does not fit.
     """

@@ -108,7 +108,7 @@ def read_sealed(file: str | os.PathLike, what: str, make: Callable[[dict[str, An
 
 
 def _check_sizes(path: Path) -> None:
-    """ValueError where the file or its header is too large to be read."""
+    """ValueError if the file or its header is too large to be read."""
     total = path.stat().st_size
     with open(path, "rb") as file:
         length = int.from_bytes(file.read(8), "little")

@@ -1,4 +1,4 @@
-"""YAML that somebody else may have written: data alone, refused in one line where no file of pharos needs it."""
+"""YAML that somebody else may have written: data alone, and refused in one line if no file of pharos needs it."""
 
 import re
 from pathlib import Path
@@ -51,8 +51,8 @@ def nodes_and_data(text: str, name: str, error: type[PharosError] = ParameterErr
         return root, yaml.load(text, Loader)
     except yaml.YAMLError as problem:
         mark = getattr(problem, "problem_mark", None)
-        place = f"{name}:{mark.line + 1}" if mark is not None else name
-        raise error(f"{place}: {getattr(problem, 'problem', None) or 'this is no YAML'}") from problem
+        position = f"{name}:{mark.line + 1}" if mark is not None else name
+        raise error(f"{position}: {getattr(problem, 'problem', None) or 'this is no YAML'}") from problem
     except RecursionError:
         raise error(f"{name}: is nested too deeply; expected a mapping with names") from None
     except ParameterError as problem:
@@ -64,7 +64,7 @@ def nodes_and_data(text: str, name: str, error: type[PharosError] = ParameterErr
 def _check_nodes(root: "yaml.Node", name: str) -> None:
     """Refuse what no file needs: keys that are no words or repeated, nodes within themselves, millions by aliases.
 
-    A node that aliases share is looked at once; its size counts wherever it stands.
+    A node that aliases share is looked at once; its size counts at each alias.
     """
     sizes: dict[int, int] = {}
 

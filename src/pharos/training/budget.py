@@ -23,6 +23,7 @@ curve. What looks like a mistake and is no error is a note (`PolicyRecorder.note
 import contextlib
 import copy
 import os
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -59,7 +60,7 @@ CHECKED = 3
 """First policies of a run that are asked again."""
 AGAIN, FEW = 8, 128
 """Up to AGAIN times, as long as the answers together are FEW: a policy that samples seldom would answer the same by
-chance where there are few observations."""
+chance if there are few observations."""
 INFO = ("action_mask", "prob")
 """Entries of `info` that Gymnasium's own environments give as well; others say what an agent is to find out."""
 SEVERAL = (
@@ -127,7 +128,7 @@ class StepBudget:
 class CountedEnv(gymnasium.Wrapper):
     """The environment of a task, whose steps count against a budget.
 
-    Without a seed in its first `reset` it has that of the run, as its action space has, so that a run is the same
+    Without a seed in its first `reset` it has the seed of the run, as its action space has, so that a run is the same
     again. `copy()` gives another one with the same budget, for vector environments:
     `gymnasium.vector.SyncVectorEnv([env.copy] * 8)`.
 
@@ -135,7 +136,8 @@ class CountedEnv(gymnasium.Wrapper):
     pickled, nor be used in another process than the one that made it: nobody would count there.
 
     `info` has nothing of what an agent is to learn: neither the state nor its index, neither the executed action nor
-    what was earned without noise; INFO is what is left. Episodes begin where the task says: `reset` takes no options.
+    what was earned without noise; INFO is what is left. Episodes begin in the start states of the task: `reset` takes
+    no options.
     """
 
     def __init__(self, task: Task, budget: StepBudget, seed: int):
@@ -257,11 +259,11 @@ class Snapshots:
             if len(tables) == 1 and self._num_checked < CHECKED:
                 self._num_checked += 1
                 for _ in range(min(max(1, FEW // count), AGAIN)):
-                    _check_again(tables[0], _answer(answers, policy, observations, count))
+                    _check_same_answers(tables[0], _answer(answers, policy, observations, count))
         return np.concatenate(tables)
 
     def _observations(self) -> Iterator[tuple[int, Any]]:
-        """Blocks of observations of all states, kept where they are small."""
+        """Blocks of observations of all states, kept if they are small."""
         if self._kept is not None:
             yield from self._kept
             return
@@ -294,7 +296,7 @@ def _answer(answers: PolicyAnswers, policy: PolicyLike, observations: Any, count
         ) from error
 
 
-def _check_again(table: np.ndarray, again: np.ndarray) -> None:
+def _check_same_answers(table: np.ndarray, again: np.ndarray) -> None:
     """Raise ParameterError for a policy whose second answer is another one than the first."""
     differ = np.abs(table - again).max(axis=1) > SAME
     if differ.any():
@@ -326,7 +328,7 @@ class PolicyRecorder:
         self.budget = StepBudget(steps, interval)
         self.env = CountedEnv(task, self.budget, seed)
         self.count = 0
-        self.in_force: PolicyLike | Evaluation = uniform_policy(task)
+        self.in_force: PolicyLike | Evaluation = uniform_choice(task.mdp)
         self.ended = 0, 0.0
         self.at_point: Callable[[int], object] = self._remember
         self._points = deque([*range(interval, steps, interval), steps])  # to come
@@ -389,7 +391,7 @@ class PolicyRecorder:
 
     def check_steps(self, curve: Curve) -> None:
         """Raise ParameterError if a curve ends elsewhere than it begins, and no step was counted."""
-        first, last = (curve.rows[place]["normalized_regret"] for place in (0, -1))
+        first, last = (curve.rows[index]["normalized_regret"] for index in (0, -1))
         if not self.budget.steps and abs(last - first) > TOLERANCE:
             raise not_stepped(self.budget.limit)
 
@@ -438,7 +440,7 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
     """Train with a generator, and evaluate the policy in force at each evaluation point, and uniform play before.
 
     Returns:
-        A row before the first step, that of uniform play, and one for each point; and the number of counted steps.
+        A row before the first step, for uniform play, and one for each point; and the number of counted steps.
     Raises:
         ParameterError: it is no generator of policies; or it has a second policy, or ends with another one than uniform
             play, when no step was counted; or whatever its code raises.
@@ -446,6 +448,16 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
     recorder = PolicyRecorder(task, steps=steps, interval=steps // evaluations, seed=seed)
     generate(learn, recorder, seed)
     return recorder.curve()
+
+
+def end_process(agent: str, limit: int) -> NoReturn:
+    """End this process: what catches BudgetSpent around `step`, and goes on, cannot be ended otherwise."""
+    sys.stderr.write(
+        f"pharos: agent {agent} went on for {IGNORED:,} steps after its {limit:,}; expected its loop to end: catch no "
+        f"BudgetSpent (`except:`, `except BaseException`) around step\n"
+    )
+    sys.stderr.flush()
+    os._exit(1)
 
 
 @contextlib.contextmanager
@@ -502,8 +514,3 @@ def not_stepped(steps: int) -> ParameterError:
         f"learn has a policy other than uniform play, and 0 of its {steps:,} steps were counted; expected it to step "
         f"the environment that it was given, or copies of it; {SEVERAL}"
     )
-
-
-def uniform_policy(task: Task) -> np.ndarray:
-    """(S, A) probabilities of uniform play."""
-    return uniform_choice(task.mdp)

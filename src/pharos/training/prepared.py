@@ -43,9 +43,9 @@ class TaskCache:
     """Tasks of runs by configuration; they share spaces, rewards, solved values and observations.
 
     Args:
-        values: config -> values at the start of its task, where they are known.
+        values: config -> values at the start of its task, if they are known.
         trust, strict: as for `RunConfig.task`.
-        device: where networks are trained, which decides about what fits together.
+        device: on which networks are trained, which decides about what fits together.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class TaskCache:
         return self.shared("task", config, TASK, lambda: self._task(config))
 
     def adopt(self, config: RunConfig, task: Task) -> None:
-        """Keep a task that exists already as that of a run."""
+        """Keep a task that exists already as the task of a run."""
         self.shared("task", config, TASK, lambda: task)
 
     def _task(self, config: RunConfig) -> Task:
@@ -92,14 +92,14 @@ class PreparedRun:
     """A run before and while it is trained: a `pharos.agents.LearningRun`, with its curve and its record.
 
     Attributes:
-        place: among the configurations; None for a run of a checkpoint that nobody asks for.
+        index: among the configurations; None for a run of a checkpoint that nobody asks for.
         tasks: that it shares with other runs.
         key: runs with equal keys train together, see `pharos.agents.Agent.prepare`; None: it is alone, has checkpoints
             in its own folder, and holds that.
         error: why it has failed.
     """
 
-    place: int | None
+    index: int | None
     config: RunConfig
     folder: Path | None
     tasks: TaskCache
@@ -118,7 +118,7 @@ class PreparedRun:
 
     @cached_property
     def hyperparameters(self) -> dict[str, Any]:
-        """All that are known, those of the configuration first."""
+        """All that are known, the configuration's first."""
         config = self.config
         return hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
 
@@ -153,7 +153,7 @@ class PreparedRun:
         self.key = None if key is None else (config.agent, config.steps, config.evaluation_interval, key)
 
     def write(self, status: str, **entries: object) -> None:
-        """Replace run.json where there is a folder: the run is "running", "failed" or "finished"."""
+        """Replace run.json if there is a folder: the run is "running", "failed" or "finished"."""
         if self.folder is None:
             return
         config = self.config

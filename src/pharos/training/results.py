@@ -81,9 +81,9 @@ def versions() -> dict[str, str]:
 def write_record(folder: Path, record: Mapping[str, Any]) -> None:
     """Replace run.json in one step; numbers that JSON cannot say are null.
 
-    The record gets a `digest` of all that it says; that of a finished run also `checksums` of the other files of the
-    run, which are written before it: of `curve.csv` (see `digest_of_curve`), and of what the agent has learnt; and
-    `written`, the date.
+    The record gets a `digest` of all that it says; the record of a finished run also has `checksums` of the other files
+    of the run, which are written before it: of `curve.csv` (see `digest_of_curve`), and of what the agent has learnt;
+    and `written`, the date.
     """
     if record.get("status") == "finished":
         written = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -159,7 +159,7 @@ def read_curve_table(folder: str | os.PathLike, columns: Iterable[str] = tuple(C
         columns: those that must be there.
     Raises:
         FileFormatError: there are none, or columns are missing. ResultCorrupted: the file was cut short or changed
-        after it was written, or is that of another run. MissingExtra: pyarrow is not installed.
+        after it was written, or belongs to another run. MissingExtra: pyarrow is not installed.
     """
     curve = _read_curve(Path(folder), columns)
     if isinstance(curve, dict):
@@ -280,7 +280,7 @@ def digest_of_curve(table: "pa.Table") -> str:
     """XXH3-128 of the columns of a curve, whatever their order or the version of Parquet that holds them.
 
     For each column, by name: its name, type and number of rows, and its values as little-endian int64, float64 (NaN
-    where there is none) or bytes of truth; of other types as JSON.
+    if there is none) or bytes of truth; of other types as JSON.
     """
     return _digest_of_columns(_columns_of(table))
 
@@ -345,9 +345,9 @@ class TrainingResult:
         config: of the run.
         result: summary: values of the optimal, uniform, worst and final policy, regrets, episodes.
         curve: a row for each evaluation, a dictionary with the columns of curve.csv.
-        agent: the trained agent: a `QLearning` or a model of Stable-Baselines3; None where the run was finished before.
+        agent: the trained agent: a `QLearning` or a model of Stable-Baselines3; None if the run was finished before.
         folder: of the run, or None.
-        seconds: time that it took, without that of compiling.
+        seconds: time that it took, without compiling.
         notes: sentences on what looks like a mistake of a function of the user's own, by kind.
     """
 
@@ -362,12 +362,12 @@ class TrainingResult:
     def __repr__(self) -> str:
         config, result = self.config, self.result
         numbers = (f"{name}={result[name]}" for name in ("final_value", "value_optimal", "normalized_regret"))
-        place = f"{config['agent']} on {config['environment']}, steps={config['steps']}"
-        return f"TrainingResult({place}, {', '.join(numbers)}, seconds={self.seconds:.2f})"
+        title = f"{config['agent']} on {config['environment']}, steps={config['steps']}"
+        return f"TrainingResult({title}, {', '.join(numbers)}, seconds={self.seconds:.2f})"
 
 
 def finished_result(folder: Path, config: RunConfig) -> TrainingResult | None:
-    """The result in a folder; None where there is none; ParameterError where it is that of another run."""
+    """The result in a folder; None if there is none; ParameterError if it belongs to another run."""
     if not (folder / "run.json").exists():
         return None
     record = read_record(folder)
@@ -406,7 +406,7 @@ def _digests(folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): digest_of_file(path) for path in files}
 
 
-def _digest(record: Mapping[str, Any]) -> str:
+def _record_digest(record: Mapping[str, Any]) -> str:
     """Digest of a record that may hold infinities and NaN."""
     return digest_of_bytes(json.dumps(record, sort_keys=True).encode())
 
@@ -433,7 +433,7 @@ class Checkpoint:
         partial.mkdir(parents=True)
         learner.save(partial)
         record = {"id": self.id, "rows": rows, "seconds": seconds, "files": _digests(partial)}
-        (partial / "curve.json").write_text(json.dumps({**record, "digest": _digest(record)}))
+        (partial / "curve.json").write_text(json.dumps({**record, "digest": _record_digest(record)}))
         for path in (*partial.rglob("*"), partial):  # the older one goes only when this one is on the disk
             sync(path)
         old = self.folder.with_name(f"{self.folder.name}.old")
@@ -461,7 +461,7 @@ class Checkpoint:
                 record = {"id": self.id, "digest": ""}
             if record.get("id") == self.id:
                 digest = record.pop("digest", None)  # which an older pharos did not write
-                if digest is not None and (digest != _digest(record) or record["files"] != _digests(folder)):
+                if digest is not None and (digest != _record_digest(record) or record["files"] != _digests(folder)):
                     raise FileFormatError(
                         f"{folder}: cannot be resumed from: it was changed after it was written; {ANEW}"
                     )

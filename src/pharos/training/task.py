@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pharos.agents import agent_called, agent_source, is_known
-from pharos.environments import Environment, as_tuples, class_called, class_of, make, source_of
+from pharos.environments import Environment, as_tuples, class_called, class_of, class_source, make
 from pharos.errors import DivergenceError, FileFormatError, ParameterError, UnknownName
 from pharos.mdp import (
     ChanceSetting,
@@ -29,7 +29,7 @@ from pharos.policies import Observer, ReachableRows, endless_value, reachable_ro
 from pharos.regret import ReferenceValues
 from pharos.solvers import GainInterval, Solution, average_reward, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
-from pharos.system.records import flat, read
+from pharos.system.records import flat, parse_record
 from pharos.system.sources import Source, is_reference, resolve, untrusted_code
 from pharos.training.options import ENGINES, OBJECTIVES, Horizon, TrainingOptions
 
@@ -75,7 +75,7 @@ class Task:
     Attributes:
         env: the environment.
         chance: of acting, and in how agents are paid; its fields are keywords too, `Task(env, sticky=0.1)`. Values and
-            regret are those of the rewards without noise and delay.
+            regret count the rewards without noise and delay.
         observation, observation_options: what the agent sees, as `pharos.observe` takes it.
         previous_action: whether the agent also sees the previously executed action.
         gamma: discount of values and returns.
@@ -83,7 +83,7 @@ class Task:
             environment's time limit.
         objective: "average": policies are also measured by what a step earns in the long run; "total" stands for
             gamma 1 without a horizon, and None for values alone.
-        values: at the start, where they are known already; None: solved for when they are needed.
+        values: at the start, if they are known already; None: solved for when they are needed.
     """
 
     env: Environment
@@ -231,7 +231,7 @@ class Task:
                 solution = solve(mdp)
                 values.append(float(solution.value_at_start))
                 error = max(error, solution.error_bound)
-            except DivergenceError:  # of total rewards: the policy may go on for ever where something is paid
+            except DivergenceError:  # of total rewards: the policy may go on for ever while something is paid
                 values.append(-math.inf if solve is worst_value else endless_value(mdp, "uniform"))
         optimal, uniform, worst = values
         return ReferenceValues(optimal, uniform, worst, error)
@@ -324,14 +324,14 @@ class RunConfig(TrainingOptions):
         parameters: all parameters of the environment, JSON-able.
         seed: of everything random.
         horizon: number of steps of an episode in values and returns; None: discounted values without a horizon, or
-            total rewards where gamma is 1.
+            total rewards if gamma is 1.
         objective: "average", of runs that also measure what a step earns in the long run; else None, and not in `id`
             and `to_dict`.
         evaluation_interval: steps between evaluations of the policy.
         hyperparameters: of the agent, which go before its defaults.
         engine: what trains networks, one of ENGINES. Tables are the same with each, so theirs is always "sb3"; `id` and
-            `to_dict` have it only where it is another.
-        sources: where a class, observation or agent of the user's own comes from, under "environment", "observation"
+            `to_dict` have it only if it is another.
+        sources: the origin of a class, observation or agent of the user's own, under "environment", "observation"
             and "agent". Their names belong to the `id`; files and checksums do not.
     """
 
@@ -372,7 +372,7 @@ class RunConfig(TrainingOptions):
         """
         observation = task.observation
         sources = {
-            "environment": source_of(type(task.env)),
+            "environment": class_source(type(task.env)),
             "observation": observation.source if isinstance(observation, OwnObservation) else None,
             "agent": agent_source(agent),
         }
@@ -404,7 +404,9 @@ class RunConfig(TrainingOptions):
             FileFormatError: an entry is missing, unknown or of another type.
         """
         try:
-            return read(RunConfig, entry, "the configuration of a run", optional=("engine", "sources", "objective"))
+            return parse_record(
+                RunConfig, entry, "the configuration of a run", optional=("engine", "sources", "objective")
+            )
         except ParameterError as error:
             raise FileFormatError(f"the configuration of a run is damaged: {error}") from error
 
@@ -446,7 +448,7 @@ class RunConfig(TrainingOptions):
         """The task of the run.
 
         Args:
-            values: at the start, which are not computed again where they are given.
+            values: at the start, which are not computed again if they are given.
             trust, strict: as for `make_environment`.
         """
         observation: str | OwnObservation = self.observation
@@ -467,7 +469,7 @@ class RunConfig(TrainingOptions):
 
     @property
     def definitions(self) -> tuple[Any, ...]:
-        """The registered class of the environment, and the registration of the observation, where there are any."""
+        """The registered class of the environment, and the registration of the observation, if there are any."""
         return (class_called(self.environment), *(registered(self.observation) or ()))
 
     def algorithm(self, *, trust: bool = False, strict: bool = False) -> "str | Callable[..., Any]":
@@ -491,7 +493,7 @@ class RunConfig(TrainingOptions):
 def run_id(config: Mapping[str, Any]) -> str:
     """The digest of a run's `config`: XXH3 with 64 bits of its sorted JSON, 16 hexadecimal digits.
 
-    Of code of the user's own its name counts, not where it lies, so that the id is the same on every machine.
+    Of code of the user's own its name counts, not its folder, so that the id is the same on every machine.
     """
     import xxhash
 

@@ -57,10 +57,10 @@ class TuningResult:
         agent, environment, observation: whose hyperparameters these are; `environment` is the name of the class.
         hyperparameters: the best that were found, all of them, those that were not searched included.
         score: mean normalised regret of the best trial.
-        first_score: that of the first trial, what the table said before; None where it was not finished.
+        first_score: the score of the first trial, what the table said before; None if it was not finished.
         trials: a dictionary for each: number, hyperparameters, score, status ("finished", "given up"), seconds,
             reports (number of evaluations -> mean so far).
-        folder: where it was written, or None.
+        folder: to which it was written, or None.
     """
 
     agent: str
@@ -213,7 +213,7 @@ class _Search:
 
     @cached_property
     def table(self) -> dict[str, Any]:
-        """Hyperparameters without the search: those of the first trial, and of every trial where none is searched."""
+        """Hyperparameters without the search: as in the first trial, and in every trial if none is searched."""
         return hyperparameters_of(self.agent, self.environment, self.observation_name)
 
     @cached_property
@@ -283,7 +283,7 @@ class _Search:
 
 
 def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dict[str, tuple[Any, ...]]:
-    """`space`, or that of the agent; ParameterError where there is none, or an entry is wrong."""
+    """`space`, or the space of the agent; ParameterError if there is none, or an entry is wrong."""
     searched = space if space is not None else agent_called(agent).space
     if not searched:
         raise ParameterError(
@@ -457,6 +457,6 @@ def _record(trial: "optuna.trial.FrozenTrial") -> dict[str, Any]:
 
 
 def _best(trials: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The first of the best trials; a score of infinity where none is finished."""
+    """The first of the best trials; a score of infinity if none is finished."""
     finished = [trial for trial in trials if trial["status"] == "finished"]
     return min(finished, key=lambda trial: trial["score"], default={"score": math.inf, "hyperparameters": {}})

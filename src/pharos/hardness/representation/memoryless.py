@@ -28,7 +28,7 @@ MOST_ENTRIES = 2_000_000
 
 @dataclass(frozen=True)
 class MemorylessLoss:
-    """Optimal value minus that of the best deterministic memoryless policy on an observation, at the start.
+    """Optimal value minus the value of the best deterministic memoryless policy on an observation, at the start.
 
     Attributes:
         lower, upper: bounds of the loss, proven; in units of return.
@@ -47,12 +47,12 @@ def memoryless_loss(
 ) -> MemorylessLoss:
     """Bound V*(start) - max over policies on observations of V(start).
 
-    Where some actions are not available, policies take what is available in all states that look alike.
+    If some actions are not available, policies take what is available in all states that look alike.
 
     Args:
         mdp: discounted or with a horizon, as `value_iteration` takes it; random actions, but no sticky ones.
         classes: (S,) the number of the observation of each state, as `observation_classes` gives it.
-        optimal: the solution of `mdp`, where there is one.
+        optimal: the solution of `mdp`, if there is one.
         budget: seconds after which the bounds so far are returned.
     Raises:
         ParameterError: actions are sticky, or no action is available in all states that look alike.
@@ -184,7 +184,7 @@ class _PolicySearch:
         return np.where(fixed < 0, actions, fixed)
 
     def lost(self, q: np.ndarray, weights: np.ndarray, actions: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-        """(C,): the weighted value that each observation loses by its one action; 0 where it has a fixed one."""
+        """(C,): the weighted value that each observation loses by its one action; 0 if it has a fixed one."""
         q = np.asarray(q)
         gaps = q.max(axis=1) - q[np.arange(len(q)), actions[self.classes]]
         lost = np.bincount(self.classes, np.where(self.live, weights * gaps, 0.0), minlength=self.count)
