@@ -54,6 +54,7 @@ from pharos.benchmark.diagnosis import (
     SHIPPED,
     fall_everywhere,
     falls,
+    gaps,
     groups_of,
     is_own,
     lowest_rungs,
@@ -287,6 +288,19 @@ def _policies(contents: Contents) -> Element | None:
     )
 
 
+def _gaps(contents: Contents) -> Element | None:
+    rows = gaps(contents)
+    if not rows:
+        return None
+    heads = ["generator", "training levels", "score on these", "on held-out levels", "gap"]
+    heads += [f"gap of {each.name}" for each in contents.beside]
+    return section(
+        "Levels seen and held out",
+        "The gap is the normalised regret on held-out levels less that on the levels of training, by seed.",
+        html_table(heads, rows, numeric=range(1, len(heads))),
+    )
+
+
 def _groups(contents: Contents) -> Element | None:
     if (near := nearest(contents)) is None:
         return None
@@ -439,6 +453,7 @@ SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
     _ladders,
     _pairs,
     _words,
+    _gaps,
     _policies,
     _core,
     _groups,
