@@ -24,9 +24,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from pharos.cli import answers
 from pharos.system import compiling
 
-compiling.SMALL = 0  # tests are small, and of compiled code; those of tests/kernels/test_interpreted.py are not
+compiling.SMALL_STATES = 0  # tests are small, and of compiled code; those of tests/kernels/test_interpreted.py are not
 compiling.announces = False  # else what a test finds on standard error depends on what was compiled before
-answers.TOLD_AFTER = math.inf  # or on how busy the machine is
+answers.SLOW_AFTER = math.inf  # or on how busy the machine is
 
 for name, derandomize in (("fixed", True), ("explore", False)):
     settings.register_profile(

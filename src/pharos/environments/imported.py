@@ -17,8 +17,8 @@ from pharos.system.arrays import OutcomeRows, rounding_of_sums
 from pharos.system.distinct_rows import DistinctRows
 
 TIME_LIMIT = 1000  # of an MDP that has no horizon, and whose source has no limit
-MOST_ENTRIES = 1 << 28  # of a table of outcomes, written out
-DIGITS = (
+MOST_TABLE_ENTRIES = 1 << 28  # of a table of outcomes, written out
+DIGIT_SPRITES = (
     ("###", "#.#", "#.#", "#.#", "###"),
     (".#.", "##.", ".#.", ".#.", "###"),
     ("###", "..#", "###", "#..", "###"),
@@ -50,7 +50,7 @@ class ImportedWorld(Environment):
     version = 1
     numbered_by = ("state",)
     is_filled = True
-    layers = {"digit": Layer(tuple("0123456789"), (226, 228, 232), sprite=DIGITS)}
+    layers = {"digit": Layer(tuple("0123456789"), (226, 228, 232), sprite=DIGIT_SPRITES)}
 
     def validate(self) -> None:
         if not isinstance(self.folder, str) or not self.folder:
@@ -299,10 +299,10 @@ def written_out(
     counts = np.bincount(rows, minlength=states * actions)
     has_end = bool((successors == -1).any())
     most, count = int(counts.max()), states + has_end
-    if count * actions * most > MOST_ENTRIES:
+    if count * actions * most > MOST_TABLE_ENTRIES:
         raise ParameterError(
             f"the table has {count:,} states, {actions} actions and up to {most:,} outcomes of each; expected at most "
-            f"{MOST_ENTRIES:,} numbers in all: it can be solved and measured, but not stepped"
+            f"{MOST_TABLE_ENTRIES:,} numbers in all: it can be solved and measured, but not stepped"
         )
     # Tables with K columns, filled up with probability 0
     index = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)

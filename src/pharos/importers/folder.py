@@ -42,10 +42,10 @@ class ImportedOutcomes(NamedTuple):
     rewards: np.ndarray
 
 
-IMAGE, GRID, VECTOR = "image", "grid", "vector"
+IMAGE_OBSERVATION, GRID_OBSERVATION, VECTOR_OBSERVATION = "image", "grid", "vector"
 BUILDING = ".building"
 """Folder, within that of an MDP, of what an import that is not finished has so far."""
-OBSERVED = {IMAGE: 4, GRID: 4, VECTOR: 2}
+OBSERVED = {IMAGE_OBSERVATION: 4, GRID_OBSERVATION: 4, VECTOR_OBSERVATION: 2}
 """Kinds of observations that a source may show -> dimensions of their array."""
 FOREIGN = ": is not empty and holds no imported MDP; choose another folder"
 
@@ -115,7 +115,7 @@ def save(
             "arrays": checksums,
             **description,
             **stored,
-            **({mdp_files.RESIDUAL: list(mdp.residual)} if any(mdp.residual) else {}),
+            **({mdp_files.RESIDUAL_NAME: list(mdp.residual)} if any(mdp.residual) else {}),
             **({mdp_files.ROUNDING: mdp.reward_table.rounding} if mdp.reward_table.rounding else {}),
         }
         storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
@@ -232,9 +232,9 @@ def _description(
     if time_limit is not None:
         description["time_limit"] = whole_number(time_limit, "time_limit", "a number of steps of at least 1")
     if shown is not None:
-        kind = observed or (IMAGE if shown.ndim == 4 else VECTOR)
+        kind = observed or (IMAGE_OBSERVATION if shown.ndim == 4 else VECTOR_OBSERVATION)
         fits = kind in OBSERVED and shown.ndim == OBSERVED[kind] and len(shown) == mdp.num_states and all(shown.shape)
-        if not fits or (shown.dtype.kind not in "biuf" if kind == VECTOR else shown.dtype != np.uint8):
+        if not fits or (shown.dtype.kind not in "biuf" if kind == VECTOR_OBSERVATION else shown.dtype != np.uint8):
             raise ParameterError(
                 f"observations have shape {shown.shape} and type {shown.dtype}; expected {mdp.num_states} images "
                 f"(S, H, W, 3) uint8, grids (S, columns, rows, C) uint8, or vectors (S, N)"

@@ -69,8 +69,8 @@ def interpreted_first(*counted: str) -> Callable:
             nonlocal count
             read = [arguments[i] for i in indices] or [each for each in arguments if not isinstance(each, int)]
             count += sum(map(_entries, read))
-            is_small = count < compiling.SMALL // LOADING or (
-                count < COMPILING * compiling.SMALL and not is_on_disk(kernel)
+            is_small = count < compiling.SMALL_STATES // LOADING or (
+                count < COMPILING * compiling.SMALL_STATES and not is_on_disk(kernel)
             )
             return quiet if is_small else compiled(*arguments)
 

@@ -230,7 +230,7 @@ def _outcome(env: Environment, state: tuple[int, ...], action: int, outcome: int
 
 BLOCK = 4096  # states whose successors are Python objects at a time
 _MOST_FILES = 1 << 16
-_SHARE = 64  # states that are worth sending to another process
+_WORTH_SENDING = 64  # states that are worth sending to another process
 
 
 class InterpretedExpansion:
@@ -401,7 +401,7 @@ class Interpreters:
 
     def branches(self, states: np.ndarray) -> Branches:
         """`interpreted_branches` of states (N, D) int64, shared between the processes if they are many."""
-        shares = min(len(self._connections) + 1, len(states) // _SHARE)
+        shares = min(len(self._connections) + 1, len(states) // _WORTH_SENDING)
         if shares < 2:
             return interpreted_branches(self.env, states.tolist())
         parts = np.array_split(states, shares)

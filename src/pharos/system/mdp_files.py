@@ -43,7 +43,7 @@ INDEX, CHUNKS, ROWS = "observation_index", "observations.bin", "observation_rows
 """The row of each state, an array; the chunks of distinct rows, a file; what is in them, an entry of the manifest."""
 PAID = ("outcome_offsets", "outcome_states", "outcome_probabilities", "outcome_rewards")
 AVAILABLE = "available"
-RESIDUAL = "residual"
+RESIDUAL_NAME = "residual"
 """Entry of the manifest: what the sums of given rows leave open, in probability and in reward; absent where nothing."""
 ROUNDING = "rounding"
 """Entry of the manifest: a bound on the error of rewards that are means; absent if rewards are exact."""
@@ -192,10 +192,10 @@ def residual_of(manifest: Mapping[str, Any]) -> tuple[float, float]:
     Raises:
         ValueError: the entry is something else.
     """
-    pair = manifest.get(RESIDUAL, [0.0, 0.0])
+    pair = manifest.get(RESIDUAL_NAME, [0.0, 0.0])
     is_pair = isinstance(pair, list) and len(pair) == 2 and all(type(each) in (int, float) for each in pair)
     if not is_pair or not all(0 <= each < math.inf for each in pair):
-        raise ValueError(f"{RESIDUAL} is {pair!r}; expected two numbers from 0 on")
+        raise ValueError(f"{RESIDUAL_NAME} is {pair!r}; expected two numbers from 0 on")
     return float(pair[0]), float(pair[1])
 
 
