@@ -267,8 +267,8 @@ def check_page_size(mdp: TabularMDP, title: str, env: Environment | None = None)
 def smaller_instance(env: Environment, most: int) -> str:
     """Instance of the same class with at most `most` states, in words: `frozen_lake/8x8 has 64`; empty without one.
 
-    The largest of the first MOST_INSTANCES named instances; else the same environment with one whole-number parameter as
-    much smaller as needed, by bisection. Cost: builds of at most `most` states.
+    The largest of the first MOST_INSTANCES named instances; else the same environment with one whole-number parameter
+    as much smaller as needed, by bisection. Cost: builds of at most `most` states.
     """
     named = [f"{env.name}/{name}" for name in type(env).instances][:MOST_INSTANCES]
     sizes = {name: size for name in named if (size := _num_states(partial(make, name), most))}

@@ -183,8 +183,8 @@ def ranges_from_the_end(rows: object, low: int, high: int, have_room: bool = Fal
 
     Rows in memory are one range. Of a mapped array, `RANGE_ROWS` rows are swept while the system reads the rows before
     them: it reads ahead by itself from the first byte to the last, but not the other way round. If the rows fill
-    memory, unless these `have_room` in it, those that were swept go before anything else: values, which may be mapped as well,
-    are needed all the time.
+    memory, unless these `have_room` in it, those that were swept go before anything else: values, which may be mapped
+    as well, are needed all the time.
     """
     rows = rows.packed if isinstance(rows, PackedIndices) else rows
     if not isinstance(rows, np.memmap):
