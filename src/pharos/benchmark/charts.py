@@ -178,8 +178,8 @@ def ladder_panel(
 
     Args:
         levels: of the rungs, which stand equally far apart; between them the frontier is interpolated.
-        lines: for each agent its normalised regret on each rung, None where it did not run.
-        theory: of the idealised learner, None where it was not predicted.
+        lines: for each agent its normalised regret on each rung, None if it did not run.
+        theory: of the idealised learner, None if it was not predicted.
         frontier: of the first agent, in units of `levels`.
         unit: label of the horizontal axis.
     """
@@ -325,7 +325,7 @@ def shortened(text: str, letters: int) -> str:
 
 
 def ends(interval: ConfidenceInterval) -> tuple[float, float]:
-    """The ends of an interval, for drawing: both at the value where one seed leaves none."""
+    """The ends of an interval, for drawing: both at the value if one seed leaves none."""
     return (interval.value, interval.value) if np.isnan(interval.low) else (interval.low, interval.high)
 
 

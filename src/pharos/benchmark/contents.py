@@ -133,7 +133,7 @@ def kind_of(results: AgentResults) -> str:
 def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:
     """Candidate names of an agent, best first: pharos' spelling, then with the folder of its results, with a number.
 
-    The agent that the report is about, and those of a file or a module, have the label that they ran with.
+    The agent that the report is about, and agents of a file or a module, have the label that they ran with.
     """
     name = label if is_first or ":" in label else agent_label(label)
     yield name
@@ -144,13 +144,13 @@ def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:
 
 
 def regret_of(agent: ScoredAgent, task: BenchmarkTask) -> ConfidenceInterval | None:
-    """Normalised regret of an agent on a task, clipped to [0, 1]; None where it did not run."""
+    """Normalised regret of an agent on a task, clipped to [0, 1]; None if it did not run."""
     own = agent.score.tasks.get(task.name)
     return None if own is None else ConfidenceInterval(1 - own.value, 1 - own.high, 1 - own.low)
 
 
 def sentence(contents: Contents) -> str:
-    """Sentence on what the agent can do, in units: a frontier for each axis, with those of the baselines."""
+    """Sentence on what the agent can do, in units: a frontier for each axis, with the baselines' frontiers."""
     clauses = []
     for axis, own in contents.agent.score.axes.items():
         if math.isnan(own.frontier.value):  # of one rung
@@ -257,7 +257,7 @@ def learning_sentence(contents: Contents) -> str:
 
 
 def unclipped_regret(contents: Contents) -> str:
-    """The mean regret on the core without clipping, in words, where runs far below random play make it differ."""
+    """The mean regret on the core without clipping, in words, if runs far below random play make it differ."""
     own = contents.agent.score
     if not own.optimality_gap.value > 1 - own.core.value + 0.1:
         return ""

@@ -1,7 +1,7 @@
 """Words of the report, which follow from its numbers: verdicts of `compare`, falls of axes, what a mistake looks like.
 
-Nothing here tests anything anew: a verdict is that of the score in `compare`, after Holm's correction, so that page and
-command cannot contradict each other; a frontier is the unit in which it is told.
+Nothing here tests anything anew: a verdict is taken from the score in `compare`, after Holm's correction, so that page
+and command cannot contradict each other. A frontier is the unit in which it is reported.
 """
 
 import math
@@ -18,16 +18,17 @@ from pharos.benchmark.suite import BenchmarkTask
 from pharos.system.wording import pluralize
 
 SHIPPED = {"dqn": ("dqn",), "ppo": ("ppo",), "table": ("q_learning",), "both": ("dqn", "ppo")}
-OWN = 0.1  # by which the regret of a residual is above that of the shipped agent of the kind
+OWN = 0.1  # by which the regret of a residual is above the regret of the shipped agent of the kind
 ONE_ACTION = 0.9  # share of states in which a policy prefers the same action, to be told so
 SHOWN = 5  # names of tasks in a sentence
 VERDICTS = (WORSE, BETTER, NEGLIGIBLE, UNDECIDED)
 
 
 def nearest(contents: Contents) -> tuple[int, float, bool] | None:
-    """Place of the baseline that the agent is held against, mean distance of their scores, whether of the same kind.
+    """Index of the baseline to compare the agent with, mean distance of their scores, whether of the same kind.
 
-    Of those of the agent's kind, else of all, the one whose scores on core tasks are nearest; None without any.
+    Among baselines of the agent's kind, else among all, the one with the nearest scores on core tasks; None without
+    any.
     """
     names = {task.name for task in contents.suite.core}
     distances = {}
@@ -131,7 +132,7 @@ def falls(contents: Contents) -> list[list[str]]:
 def groups_of(contents: Contents) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
     """Names of core tasks by what is seen, and by property: reward sizes, length, ends, chance, number of actions.
 
-    Properties with one group say nothing, and are left out; so are those of tasks that `known_properties` lacks.
+    Properties with one group say nothing, and are left out; so are tasks that `known_properties` lacks.
     """
     by_observation: dict[str, list[str]] = {}
     kinds: list[dict[str, list[str]]] = []

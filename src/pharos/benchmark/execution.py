@@ -85,8 +85,8 @@ def run(  # noqa: PLR0913
 ) -> Outcome:
     """Run an agent on the tasks of a suite, with one setting for all of them.
 
-    Finished runs in `out` are kept, so that the same call goes on where it was killed, and to the same bytes of
-    results; runs of the batched engine and of tables go on from their last checkpoint, others begin anew.
+    Finished runs in `out` are kept, so that the same call resumes after an interruption, and ends with the same bytes
+    of results. Runs of the batched engine and of tables resume from their last checkpoint, others begin anew.
 
     Args:
         agent: a name (q_learning, dqn, ppo, a2c; oracle, random), `module:Class` or `file.py:Class` with
@@ -98,7 +98,7 @@ def run(  # noqa: PLR0913
         quick: the first three seeds of the core alone; what is made of it is preliminary.
         tasks: "core", axes and names of tasks; None: all.
         name: label of the agent in tables; its own when not given.
-        hyperparameters: of all tasks; they go before those of the suite and the agent.
+        hyperparameters: of all tasks; they override those that the suite and the agent have.
         workers: processes; as many as processors when not given. Changes no result.
         timeout: seconds after which a run of the user's own code, or of Stable-Baselines3, is ended, and failed; None:
             never.
@@ -108,7 +108,7 @@ def run(  # noqa: PLR0913
             agent, setting or suite. AllRunsFailed: no run has finished. FolderLocked: another process is at it.
     Cost: of v1, 30,000 steps a task and seed.
     """
-    folder = Path(out).absolute()  # an agent may change the directory where its file is loaded
+    folder = Path(out).absolute()  # an agent may change the directory when its file is loaded
     suite = suite if isinstance(suite, Suite) else load_suite(suite)
     form = agent_form(agent, suite, hyperparameters)
     numbers = [int(seed) for seed in seeds][: QUICK if quick else None]
@@ -254,7 +254,7 @@ def mean_facts(facts: Sequence[Mapping[str, Any]], curves: np.ndarray) -> dict[s
 
 
 def equal_seeds(curves: Mapping[str, np.ndarray]) -> str:
-    """A sentence if all seeds have equal curves on more than a third of the tasks where any run learns, else ""."""
+    """A sentence if all seeds have equal curves on more than a third of the tasks on which any run learns, else ""."""
     several = [curve for curve in curves.values() if len(curve) > 1 and (curve != curve[:1, :1]).any()]
     equal = sum((curve == curve[0]).all() for curve in several)
     if not several or equal <= len(several) / 3:

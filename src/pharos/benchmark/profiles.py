@@ -33,11 +33,11 @@ BROKEN = 0.5  # mean regret of an agent of which no check and no fault says what
 
 @dataclass(frozen=True)
 class Symptom:
-    """A reading that is unlike that of any healthy agent.
+    """A reading that no healthy agent has.
 
     Attributes:
         reading: its name. is_high: whether it is wrong above the limit, not below.
-        margin: beyond the most extreme healthy agent. beyond: what it is beyond besides, wherever healthy agents are.
+        margin: beyond the most extreme healthy agent. beyond: what it is beyond besides, whatever healthy agents have.
         wrong: sentence, with {value} for `show(reading)`. advice: what to look at.
         faults: of the library that it is a sign of, the most likely first.
         kind: of agents that it is a symptom of; empty: of all.
@@ -515,7 +515,7 @@ class Diagnosis:
 
 
 def meanings(kind: str) -> dict[str, str]:
-    """Faults in words; of all kinds where it is empty."""
+    """Faults in words; of all kinds if it is empty."""
     return {name: text for agent, table in FAULTS.items() if kind in ("", agent) for name, text in table.items()}
 
 
@@ -531,10 +531,10 @@ def diagnose(
     """Train an agent on twelve small worlds, and say what is wrong with it, by which number, and what to try.
 
     Its policies are asked for `q_values(observations)`, (N, A), or `values(observations)`, (N,), if they offer them, as
-    those of Stable-Baselines3 do: these are held against exact ones. Without, only its behaviour is judged.
+    policies of Stable-Baselines3 do. These values are compared with exact ones. Without them only behaviour is judged.
 
     Args:
-        agent, hyperparameters, worlds, seeds, steps, tell: as `examine` takes them. Limits and likeness are those of
+        agent, hyperparameters, worlds, seeds, steps, tell: as `examine` takes them. Limits and likeness come from
             agents with all worlds, two seeds and 4,000 steps.
     Raises:
         ParameterError: it is no agent, or it yields no policy.
