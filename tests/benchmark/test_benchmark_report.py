@@ -355,7 +355,7 @@ def test_names_of_tasks_show_what_the_task_is(contents):
     assert "<title>hard: deep_sea; observation vector; no chance added; regret 0.90</title>" in text
 
 
-def test_without_ladders_the_sentence_begins_with_the_core_and_its_place():
+def test_of_a_suite_without_ladders_the_sentence_begins_with_the_core_and_its_place():
     four = [BenchmarkTask(name, "deep_sea", digest=name) for name in "abcd"]
     suite = Suite("small", SUITE.protocol, tuple(four), (), "d1")
 
@@ -366,8 +366,7 @@ def test_without_ladders_the_sentence_begins_with_the_core_and_its_place():
     text = sentence(contents_of(of("mine", 0.4, 0.6, 0.7, 0.3), beside=beside, suite=suite))
     assert text == (
         "Core score 0.50 (0.49 to 0.51) on 4 tasks, below DQN's 0.80, above PPO's 0.10 on 2 tasks in common, not shown "
-        "to differ from x's 0.50, beside y's 0.55 on 1 task in common; worst on c, b and a. The ladders were not run, "
-        "so there are no frontiers."
+        "to differ from x's 0.50, beside y's 0.55 on 1 task in common; worst on c, b and a."
     )
 
 

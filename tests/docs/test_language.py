@@ -24,7 +24,7 @@ LIMITS = {
     ("docstrings", "where"): (7.3, 2),
     ("docstrings", "that of"): (2.4, 0.5),
 }
-AT_LEAST = {("guides", "you"): (12, 6), ("docstrings", "if"): (2.1, 3)}
+AT_LEAST = {("guides", "you"): (13, 6), ("docstrings", "if"): (2.1, 3)}
 SHARED_NAMES = {"functions": (81, 0), "constants": (193, 0)}  # names in two files or more: present limit, aim
 
 PATTERNS = {
@@ -38,7 +38,7 @@ FORMULA = re.compile(r"[=<>+*/^|][^.;:]{0,80}\s\(?where\b", re.I)  # "= r + gamm
 
 # Code, output, quoted messages, addresses and markup, none of which is the prose of a page.
 NOT_PROSE = re.compile(
-    r"^(?:---\n.*?\n---\n)?|^ *(```|~~~).*?^ *\1|<!--.*?-->|<style.*?</style>|<script.*?</script>|</?[a-zA-Z][^<>]*>"
+    r"\A---\n.*?\n---\n|^ *(```|~~~).*?^ *\1|<!--.*?-->|<style.*?</style>|<script.*?</script>|</?[a-zA-Z][^<>]*>"
     r"|&#?\w+;|``.+?``|`[^`]+`|\$\$.+?\$\$|\$[^$\n]+\$|(?<=\])\([^)\s]+\)|\"[^\"\n]*\"",
     re.S | re.M,
 )

@@ -39,6 +39,7 @@ from pharos.agents import (
 )
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
+from pharos.solvers import uniform_policy
 from pharos.system.sources import Source, find_source, is_reference, load_source, source_of
 from pharos.system.wording import capped, in_one_line, line_in
 from pharos.system.workers import Terminated, Workers
@@ -64,7 +65,6 @@ from pharos.training import (
     regret,
     run_id,
     train_configs,
-    uniform_policy,
     write_curve,
     write_policy,
     write_record,
@@ -252,7 +252,8 @@ class TrainedForm(Form):
             failures = f", {now.failed} failed" if now.failed else ""
             settings.tell(now.done / now.total, f"{now.finished} of {len(jobs)} runs{failures}")
 
-        tasks = TaskCache(trust=True)  # the user has named the code
+        stored = {config.id: job.task.stored_values for config, job in zip(configs, jobs, strict=True)}
+        tasks = TaskCache(lambda config: stored[config.id], trust=True)  # the user has named the code
         options: dict[str, Any] = {"progress": progress, "tasks": tasks, "workers": settings.workers}
         train_configs(configs, folders, checkpoints=settings.checkpoints, seconds=seconds, **options)
 
@@ -278,7 +279,7 @@ def _train_alone(label: str, entry: dict[str, Any], checkpoints: Path, jobs: Seq
     _seed(job.seed)
     config = RunConfig.from_dict(entry)
     try:
-        tasks = TaskCache(trust=True)  # the user has named the code
+        tasks = TaskCache(lambda _: job.task.stored_values, trust=True)  # the user has named the code
         (end,) = train_configs([config], [job.folder], checkpoints=checkpoints, tasks=tasks)
         send((job.folder, end.error if isinstance(end, FailedRun) else None))
     except Terminated:
@@ -597,6 +598,8 @@ class ExactForm(Form):
         return RunResult(np.full(protocol.evaluations, self.regrets[job.task.name]), True, 0)
 
     def _regret(self, task: Task) -> float:
-        if self.label == "oracle":
-            return 0.0
-        return float(regret(evaluate_agent(uniform_policy(task), task).value, task.reference, normalized_by="uniform"))
+        if self.label == "oracle" or task.values is not None:  # U of a large task is stored
+            return float(self.label != "oracle")
+        return float(
+            regret(evaluate_agent(uniform_policy(task.mdp), task).value, task.reference, normalized_by="uniform")
+        )

@@ -33,6 +33,7 @@ from pharos.system.wording import pluralize
 BESIDE = ("dqn", "ppo", "q_learning")
 LEARNERS = ("dqn", "ppo")  # idealised, with networks
 RESIDUAL = 0.2
+NO_LADDERS = " The ladders were not run, so there are no frontiers."
 LATE = 0.2  # of an agent that learns late, by which the final score exceeds the mean one, with its whole interval
 ENDS_WORSE = 0.05  # the same of one that ends worse than it was, by which the final score is lower
 MOST = 5  # reasons of failures on the page
@@ -108,7 +109,7 @@ def contents_of(
     own = results_of(results)
     suite = suite_of_results(own, suite)
     if beside is None:
-        beside = [name for name in BESIDE if name in baselines(suite.name) and name != own.agent]
+        beside = [f"{suite.name}/{name}" for name in BESIDE if name in baselines(suite.name) and name != own.agent]
     if predictor not in (None, "none", *PREDICTORS):
         raise ParameterError(f"predictor {predictor}; expected one of {', '.join(PREDICTORS)}, none")
     others = [results_of(each) for each in beside]
@@ -183,7 +184,7 @@ def _core_sentence(contents: Contents) -> str:
     parts = [f"Core score {number(contents.agent.score.core)} on {pluralize(len(names), 'task')}"]
     parts += [f"{word} {listed(texts)}" for word, texts in groups.items() if texts]
     worst = f"worst on {listed(names[:3])}" if len(names) > 3 else ""
-    return "; ".join(filter(None, (", ".join(parts), worst))) + ". The ladders were not run, so there are no frontiers."
+    return "; ".join(filter(None, (", ".join(parts), worst))) + "." + NO_LADDERS * bool(contents.suite.ladders)
 
 
 def _split(text: str) -> tuple[str, str]:

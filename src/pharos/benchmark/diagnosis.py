@@ -164,7 +164,9 @@ def shipped_regret(contents: Contents, task: BenchmarkTask) -> float | None:
     regrets = []
     for name in SHIPPED.get(contents.predictor, ()):
         beside = [each.results for each in contents.beside if each.results.agent == name]
-        shipped = beside or ([AgentResults.read(name)] if name in baselines(contents.suite.name) else [])
+        shipped = beside or (
+            [AgentResults.read(f"{contents.suite.name}/{name}")] if name in baselines(contents.suite.name) else []
+        )
         regrets += [float(1.0 - run_scores(each)[task.name].mean()) for each in shipped if task.name in each.curves]
     return max(regrets, default=None)
 

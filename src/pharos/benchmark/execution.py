@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from pharos.agents import COMPILED
 from pharos.benchmark.agents import Form, Job, RunSettings, Tell, agent_form
 from pharos.benchmark.results import FILE, AgentResults
 from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, score
@@ -28,7 +29,6 @@ from pharos.system.wording import in_one_line, pluralize
 from pharos.system.workers import usable_workers
 from pharos.training import versions
 
-QUICK = 3  # seeds
 SUITE, AGENT, SCORE = "suite.json", "agent.json", "score.json"
 SHOWN = 200  # characters of what differs
 
@@ -74,7 +74,7 @@ def run(  # noqa: PLR0913
     suite: str | Path | Suite = "v1",
     *,
     out: str | os.PathLike,
-    seeds: Iterable[int] = range(10),
+    seeds: Iterable[int] | None = None,
     quick: bool = False,
     tasks: str | Iterable[str] | None = None,
     name: str | None = None,
@@ -94,8 +94,9 @@ def run(  # noqa: PLR0913
             yields policies. Code that is named here is imported.
         suite: name, file, or a suite that was loaded, by `load_suite(file, trust=True)` if it names code.
         out: folder of one agent with one setting, of one suite.
-        seeds: of the runs of each task.
-        quick: the first three seeds of the core alone; what is made of it is preliminary.
+        seeds: of the runs of each task; None: as many as the suite asks for, from 0 on.
+        quick: the tasks and the number of seeds that the suite has for a quick look, of v1 the core with three; what is
+            made of it is preliminary.
         tasks: "core", axes and names of tasks; None: all.
         name: label of the agent in tables; its own when not given.
         hyperparameters: of all tasks; they override those that the suite and the agent have.
@@ -106,19 +107,25 @@ def run(  # noqa: PLR0913
     Raises:
         ParameterError: an option is wrong, a task is another one on this installation, or the folder holds another
             agent, setting or suite. AllRunsFailed: no run has finished. FolderLocked: another process is at it.
-    Cost: of v1, 30,000 steps a task and seed.
+    Cost: of v1, 30,000 steps a task and seed; of large, 600,000.
     """
     folder = Path(out).absolute()  # an agent may change the directory when its file is loaded
     suite = suite if isinstance(suite, Suite) else load_suite(suite)
     form = agent_form(agent, suite, hyperparameters)
-    numbers = [int(seed) for seed in seeds][: QUICK if quick else None]
+    protocol = suite.protocol
+    numbers = [int(seed) for seed in (range(protocol.seeds) if seeds is None else seeds)]
+    numbers = numbers[: suite.quick_seeds if quick else None]
     if not numbers or len(set(numbers)) < len(numbers) or min(numbers) < 0:
         raise ParameterError(f"seeds are {numbers}; expected whole numbers of at least 0, each once")
-    entries = selected(suite, CORE if quick and tasks is None else tasks)
-    protocol = suite.protocol
+    entries = selected(suite, suite.quick_tasks if quick and tasks is None else tasks)
     if protocol.steps % protocol.evaluations:
         raise ParameterError(
             f"suite {suite.name}: {protocol.steps} steps with {protocol.evaluations} evaluations; expected a multiple"
+        )
+    if form.kind == COMPILED and any(task.stored for task in entries):
+        raise ParameterError(
+            f"agent {form.label!r} learns from tables of observations, and tasks of suite {suite.name} have "
+            f"millions of states; expected an agent that steps an environment, such as file.py:learn"
         )
     for task in entries:
         task.check(protocol)

@@ -347,10 +347,12 @@ def _words(contents: Contents) -> Element | None:
     )
 
 
-def _residuals(contents: Contents) -> Element:
+def _residuals(contents: Contents) -> Element | None:
     title = "Residuals: worse than theory says"
     if contents.predictor == "none":
         return _section(title, "No idealised learner is known for this kind of agent.")
+    if all(contents.predicted(task) is None for task in contents.suite.tasks):
+        return None
     rows = residuals(contents)
     means = PREDICTORS[contents.predictor]
     text = (

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from pharos.benchmark.suite import Ladder, Suite
 
 CROSSING = 0.5  # normalised regret at the frontier
-ENOUGH_SEEDS = 10  # scores of fewer are preliminary
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,7 @@ class BenchmarkScore:
         iqm: mean of the middle half of all runs of all core tasks, pooled as in Agarwal et al. (2021).
         optimality_gap: mean over core runs of max(0, regret): 1 - core, but runs below random count in full.
         axes: by axis; tasks: score by name, the core's and the ladders'.
-        preliminary: fewer than 10 seeds, or tasks without results.
+        preliminary: fewer seeds than the suite asks for, 10 of v1, or tasks without results.
         below_random: tasks whose mean normalised regret exceeds 1 by its whole interval.
         missing: tasks of the suite without results, which no score contains.
     """
@@ -170,7 +169,7 @@ def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
         optimality_gap=ConfidenceInterval.of_mean([np.maximum(regrets[name], 0.0) for name in core], (0.0, math.inf)),
         axes={ladder.axis: axis for ladder in suite.ladders if (axis := axis_score(ladder, runs)) is not None},
         tasks={name: ConfidenceInterval.of_mean([runs[name]], (0.0, 1.0)) for name in names},
-        preliminary=seeds < ENOUGH_SEEDS or bool(missing),
+        preliminary=seeds < suite.protocol.seeds or bool(missing),
         below_random=tuple(name for name in names if regret_intervals[name].low > 1.0),
         missing=missing,
     )

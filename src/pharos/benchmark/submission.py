@@ -93,6 +93,11 @@ class Submission:
         """Results in the folder of `benchmark.run` and the final policies of its runs; raises as `submit`."""
         results = AgentResults.read(folder)
         check_suite(results, suite, str(folder))
+        if large := [task for task in suite.tasks if task.stored and task.name in results.curves]:
+            raise ParameterError(
+                f"{folder}: {large[0].name} has {int(large[0].stored['states']):,} states, so its policies fit in no "
+                f"file; expected runs of another suite: publish its results.safetensors, and the agent's code"
+            )
         policies: dict[tuple[str, int], np.ndarray] = {}
         runs = [(task, seed) for task in results.curves for seed in results.seeds]
         for done, (name, seed) in enumerate(runs):

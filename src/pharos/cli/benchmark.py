@@ -56,6 +56,7 @@ COMPUTED = (
     *("states", "episodes"),
 )
 """Numbers of one task."""
+LONG = 600  # minutes
 
 
 @app.command("show")
@@ -85,7 +86,7 @@ def run(
     out: Path,
     suite: Annotated[str, "NAME|FILE"] = "v1",
     hyperparameters: Mapping[str, Any] | None = None,
-    seeds: Annotated[str, "N|A:B|S,..."] = "10",
+    seeds: Annotated[str | None, "N|A:B|S,..."] = None,
     quick: bool = False,
     tasks: Annotated[list[str] | None, "core|AXIS|NAME"] = None,
     name: str | None = None,
@@ -100,8 +101,8 @@ def run(
         out: Write the runs and results of one agent with one setting into this folder.
         suite: Run the tasks of this suite.
         hyperparameters: Set a hyperparameter, for all tasks.
-        seeds: Number of seeds, from 0 on; or a range, such as 1000:1003.
-        quick: Run only the first three seeds of the core; results are preliminary.
+        seeds: Number of seeds, from 0 on; or a range, such as 1000:1003. Default: as many as the suite asks for.
+        quick: Run a first look, of v1 the first three seeds of the core alone; results are preliminary.
         tasks: Run only the core, an axis or a task. Repeatable.
         name: Label in tables. Default: the agent's name.
         workers: Number of processes. Default: as many as processors.
@@ -109,7 +110,7 @@ def run(
     """
     from pharos import benchmark
 
-    numbers = list(range(int(seeds))) if seeds.isdigit() else parse_seeds(seeds)
+    numbers = None if seeds is None else range(int(seeds)) if seeds.isdigit() else parse_seeds(seeds)
     loaded = benchmark.load_suite(suite, trust=trust)
     with progress_bar("runs", 1000, "checking tasks, loading, compiling") as show, termination():
         try:
@@ -405,14 +406,18 @@ def _print(suite: "Suite") -> None:
     for ladder in [None, *suite.ladders]:
         for task in suite.core if ladder is None else ladder.tasks:
             level = "" if task.level is None or ladder is None else f"{task.level:.3g} {ladder.unit}"
+            level = f"{task.stored['states']:,} states" if task.stored else level
             numbers = (task.predicted.get(name) for name in ("dqn", "ppo", "table"))
             cells = ("" if value is None else f"{value:.2f}" for value in numbers)
             rows.append(("" if task.axis == axis else task.axis, task.name, level, *cells))
             axis = task.axis
-    text = "Regret as predicted before any run: 0 is optimal, 1 is uniform play."
+    notes = []
+    if any(task.predicted for task in suite.tasks):
+        notes.append("Regret as predicted before any run: 0 is optimal, 1 is uniform play.")
     if minutes := _minutes(suite):
-        times = ", ".join(f"{agent.upper()} {value:.0f}" for agent, value in minutes.items())
-        text += f" Minutes of one processor, all seeds, as shipped: {times}"
+        unit, size = ("Hours", 60) if max(minutes.values()) > LONG else ("Minutes", 1)
+        times = ", ".join(f"{agent.upper()} {value / size:.0f}" for agent, value in minutes.items())
+        notes.append(f"{unit} of one processor, all seeds, as shipped: {times}")
     protocol = suite.protocol
     setting = (
         f"{protocol.steps:,} steps a task, {pluralize(protocol.evaluations, 'evaluation')}, "
@@ -420,7 +425,7 @@ def _print(suite: "Suite") -> None:
     )
     title = f"{suite.name}, {pluralize(len(suite.tasks), 'task')}: {suite.digest}"
     columns = ("axis", "task", "level", ">DQN", ">PPO", ">table")
-    print_table(title, columns, rows, before=[setting, ""], notes=[text])
+    print_table(title, columns, rows, before=[setting, ""], notes=[" ".join(notes)])
 
 
 SuiteOption = Annotated[

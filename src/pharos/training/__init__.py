@@ -21,7 +21,6 @@ if TYPE_CHECKING:
         errors_in_one_line,
         generate,
         generated_curve,
-        uniform_policy,
     )
     from pharos.training.curve import GAIN_TOLERANCE, Curve, Evaluation, RegretCurve, evaluate_agent
     from pharos.training.execution import (

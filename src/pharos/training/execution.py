@@ -25,7 +25,7 @@ from pharos.training.batch import CallbackError, remove_batch, train_group
 from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
 from pharos.training.results import TrainingResult
 from pharos.training.schedule import halves, plan
-from pharos.training.task import RunConfig
+from pharos.training.task import RunConfig, TaskValues
 
 ATTEMPTS = 3
 """How often a group is begun whose process is killed, before it is halved, or fails."""
@@ -376,7 +376,8 @@ class Training(Execution[PreparedRun]):
         if self.pool is None:
             fresh = [PreparedRun(run.index, run.config, run.folder, self.tasks) for run in group]
             return partial(train_group, **self.options), (fresh, self.checkpoints), ()
-        entries = [(run.index, run.config.to_dict(), run.folder) for run in group]
+        values = [None if self.tasks.values is None else self.tasks.values(run.config) for run in group]
+        entries = [(run.index, run.config.to_dict(), run.folder, own) for run, own in zip(group, values, strict=True)]
         arguments = entries, self.checkpoints, self.tasks.device, self.options
         return _train_in_process, arguments, group[0].config.definitions
 
@@ -419,7 +420,7 @@ class Training(Execution[PreparedRun]):
 
 
 def _train_in_process(
-    entries: Sequence[tuple[int, dict[str, Any], Path]],
+    entries: Sequence[tuple[int, dict[str, Any], Path, TaskValues | None]],
     checkpoints: Path | None,
     device: str,
     options: Mapping[str, Any],
@@ -430,8 +431,14 @@ def _train_in_process(
     SIGTERM ends it at once, as there is nothing to clean up, and a repeated call needs its locks.
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    tasks = TaskCache(trust=True, device=device)  # of code that the process which started this one has imported
-    runs = [PreparedRun(index, RunConfig.from_dict(config), folder, tasks) for index, config, folder in entries]
+    run_configs = [RunConfig.from_dict(config) for _, config, _, _ in entries]
+    stored = {config.id: own for config, (*_, own) in zip(run_configs, entries, strict=True)}
+    # Code is that which the process that started this one has imported
+    tasks = TaskCache(lambda config: stored[config.id], trust=True, device=device)
+    runs = [
+        PreparedRun(index, config, folder, tasks)
+        for config, (index, _, folder, _) in zip(run_configs, entries, strict=True)
+    ]
 
     def report(message: tuple[Any, ...]) -> None:
         kind, *content, last = message

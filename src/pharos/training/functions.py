@@ -16,9 +16,10 @@ import numpy as np
 
 from pharos.agents import COMPILED, GENERATOR, generator_of, register_form
 from pharos.errors import ParameterError
+from pharos.mdp import uniform_choice
 from pharos.policies import PolicyLike
 from pharos.solvers import GainInterval
-from pharos.training.budget import IGNORED, PolicyRecorder, errors_in_one_line, generate, uniform_policy
+from pharos.training.budget import IGNORED, PolicyRecorder, errors_in_one_line, generate
 from pharos.training.curve import Evaluation, evaluate_agent
 from pharos.training.jax_agents import compiled_curves
 from pharos.training.results import write_policy
@@ -87,7 +88,7 @@ class CompiledLearner:
     def __init__(self, runs: Sequence[Any], learn: Callable[..., Any]):
         self.runs, self.function = runs, learn
         self.episodes, self.returns = np.zeros(len(runs), np.int64), np.zeros(len(runs))
-        self.values = [evaluate_agent(uniform_policy(runs[0].task), runs[0].task)] * len(runs)
+        self.values = [evaluate_agent(uniform_choice(runs[0].task.mdp), runs[0].task)] * len(runs)
 
     def learn(self, points: Sequence[int], at_point: Callable[[int], object]) -> None:
         """Train, then call `at_point` at each point. ParameterError: these are not equally distant."""
