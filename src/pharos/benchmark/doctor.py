@@ -209,7 +209,7 @@ def readings(examinations: Sequence[Examination]) -> dict[str, float]:
     exact ones; `truth`, their correlation with exact ones, and `truth_unvisited` elsewhere; `bias`, their mean error in
     deviations; `ends`, values of terminal states in deviations; `deaf`, the share of numbers of observations that
     change nothing, `deaf_last` of last ones; `wavering`, log10 of the change if asked again; `forgets`, the residual
-    in lately visited states less the residual of all; `own`, whether they are nearer to values of the agent's own policy than to
+    in lately visited states less the residual of all; `own`, whether they are nearer to values of its policy than to
     optimal ones; `far`, the error far from the end less the error near it.
     Of all: `overlap` of late behaviour with the policy, and `overlap_shifted` with its actions shifted, less that;
     `random`, entropy of late behaviour, 1 as uniform; `certain`, probability of the likeliest action; `coverage` of

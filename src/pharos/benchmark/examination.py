@@ -1,7 +1,7 @@
 """An agent trained on twelve small worlds, with all that there is to see of it: the material of `pharos diagnose`.
 
-Each run ends in an `Examination`: the world as arrays, how often the agent took which action in which state while it learnt, and
-what its last policy answers about every state. A policy may offer `q_values(observations)`, (N, A), or
+Each run ends in an `Examination`: the world as arrays, how often the agent took which action in which state while it
+learnt, and what its last policy answers about every state. A policy may offer `q_values(observations)`, (N, A), or
 `values(observations)`, (N,); policies of Stable-Baselines3 are asked in their own way.
 """
 
