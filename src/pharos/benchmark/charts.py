@@ -263,7 +263,9 @@ def regret_axis(left: float, right: float, top: float, bottom: float) -> list[El
     return shapes + [label(left - 5, y + 4, name, "end", "faint") for name, y in heights.items()]
 
 
-def plane(points: Sequence[tuple[str, float, float, float]], below: str, beside: Sequence[str], title: str) -> Element:
+def scatter(
+    points: Sequence[tuple[str, float, float, float]], below: str, beside: Sequence[str], title: str
+) -> Element:
     """Tasks as dots: (name, x, y, regret in [0, 1]), the darker the less regret, in a scale for all eyes.
 
     Args:

@@ -119,10 +119,10 @@ def contents_of(
         name = next(name for name in _names(source, each.agent, not agents) if name.lower() not in names)
         agents.append(ScoredAgent(name, each, score(each, suite)))
     comparisons = [compare(own, each, suite=suite) for each in others]
-    return Contents(suite, agents[0], agents[1:], comparisons, predictor or kind_of(own))
+    return Contents(suite, agents[0], agents[1:], comparisons, predictor or learner_kind(own))
 
 
-def kind_of(results: AgentResults) -> str:
+def learner_kind(results: AgentResults) -> str:
     """The idealised learner that an agent is a kind of, by its name and source; "both" if these do not tell."""
     names = f"{results.agent} {results.record.get('source')}".lower()
     if "recurrent" in names:  # no idealised learner has a memory
@@ -198,7 +198,7 @@ def listed(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
-def residuals(contents: Contents) -> list[tuple[BenchmarkTask, ConfidenceInterval, float]]:
+def residual_tasks(contents: Contents) -> list[tuple[BenchmarkTask, ConfidenceInterval, float]]:
     """Tasks whose regret is more than 0.2 above the predicted one, the largest first: task, observed, predicted."""
     pairs = [(task, regret_of(contents.agent, task), contents.predicted(task)) for task in contents.suite.tasks]
     rows = [(task, own, expected) for task, own, expected in pairs if own is not None and expected is not None]

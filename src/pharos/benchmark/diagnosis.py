@@ -10,7 +10,16 @@ from dataclasses import replace
 
 from pharos.benchmark.charts import frontier_text
 from pharos.benchmark.comparison import BETTER, LEAST, NEGLIGIBLE, UNDECIDED, WORSE, Comparison, Difference
-from pharos.benchmark.contents import PREDICTORS, Contents, ScoredAgent, kind_of, listed, number, residuals, signed
+from pharos.benchmark.contents import (
+    PREDICTORS,
+    Contents,
+    ScoredAgent,
+    learner_kind,
+    listed,
+    number,
+    residual_tasks,
+    signed,
+)
 from pharos.benchmark.properties import known_properties
 from pharos.benchmark.results import AgentResults, baselines
 from pharos.benchmark.scores import CROSSING, AxisScore, equal_seeds, run_scores
@@ -38,8 +47,8 @@ def nearest(contents: Contents) -> tuple[int, float, bool] | None:
             distances[k] = sum(own) / len(own)
     if not distances:
         return None
-    kind = kind_of(contents.agent.results)
-    same = [k for k in distances if kind == kind_of(contents.beside[k].results) and kind not in ("both", "none")]
+    kind = learner_kind(contents.agent.results)
+    same = [k for k in distances if kind == learner_kind(contents.beside[k].results) and kind not in ("both", "none")]
     place = min(same or distances, key=distances.__getitem__)
     return place, distances[place], bool(same)
 
@@ -180,14 +189,16 @@ def is_own(contents: Contents, task: BenchmarkTask, regret: float) -> bool:
 def predictor_sentence(contents: Contents) -> str:
     """Sentence on which idealised learner was taken, and the number of tasks that the others would list."""
     counts = {
-        name: len(residuals(replace(contents, predictor=name))) for name in PREDICTORS if name != contents.predictor
+        name: len(residual_tasks(replace(contents, predictor=name)))
+        for name in PREDICTORS
+        if name != contents.predictor
     }
     others = listed([f"{count} beside {PREDICTORS[name]}" for name, count in counts.items()])
     request = (
         "The agent's name does not say its kind, so the worse of two was taken, which lists the fewest; say it: "
         "--predictor dqn, ppo, table or none. "
     )
-    is_unsaid = contents.predictor == kind_of(contents.agent.results) == "both"
+    is_unsaid = contents.predictor == learner_kind(contents.agent.results) == "both"
     return f"{request if is_unsaid else ''}Others would list {others}."
 
 

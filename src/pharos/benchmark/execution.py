@@ -21,11 +21,11 @@ import numpy as np
 from pharos.agents import COMPILED
 from pharos.benchmark.agents import Form, Job, RunSettings, Tell, agent_form
 from pharos.benchmark.results import FILE, AgentResults
-from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, score
+from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, equal_seeds, score
 from pharos.benchmark.suite import CORE, EARLIER, BenchmarkTask, Suite, load_suite
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError, PharosError, UnknownName
 from pharos.system import storage
-from pharos.system.wording import in_one_line, pluralize
+from pharos.system.wording import in_one_line
 from pharos.system.workers import usable_workers
 from pharos.training import versions
 
@@ -258,15 +258,3 @@ def mean_facts(facts: Sequence[Mapping[str, Any]], curves: np.ndarray) -> dict[s
         regrets = [np.mean(each.get("greedy_regret", curve)) for each, curve in zip(facts, curves, strict=True)]
         means["greedy_score"] = float(np.mean(1.0 - np.clip(regrets, 0.0, 1.0)))
     return means
-
-
-def equal_seeds(curves: Mapping[str, np.ndarray]) -> str:
-    """A sentence if all seeds have equal curves on more than a third of the tasks on which any run learns, else ""."""
-    several = [curve for curve in curves.values() if len(curve) > 1 and (curve != curve[:1, :1]).any()]
-    equal = sum((curve == curve[0]).all() for curve in several)
-    if not several or equal <= len(several) / 3:
-        return ""
-    return (
-        f"all seeds have the same curve on {equal} of {pluralize(len(several), 'task')}, so intervals over seeds say "
-        f"nothing; expected learn to use its seed: random numbers, weights, the first reset"
-    )

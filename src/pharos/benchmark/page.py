@@ -19,8 +19,8 @@ from pharos.benchmark.charts import (
     ladder_panel,
     learning_panel,
     legend,
-    plane,
     radar,
+    scatter,
 )
 from pharos.benchmark.comparison import EQUAL_SEEDS, LEAST, UNKNOWN, WORSE, compare_groups
 from pharos.benchmark.contents import (
@@ -38,7 +38,7 @@ from pharos.benchmark.contents import (
     listed,
     number,
     regret_of,
-    residuals,
+    residual_tasks,
     run_warnings,
     seeds_text,
     sentence,
@@ -317,7 +317,7 @@ def _plane(contents: Contents) -> Element | None:
         "What makes a task hard, and where the agent fails",
         "Each dot is a task, placed by what theory predicts before any run: to the right, even a learner with a table "
         "needs longer; above, a network loses more than a table. The colour is the agent's regret.",
-        _figure("", plane(points, below, beside, "tasks by predicted difficulty, coloured by regret"), class_="wide"),
+        _figure("", scatter(points, below, beside, "tasks by predicted difficulty, coloured by regret"), class_="wide"),
     )
 
 
@@ -353,7 +353,7 @@ def _residuals(contents: Contents) -> Element | None:
         return _section(title, "No idealised learner is known for this kind of agent.")
     if all(contents.predicted(task) is None for task in contents.suite.tasks):
         return None
-    rows = residuals(contents)
+    rows = residual_tasks(contents)
     means = PREDICTORS[contents.predictor]
     text = (
         f"Tasks where the regret is more than {RESIDUAL:g} above that of {means}, predicted before any run. Theory "

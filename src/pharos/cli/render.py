@@ -162,7 +162,7 @@ def _optimal(target: Target, gamma: float, max_states: int | None) -> Callable[[
 
 ESCAPES = {"[A": "up", "[B": "down", "[C": "right", "[D": "left", "OA": "up", "OB": "down", "OC": "right", "OD": "left"}
 SIGNS = {"up": "↑", "left": "←", "down": "↓", "right": "→", "space": "space"}
-QUIT, NEW_GAME, BACK = "q", "r", "u"
+QUIT, NEW_GAME, UNDO = "q", "r", "u"
 
 
 def play(target: Target, *, state: str | None = None, seed: Seed | None = None) -> Answer:
@@ -218,7 +218,7 @@ class Game:
         """Execute the command of a key: an action, AGAIN (restart), BACK (undo one step); other keys do nothing."""
         if key == NEW_GAME:
             self.state, self.history = self.start, []
-        elif key == BACK and self.history:
+        elif key == UNDO and self.history:
             self.state = self.history.pop()[0]
         elif key in self.keys and not self.over:
             action = self.keys[key]
@@ -247,7 +247,7 @@ def _picture(game: Game) -> "RenderableType":
     for key, action in game.keys.items():
         names.setdefault(action, []).append(SIGNS.get(key, key))
     does = [f"{'/'.join(sorted(shown, key=len))} {game.env.actions[action]}" for action, shown in names.items()]
-    help_line = Text("   ".join([*does, f"{BACK} undo", f"{NEW_GAME} restart", f"{QUIT} quit"]), style="dim")
+    help_line = Text("   ".join([*does, f"{UNDO} undo", f"{NEW_GAME} restart", f"{QUIT} quit"]), style="dim")
     return Group(line, Text(), colored_text(game.env, game.state), Text(), help_line)
 
 

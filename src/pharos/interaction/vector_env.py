@@ -38,7 +38,7 @@ from pharos.system.threads import in_blocks
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
-BLOCK = 4096  # steps that are worth a thread's while
+STEPS_PER_THREAD = 4096  # steps that are worth a thread's while
 LARGEST_TABLE = 1 << 28  # bytes of observations that are computed beforehand
 _NO_VECTORS = np.empty((0, 0), np.float32)
 
@@ -146,7 +146,7 @@ class RulesStepper(Stepper):
             if fault >= 0:
                 faults.append(fault)
 
-        in_blocks(run, len(self.current), BLOCK)
+        in_blocks(run, len(self.current), STEPS_PER_THREAD)
         if faults:
             i, component = divmod(min(faults), self.current.shape[1])
             self.simulator.raise_fault(self.current[i], int(batch.executed[i]), component)
@@ -188,7 +188,7 @@ class TableStepper(Stepper):
         def run(first: int, last: int) -> None:
             walk_table(self._transitions, self._rewards, self._staying, terminal, setting, arrays, first, last)
 
-        in_blocks(run, len(self.current), BLOCK)
+        in_blocks(run, len(self.current), STEPS_PER_THREAD)
 
     def seen(self, positions: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
         if self._is_index:

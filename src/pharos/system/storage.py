@@ -40,7 +40,7 @@ except ImportError:  # Windows
 LOCK = "lock"
 CLAIM = "lock.claim"
 """File that stands in for a lock where the file system has none: the process that makes it holds the folder."""
-POLL_SECONDS = 0.2
+LOCK_POLL_SECONDS = 0.2
 CLAIM_ATTEMPTS = 200
 
 DIGEST = "digest"
@@ -328,7 +328,7 @@ def waiting_lock(
             if not is_announced:
                 on_wait(f"{folder}: another process is {activity} there; waiting until it is done")
                 is_announced = True
-            time.sleep(POLL_SECONDS)
+            time.sleep(LOCK_POLL_SECONDS)
 
 
 def _flock(file: TextIO, folder: Path, error: type[PharosError], activity: str) -> bool:
