@@ -80,10 +80,10 @@ class BenchmarkTask:
         environment, parameters: as `pharos.make` takes them; or "levels", with those of `levels_of`.
         observation, observation_options: as `pharos.observe`.
         chance: the kinds of `ChanceSetting` that are not 0.
-        axis: "core", or that of its ladder.
+        axis: "core", or the axis of its ladder.
         level: on a ladder: the measured quantity, in the ladder's unit; None in the core.
         predicted: by `pharos.predict`, normalised regret, 0 optimal and 1 uniform play: "dqn", "ppo", and "table",
-            that of the DQN with a table; some may be missing.
+            for the DQN with a table; some may be missing.
         value_optimal, value_uniform: at the start, of the optimal policy and of uniform play.
         digest: SHA-256 of the task as it was frozen; see `digest_of_task`.
         seconds: processor time of one run of a baseline that was measured, by its name; a guide.
@@ -241,7 +241,7 @@ class Suite:
         return {task.name: task for task in self.tasks}
 
     def task(self, name: str) -> BenchmarkTask:
-        """The task of this name; UnknownName where there is none."""
+        """The task of this name; UnknownName if there is none."""
         if name not in self._by_name:
             raise UnknownName(f"task of suite {self.name}", name, self._by_name)
         return self._by_name[name]

@@ -184,7 +184,7 @@ def _in_memory(
     Large values that memory has room for are swept there, as pages of a file that change are written again and again,
     and copied to their file every ten minutes, if that costs little, and in the end, whatever ends it.
     """
-    if mapped is None or mapped.nbytes <= memory.SMALL or not memory.fits(mapped.nbytes, memory.SHARE_OF_VALUES):
+    if mapped is None or mapped.nbytes <= memory.SMALL_BYTES or not memory.fits(mapped.nbytes, memory.SHARE_OF_VALUES):
         yield mapped, progress
         return
     x, due = np.array(mapped), time.monotonic() + _SECONDS

@@ -35,7 +35,8 @@ from pharos.training.options import ENGINES, OBJECTIVES, Horizon, TrainingOption
 
 RETURN_TAIL = 1e-9  # part of a discounted return that is not looked at
 HELD_OUT = 2.0**-1000
-"""Probability of start states where no episode begins, as no random number is so small: they are held out. If a task has some, values and regret are those of episodes that begin there, each state as likely."""
+"""Probability of start states in which no episode begins, as no random number is so small: they are held out. If a task
+has some, values and regret are those of episodes that begin there, each state as likely."""
 
 
 @dataclass(frozen=True)
