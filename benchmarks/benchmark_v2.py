@@ -53,7 +53,7 @@ def main() -> None:
 def ladders_of(v1):
     """Yield axis, unit, quantity, measure and tasks of each ladder."""
     episodes = "log2 of the episodes that random play needs"
-    for axis, cost, words in (("free", 0.0, "nothing"), ("costly", 0.5, "half of the treasure")):
+    for axis, cost, words in (("free", 0.0, "nothing"), ("costly", 0.2, "a fifth of the treasure")):
         sizes = [
             BenchmarkTask(
                 f"sea-{axis}-{size}", "deep_sea", {"size": size, "mapping_seed": 1, "move_cost": cost}, "one_hot"
