@@ -49,8 +49,9 @@ LESIONS_V2 = {  # the same, of v2
     ),
     "short horizon: discount 0.5, not 0.95": ("dqn", "credit", "dqn", {"gamma": 0.5}),
     "a table: Q-learning, not DQN": ("dqn", "scale", "q_learning", {}),
+    "layers of 2 units, not 32": (FAULTY, "representation", FAULTY, {"width": 2}),
     "rewards clipped to their signs": (FAULTY, "large_rewards", FAULTY, {"fault": "rewards_clipped"}),
-    "sees the last observation, not nine": (WINDOW, "hidden", WINDOW, {"length": 1}),
+    "sees the last observation, not five": (WINDOW, "hidden", WINDOW, {"length": 1}),
 }
 RELATED = ({"exploration_free", "exploration_costly"}, {"large_rewards", "small_rewards"})
 SAMPLE = {
@@ -59,7 +60,7 @@ SAMPLE = {
 }
 
 
-def window(env, steps, seed, *, length=9):
+def window(env, steps, seed, *, length=5):
     """Q-learning on a table of the last `length` observations; its policy has them as memory."""
     rng = np.random.default_rng(seed)
     num_actions = int(env.action_space.n)
