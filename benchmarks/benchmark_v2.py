@@ -14,7 +14,7 @@ from pharos.benchmark.suite import FOLDER, PAIRS
 
 PROTOCOL = Protocol(steps=10_000, evaluations=10)
 CHOICE, FOUR = "delayed_choice", {"num_actions": 4, "cues": 4}
-WAIT = {"delays": [1, 2, 3, 4, 5], "mapping_seed": 2, "bonus": 1.0}  # the best of five is worth twice any other
+WAIT = {"delays": [1, 2, 3, 4, 5], "mapping_seed": 1, "bonus": 3.0}  # the second of five is worth four of any other
 BASIC = {
     "basic-bandit": {"length": 1, "num_actions": 4, "cues": 1},
     "basic-sight": {"length": 1, **FOUR},
