@@ -552,7 +552,7 @@ def values(kernel, learned, out):
 @kernel
 def learn(
     outcomes, terminal, group, starts, cumulative, chance, limit, kernel, learned, target, memory, visits, place, word,
-    noise, schedule, largest_step, largest_error, steps,
+    noise, schedule, largest_step, steps,
 ):  # fmt: skip
     """`steps` steps of an epsilon-greedy walk, with gradient steps on minibatches of its transitions.
 
@@ -567,7 +567,6 @@ def learn(
     noise: (standard deviation of the noise of rewards, its random word); schedule: (gamma, first epsilon, last epsilon,
     steps of exploration, first step of learning, gradient steps in so many steps: two numbers, size of a minibatch).
     largest_step: the largest that does not overshoot; a minibatch takes that, or the largest that it bears itself.
-    largest_error: where temporal differences are cut: 1 for the Huber loss, infinity for the squared one.
     """
     offsets, next_states, outcome_rewards, cumulative_probabilities = outcomes
     observations, actions, next_observations, rewards = memory
@@ -643,8 +642,7 @@ def learn(
                         if set_has(chance, d, a):
                             best = max(best, _value(kernel, target, d, a))
                     y += gamma * best
-                error = y - _value(kernel, learned, observations[j], actions[j])
-                errors[i] = min(max(error, -largest_error), largest_error)
+                errors[i] = y - _value(kernel, learned, observations[j], actions[j])
             # largest step of this minibatch that does not overshoot, by the row sums of its kernel (Gershgorin)
             bound = 0.0
             for i in range(size):

@@ -13,22 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.errors import ParameterError
 from pharos.hardness.representation.learning import (
-    LANDMARKS,
     MARGIN,
-    MOST_EXACT,
     WORST_GREEDY,
     Grouped,
     IdealisedLearner,
     Identity,
     KernelOperator,
-    Landmarks,
     Representation,
     Schedule,
     greedy_policy,
 )
-from pharos.hardness.visitation import drawn
 from pharos.mdp import TabularMDP, paid_outcomes, require_mdp, whole_number
 from pharos.solvers import Solution
 
@@ -69,17 +65,15 @@ class SampledCurve:
     Attributes:
         steps: (J,) at which walks were evaluated.
         greedy: (walks, J).
-        worst: a policy's regret counts no more than this.
     """
 
     steps: np.ndarray
     greedy: np.ndarray
-    worst: float = WORST_GREEDY
 
     @property
     def walks(self) -> np.ndarray:
-        """(walks,) the mean over evaluations of each; a policy counts at most `worst`."""
-        return np.minimum(self.greedy, self.worst).mean(axis=1)
+        """(walks,) the mean over evaluations of each; a policy counts at most WORST_GREEDY."""
+        return np.minimum(self.greedy, WORST_GREEDY).mean(axis=1)
 
     @property
     def mean(self) -> float:
@@ -107,7 +101,6 @@ class SampledRegret:
         landmarks: of the approximation; None: the kernel is exact.
         estimated_error: half of the landmarks change the value by that much: an estimate, not a bound; 0 where exact.
         conventions: schedule, sampling, episode, observation and network.
-        name: of the measure.
     """
 
     descent: SampledCurve
@@ -118,7 +111,6 @@ class SampledRegret:
     landmarks: int | None = None
     estimated_error: float = 0.0
     conventions: Mapping[str, Any] = field(default_factory=dict)
-    name: str = "sampled_regret"
 
     @property
     def value(self) -> float:
@@ -135,9 +127,9 @@ class SampledRegret:
     def note(self) -> str:
         """Deviation between walks, and the landmarks with their estimated error, as text."""
         count = len(self.descent.greedy)
-        text = f"{self.name}: a mean over {count} walks, one of which deviates by {self.deviation:.2g}"
+        text = f"sampled_regret: a mean over {count} walks, one of which deviates by {self.deviation:.2g}"
         if count == 1:
-            text = f"{self.name}: of a single walk"
+            text = "sampled_regret: of a single walk"
         if self.landmarks is None:
             return text
         return (
@@ -212,21 +204,31 @@ def sampled_regret(
     Source: pharos; Mnih et al. (2015) for what is drawn.
     """
     learner = SampledLearner(mdp, representation, schedule, horizon, solution, progress)
-    return learner.measured(sampling or Sampling())
+    learner.sampling = sampling = sampling or Sampling()
+    operators, landmarks = learner.operators()
+    (descent, adam), *half = map(learner.both, operators)
+    error = sum((abs(descent.mean + adam.mean - one.mean - other.mean) / 2 for one, other in half), 0.0)
+    of_schedule = {name: value for name, value in asdict(learner.schedule).items() if name != "optimizer"}
+    settings = {"schedule": of_schedule, "sampling": asdict(sampling)}
+    conventions = learner.conventions(settings, {"greedy": WORST_GREEDY})
+    conventions["step_size"] += ", at most what a minibatch bears"
+    return SampledRegret(
+        descent=descent,
+        adam=adam,
+        tabular=learner.curve_of_walks(learner.table, Identity()),
+        observations=len(learner.observations),
+        states=len(learner.states),
+        landmarks=landmarks,
+        estimated_error=error,
+        conventions=conventions,
+    )
 
 
 class SampledLearner(IdealisedLearner):
-    """Q-learning in a kernel, from drawn transitions of an MDP.
-
-    Attributes:
-        largest_error: where temporal differences are cut.
-        worst: a policy's regret counts no more than this.
-    """
+    """Q-learning in a kernel, from drawn transitions of an MDP."""
 
     measure = "sampled_regret"
     sampling: Sampling
-    largest_error = math.inf
-    worst = WORST_GREEDY
 
     @cached_property
     def outcomes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -240,28 +242,6 @@ class SampledLearner(IdealisedLearner):
         ends = np.where(states == self.whole.num_states, -1, states)
         return offsets, ends, np.asarray(rewards, np.float64), levels
 
-    def measured(self, sampling: Sampling) -> SampledRegret:
-        """The measure: both kernels and a table."""
-        self.sampling = sampling
-        operators, landmarks = self.operators()
-        (descent, adam), *half = map(self.both, operators)
-        error = sum((abs(descent.mean + adam.mean - one.mean - other.mean) / 2 for one, other in half), 0.0)
-        of_schedule = {name: value for name, value in asdict(self.schedule).items() if name != "optimizer"}
-        settings = {"schedule": of_schedule, "sampling": asdict(sampling)}
-        conventions = self.conventions(settings, {"greedy": self.worst} if math.isfinite(self.worst) else {})
-        conventions["step_size"] += ", at most what a minibatch bears"
-        return SampledRegret(
-            descent=descent,
-            adam=adam,
-            tabular=self.curve_of_walks(self.table, Identity()),
-            observations=len(self.observations),
-            states=len(self.states),
-            landmarks=landmarks,
-            estimated_error=error,
-            conventions=conventions,
-            name=self.measure,
-        )
-
     def both(self, operator: KernelOperator) -> tuple[SampledCurve, SampledCurve]:
         """(regret with a kernel, regret with its root)."""
         observations = self.observations
@@ -274,12 +254,7 @@ class SampledLearner(IdealisedLearner):
         steps = np.unique(np.round(np.linspace(0, self.schedule.steps, LOOKS + 1)).astype(np.int64))
         seeds = range(self.sampling.seed, self.sampling.seed + self.sampling.walks)
         walks = (self.walk(observations, operator, steps, seed) for seed in seeds)
-        regrets = np.array([[self._regret_of(q, observations) for q in walk] for walk in walks])
-        return SampledCurve(steps, regrets, self.worst)
-
-    def start(self, observations: Grouped, seed: int) -> np.ndarray:
-        """Q (A, C) of a walk before its first step."""
-        return np.zeros((self.whole.num_actions, len(observations)))
+        return SampledCurve(steps, np.array([[self._regret_of(q, observations) for q in walk] for walk in walks]))
 
     def _regret_of(self, q: np.ndarray, observations: Grouped) -> float:
         """Regret of the policy that is greedy in values (C, A)."""
@@ -296,7 +271,7 @@ class SampledLearner(IdealisedLearner):
         group = np.full(mdp.num_states, -1, np.int64)
         group[self.numbers] = observations.groups
         kernel = operator.parts(count)
-        learnt = self.start(observations, seed), np.zeros((num_actions, kernel[1].shape[1]))
+        learnt = np.zeros((num_actions, count)), np.zeros((num_actions, kernel[1].shape[1]))
         target = tuple(each.copy() for each in learnt)
         size = min(sampling.buffer_size, schedule.steps)
         memory = *(np.zeros(size, np.int64) for _ in range(3)), np.zeros(size)
@@ -329,70 +304,5 @@ class SampledLearner(IdealisedLearner):
                 *(self.outcomes, np.asarray(mdp.terminal, np.bool_), group),
                 *(np.asarray(mdp.start_states, np.int64), cumulative, (*chance, *sets)),
                 *(self.episode, kernel, learnt, target, memory, visits, place, word, noise, numbers),
-                *(largest_step, self.largest_error, int(next_stop - step)),
+                *(largest_step, int(next_stop - step)),
             )
-
-
-# With the agent's loss, from a random network -------------------------------------------------------------------------
-
-
-@require_mdp
-def huber_regret(
-    mdp: TabularMDP,
-    representation: Representation,
-    *,
-    schedule: Schedule | None = None,
-    sampling: Sampling | None = None,
-    solution: Solution | None = None,
-    horizon: int | None = None,
-    progress: Callable[[str], object] | None = None,
-) -> SampledRegret:
-    """Return the regret of Q-learning in a network's tangent kernel with the Huber loss, from a random network.
-
-    `sampled_regret`, its means over walks and over K and the root of K, of a learner with two things that a DQN has:
-
-        Q(., a) += eta / |B| sum_i [a_i = a] min(max(y_i - Q(s_i, a_i), -1), 1) K(., s_i)
-        Q(., a) at the first step is drawn from the Gaussian process of the network's outputs, for each action anew
-
-    So the unit of rewards counts: the larger they are, the more steps it takes to learn their values. No policy's
-    regret is cut, as that of runs is not. A table begins at zeros.
-
-    Args and the rest of what it raises: as for `sampled_regret`.
-    Raises:
-        UndefinedMeasure: the representation does not say the covariance of the network's outputs.
-    Cost: `sampled_regret`, and C^3 once more for the draw.
-    Source: pharos; Huber (1964) and Mnih et al. (2015) for the loss, Lee et al. (2018) for the process.
-    """
-    learner = HuberLearner(mdp, representation, schedule, horizon, solution, progress)
-    return learner.measured(sampling or Sampling())
-
-
-class HuberLearner(SampledLearner):
-    """The sampled learner with the Huber loss, from a random network."""
-
-    measure = "huber_regret"
-    largest_error = 1.0
-    worst = math.inf
-
-    @cached_property
-    def outputs(self) -> Landmarks:
-        """The covariance of the random network's outputs over observations, as features and a diagonal."""
-        observed, covariance = self.observations.representatives, self.representation.covariance
-        if covariance is None:
-            raise UndefinedMeasure(
-                f"{self.measure} needs the covariance of the network's outputs, which this representation does not "
-                "have: take a network with a closed form, such as mlp128x2"
-            )
-        some = observed if len(observed) <= MOST_EXACT else observed[drawn(self.weights, LANDMARKS)]
-        return Landmarks(covariance, observed, some)
-
-    def start(self, observations: Grouped, seed: int) -> np.ndarray:
-        if observations is self.table:
-            return super().start(observations, seed)
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(3,)))
-        features, diagonal, actions = self.outputs.features, self.outputs.diagonal, self.whole.num_actions
-        of_features, own = (
-            rng.standard_normal((features.shape[1], actions)),
-            rng.standard_normal((len(features), actions)),
-        )
-        return np.ascontiguousarray((features @ of_features + np.sqrt(diagonal) * own).T)
