@@ -13,7 +13,7 @@ import pharos
 from naive.horizon import analysis
 from pharos import hardness
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
-from pharos.hardness.effective_horizon import LargeHorizon, NodeHorizon, parts_of
+from pharos.hardness.effective_horizon import LargeHorizon, NodeHorizon, horizon_fields
 from pharos.hardness.steps import TIE
 from pharos.mdp import (
     TabularMDP,
@@ -113,8 +113,8 @@ def test_it_is_what_its_definition_says(mdp, chance, steps):
 @pytest.mark.long
 @examples(150, deterministic_mdps(max_states=6, max_actions=3), st.integers(1, 7))
 def test_the_compiled_analysis_is_the_other_one(mdp, steps):
-    one = parts_of(NodeHorizon.of_steps(mdp, steps))
-    other = parts_of(LargeHorizon(mdp, steps, TIE))
+    one = horizon_fields(NodeHorizon.of_steps(mdp, steps))
+    other = horizon_fields(LargeHorizon(mdp, steps, TIE))
     assert one.keys() == other.keys()
     for name in one:
         assert one[name] == pytest.approx(other[name], rel=1e-12, abs=1e-12), name
@@ -122,7 +122,7 @@ def test_the_compiled_analysis_is_the_other_one(mdp, steps):
 
 @pytest.mark.long
 def test_the_compiled_analysis_of_key_corridor_is_the_published_one():
-    found = parts_of(LargeHorizon(key_corridor(), 100, TIE))
+    found = horizon_fields(LargeHorizon(key_corridor(), 100, TIE))
     expected = published("_analyzed")
     assert (found["k_min"], found["effective_planning_window"]) == (expected["min_k"], expected["epw"])
     assert found["ms"] == expected["effective_horizon_results"]["ms"]
@@ -202,11 +202,11 @@ def test_a_report_with_a_horizon_has_it_and_one_without_says_what_is_missing():
 )
 def test_states_that_no_episode_meets_do_not_matter(mdp, chance, steps):
     mdp = random_actions(sticky_actions(mdp, chance.get("sticky", 0.0)), chance.get("random", 0.0))
-    whole, part = (parts_of(NodeHorizon.of_steps(each, steps)) for each in (mdp, mdp_within(mdp, steps)))
+    whole, part = (horizon_fields(NodeHorizon.of_steps(each, steps)) for each in (mdp, mdp_within(mdp, steps)))
     for name in whole:
         assert part[name] == pytest.approx(whole[name], rel=1e-9, abs=1e-12), name
     if not chance and mdp.next_states is not None:
-        whole, part = (parts_of(LargeHorizon(each, steps, TIE)) for each in (mdp, mdp_within(mdp, steps)))
+        whole, part = (horizon_fields(LargeHorizon(each, steps, TIE)) for each in (mdp, mdp_within(mdp, steps)))
         assert part == whole
 
 
@@ -235,8 +235,8 @@ def test_actions_that_rounding_or_less_than_the_tie_tolerance_tells_apart_are_bo
     )
     expected = 1 if less < TIE else 2
     assert 0.1 + 0.2 > 0.3
-    assert parts_of(NodeHorizon.of_steps(mdp, 2))["k_min"] == expected
-    assert parts_of(LargeHorizon(mdp, 2, TIE))["k_min"] == expected
+    assert horizon_fields(NodeHorizon.of_steps(mdp, 2))["k_min"] == expected
+    assert horizon_fields(LargeHorizon(mdp, 2, TIE))["k_min"] == expected
 
 
 @pytest.mark.parametrize("function", [hardness.effective_horizon, hardness.gorp_bound])

@@ -10,7 +10,7 @@ from numba import njit
 
 from pharos.environments import Components
 from pharos.errors import ParameterError
-from pharos.kernels.hash_table import fill, fill_more, fill_range, find, mixed, slot_of
+from pharos.kernels.hash_table import fill, fill_more, fill_range, find_states, mixed, slot_of
 from pharos.rules.layout import AT_ONCE, layout_of, pack_states, unpack_states
 from pharos.rules.packed_view import clear_fault, fault, get_word, packed_view, set_word
 from strategies import examples
@@ -177,7 +177,7 @@ def test_what_is_in_the_table_is_found_and_nothing_else(words, count, seed):
     fill(table, states, len(states))
     assert sorted(table[table >= 0].tolist()) == list(range(len(states)))
     out = np.empty(len(keys), np.int64)
-    find(table, states, keys, out)
+    find_states(table, states, keys, out)
     assert out.tolist() == [*range(len(states)), *[-1] * len(others)]
 
 
@@ -186,7 +186,7 @@ def test_a_full_table_wraps_around():
     table = np.full(1 << 16, -1, np.int32)
     fill(table, keys, len(keys))
     out = np.empty(len(keys), np.int64)
-    find(table, keys, keys, out)
+    find_states(table, keys, keys, out)
     assert (out == np.arange(len(keys))).all()
 
 
@@ -208,7 +208,7 @@ def test_a_table_filled_part_by_part_holds_every_state_once(parts, count):
         fill_more(table, states, indices)
     assert sorted(table[table >= 0].tolist()) == list(range(count))
     out = np.empty(len(keys), np.int64)
-    find(table, states, keys, out)
+    find_states(table, states, keys, out)
     assert out.tolist() == [*range(count), *[-1] * len(others)]
 
 

@@ -409,7 +409,7 @@ class Tables(ArrayLearner):
             self.tables[0].restore(state)
             return
         for i, table in enumerate(self.tables):
-            table.restore(state_of(state, i))
+            table.restore(learner_state(state, i))
 
     def publish(self, i: int, folder: Path) -> None:
         """Write the greedy policy, as POLICY."""
@@ -424,7 +424,7 @@ def joined_states(states: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.nd
     return {f"{i}/{name}": array for i, state in enumerate(states) for name, array in state.items()}
 
 
-def state_of(joined: Mapping[str, np.ndarray], i: int) -> dict[str, np.ndarray]:
+def learner_state(joined: Mapping[str, np.ndarray], i: int) -> dict[str, np.ndarray]:
     """State of learner i."""
     prefix = f"{i}/"
     return {name[len(prefix) :]: array for name, array in joined.items() if name.startswith(prefix)}

@@ -183,7 +183,7 @@ def _expected(name: str, value: object) -> str | None:
     return None
 
 
-def extractor(space: Any) -> type:
+def extractor_class(space: Any) -> type:
     """The class of feature extractor for an observation space."""
     from stable_baselines3.common.torch_layers import CombinedExtractor
 
@@ -221,7 +221,7 @@ def make_model(
         wrong = options["policy_kwargs"]
         raise ParameterError(f"agent {_title(agent)!r}: policy_kwargs is {wrong!r}; expected a mapping")
     network = {
-        "features_extractor_class": extractor(env.observation_space),
+        "features_extractor_class": extractor_class(env.observation_space),
         "net_arch": options.pop("net_arch", [FEATURES]),
         **options.pop("policy_kwargs", {}),
     }

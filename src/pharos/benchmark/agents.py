@@ -39,6 +39,7 @@ from pharos.agents import (
 )
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
+from pharos.solvers import uniform_policy
 from pharos.system.sources import Source, find_source, is_reference, load_source, source_of
 from pharos.system.wording import capped, in_one_line, line_in
 from pharos.system.workers import Terminated, Workers
@@ -64,7 +65,6 @@ from pharos.training import (
     regret,
     run_id,
     train_configs,
-    uniform_policy,
     write_curve,
     write_policy,
     write_record,
@@ -600,4 +600,6 @@ class ExactForm(Form):
     def _regret(self, task: Task) -> float:
         if self.label == "oracle" or task.values is not None:  # U of a large task is stored
             return float(self.label != "oracle")
-        return float(regret(evaluate_agent(uniform_policy(task), task).value, task.reference, normalized_by="uniform"))
+        return float(
+            regret(evaluate_agent(uniform_policy(task.mdp), task).value, task.reference, normalized_by="uniform")
+        )

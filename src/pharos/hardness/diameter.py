@@ -284,7 +284,7 @@ class KeptBounds:
         Raises:
             FileFormatError: the folder holds the bounds of another graph.
         """
-        self._folder, self._graph = folder, digest_of(graph)
+        self._folder, self._graph = folder, graph_digest(graph)
         self._size = graph.num_nodes
         self.dtype: np.dtype | None = None
         path = folder / _RECORD
@@ -325,7 +325,7 @@ class KeptBounds:
             (self._folder / name).unlink(missing_ok=True)
 
 
-def digest_of(graph: Graph) -> str:
+def graph_digest(graph: Graph) -> str:
     """Digest of all that distances depend on: the table, the states that end, and the state to which these lead."""
     digest = xxhash.xxh3_128(f"{graph.next_states.shape} {graph.start} {graph.has_end}".encode())
     for rows in (graph.next_states, graph.ends):

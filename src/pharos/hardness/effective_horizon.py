@@ -26,7 +26,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from pharos.errors import PrecisionError, UndefinedMeasure
-from pharos.hardness.gaps import optimal_solution, solved
+from pharos.hardness.gaps import optimal_solution, solution_within
 from pharos.hardness.gorp import gorp_bound
 from pharos.hardness.interval import fields_of
 from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
@@ -138,7 +138,9 @@ def effective_horizon(
     mdp = mdp_within(mdp, steps)
     compiled = applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > COMPILED
     report = progress or str
-    parts = parts_of(LargeHorizon(mdp, steps, TIE, report) if compiled else NodeHorizon.of_steps(mdp, steps, report))
+    parts = horizon_fields(
+        LargeHorizon(mdp, steps, TIE, report) if compiled else NodeHorizon.of_steps(mdp, steps, report)
+    )
     bound = gorp_bound(mdp, horizon=steps, max_k=tight, progress=progress).value if tight else None
     conventions = {
         "horizon": steps,
@@ -150,7 +152,7 @@ def effective_horizon(
     return EffectiveHorizon(**parts, tight=bound, conventions=conventions)
 
 
-def parts_of(values: "NodeHorizon | LargeHorizon") -> dict[str, Any]:
+def horizon_fields(values: "NodeHorizon | LargeHorizon") -> dict[str, Any]:
     """Fields of an `EffectiveHorizon`, but for `tight` and `conventions`."""
     assert values.steps is not None
     ahead, greedy = look_ahead(values, values.steps, values.most_actions, values.greedy_return, values.report)
@@ -317,7 +319,7 @@ class NodeHorizon:
         from pharos.kernels import horizon
 
         result = np.empty(self.num_nodes)
-        horizon.largest(self.choices.table, values, result)
+        horizon.largest_after(self.choices.table, values, result)
         return result
 
     def restart_from_rewards(self) -> None:
@@ -421,7 +423,7 @@ class LargeHorizon:
         for t in range(steps - 1, -1, -1):
             now, after = t % 2, 1 - t % 2
             report(f"values of step {t} of {steps}")
-            kernels.values(
+            kernels.step_values(
                 *(self.next_states, self.rewards, tie, best[after], worst[after], self.ahead[t + 1]),
                 *(best[now], worst[now], self.ahead[t], self.optimal[t], self.spread[t]),
             )
@@ -476,7 +478,7 @@ class LargeHorizon:
             self.kernels.lookahead(self.next_states, self.rewards, 1.0, self.ahead[t + 1], self.ahead[t])
             if spread:
                 after = self.spread[t + 1] if t + 1 < self.steps else nothing
-                self.kernels.largest(self.next_states, after, self.spread[t])
+                self.kernels.largest_after(self.next_states, after, self.spread[t])
 
     def restart_from_rewards(self) -> None:
         self.ahead[:] = 0.0
@@ -584,7 +586,7 @@ def _nodes_of(
 
     def solution_of(solve: Callable[..., Solution], play: str) -> Solution:
         report(f"values of {play} play")
-        return solved(
+        return solution_within(
             solve, mdp, tolerance, progress=lambda sweeps, _: report(f"sweep {sweeps} of the values of {play} play")
         )
 

@@ -49,7 +49,7 @@ class Step(NamedTuple):
 
     own: np.ndarray  # (S + 1, W) x of this step
     next_x: np.ndarray  # (S + 1, W) x of the next step
-    later: np.ndarray  # (S,) see `steps_of`
+    later: np.ndarray  # (S,) see `value_steps`
     first: np.ndarray
 
 
@@ -80,7 +80,7 @@ class GapBlock(NamedTuple):
 
 def weighted_gaps(mdp: TabularMDP, solution: Solution) -> Iterator[GapBlock]:
     """The gaps of all states, in blocks."""
-    for number, step in enumerate(steps_of(mdp, solution)):
+    for number, step in enumerate(value_steps(mdp, solution)):
         yield from _gaps_of_step(mdp, step, number, solution.horizon is None and not mdp.is_sticky)
 
 
@@ -113,7 +113,7 @@ def _of_sets(gap: np.ndarray, sets: np.ndarray | None) -> np.ndarray:
     return gap if sets is None else np.where(sets, gap, np.inf)
 
 
-def steps_of(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
+def value_steps(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
     """Yield the values of each step t = 1, ..., T, or once, and how many times each state counts.
 
     later (S,): 1 for a reachable state, under sticky actions the number of actions by which it can be
@@ -507,7 +507,7 @@ def gaps_of_states(
     solution = optimal_solution(mdp, solution)
     tolerance = _tolerance(tie_tolerance, _error(mdp, solution))
     blocks = ((part.gap, part.counted) for part in weighted_gaps(mdp, solution))
-    return blocks, tolerance, _conventions(mdp, solution, tolerance)
+    return blocks, tolerance, _gap_conventions(mdp, solution, tolerance)
 
 
 def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
@@ -517,7 +517,7 @@ def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
         ParameterError: it is of another kind or MDP.
     """
     if solution is None:
-        return solved(value_iteration, mdp, 1e-9)
+        return solution_within(value_iteration, mdp, 1e-9)
     shape = (mdp.num_states, mdp.num_actions)
     solution_shape = (solution.mdp.num_states, solution.mdp.num_actions)
     chance, other = ((each.chance, each.laziness) for each in (mdp, solution.mdp))
@@ -533,7 +533,7 @@ def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
     return solution
 
 
-def solved(solve: Callable[..., Solution], mdp: TabularMDP, tolerance: float, **options: Any) -> Solution:
+def solution_within(solve: Callable[..., Solution], mdp: TabularMDP, tolerance: float, **options: Any) -> Solution:
     """A solution to a tolerance, in return; if floats do not reach it, to the least multiple by a power of ten that
     they reach, which `error_bound` says.
 
@@ -575,7 +575,7 @@ def _tolerance(tie_tolerance: float | None, error: float) -> float:
     return float(tolerance)
 
 
-def _conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[str, Any]:
+def _gap_conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[str, Any]:
     return {
         **solution.conventions(),
         "tie_tolerance": tolerance,
@@ -608,7 +608,7 @@ def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) ->
         edges=10.0 ** ((np.arange(first, last + 2) - kernels.BIN_OF_ONE) / 4),
         tie_tolerance=tolerance,
         error=error,
-        conventions=_conventions(mdp, solution, tolerance),
+        conventions=_gap_conventions(mdp, solution, tolerance),
     )
 
 

@@ -212,7 +212,7 @@ class HittingTimes:
     def bounds(self, j: np.ndarray, count: int) -> HittingBounds:
         """Bounds by the residuals of J; the greedy policy stands in `policy` then. `least` is the best lower one."""
         arrays = (*self.arrays, self.goal, self.order, count, j, None, self.policy, None, None)
-        above, below, largest = hitting.residuals(*arrays)
+        above, below, largest = hitting.residual_bounds(*arrays)
         bounds = certified(above, below, largest)
         self.least = max(self.least, bounds.lower)
         return bounds
@@ -416,7 +416,7 @@ class HittingTimes:
         in `policy`."""
         residual, error = np.zeros_like(high), np.zeros_like(high)
         arrays = (high, low, self.policy, residual, error)
-        return residual, error, hitting.residuals(*self.arrays, self.goal, self.order, count, *arrays)[:2]
+        return residual, error, hitting.residual_bounds(*self.arrays, self.goal, self.order, count, *arrays)[:2]
 
 
 # Hitting equations ----------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from pharos.errors import MeasureUnfinished, ParameterError, UndefinedMeasure, UnknownName
 from pharos.hardness.diameter import diameter, start_eccentricity_interval
 from pharos.hardness.effective_horizon import effective_horizon, stationary_effective_horizon
-from pharos.hardness.gaps import Gaps, resolved_gaps, solved
+from pharos.hardness.gaps import Gaps, resolved_gaps, solution_within
 from pharos.hardness.gorp import gorp_bound
 from pharos.hardness.interval import Budget, BudgetClock, Certified, MeasureProgress
 from pharos.hardness.representation.kernel_regret import (
@@ -77,7 +77,7 @@ class Problem:
     @cached_property
     def _solved(self) -> Solution | MeasureUnfinished:  # what a budget has ended is not tried by the next measure again
         try:
-            return solved(
+            return solution_within(
                 value_iteration,
                 self.mdp,
                 self.tolerance,

@@ -171,7 +171,7 @@ def report(  # noqa: PLR0913
     options = (representation, schedule, rollouts, sampling, None if folder is None else Path(folder))
     is_strict = budget is not None
     problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress, *options, is_strict)
-    conventions = _conventions(problem)
+    conventions = _problem_conventions(problem)
     file = ResultsFile(mdp, conventions) if keep else None
     results = {}
     for measure in wanted:
@@ -200,7 +200,9 @@ def _measured(measure: Measure, problem: Problem, file: "ResultsFile | None") ->
         is_over = isinstance(error, MeasureUnfinished)
         return replace(empty, undefined=str(error), is_out_of_budget=is_over, seconds=watch.seconds)
     certificate, seconds = certificate_of(outcome), watch.seconds
-    result = replace(empty, value=_plain(outcome), text=_text(outcome), certificate=certificate, seconds=seconds)
+    result = replace(
+        empty, value=_plain(outcome), text=_text_of_value(outcome), certificate=certificate, seconds=seconds
+    )
     if file is not None:
         file.put(measure, result, problem.budget, problem.error_bound)
     return result
@@ -216,7 +218,7 @@ def _plain(value: object) -> object:
     return value
 
 
-def _text(value: object) -> str:
+def _text_of_value(value: object) -> str:
     if isinstance(value, float | np.floating):
         return f"{value:.10g}"
     return str(value)
@@ -228,7 +230,7 @@ def _infinite(value: object) -> bool:
     return isinstance(value, float) and math.isinf(value)
 
 
-def _conventions(problem: Problem) -> dict[str, Any]:
+def _problem_conventions(problem: Problem) -> dict[str, Any]:
     mdp = problem.mdp
     starts = [[int(s), float(p)] for s, p in zip(mdp.start_states[:100], mdp.start_probabilities, strict=False)]
     representation = problem.representation
@@ -303,7 +305,7 @@ class ResultsFile:
             certificate = Certificate(**content["certificate"])
             if not certificate.is_exact and budget.exceeds(Budget(**content["budget"])):
                 return None
-            _check(content["value"])
+            _check_value(content["value"])
             text, seconds = str(content["text"]), float(content["seconds"])
             bound = None if content["error_bound"] is None else float(content["error_bound"])
         except (KeyError, TypeError, ValueError):
@@ -381,7 +383,7 @@ class ResultsFile:
             warnings.warn(f"{self.path}: {what}; it is measured anew", stacklevel=2)
 
 
-def _check(value: object) -> None:
+def _check_value(value: object) -> None:
     """ValueError if a value cannot be one: an interval whose ends are the wrong way round, or NaN."""
     if isinstance(value, Mapping):
         lower, upper = value.get("lower"), value.get("upper")

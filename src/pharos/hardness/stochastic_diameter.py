@@ -32,10 +32,10 @@ leave them is to give up,
     E(x, y) <= c(x) + l(x) E(h, y), where c(y) = l(y) = 0, and outside c = U, l = 1,
 
 holds for c = U, l = 1 everywhere, and goes on to hold where c(x), l(x) become 1 + sum P c and sum P l under any action,
-node by node (`shortened`). So E(h, y) <= (E(h, x) + c(x)) / (1 - l(x)) for every x around y, and what was a slip at
-each step on the way is one for as many steps as lie between x and y. Each x on the way still has to be met exactly, at
-a factor of 1 / (1 - l(x)) each time. So a few targets, drawn at random, are bounded by long ways of thousands of nodes
-from each other, and every target by a short way from one of them: a few factors instead of hundreds.
+node by node (`shortened_bounds`). So E(h, y) <= (E(h, x) + c(x)) / (1 - l(x)) for every x around y, and what was a slip
+at each step on the way is one for as many steps as lie between x and y. Each x on the way still has to be met exactly,
+at a factor of 1 / (1 - l(x)) each time. So a few targets, drawn at random, are bounded by long ways of thousands of
+nodes from each other, and every target by a short way from one of them: a few factors instead of hundreds.
 """
 
 import itertools
@@ -51,7 +51,7 @@ from pharos.hardness.hitting_times import SWEEPS, HittingTimes
 from pharos.hardness.interval import MORE, BudgetClock, Interval
 from pharos.kernels import hitting
 from pharos.kernels.hitting import UNIT
-from pharos.mdp import ExpandedMDP, TabularMDP, outcomes_of
+from pharos.mdp import ExpandedMDP, TabularMDP, outcome_matrix
 from pharos.system.workers import usable_workers
 
 # Nodes around each state among which ways back are looked for: a few steps in all directions of a grid.
@@ -91,7 +91,7 @@ class HubBounds:
             chance.first_chosen,
             chance.first_uniform / num_actions,
         )
-        self._outcomes = _outcomes(mdp, restart)
+        self._outcomes = _outcome_lists(mdp, restart)
         first, _, node, _ = self._outcomes
         owner = np.repeat(np.arange(len(first) - 1), np.diff(first))
         self._num_actions = num_actions
@@ -142,7 +142,9 @@ class HubBounds:
             for passes in range(PASSES):
                 # twice with all arrays, as two take turns
                 arrays: tuple[object, ...] = (*self._fixed, *self._ways, own, times, value, new, passes < 2)
-                parts = [pool.submit(hitting.attempt, low, high, *arrays) for low, high in itertools.pairwise(edges)]
+                parts = [
+                    pool.submit(hitting.attempt_costs, low, high, *arrays) for low, high in itertools.pairwise(edges)
+                ]
                 short = max(part.result() for part in parts)
                 if short <= ACCURACY * (1 - self._rho):
                     break
@@ -212,10 +214,10 @@ class HubBounds:
         return self._steps[1]
 
 
-def _outcomes(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _outcome_lists(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(first, action, node, probability) of the outcomes of executing each action in each state; action -1: any."""
     terminal = np.asarray(mdp.terminal)
-    executed, ends = outcomes_of(mdp, terminal)
+    executed, ends = outcome_matrix(mdp, terminal)
     num_states, num_actions = mdp.num_states, mdp.num_actions
     starts = np.flatnonzero(np.asarray(mdp.start_probabilities) > 0)
     ended = np.append(np.flatnonzero(terminal), np.full(int(ends), num_states, np.int64)).astype(np.int64)
@@ -324,7 +326,7 @@ class TargetBounds:
         if self._first is None or self._travel is None or self._is_short:
             return
         (to_hub, times, away), self._is_short = self._first, True
-        for shorter in shortened(self._travel, times, away, self.spending):
+        for shorter in shortened_bounds(self._travel, times, away, self.spending):
             np.minimum(self.upper, to_hub + shorter, out=self.upper)
             self.drop()
             self.report()
@@ -482,7 +484,9 @@ class _Diameter(TargetBounds):
         return looks
 
 
-def shortened(travel: HubBounds, times: np.ndarray, away: np.ndarray, spending: BudgetClock) -> Iterator[np.ndarray]:
+def shortened_bounds(
+    travel: HubBounds, times: np.ndarray, away: np.ndarray, spending: BudgetClock
+) -> Iterator[np.ndarray]:
     """Bounds of the times from a hub to each target, ever shorter, while this helps and the budget allows for more.
 
     times, away: (targets,) upper bounds of the expected steps to the hub, and from it.

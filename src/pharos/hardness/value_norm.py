@@ -68,7 +68,7 @@ def certified_value_norm(
     scale = 2.0 ** math.frexp(size)[1] if 0 < size < math.inf else 1.0  # squares of 1e160 and 1e-170 are no floats
     for number, block in enumerate(np.array_split(states, max(1, -(-states.size // _BLOCK)))):
         progress(f"state {number * _BLOCK:,} of {states.size:,}")
-        means, within = _outcomes(mdp, solution.x, block, scale)
+        means, within = _moments(mdp, solution.x, block, scale)
         first = lone[block]
         largest = max(largest, _largest_variance(mdp.chance.first.at(block[first]), means[first], within[first], 0))
         for previous in range(mdp.width):
@@ -85,7 +85,7 @@ def certified_value_norm(
     return Certified(value, lower, upper, upper - lower <= _NARROW * upper or upper == 0.0)
 
 
-def _outcomes(mdp: TabularMDP, x: np.ndarray, states: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+def _moments(mdp: TabularMDP, x: np.ndarray, states: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
     """((N, A) mean less the mean of the row, (N, A) variance) of the next state's value under each executed action,
     over `scale`."""
     means = mdp.dynamics.expected(x, states) / scale

@@ -359,7 +359,7 @@ def standard_occupancy(
     return StandardOccupancy(total, solution.q)
 
 
-def drawn(weights: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
+def drawn_indices(weights: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
     """(count,) different indices, drawn by nine parts of weights (N,) and one of uniform chance, in random order."""
     share = 0.9 * weights / weights.sum() + 0.1 / len(weights)
     return np.random.default_rng(seed).choice(len(weights), count, replace=False, p=share / share.sum())
@@ -596,11 +596,11 @@ def mixing_time(
     if isinstance(epsilon, bool) or not isinstance(epsilon, int | float | np.floating) or not 0 < epsilon < 0.5:
         raise ParameterError(f"epsilon is {epsilon!r}; expected a number between 0 and 1/2")
     if mdp.num_states > 100 * MOST_NODES:  # too many to be written out, even if few can be reached
-        raise UndefinedMeasure(_too_many(mdp.num_states))
+        raise UndefinedMeasure(_too_large_for_matrix(mdp.num_states))
     choices = ExpandedMDP.of(mdp, restart).reachable()
     size = len(choices.underlying)
     if size > MOST_NODES:
-        raise UndefinedMeasure(_too_many(size))
+        raise UndefinedMeasure(_too_large_for_matrix(size))
     table = PolicyTable.of(mdp, policy)
     inside = np.minimum(choices.underlying, mdp.num_states - 1)
     actions = table.probabilities[inside, choices.previous if table.looks_back else 0]
@@ -610,7 +610,7 @@ def mixing_time(
     )
     chain = scipy.sparse.csr_matrix(owner @ chain)
     if mdp.is_sticky:
-        chain = _merged(chain, choices.underlying, np.append(np.asarray(mdp.terminal), True))
+        chain = _without_previous(chain, choices.underlying, np.append(np.asarray(mdp.terminal), True))
         size = chain.shape[0]
     chain.eliminate_zeros()
     if lazy:
@@ -625,11 +625,11 @@ def mixing_time(
     period = _period(chain)
     if period != 1:
         return MixingTime(math.inf, period, 1.0, conventions)
-    steps, distance = _time(chain.toarray(), float(epsilon), progress or str)
+    steps, distance = _mixing_time(chain.toarray(), float(epsilon), progress or str)
     return MixingTime(float(steps), 1, distance, conventions)
 
 
-def _merged(chain: "csr_matrix", underlying: np.ndarray, ended: np.ndarray) -> "csr_matrix":
+def _without_previous(chain: "csr_matrix", underlying: np.ndarray, ended: np.ndarray) -> "csr_matrix":
     """The chain in which an episode that has ended does not remember the previous action."""
     label = np.where(ended[underlying], underlying, len(ended) + np.arange(len(underlying)))
     _, first, index = np.unique(label, return_index=True, return_inverse=True)
@@ -637,7 +637,7 @@ def _merged(chain: "csr_matrix", underlying: np.ndarray, ended: np.ndarray) -> "
     return scipy.sparse.csr_matrix(chain[first] @ membership)
 
 
-def _too_many(nodes: int) -> str:
+def _too_large_for_matrix(nodes: int) -> str:
     return (
         f"mixing_time: {nodes} nodes are more than the {MOST_NODES} whose matrix fits; a smaller instance "
         f"would define it"
@@ -663,7 +663,7 @@ def _period(chain: "csr_matrix") -> int:
     return int(np.gcd.reduce(level[rows] + 1 - level[columns]))
 
 
-def _time(chain: np.ndarray, epsilon: float, report: Callable[[str], object]) -> tuple[int, float]:
+def _mixing_time(chain: np.ndarray, epsilon: float, report: Callable[[str], object]) -> tuple[int, float]:
     """(t_mix, distance there): squares until it is near enough, then bisection by the squares on the way."""
     size = len(chain)
     epsilon += ROUNDING

@@ -103,7 +103,7 @@ def anneal(first, last, share, elapsed, out):
 
 
 @kernel
-def look_up(table, begins, states, out):
+def look_up_rows(table, begins, states, out):
     """out (W, pitch): the rows of a table (R, size), one after another, of the states (W, B) of each run.
 
     begins (W,): the row of each run's first state.
@@ -171,7 +171,7 @@ def start(keys, runs, starts, cumulative, state):
 
 
 @kernel
-def execute_in_sets(keys, step, chances, sets, previous, actions, executed):
+def execute_runs_in_sets(keys, step, chances, sets, previous, actions, executed):
     """executed (W, E): what is executed of chosen actions, in states with the sets (W, E, A) bool.
 
     Draws what `advance` would draw. chances (W, 4): as in `stepping.Setting`; previous (W, E): -1 if there is none.
@@ -484,7 +484,7 @@ def gather(order, first, sources, targets):
 
 
 @kernel
-def normalize(advantages):
+def normalize_advantages(advantages):
     """Normalise advantages (W, B) in place: less the mean of each run, by its standard deviation + 1e-8; B >= 2."""
     number = advantages.shape[1]
     for i in range(advantages.shape[0]):

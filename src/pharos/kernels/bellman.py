@@ -22,7 +22,7 @@ from numba import njit, types, uint64
 
 from pharos.kernels.interpreted import interpreted_first, overload
 from pharos.kernels.kernel_cache import kernel
-from pharos.kernels.outcomes import expectation, fetch_values, outcome, outcomes_of, size_of
+from pharos.kernels.outcomes import expectation, fetch_values, outcome, outcome_numbers, size_of
 
 # Orders ---------------------------------------------------------------------------------------------------------------
 
@@ -49,7 +49,7 @@ def is_increasing(transitions, live, age):
     for s in range(num_states):
         if live[s]:
             for a in range(num_actions):
-                for k in outcomes_of(transitions, s, a):
+                for k in outcome_numbers(transitions, s, a):
                     t, _ = outcome(transitions, s, a, k)
                     if t >= 0 and state_at(age, t) <= state_at(age, s):
                         return s, a, np.int64(t)
@@ -68,7 +68,7 @@ def topological_order(transitions, live):
     for s in range(num_states):
         if live[s]:
             for a in range(num_actions):
-                for k in outcomes_of(transitions, s, a):
+                for k in outcome_numbers(transitions, s, a):
                     t, _ = outcome(transitions, s, a, k)
                     if t >= 0:
                         waiting[t] += 1
@@ -87,7 +87,7 @@ def topological_order(transitions, live):
         if not live[s]:
             continue
         for a in range(num_actions):
-            for k in outcomes_of(transitions, s, a):
+            for k in outcome_numbers(transitions, s, a):
                 t, _ = outcome(transitions, s, a, k)
                 if t >= 0:
                     waiting[t] -= 1
@@ -109,7 +109,7 @@ def longest_path(transitions, live, order):
         if live[s]:
             edges = 0
             for a in range(num_actions):
-                for k in outcomes_of(transitions, s, a):
+                for k in outcome_numbers(transitions, s, a):
                     t, _ = outcome(transitions, s, a, k)
                     if t >= 0:
                         edges = max(edges, length[t] + 1)
@@ -442,7 +442,7 @@ def sticky_policy_backup(transitions, table, palette, gamma, weights, policy, v,
 
 @interpreted_first()
 @kernel
-def chain_values(successor, reward, gamma, v, order):
+def solve_chain(successor, reward, gamma, v, order):
     """Exact values on the graph of a deterministic policy: successor (S,), -1 ends; reward (S,); v gets the values.
 
     Every walk runs into the end, into a state already done, or into a new cycle, whose value is the geometric series of
@@ -524,7 +524,7 @@ def number_components(transitions, live, component, path, waiting):
             if live[s]:
                 a, k = np.int64(action[depth]), np.int64(branch[depth])
                 while a < num_actions and next_state == s:
-                    while k < len(outcomes_of(transitions, s, a)):
+                    while k < len(outcome_numbers(transitions, s, a)):
                         t, _ = outcome(transitions, s, a, k)
                         if t >= 0 and component[t] == 0:
                             next_state = np.int64(t)  # and look at this transition again, when it is finished
@@ -580,7 +580,7 @@ def component_order(transitions, live, component, first, is_cyclic, order):
         first[c] += 1
         if live[s] and not is_cyclic[c]:
             for a in range(num_actions):
-                for k in outcomes_of(transitions, s, a):
+                for k in outcome_numbers(transitions, s, a):
                     t, _ = outcome(transitions, s, a, k)
                     is_cyclic[c] |= t == s
     # `first` points to the ends now: shift it back
@@ -590,7 +590,7 @@ def component_order(transitions, live, component, first, is_cyclic, order):
 
 
 @kernel
-def joined(first, is_cyclic, least):
+def joined_components(first, is_cyclic, least):
     """(starts (G + 1,) in the order, whether each group has a cycle): neighbouring components joined into groups.
 
     Components without a cycle are joined as long as they follow each other; one with a cycle is joined by those that
@@ -630,9 +630,9 @@ def sweep_groups(
 ):
     """Sweep group by group, from the last to the first, each until it changes by at most `target`, or by its rounding.
 
-    starts, has_cycle: as from `joined`; rounding: a change that is no more than rounding, relative to the values.
-    max_backups: after so many each group that is left is swept once. largest_before: the largest absolute value so far.
-    The other arguments are the arguments of all backups.
+    starts, has_cycle: as from `joined_components`; rounding: a change that is no more than rounding, relative to the
+    values. max_backups: after so many each group that is left is swept once. largest_before: the largest absolute value
+    so far. The other arguments are the arguments of all backups.
     """
     for group in range(len(has_cycle) - 1, -1, -1):
         change, largest = np.inf, largest_before

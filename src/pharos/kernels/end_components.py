@@ -18,7 +18,7 @@ from numba import types
 from pharos.kernels.bellman import set_has
 from pharos.kernels.interpreted import interpreted_first, overload
 from pharos.kernels.kernel_cache import kernel
-from pharos.kernels.outcomes import outcome, outcomes_of, size_of
+from pharos.kernels.outcomes import outcome, outcome_numbers, size_of
 
 
 def weights_after(weights, s, b):
@@ -53,7 +53,7 @@ def may_execute(weights, allowed, count, n, s, b, e):
 
 @interpreted_first()
 @kernel
-def number_components(transitions, weights, allowed, count, component, path, waiting):
+def number_node_components(transitions, weights, allowed, count, component, path, waiting):
     """component[n] = the number of the strongly connected component of n; returns how many there are.
 
     A component has a smaller number than those that it leads to. component, path, waiting (N,) integers; the last two
@@ -87,7 +87,7 @@ def number_components(transitions, weights, allowed, count, component, path, wai
                 if not may_execute(weights, allowed, count, n, s, n - s * width, e):
                     e, k = e + 1, np.int64(0)
                     continue
-                while k < len(outcomes_of(transitions, s, e)):
+                while k < len(outcome_numbers(transitions, s, e)):
                     t, _ = outcome(transitions, s, e, k)
                     if t >= 0:
                         m = np.int64(t) * width + (e if width > 1 else 0)
@@ -141,7 +141,7 @@ def remove_leaving(transitions, weights, component, allowed, count, leaves):
         for e in range(num_actions):
             leaves[e] = False
             if may_execute(weights, allowed, count, n, s, b, e):
-                for k in outcomes_of(transitions, s, e):
+                for k in outcome_numbers(transitions, s, e):
                     t, _ = outcome(transitions, s, e, k)
                     m = np.int64(t) * width + (e if width > 1 else 0)
                     if t < 0 or component[m] != component[n] or count[m] == 0:

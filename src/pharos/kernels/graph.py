@@ -21,7 +21,7 @@ import numpy as np
 
 from pharos.kernels.interpreted import interpreted_first
 from pharos.kernels.kernel_cache import kernel
-from pharos.kernels.outcomes import outcome, outcomes_of, size_of
+from pharos.kernels.outcomes import outcome, outcome_numbers, size_of
 
 
 @interpreted_first()
@@ -192,7 +192,7 @@ def onwards(transitions, nodes, n, next_nodes, is_visited):
     count = 0
     for i in range(n):
         for a in range(size_of(transitions)[1]):
-            for j in outcomes_of(transitions, nodes[i], a):
+            for j in outcome_numbers(transitions, nodes[i], a):
                 t, _ = outcome(transitions, nodes[i], a, j)
                 if t >= 0 and not is_visited[t]:
                     is_visited[t] = True

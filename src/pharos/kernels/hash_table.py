@@ -80,7 +80,7 @@ def entry_at(typing_context, table, slot):
 
 @in_python(lambda table, slot, index: table.__setitem__(slot, index))
 @intrinsic
-def publish(typing_context, table, slot, index):
+def store_released(typing_context, table, slot, index):
     """Set table[slot] = index by a releasing store: threads that read it by `entry_at` see all earlier writes."""
 
     def codegen(context, builder, sig, args):
@@ -188,7 +188,7 @@ def fill_more(table, states, indices):
 
 @interpreted_first("keys")
 @kernel
-def find(table, states, keys, out):
+def find_states(table, states, keys, out):
     """out[j] = index of keys[j] among the states, or -1. keys (N, W) uint64."""
     capacity = table.shape[0]
     words = states.shape[1]
@@ -247,7 +247,7 @@ def insert_missing(table, states, keys, indices, successors, progress):
                     index = count
                     for k in range(words):
                         states[count, k] = keys[j, k]
-                    publish(table, slot, count)
+                    store_released(table, slot, count)
                     count += 1
                     break
                 # an occupied slot: compare all words, and go on to the next slot if they differ
@@ -299,7 +299,7 @@ def route(keys, indices, size, order, counts):
 
 
 @kernel
-def claim(table, keys, numbers, count, candidates, indices, entries):
+def claim_entries(table, keys, numbers, count, candidates, indices, entries):
     """Find the entry of each candidate that this owner is asked for, and make one for each that is new.
 
     candidates (N, W), indices (N,): states and their indices in the block; entries (N,) int64 gets their entries. Of
@@ -429,7 +429,7 @@ def look_up(entries, keys, order, low, high, indices, slots):
 
 
 @kernel
-def number(keys, indices, successors, states, appended, progress):
+def number_states(keys, indices, successors, states, appended, progress):
     """Number new states in the order of candidates, and write them to states[count - appended :].
 
     indices (M,): as `look_up` leaves them. Row i of successors (rows, A) belongs to state progress[FIRST] + i;

@@ -113,15 +113,15 @@ def sweep_in_place(rows, common, shares_rows, goal, order, count, j, mode):
 
 @interpreted_first()
 @kernel
-def residuals(rows, common, shares_rows, goal, order, count, high, low, policy, residual, error):
+def residual_bounds(rows, common, shares_rows, goal, order, count, high, low, policy, residual, error):
     """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; T is one Bellman step.
 
     j = high; or j = high + low, two floats a node, so that j may be 1e16 times its differences. policy[n] = the action
     that attains T j. residual, error (N,): T j - j, and by how much it may be off; None if low is.
 
     T j(n) - j(n) = 1 + min_a sum_m p(m | n, a) (j(m) - j(n)): written with differences, no rounding error grows with j
-    itself. Both bounds count all rounding: `operations` says how many units in the last place one sum may be off. The
-    error of a difference of two pairs is a unit of the difference and eight units of a unit of the numbers.
+    itself. Both bounds count all rounding: `rounding_units` says how many units in the last place one sum may be off.
+    The error of a difference of two pairs is a unit of the difference and eight units of a unit of the numbers.
     """
     first, node, weight = rows
     always, always_node, always_weight = common
@@ -160,7 +160,9 @@ def residuals(rows, common, shares_rows, goal, order, count, high, low, policy, 
                 magnitude += abs(step)
                 if low is not None:
                     extent += weight[k] * (abs(high[node[k]]) + abs(value))
-            slack = operations(num_actions, first[row + 1] - first[row] + always[n + 1] - always[n]) * UNIT * magnitude
+            slack = (
+                rounding_units(num_actions, first[row + 1] - first[row] + always[n + 1] - always[n]) * UNIT * magnitude
+            )
             if low is not None:
                 slack += 8 * UNIT * UNIT * extent
             total += shared
@@ -177,7 +179,7 @@ def residuals(rows, common, shares_rows, goal, order, count, high, low, policy, 
 
 
 @kernel
-def operations(num_actions, terms):
+def rounding_units(num_actions, terms):
     """Units in the last place by which a sum of `terms` products may be off, relative to the sum of their sizes.
 
     One for each product, difference and addition; num_actions + 8 for a probability, itself a sum over the actions that
@@ -425,7 +427,7 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
 
 @interpreted_first()
 @kernel
-def attempt(
+def attempt_costs(
     begin, end, outcomes, owner, weights, num_previous, square, steps, start, way, constant, times, value, new, once
 ):
     """new[i] = constant + the expected cost of the outcomes that happen if outcome i is aimed at.

@@ -17,7 +17,7 @@ from pharos.kernels.kernel_cache import kernel
 
 
 @kernel(parallel=True)
-def values(next_states, rewards, tie, best, worst, explored, best_now, worst_now, explored_now, optimal, variance):
+def step_values(next_states, rewards, tie, best, worst, explored, best_now, worst_now, explored_now, optimal, variance):
     """One step backwards: the values of optimal, worst and uniform play, and two inputs of the simple bound.
 
     best, worst, explored (S,): of the step after; *_now (S,): of this step. optimal (S,) unsigned: bit a where Q*(s, a)
@@ -64,7 +64,7 @@ def lookahead(next_states, rewards, gamma, after, now):
 
 @interpreted_first()
 @kernel(parallel=True)
-def largest(next_states, after, now):
+def largest_after(next_states, after, now):
     """now (S,) = max over a of after(next state), at least 0."""
     for s in prange(len(next_states)):
         high = 0.0

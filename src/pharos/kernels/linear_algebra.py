@@ -37,7 +37,7 @@ def subtract_from(y, out):
 
 
 @kernel
-def advance(x, factor, y):
+def add_scaled(x, factor, y):
     """x += factor y, in place; returns the sum of x."""
     total = 0.0
     for i in range(len(x)):
@@ -47,7 +47,7 @@ def advance(x, factor, y):
 
 
 @kernel
-def turn(direction, beta, omega, moved, residual):
+def next_direction(direction, beta, omega, moved, residual):
     """direction = residual + beta (direction - omega moved), in place; returns its sum."""
     total = 0.0
     for i in range(len(direction)):

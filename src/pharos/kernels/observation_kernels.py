@@ -30,7 +30,7 @@ def mark_components(states, low, offset, out):
 
 
 @kernel(inline="always")
-def _mixed(word):
+def _mixed_word(word):
     """Mix the bits of a word by the finalizer of SplitMix64 (Steele, Lea and Flood, 2014)."""
     word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -54,14 +54,14 @@ def scramble(states, low, lengths, keys, out):
             first, last = (0, half) if r % 2 == 0 else (half, num_bits)
             word = keys[r]
             for index in range(first, last):
-                word = _mixed(word + step + np.uint64(out[n, index]))
+                word = _mixed_word(word + step + np.uint64(out[n, index]))
             # flips bits of the other half: a new word for every 64 of them
             begin, end = (half, num_bits) if r % 2 == 0 else (0, half)
             mask = word
             for index in range(begin, end):
                 if (index - begin) % 64 == 0:
                     word += step
-                    mask = _mixed(word)
+                    mask = _mixed_word(word)
                 out[n, index] ^= np.int8(mask & one)
                 mask >>= one
 

@@ -12,7 +12,7 @@ from numba import njit, types
 from pharos.kernels.bellman import set_has, set_size
 from pharos.kernels.interpreted import interpreted_first, overload
 from pharos.kernels.kernel_cache import kernel
-from pharos.kernels.outcomes import outcome, outcomes_of, size_of
+from pharos.kernels.outcomes import outcome, outcome_numbers, size_of
 
 
 @njit(forceinline=True)
@@ -84,7 +84,7 @@ def push(transitions, live, policy, weights, now, after):
         # split the mass of s by executed actions, then by their outcomes
         _execute(policy, weights, now, s, mass, executed)
         for a in range(num_actions):
-            for i in outcomes_of(transitions, s, a):
+            for i in outcome_numbers(transitions, s, a):
                 t, p = outcome(transitions, s, a, i)
                 if t >= 0:
                     after[t, a if by_action else 0] += p * executed[a]
@@ -120,7 +120,7 @@ def count_visits(transitions, live, policy, weights, gamma, least, waiting, visi
             visits[s, b] += waiting[s, b]
         waiting[s] = 0.0
         for a in range(num_actions):
-            for i in outcomes_of(transitions, s, a):
+            for i in outcome_numbers(transitions, s, a):
                 t, p = outcome(transitions, s, a, i)
                 if t >= 0 and live[t]:
                     waiting[t, a if by_action else 0] += p * (gamma * leaving[a])
@@ -155,7 +155,7 @@ def support(transitions, live, policy, weights, reachable):
             if executed[a] <= 0.0:
                 continue
             c = a if by_action else 0
-            for i in outcomes_of(transitions, s, a):
+            for i in outcome_numbers(transitions, s, a):
                 t, _ = outcome(transitions, s, a, i)
                 if t >= 0 and live[t] and reachable[t, c] == 0.0:
                     reachable[t, c] = 1.0

@@ -15,7 +15,7 @@ Kernels take `transitions`, one of three things:
 - a pair (`transitions` of the first two kinds, p): with probability p a state stays what it is, else they hold. Staying
   is the last outcome of each row.
 
-`outcomes_of` and `outcome` give them one by one, `expectation` adds up values. Loops over tables cost nothing more:
+`outcome_numbers` and `outcome` give them one by one, `expectation` adds up values. Loops over tables cost nothing more:
 their indices are unsigned, as signed ones would be checked at each read for counting from the end.
 
 State spaces store the possible outcomes, row after row, and their probabilities as codes of a palette. Row s A + a
@@ -87,7 +87,7 @@ def _getitem(indices, where):
 
 
 @overload_attribute(PackedIndicesType, "shape")
-def _shape(indices):
+def _typed_shape(indices):
     return lambda indices: indices.entries.shape
 
 
@@ -147,14 +147,14 @@ def _size_of(transitions):
     return lambda transitions: transitions[4]
 
 
-def outcomes_of(transitions, s, a):
+def outcome_numbers(transitions, s, a):
     """The numbers of the outcomes of (s, a), as a range. Impossible ones among them repeat the state of another."""
 
 
-@overload(outcomes_of)
-def _outcomes_of(transitions, s, a):
+@overload(outcome_numbers)
+def _typed_outcome_numbers(transitions, s, a):
     if _is_lazy(transitions):
-        return lambda transitions, s, a: range(len(outcomes_of(transitions[0], s, a)) + 1)
+        return lambda transitions, s, a: range(len(outcome_numbers(transitions[0], s, a)) + 1)
     if is_table(transitions):
         return lambda transitions, s, a: range(1)
     if isinstance(transitions[5], types.BaseTuple):
@@ -178,7 +178,7 @@ def _outcome(transitions, s, a, k):
     if _is_lazy(transitions):
 
         def moves_or_stays(transitions, s, a, k):
-            if np.int64(k) == len(outcomes_of(transitions[0], s, a)):
+            if np.int64(k) == len(outcome_numbers(transitions[0], s, a)):
                 return np.int64(s), transitions[1]
             t, p = outcome(transitions[0], s, a, k)
             return np.int64(t), (1.0 - transitions[1]) * p
@@ -232,27 +232,29 @@ def _expectation(transitions, v, s, a):
     if _is_lazy(transitions):
 
         def moves_or_stays(transitions, v, s, a):
-            return (1.0 - transitions[1]) * expectation(transitions[0], v, s, a) + transitions[1] * _value(v, s, a)
+            return (1.0 - transitions[1]) * expectation(transitions[0], v, s, a) + transitions[1] * _typed_value(
+                v, s, a
+            )
 
         return moves_or_stays
     if is_table(transitions):
-        return lambda transitions, v, s, a: _value(v, transitions[uint64(s), uint64(a)], uint64(a))
+        return lambda transitions, v, s, a: _typed_value(v, transitions[uint64(s), uint64(a)], uint64(a))
 
     def several(transitions, v, s, a):
         total = 0.0
-        for k in outcomes_of(transitions, s, a):
+        for k in outcome_numbers(transitions, s, a):
             t, p = outcome(transitions, s, a, k)
-            total += p * _value(v, t, a)
+            total += p * _typed_value(v, t, a)
         return total
 
     return several
 
 
-def _value(v, s, a):
+def _typed_value(v, s, a):
     """v[s], or v[s, a] if v depends on the executed action."""
 
 
-@overload(_value, jit_options={"forceinline": True})
+@overload(_typed_value, jit_options={"forceinline": True})
 def _value_of(v, s, a):
     return (lambda v, s, a: v[s]) if v.ndim == 1 else (lambda v, s, a: v[s, a])
 
@@ -284,7 +286,7 @@ def expected(transitions, x, states, out):
     out[:] = 0.0
     for i in range(len(states)):
         for a in range(out.shape[1]):
-            for j in outcomes_of(transitions, states[i], a):
+            for j in outcome_numbers(transitions, states[i], a):
                 t, p = outcome(transitions, states[i], a, j)
                 if p > 0.0:
                     for m in range(x.shape[2]):
@@ -299,7 +301,7 @@ def entries(transitions, states, actions, index, next_states, probabilities):
     """
     n = 0
     for i in range(len(states)):
-        for k in outcomes_of(transitions, states[i], actions[i]):
+        for k in outcome_numbers(transitions, states[i], actions[i]):
             t, p = outcome(transitions, states[i], actions[i], k)
             if p > 0.0:
                 index[n], next_states[n], probabilities[n] = i, t, p
@@ -315,7 +317,7 @@ def push_forward(transitions, mass, out):
     for s in range(mass.shape[0]):
         for a in range(mass.shape[1]):
             if mass[s, a] != 0.0:
-                for i in outcomes_of(transitions, s, a):
+                for i in outcome_numbers(transitions, s, a):
                     t, p = outcome(transitions, s, a, i)
                     if t >= 0:
                         out[t, a if by_action else 0] += p * mass[s, a]
@@ -323,12 +325,12 @@ def push_forward(transitions, mass, out):
 
 @interpreted_first("states")
 @kernel
-def largest(transitions, x, states, sign, out):
+def extreme_outcomes(transitions, x, states, sign, out):
     """out[i, a] = the largest (sign 1) or smallest (-1) of x (S + 1,) over what (states[i], a) may lead to."""
     for i in range(len(states)):
         for a in range(out.shape[1]):
             best = -np.inf
-            for k in outcomes_of(transitions, states[i], a):
+            for k in outcome_numbers(transitions, states[i], a):
                 best = max(best, sign * x[outcome(transitions, states[i], a, k)[0]])
             out[i, a] = sign * best
 
@@ -339,7 +341,7 @@ def mark_arrivals(transitions, states, out):
     """out[t, a] = True if executing a in one of `states` may lead to t."""
     for s in states:
         for a in range(out.shape[1]):
-            for k in outcomes_of(transitions, s, a):
+            for k in outcome_numbers(transitions, s, a):
                 t, _ = outcome(transitions, s, a, k)
                 if t >= 0:
                     out[t, a] = True
@@ -359,7 +361,7 @@ def _drawn_outcome(transitions, s, a, u):
 
     def several(transitions, s, a, u):
         number, probability, total = 0, 0.0, 0.0
-        for k in outcomes_of(transitions, s, a):
+        for k in outcome_numbers(transitions, s, a):
             p = outcome(transitions, s, a, k)[1]
             if p > 0.0 and total <= u:
                 number, probability = k, p
@@ -373,7 +375,7 @@ def _drawn_outcome(transitions, s, a, u):
 def drawn(transitions, s, a, u):
     """The next state of (s, a), -1 for the end, drawn by u in [0, 1); probabilities need not sum to 1."""
     total = 0.0
-    for k in outcomes_of(transitions, s, a):
+    for k in outcome_numbers(transitions, s, a):
         total += outcome(transitions, s, a, k)[1]
     return np.int64(outcome(transitions, s, a, drawn_outcome(transitions, s, a, u * total)[0])[0])
 
@@ -392,7 +394,7 @@ def have_one_outcome(transitions):
     num_states, num_actions = size_of(transitions)
     for s in range(num_states):
         for a in range(num_actions):
-            for i in outcomes_of(transitions, s, a):
+            for i in outcome_numbers(transitions, s, a):
                 chance = outcome(transitions, s, a, i)[1]
                 if chance != 1.0 and chance != 0.0:  # rows sum to 1 up to a tolerance: a second one may be small
                     return False

@@ -87,7 +87,7 @@ def affected_states(next_states, changed, candidates):
 
 
 @kernel
-def split(next_states, classes, sizes, count, candidates, n, slots, used, new, changed):
+def split_classes(next_states, classes, sizes, count, candidates, n, slots, used, new, changed):
     """Split classes by the classes that the candidates lead to; returns the number of classes.
 
     Members that are no candidates lead to what their class led to before, and keep its number; so does the first group

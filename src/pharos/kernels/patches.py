@@ -141,7 +141,7 @@ def _spread(products, members, total):
 
 
 @kernel
-def _collected(dy, members, dz):
+def _sum_members(dy, members, dz):
     """dz (G, outputs) = the sum of dy (B, outputs) over the members of each group."""
     dz[:] = 0.0
     for b in range(len(members)):
@@ -255,7 +255,7 @@ def backward(parameters, gradients, offsets, shape, indices, x, dy, memory):
         for p in range(pixels):
             first, end, rows = begins[i, p], begins[i, p + 1], slice(p * FILTERS, (p + 1) * FILTERS)
             dz_of = dz[: end - first]
-            _collected(dy[i], members[i, p], dz_of)
+            _sum_members(dy[i], members[i, p], dz_of)
             h, w, dw = hidden[i, first:end], weight[rows], of_weight[rows]
             for f in range(FILTERS):
                 _combine(h[:, f], dz_of, live, _live(h[:, f], live), dw[f])

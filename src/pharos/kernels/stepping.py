@@ -510,7 +510,7 @@ def _product(x, y):
 
 
 @njit(forceinline=True)
-def _value(kernel, learned, c, a):
+def _q_value(kernel, learned, c, a):
     """Q(c, a), of the tabular part and the features."""
     _, features, _ = kernel
     q, weights = learned
@@ -528,7 +528,7 @@ def _likeness(kernel, c, d):
 
 
 @njit(forceinline=True)
-def _add(kernel, learned, c, a, step):
+def _gradient_step(kernel, learned, c, a, step):
     """Q(., a) += step K(., c): a gradient step on Q(c, a)."""
     matrix, features, diagonal = kernel
     q, weights = learned
@@ -542,11 +542,11 @@ def _add(kernel, learned, c, a, step):
 
 
 @kernel
-def values(kernel, learned, out):
+def kernel_values(kernel, learned, out):
     """out (C, A) = Q of all observations and actions."""
     for c in range(out.shape[0]):
         for a in range(out.shape[1]):
-            out[c, a] = _value(kernel, learned, c, a)
+            out[c, a] = _q_value(kernel, learned, c, a)
 
 
 @kernel
@@ -590,13 +590,13 @@ def learn(
         if uniform_number(word, 0) < epsilon:
             action = action_of_set(chance, num_actions, word, c)
         else:  # greedy, ties at random
-            best, ties = _value(kernel, learned, c, 0), 1
+            best, ties = _q_value(kernel, learned, c, 0), 1
             if not set_has(chance, c, 0):
                 best = -np.inf
             for a in range(1, num_actions):
                 if not set_has(chance, c, a):
                     continue
-                q = _value(kernel, learned, c, a)
+                q = _q_value(kernel, learned, c, a)
                 if q > best:
                     best, ties, action = q, 1, a
                 elif q == best:
@@ -638,12 +638,12 @@ def learn(
                 y = rewards[j]
                 if next_observations[j] >= 0:
                     d = next_observations[j]
-                    best = _value(kernel, target, d, 0) if set_has(chance, d, 0) else -np.inf
+                    best = _q_value(kernel, target, d, 0) if set_has(chance, d, 0) else -np.inf
                     for a in range(1, num_actions):
                         if set_has(chance, d, a):
-                            best = max(best, _value(kernel, target, d, a))
+                            best = max(best, _q_value(kernel, target, d, a))
                     y += gamma * best
-                errors[i] = y - _value(kernel, learned, observations[j], actions[j])
+                errors[i] = y - _q_value(kernel, learned, observations[j], actions[j])
             # largest step of this minibatch that does not overshoot, by the row sums of its kernel (Gershgorin)
             bound = 0.0
             for i in range(size):
@@ -657,4 +657,4 @@ def learn(
             # move Q along the kernel of each transition
             step = min(largest_step, 1.0 / bound) / size
             for i in range(size):
-                _add(kernel, learned, observations[batch[i]], actions[batch[i]], step * errors[i])
+                _gradient_step(kernel, learned, observations[batch[i]], actions[batch[i]], step * errors[i])

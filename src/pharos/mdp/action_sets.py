@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp.arguments import as_array
+from pharos.mdp.arguments import array_argument
 
 if TYPE_CHECKING:
     from pharos.mdp.tabular import TabularMDP
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def checked_sets(available: object, shape: tuple[int, int]) -> np.ndarray:
     """(S, A) bool of an argument `available`; ParameterError if it is something else."""
-    array = as_array(available, "available")
+    array = array_argument(available, "available")
     is_truth = array.dtype == bool or (array.dtype.kind in "iu" and bool(np.isin(array, (0, 1)).all()))
     if array.shape != shape or not is_truth:
         raise ParameterError(

@@ -128,7 +128,7 @@ class PolicyTable:
             if table.ndim == 1:
                 return PolicyTable(num_actions, actions=table)
             return PolicyTable(num_actions, np.eye(num_actions)[table])
-        table = _normalized(mdp, table)
+        table = _rows_of_sum_one(mdp, table)
         check_choices(table, mdp.available)
         return PolicyTable(num_actions, table if table.ndim == 3 else table[:, None])
 
@@ -209,7 +209,7 @@ def _check_actions(mdp: "TabularMDP", actions: np.ndarray) -> None:
         check_choices(np.eye(num_actions, dtype=bool)[actions], mdp.available)
 
 
-def _normalized(mdp: "TabularMDP", table: np.ndarray) -> np.ndarray:
+def _rows_of_sum_one(mdp: "TabularMDP", table: np.ndarray) -> np.ndarray:
     """Rows divided by their sums, in float64; those that sum to 1 as they are stay so to the bit."""
     num_states, num_actions = mdp.num_states, mdp.num_actions
     shapes = [(num_states, num_actions)] + ([(num_states, num_actions + 1, num_actions)] if mdp.is_sticky else [])

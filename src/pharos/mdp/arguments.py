@@ -49,7 +49,7 @@ def _remedy(value: object) -> str:
     return "pharos.build(env).mdp(gamma=0.99), or TabularMDP.from_arrays(...)"
 
 
-def as_array(value: object, name: str, dtype: npt.DTypeLike | None = None) -> np.ndarray:
+def array_argument(value: object, name: str, dtype: npt.DTypeLike | None = None) -> np.ndarray:
     """The argument `name` as an array; ParameterError if it is none, such as lists of several lengths."""
     try:
         return np.asarray(value, dtype)
@@ -63,7 +63,7 @@ def checked_next_states(next_states: object) -> np.ndarray:
     Raises:
         ParameterError: it is not a table of states; the first wrong entry is named.
     """
-    table = as_array(next_states, "next_states")
+    table = array_argument(next_states, "next_states")
     if table.ndim != 2 or table.size == 0 or table.dtype.kind not in "iu":
         raise ParameterError(
             f"next_states has shape {table.shape} and type {table.dtype}; expected integers of shape (states, actions)"

@@ -309,7 +309,7 @@ class Dynamics(ABC):
     def _extreme(self, x: np.ndarray, states: States, sign: float) -> np.ndarray:
         rows = np.arange(self.num_states)[states]
         out = np.empty((len(rows), self.num_actions))
-        outcomes.largest(self.for_kernels, np.ascontiguousarray(x, np.float64), rows, sign, out)
+        outcomes.extreme_outcomes(self.for_kernels, np.ascontiguousarray(x, np.float64), rows, sign, out)
         return out
 
     def leads_to(self, state: int) -> np.ndarray:
@@ -355,7 +355,7 @@ class Dynamics(ABC):
         order = np.empty(self.num_states, np.int64)
         bellman.component_order(self.for_kernels, live, number, first, is_cyclic, order)
         largest = int(np.diff(first).max(initial=0, where=is_cyclic))
-        starts, has_cycle = bellman.joined(first, is_cyclic, least)
+        starts, has_cycle = bellman.joined_components(first, is_cyclic, least)
         return StronglyConnected(order, starts, has_cycle, count, largest)
 
     def settle_components(
@@ -510,7 +510,7 @@ def as_indices(table: np.ndarray, num_states: int) -> np.ndarray:
     return np.ascontiguousarray(table, np.int32 if num_states < 2**31 else np.int64)
 
 
-def split(blocks: Blocks, shape: tuple[int, ...], start: int, stop: int) -> tuple[Indices, np.ndarray]:
+def part_with_halo(blocks: Blocks, shape: tuple[int, ...], start: int, stop: int) -> tuple[Indices, np.ndarray]:
     """(next states of a range renumbered for its part, int32 if that is enough; its halo).
 
     Args:

@@ -134,7 +134,9 @@ class ExpandedMDP:
         num_states, num_actions = mdp.num_states, mdp.num_actions
         width = mdp.policy_width  # node s (A + 1) + b, b = A: no previous action
         terminal = np.asarray(mdp.terminal)
-        executed, ends = outcomes_of(mdp, terminal)  # (S A, S + ends): outcome of executing an action in a live state
+        executed, ends = outcome_matrix(
+            mdp, terminal
+        )  # (S A, S + ends): outcome of executing an action in a live state
         # Nodes.
         size = num_states + ends
         nodes = size * width
@@ -229,7 +231,7 @@ def nodes_of_outcomes(outcomes: "scipy.sparse.csr_matrix", num_actions: int, wid
     return scipy.sparse.csr_matrix((coo.data, (coo.row, nodes)), shape=(outcomes.shape[0], outcomes.shape[1] * width))
 
 
-def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> "tuple[scipy.sparse.csr_matrix, bool]":
+def outcome_matrix(mdp: TabularMDP, terminal: np.ndarray) -> "tuple[scipy.sparse.csr_matrix, bool]":
     """(S A, S + 1 or S) outcomes of executing actions, rows of terminal states empty; whether the end is among them."""
     matrix = mdp.dynamics.matrix(~terminal)
     ends = bool((matrix.indices == mdp.num_states).any())

@@ -109,7 +109,7 @@ def names_from(
 ) -> Names:
     """Names from what a user gives; ParameterError if they do not fit (S, A) states and actions."""
     num_states, num_actions = shape
-    masks = {name: _mask(name, each, num_states) for name, each in labels.items()}
+    masks = {name: _label_mask(name, each, num_states) for name, each in labels.items()}
     columns = {name: np.asarray(each) for name, each in variables.items()}
     for name, column in columns.items():
         if column.shape != (num_states,) or column.dtype.kind not in "biu":
@@ -122,7 +122,7 @@ def names_from(
     return Names(masks, columns, None if actions is None else tuple(actions))
 
 
-def _mask(name: str, states: object, num_states: int) -> np.ndarray:
+def _label_mask(name: str, states: object, num_states: int) -> np.ndarray:
     array = np.asarray(states)
     if array.dtype == np.bool_ and array.shape == (num_states,):
         return array

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from pharos.environments import Environment
 from pharos.errors import ParameterError, StateSpaceError
 from pharos.kernels import outcomes
-from pharos.mdp.arguments import as_array
+from pharos.mdp.arguments import array_argument
 from pharos.system.arrays import read_only
 from pharos.system.memory import large_zeros
 from pharos.system.workers import usable_workers
@@ -234,7 +234,7 @@ def rounding_of_mean(outcomes: int, largest: float) -> float:
 
 def rewards_of_shape(rewards: npt.ArrayLike | Rewards, shape: tuple[int, ...]) -> Rewards:
     """Rewards of an array, or those that were made; ParameterError if their shape is not `shape`, or not finite."""
-    array = rewards.array if isinstance(rewards, Rewards) else as_array(rewards, "rewards", np.float64)
+    array = rewards.array if isinstance(rewards, Rewards) else array_argument(rewards, "rewards", np.float64)
     if array.shape != shape:
         raise ParameterError(f"rewards have shape {array.shape}; expected {shape}, one for each state and action")
     return rewards if isinstance(rewards, Rewards) else Rewards.from_array(array)
@@ -248,7 +248,7 @@ def expected_over_outcomes(
     Raises:
         ParameterError: they have neither shape, or one of a possible outcome is not finite.
     """
-    array, shape = as_array(rewards, "rewards", np.float64), probabilities.shape
+    array, shape = array_argument(rewards, "rewards", np.float64), probabilities.shape
     if array.shape == shape[:2]:
         return array, 0.0
     if array.shape != shape:
@@ -308,7 +308,7 @@ def rewards_of_space(
             f"the rewards; import the module that registers it, or pass rewards as an (S, A) array"
         )
     env = space.environment if rewards is None else _with_reward(space.environment, rewards)
-    return _collected(space, env, _blocks(space, env, workers))
+    return _rewards_of_blocks(space, env, _blocks(space, env, workers))
 
 
 def ranged_rewards(space: "StateSpace") -> "Rewards":
@@ -317,7 +317,7 @@ def ranged_rewards(space: "StateSpace") -> "Rewards":
     assert env is not None
 
     def compute(start: int, stop: int) -> "Rewards":
-        return _collected(space, env, _blocks(space, env, None, start, stop), start, stop)
+        return _rewards_of_blocks(space, env, _blocks(space, env, None, start, stop), start, stop)
 
     return RangedRewards((space.num_states, space.num_actions), compute)
 
@@ -349,10 +349,10 @@ def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "
                 table = own.reshape(count, num_actions).astype(space.successors.dtype)
                 yield start, rules.block(states, table, terminal, 0, count), 0.0
 
-    return _collected(space, env, blocks())
+    return _rewards_of_blocks(space, env, blocks())
 
 
-def _collected(
+def _rewards_of_blocks(
     space: "StateSpace",
     env: Environment,
     blocks: Blocks,

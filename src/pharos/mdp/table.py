@@ -18,8 +18,8 @@ import numpy.typing as npt
 from pharos.errors import ParameterError
 from pharos.kernels import outcomes as kernels
 from pharos.mdp.actions import States
-from pharos.mdp.arguments import as_array
-from pharos.mdp.dynamics import Dynamics, Outcomes, TopologicalOrder, as_indices, split
+from pharos.mdp.arguments import array_argument
+from pharos.mdp.dynamics import Dynamics, Outcomes, TopologicalOrder, as_indices, part_with_halo
 from pharos.mdp.row_sums import ROUNDED, normalized_rows, rounding_hint
 from pharos.system.arrays import (
     Indices,
@@ -94,7 +94,7 @@ class Table(Dynamics):
 
     def part(self, start: int, stop: int) -> tuple["Table", np.ndarray]:
         rows = index_rows(self.next_states, start, stop)
-        local, halo = split(partial(index_blocks, rows), rows.shape, start, stop)
+        local, halo = part_with_halo(partial(index_blocks, rows), rows.shape, start, stop)
         return Table(local), halo
 
     def _restricted_to(self, states: np.ndarray) -> "Table":
@@ -228,7 +228,7 @@ def checked_outcomes(
         ParameterError: a shape or type is wrong, an index is outside, or a row holds no probabilities; the first such
             entry is named.
     """
-    table, chances = as_array(successors, "successors"), as_array(probabilities, "probabilities")
+    table, chances = array_argument(successors, "successors"), array_argument(probabilities, "probabilities")
     if table.ndim != 3 or table.size == 0 or table.dtype.kind not in "iu":
         raise ParameterError(
             f"successors have shape {table.shape} and type {table.dtype}; expected integers of shape "
@@ -459,7 +459,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
     def part(self, start: int, stop: int) -> tuple["OutcomeTable", np.ndarray]:
         first, last = self.begins(np.array([start, stop]) * self.num_actions).tolist()
         entries = index_rows(self.flat, first, last)
-        local, halo = split(partial(index_blocks, entries), entries.shape, start, stop)
+        local, halo = part_with_halo(partial(index_blocks, entries), entries.shape, start, stop)
         return self._of_states(slice(start, stop), slice(first, last), local), halo
 
     def _restricted_to(self, states: np.ndarray) -> "OutcomeTable":

@@ -54,7 +54,7 @@ def observation_classes(
     def observations_of(block: slice) -> np.ndarray:
         return observation(space.states(block))
 
-    return _numbered(observations_of, space.num_states, observation.name, progress)
+    return _class_numbers(observations_of, space.num_states, observation.name, progress)
 
 
 def history_aliasing(
@@ -81,7 +81,7 @@ def history_aliasing(
         states = space.states(part.ravel())
         return observation.of_histories(states.reshape(*part.shape, -1))
 
-    classes = _numbered(observations_of, len(histories), observation.name, progress)
+    classes = _class_numbers(observations_of, len(histories), observation.name, progress)
     ends, terminal = histories[:, -1], np.asarray(space.terminal)
 
     def sharing(among: np.ndarray) -> int:
@@ -117,7 +117,7 @@ def _histories(space: "StateSpace", length: int, max_histories: int) -> np.ndarr
     return np.array(sorted(visited), np.int64)
 
 
-def _numbered(
+def _class_numbers(
     observations_of: Callable[[slice], np.ndarray], count: int, name: str, progress: AliasingCallback | None
 ) -> np.ndarray:
     """(count,) int64, the numbers of different observations, which `observations_of` gives for blocks of rows."""

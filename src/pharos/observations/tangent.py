@@ -165,12 +165,12 @@ def representation(
             },
             **named,
             "landmarks": landmarks,
-            "digest": _digest(inputs, space.num_states),
+            "digest": _inputs_digest(inputs, space.num_states),
         },
     )
 
 
-def _digest(inputs: Callable[[np.ndarray], np.ndarray], num_states: int) -> str:
+def _inputs_digest(inputs: Callable[[np.ndarray], np.ndarray], num_states: int) -> str:
     """Digest of the network's input in up to SAMPLE states all over the space."""
     import xxhash
 

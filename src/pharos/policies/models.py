@@ -77,7 +77,7 @@ class DeepPolicy:
 
         policy = self.model.policy
         policy.set_training_mode(False)
-        batch = _as_policy_sees(_normalized(self.model, observations), policy.observation_space)
+        batch = _as_policy_sees(_as_normalizer_gives(self.model, observations), policy.observation_space)
         with torch.no_grad():
             tensor, _ = policy.obs_to_tensor(batch)
             q_net: Callable[..., torch.Tensor] | None = getattr(policy, "q_net", None)
@@ -130,7 +130,7 @@ class RecurrentDeepPolicy:
         policy = self.model.policy
         policy.set_training_mode(False)
         with torch.no_grad():
-            batch = _as_policy_sees(_normalized(self.model, observations), policy.observation_space)
+            batch = _as_policy_sees(_as_normalizer_gives(self.model, observations), policy.observation_space)
             tensor, _ = policy.obs_to_tensor(batch)
             hidden, cell = (torch.from_numpy(part.swapaxes(0, 1).copy()) for part in state)
             begins = torch.from_numpy(starts.astype(np.float32))
@@ -211,7 +211,7 @@ def _normalizer(model: object) -> "VecNormalize | None":
     return None if of is None else of()
 
 
-def _normalized(model: object, observations: Observations) -> Observations:
+def _as_normalizer_gives(model: object, observations: Observations) -> Observations:
     """Observations as the VecNormalize of a model gives them, whose statistics stay as they are."""
     normalizer = _normalizer(model)
     if normalizer is None or not normalizer.norm_obs:

@@ -251,7 +251,7 @@ def _packed(tree: Arrays, count: int) -> list[bytes]:
     return [row.tobytes() for row in joined]
 
 
-def answers_of(
+def policy_answers(
     policy: PolicyLike, mdp: TabularMDP, observer: Observer, **options: Unpack[AnswerOptions]
 ) -> PolicyAnswers:
     """Answers of a policy that sees observations: of the state alone, of the last frames, or with a memory."""
@@ -368,7 +368,7 @@ def _answers(
 ) -> QueriedPolicy:
     """Answers of a table, or of a policy that sees observations."""
     if not isinstance(policy, np.ndarray):
-        return answers_of(policy, mdp, observer(), **options)
+        return policy_answers(policy, mdp, observer(), **options)
     if options.get("masks") is not None:
         raise ParameterError("masks given for a policy that is a table; expected a model trained under masks")
     return TableAnswers(_table_of(policy, options.get("deterministic", False)), mdp)

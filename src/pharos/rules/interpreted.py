@@ -14,7 +14,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import RuleError
-from pharos.kernels.hash_table import COUNT, FIRST, find, insert_missing, pack_rows, slots_of, unpack_rows
+from pharos.kernels.hash_table import COUNT, FIRST, find_states, insert_missing, pack_rows, slots_of, unpack_rows
 from pharos.rules.layout import Layout, unpack_states
 from pharos.system.arrays import SUM_TOLERANCE
 from pharos.system.workers import without_interrupts
@@ -261,7 +261,7 @@ class InterpretedExpansion:
             rows = slice(first - base, last - base)
             part = slice(rows.start * self.branches, rows.stop * self.branches)
             self._expand(states[first:last], keys[part], terminal[rows], probabilities[rows])
-            find(table, states, keys[part], indices[part])
+            find_states(table, states, keys[part], indices[part])
         size = (stop - base) * self.branches
         missing = np.flatnonzero(indices[:size] < 0)
         slots = np.empty(len(missing), np.int64)

@@ -158,7 +158,7 @@ def average_reward(
     v, error, choices = _ends(nodes, component, inside, stops, room, staying, tolerance / 4)
     gain = _of_states(mdp, select, v - error, v + error)
     if not (gain.upper - gain.lower).max(initial=0.0) <= 2 * tolerance and not any(mdp.residual):
-        raise _imprecise(mdp, tolerance)
+        raise _precision_error(mdp, tolerance)
     if isinstance(select, PolicyTable):
         return AverageReward(mdp, select.kind, gain, select.table, tolerance)
     return AverageReward(mdp, select.kind, gain, _policy_table(mdp, nodes.sign, v, choices), tolerance)
@@ -174,7 +174,7 @@ def _selection(mdp: TabularMDP, policy: TablePolicy | str | None) -> Selection:
     return PolicyTable.of(mdp, policy.policy_table() if isinstance(policy, TableAgent) else policy)
 
 
-def _imprecise(mdp: TabularMDP, tolerance: float) -> PrecisionError:
+def _precision_error(mdp: TabularMDP, tolerance: float) -> PrecisionError:
     return PrecisionError(
         f"{mdp}: 64-bit floats, within limits of time, prove no average reward to a tolerance of {tolerance:g}; raise "
         "the tolerance, or discount (gamma < 1)"
@@ -220,7 +220,7 @@ def _gains(
         gains[k], error[k] = (mean.upper + mean.lower) / 2, (mean.upper - mean.lower) / 2 * MARGIN
         error[k] += 2 * UNIT * abs(gains[k])
         if not error[k] <= tolerance and not any(nodes.mdp.residual):
-            raise _imprecise(nodes.mdp, 2 * tolerance)
+            raise _precision_error(nodes.mdp, 2 * tolerance)
         origin = choices.origin[mean.policy]
         staying[origin // per_node] = origin % per_node
     return gains, error, staying
@@ -526,7 +526,7 @@ def _swept_ends(problem: GoalProblem, tolerance: float) -> tuple[np.ndarray, np.
         if sweep % 8 == 7 and (upper - lower).max() <= 2 * tolerance:
             break
     else:
-        raise _imprecise(problem.mdp, tolerance)
+        raise _precision_error(problem.mdp, tolerance)
     best = best_rows(choices, (choices.rewards + choices.matrix @ lower) / leaving)
     middle, half = (upper + lower) / 2, (upper - lower) / 2 * MARGIN
     of_nodes = problem.node_of[:-2]

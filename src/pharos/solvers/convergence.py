@@ -61,7 +61,7 @@ class Convergence:
         self.sweeps, self.in_vain, self.least = 0, 0, math.inf
         self.bound = backup.rounding(0.0) / (1 - backup.factor) if backup.factor < 1 else math.inf
         if not self.bound <= tolerance:
-            raise imprecise(mdp, self.bound, tolerance, self.is_single)
+            raise precision_error(mdp, self.bound, tolerance, self.is_single)
         self._bounds: list[float] = []
 
     def is_met(self, bound: float) -> bool:
@@ -93,9 +93,9 @@ class Convergence:
     def check(self, is_moving: bool, patience: float) -> None:
         """PrecisionError unless sweeps move values by more than rounding does, and have gained within `patience`."""
         if not math.isfinite(self.bound):
-            raise imprecise(self.mdp, self.bound, self.tolerance, self.is_single)
+            raise precision_error(self.mdp, self.bound, self.tolerance, self.is_single)
         if not is_moving or self.in_vain > patience:
-            raise imprecise(self.mdp, min(self.least, self.bound), self.tolerance, self.is_single)
+            raise precision_error(self.mdp, min(self.least, self.bound), self.tolerance, self.is_single)
 
 
 def operations(mdp: TabularMDP, sweeps: float) -> float:
@@ -103,7 +103,7 @@ def operations(mdp: TabularMDP, sweeps: float) -> float:
     return sweeps * (CALL + 4.0 * mdp.num_states * mdp.width * mdp.num_actions)
 
 
-def imprecise(mdp: TabularMDP, bound: float, tolerance: float, is_single: bool = False) -> PrecisionError:
+def precision_error(mdp: TabularMDP, bound: float, tolerance: float, is_single: bool = False) -> PrecisionError:
     """PrecisionError that 64-bit floats, or 32-bit ones if values are stored so, do not reach the tolerance."""
     bits, end, advice = (32, "3.4e38", "use float64, ") if is_single else (64, "1.8e308", "")
     if not math.isfinite(bound):

@@ -39,7 +39,15 @@ from numpy.typing import DTypeLike
 
 from pharos.errors import PrecisionError
 from pharos.mdp import BellmanEquation, Part, PolicyTable, Selection, TabularMDP
-from pharos.solvers.convergence import SETTLED, SETTLING, Convergence, imprecise, operations, shrinking, sweeps_left
+from pharos.solvers.convergence import (
+    SETTLED,
+    SETTLING,
+    Convergence,
+    operations,
+    precision_error,
+    shrinking,
+    sweeps_left,
+)
 from pharos.solvers.policy_iteration import PolicyIteration
 from pharos.system.memory import SHARE_OF_VALUES, available_memory, large_zeros
 
@@ -219,7 +227,7 @@ def _in_single(backup: Backup[TabularMDP], convergence: Convergence, x: np.ndarr
                 x[:] = result.x
             bound = (result.bound + backup.stored(largest_of(result.x))) * MARGIN
             if not bound <= tolerance:
-                raise imprecise(backup.mdp, bound, tolerance, is_single=True)
+                raise precision_error(backup.mdp, bound, tolerance, is_single=True)
             return FixedPoint(x, bound, convergence.sweeps + result.sweeps)
         convergence.check(shift != 0.0, backup.patience)
 
@@ -261,7 +269,7 @@ def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np
             residual = np.abs(reward + mdp.gamma * x[successor, 0] - x[:-1, 0]).max(initial=0.0)
         bound = (float(residual) + rounding) / (1 - mdp.gamma)
     if not math.isfinite(bound):
-        raise imprecise(mdp, bound, 0.0)
+        raise precision_error(mdp, bound, 0.0)
     return bound * MARGIN
 
 
@@ -305,7 +313,7 @@ def _in_one_pass(
     if progress is not None:
         progress(1, bound)
     if not bound <= tolerance:
-        raise imprecise(mdp, bound, tolerance, backup.is_single)
+        raise precision_error(mdp, bound, tolerance, backup.is_single)
     return FixedPoint(x, bound, 1)
 
 

@@ -126,19 +126,21 @@ def bicgstab(
             linear_algebra.shift(direction, np.float64(total) / size / constant, towards)
             moved[:] = times(towards)
             alpha = np.float64(rho) / linear_algebra.products(right, moved)[0]
-            total = linear_algebra.advance(residual, -alpha, moved)
+            total = linear_algebra.add_scaled(residual, -alpha, moved)
             # Stabilisation: the step along the residual that makes the new residual smallest.
             linear_algebra.shift(residual, np.float64(total) / size / constant, onwards)
             stabilised = times(onwards)
             across, own = linear_algebra.products(residual, stabilised)
             omega = np.float64(across) / own
-            linear_algebra.advance(x, alpha, towards)
-            linear_algebra.advance(x, omega, onwards)
-            linear_algebra.advance(residual, -omega, stabilised)
+            linear_algebra.add_scaled(x, alpha, towards)
+            linear_algebra.add_scaled(x, omega, onwards)
+            linear_algebra.add_scaled(residual, -omega, stabilised)
             # Next direction.
             before = rho
             rho, norm = linear_algebra.products(right, residual)
-            total = linear_algebra.turn(direction, (rho / np.float64(before)) * (alpha / omega), omega, moved, residual)
+            total = linear_algebra.next_direction(
+                direction, (rho / np.float64(before)) * (alpha / omega), omega, moved, residual
+            )
             if not norm < 1e8 * best:
                 break
             best = min(best, norm)
@@ -359,7 +361,7 @@ def chain(mdp: TabularMDP, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def chain_values(gamma: float, successor: np.ndarray, reward: np.ndarray) -> tuple[np.ndarray, int]:
     """((S,) values on a functional graph, in O(S); if gamma is 1 a state on a cycle of infinite value, else -1)."""
     v = np.empty(len(successor))
-    return v, int(bellman.chain_values(successor, reward, gamma, v, np.empty(len(successor), np.int64)))
+    return v, int(bellman.solve_chain(successor, reward, gamma, v, np.empty(len(successor), np.int64)))
 
 
 def linear_values(mdp: TabularMDP, policy: PolicyTable, guess: np.ndarray) -> np.ndarray:

@@ -239,7 +239,7 @@ class RankedBackup:
         part, equation = self.part, self.backup.equation
         x = self.part.zeros()
         numbers = np.concatenate([np.arange(part.start, part.stop), part.halo])
-        x[:-1] = (_mixed(numbers)[:, None] >> np.uint64(12)) * 2.0**-52
+        x[:-1] = (_mixed_numbers(numbers)[:, None] >> np.uint64(12)) * 2.0**-52
         total = 0
         for start in range(0, len(part), _BLOCK):
             states = slice(start, min(start + _BLOCK, len(part)))
@@ -250,7 +250,7 @@ class RankedBackup:
                     2 * bits.shape[1]
                 )
                 position = position + np.uint64(2) * np.arange(bits.shape[1], dtype=np.uint64) + np.uint64(kind)
-                total += int(np.add.reduce(_mixed(bits ^ _mixed(position)), axis=None, dtype=np.uint64))
+                total += int(np.add.reduce(_mixed_numbers(bits ^ _mixed_numbers(position)), axis=None, dtype=np.uint64))
         totals = self.rank.allgather(np.array([total % 2**64], np.uint64))
         return f"{sum(int(each[0]) for each in totals) % 2**64:016x}"
 
@@ -260,7 +260,7 @@ def _larger(one: float, other: float) -> float:
     return float(np.maximum(one, other))
 
 
-def _mixed(numbers: np.ndarray) -> np.ndarray:
+def _mixed_numbers(numbers: np.ndarray) -> np.ndarray:
     """Whole numbers as uint64, mixed by splitmix64."""
     with np.errstate(over="ignore"):
         z = numbers.astype(np.uint64) + np.uint64(_MIX[0])

@@ -34,14 +34,14 @@ def rational_values(
     count, entries_left = choices.num_nodes, MOST_ENTRIES
     written = fractions_of(choices)
     if written is None:
-        raise _too_many(count)
+        raise _too_many_nodes(count)
     rows = [_divided(*row) for row in written]
     policy, improvements = policy.copy(), 0
     while True:
         v, entries = eliminated([rows[i] for i in policy], count, entries_left)
         entries_left -= entries
         if entries_left < 0:
-            raise _too_many(count)
+            raise _too_many_nodes(count)
         if v is None:
             raise infinite(choices, policy[_stuck(choices, policy)])
         v.append(Fraction(0))
@@ -113,7 +113,7 @@ def best_mean(
     return gain, better
 
 
-def _too_many(count: int) -> PrecisionError:
+def _too_many_nodes(count: int) -> PrecisionError:
     return PrecisionError(
         f"64-bit floats cannot tell the total reward of {count} nodes within the tolerance, or whether it is finite, "
         "and they are too many for rational numbers; raise the tolerance, lower gamma, or give a horizon"

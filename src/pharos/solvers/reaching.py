@@ -235,7 +235,7 @@ def reach(
     Source: Baier and Katoen (2008), chapter 10; Haddad and Monmege (2018).
     """
     with_end = isinstance(target, str) and target == TERMINAL
-    mask = _mask(mdp, target)
+    mask = _target_mask(mdp, target)
     if costs is not None:
         costs = np.asarray(costs, np.float64)
         if costs.shape != mdp.rewards.shape or not (np.isfinite(costs) & (costs >= 0)).all():
@@ -244,7 +244,7 @@ def reach(
     return Reachability(replace(mdp, gamma=1.0, horizon=None), mask, with_end, costs, tolerance)
 
 
-def _mask(mdp: TabularMDP, target: ArrayLike | str) -> np.ndarray:
+def _target_mask(mdp: TabularMDP, target: ArrayLike | str) -> np.ndarray:
     if isinstance(target, str):
         if target == TERMINAL:
             return np.array(mdp.terminal)

@@ -24,7 +24,7 @@ from pharos.mdp import (
     require_mdp,
     uniform_choice,
 )
-from pharos.solvers.convergence import imprecise
+from pharos.solvers.convergence import precision_error
 from pharos.solvers.fixed_point import (
     MARGIN,
     Backup,
@@ -147,7 +147,7 @@ def _until_the_end(mdp: TabularMDP, select: Selection, solving: Solving, watch: 
     rounding = 0.0 if goals.is_exact and not backup.is_single else backup.rounding(largest)
     bound = (float(goals.error.max(initial=0.0)) + rounding) * MARGIN
     if not bound <= solving.tolerance and not any(mdp.residual):
-        raise imprecise(mdp, bound, solving.tolerance, backup.is_single)
+        raise precision_error(mdp, bound, solving.tolerance, backup.is_single)
     if solving.values is not None:
         mapped = _kept_values(solving.values, x.shape, solving.dtype)
         mapped[:] = x

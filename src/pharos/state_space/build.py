@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceLocked, StateSpaceMismatch
-from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, Plan, lock, read_manifest
+from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, Plan, lock_build, read_manifest
 from pharos.state_space.progress import BuildCallback, reporter
 from pharos.state_space.store import StateSpace, load
 from pharos.state_space.stored import SHARDS, check_files
@@ -94,7 +94,7 @@ def build(
     path = Path(folder) if folder is not None else folder_of(plan)
     options = Options(max_states, memory, workers, checkpoint_seconds)
     with rank_of_build(plan, memory) if processes == "mpi" else contextlib.nullcontext() as rank:
-        hold = _waiting if (folder is None if wait is None else wait) else lock
+        hold = _waiting if (folder is None if wait is None else wait) else lock_build
         was_there = (rank is None or rank.rank == 0) and _build(plan, path, rank, options, progress, hold)
     return load(path, verify=was_there, environment=env)
 
@@ -110,11 +110,11 @@ def _build(
     """Complete the state space in the folder; returns whether it was complete before."""
     from pharos.state_space.journal import remove_parts
     from pharos.state_space.ranked_table import RankedSearch
-    from pharos.state_space.search import Search, check_size, journal_of
+    from pharos.state_space.search import Search, check_max_states, journal_of
 
     manifest = _manifest_of(plan, path)
     if manifest is not None and manifest["complete"]:
-        check_size(plan.env, manifest["num_states"], 0, options.max_states)
+        check_max_states(plan.env, manifest["num_states"], 0, options.max_states)
         if plan.env.has_chance:
             remove_parts(path)
         return True

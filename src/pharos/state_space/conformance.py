@@ -89,7 +89,7 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
     states, complete = _some_states(env, check, max_states, seed)
     if not check.transitions:
         notes.append("every start state is terminal: episodes end before they begin")
-    _check_again(check, states, seed)
+    _check_no_memory(check, states, seed)
     if env.layers:
         for state in states:
             check.drawing(state)
@@ -161,7 +161,7 @@ def _has_choice(check: InterpretedCheck, states: list[State], gamma: float = 0.9
     return bool((np.ptp(q.reshape(-1, num_actions), axis=1) > 1e-9 * np.abs(q).max()).any())
 
 
-def _check_again(check: InterpretedCheck, states: list[State], seed: int) -> None:
+def _check_no_memory(check: InterpretedCheck, states: list[State], seed: int) -> None:
     """Call the rules again in some states, in random order: they must have no memory."""
     for state in random.Random(seed).sample(states, min(len(states), 200)):
         check.repeat(state)
@@ -380,11 +380,12 @@ def _check_built(env: Environment, check: InterpretedCheck, states: list[State])
                     target[index[check.transitions[branch]]] += check.probabilities[branch]
             if bool(terminal[i]) != ends or (abs(row - target) > SUM_TOLERANCE).any():
                 raise RuleError(
-                    f"{check.where('transition', state, a)}: built, it leads to {_text(row)}; expected {_text(target)}"
+                    f"{check.where('transition', state, a)}: built, it leads to {_row_text(row)}; "
+                    f"expected {_row_text(target)}"
                 )
 
 
-def _text(row: np.ndarray) -> str:
+def _row_text(row: np.ndarray) -> str:
     """Text of a distribution over states."""
     return ", ".join(f"state {i} ({row[i]:.6g})" for i in np.flatnonzero(row))
 

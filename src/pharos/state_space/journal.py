@@ -194,7 +194,7 @@ class Journal:
         narrow, self._indices = self._successors_name, SUCCESSORS40
         old = self._files[narrow]
         self._files[self._successors_name] = GrowingFile(self.path / self._successors_name)
-        for _, entries in blocks_of(old, np.dtype("<i4")):
+        for _, entries in number_blocks(old, np.dtype("<i4")):
             self._append_successors(entries)
         self._written = self._entries(position)
         self.commit(complete=False)
@@ -267,7 +267,7 @@ class Journal:
         check_rules(self.path, self.plan.env, self.plan.layout, self.stored_states(position.count), successors, bits)
 
 
-def blocks_of(file: GrowingFile, dtype: np.dtype, entries: int | None = None) -> Iterator[tuple[int, np.ndarray]]:
+def number_blocks(file: GrowingFile, dtype: np.dtype, entries: int | None = None) -> Iterator[tuple[int, np.ndarray]]:
     """Blocks of the numbers in a file: pairs (index of the first one, array), in order.
 
     Args:

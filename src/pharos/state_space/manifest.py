@@ -87,9 +87,9 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
                 f"{folder}: format version {manifest['format_version']}; this pharos reads versions {FORMAT_VERSION} "
                 f"to {INT40_VERSION}: build again"
             )
-        if digest_of(manifest) != manifest["digest"]:
+        if manifest_digest(manifest) != manifest["digest"]:
             raise ValueError("it was changed after it was written")
-        _check(manifest)
+        _check_space(manifest)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise StateSpaceCorrupted(f"{path}: {reason}; {AGAIN}") from None
@@ -112,7 +112,7 @@ def has_chance(manifest: dict[str, Any]) -> bool:
     return version == OUTCOMES_VERSION or (version == INT40_VERSION and "outcomes" in manifest)
 
 
-def digest_of(manifest: dict[str, Any]) -> str:
+def manifest_digest(manifest: dict[str, Any]) -> str:
     """SHA-256 of a manifest without its own digest."""
     content = {key: value for key, value in manifest.items() if key != "digest"}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -133,7 +133,7 @@ def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
 # Checks of a manifest -------------------------------------------------------------------------------------------------
 
 
-def _check(manifest: dict[str, Any]) -> None:
+def _check_space(manifest: dict[str, Any]) -> None:
     """Raise a ValueError if a manifest, whoever wrote it, describes no possible state space."""
     for name in ("num_states", "num_actions"):
         _whole(manifest[name], name, 1)
@@ -439,14 +439,14 @@ def cannot_write(path: Path, error: OSError) -> DiskFull:
     )
 
 
-def lock(folder: Path) -> contextlib.AbstractContextManager[None]:
+def lock_build(folder: Path) -> contextlib.AbstractContextManager[None]:
     """Hold the folder for this process; StateSpaceLocked if another one builds there. See `storage.lock`."""
     return storage.lock(folder, StateSpaceLocked, "building")
 
 
 def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     """Replace the manifest in one step: it is the commit point of everything else in the folder."""
-    manifest = {**manifest, "digest": digest_of(json.loads(json.dumps(manifest)))}
+    manifest = {**manifest, "digest": manifest_digest(json.loads(json.dumps(manifest)))}
     path = folder / MANIFEST
     try:
         storage.replace_file(path, json.dumps(manifest, indent=1))

@@ -76,7 +76,7 @@ class Owner:
             self._grow()
         entries = np.empty(len(candidates), np.int64)
         arrays = self.table.slots, self.table.states, self.numbers
-        self.count = hash_table.claim(*arrays, self.count, candidates, block_indices, entries)
+        self.count = hash_table.claim_entries(*arrays, self.count, candidates, block_indices, entries)
         return entries
 
     def _grow(self) -> None:

@@ -376,7 +376,9 @@ class Search:
     # Limits and reports -----------------------------------------------------------------------------------------------
 
     def _check_size(self) -> None:
-        check_size(self.env, self.position.count, self.position.count - self.position.first, self.options.max_states)
+        check_max_states(
+            self.env, self.position.count, self.position.count - self.position.first, self.options.max_states
+        )
 
     def _report(self, finished: bool = False) -> None:
         at, seconds = self.position, time.perf_counter() - self._began
@@ -388,7 +390,7 @@ def journal_of(path: Path, plan: Plan) -> Journal:
     return OutcomeJournal(path, plan) if plan.env.has_chance else Journal(path, plan)
 
 
-def check_size(env: Environment, count: int, left: int, max_states: int | None) -> None:
+def check_max_states(env: Environment, count: int, left: int, max_states: int | None) -> None:
     """Raise StateSpaceTooLarge if there are more than `max_states` states, of which `left` are not expanded."""
     if count > INT40_STATES:
         raise StateSpaceTooLarge(f"{env} has more than {INT40_STATES} states, which indices of 40 bits cannot number")

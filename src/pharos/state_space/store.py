@@ -32,17 +32,17 @@ from pharos.state_space.manifest import (
     successors_name,
 )
 from pharos.state_space.stored import (
-    blocks_of,
-    check_environment,
+    byte_blocks,
+    check_components,
     check_files,
     check_outcome_rules,
     check_outcomes,
     check_rules,
     check_states,
     check_successors,
+    file_parts,
     mapped,
     outcomes_to_check,
-    parts_of,
     states_to_check,
     stored_outcomes,
 )
@@ -231,7 +231,7 @@ class StateSpace:
 
     def indices(self, states: np.ndarray) -> np.ndarray:
         """Numbers (N,) int64 of states (N, D); ParameterError if one is not reachable."""
-        from pharos.kernels.hash_table import find
+        from pharos.kernels.hash_table import find_states
 
         states = np.asarray(states)
         if states.ndim != 2 or states.shape[1] != len(self.component_names):
@@ -243,7 +243,7 @@ class StateSpace:
         out = np.empty(len(states), np.int64)
         inside = (states >= self.layout.low) & (states < self.layout.low + self.layout.size)
         keys = pack_states(self.layout, np.where(inside, states, self.layout.low))
-        find(self._table, self.packed_states, keys, out)
+        find_states(self._table, self.packed_states, keys, out)
         wrong = np.flatnonzero((out < 0) | ~inside.all(axis=1))
         if wrong.size:
             raise ParameterError(
@@ -331,7 +331,7 @@ class StateSpace:
     def verify(self) -> None:
         """Read every file once and compare it with its checksums; StateSpaceCorrupted if one differs."""
         for name, entry in self.manifest["arrays"].items():
-            blocks = blocks_of(parts_of(self.folder, self.manifest, name), CHECKSUM_BYTES)
+            blocks = byte_blocks(file_parts(self.folder, self.manifest, name), CHECKSUM_BYTES)
             for number, (expected, block) in enumerate(
                 itertools.zip_longest(entry["checksums"], blocks, fillvalue=b"")
             ):
@@ -342,7 +342,7 @@ class StateSpace:
                     )
 
     def _map(self, name: str, dtype: str | np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-        return mapped(parts_of(self.folder, self.manifest, name), dtype)[: math.prod(shape)].reshape(shape)
+        return mapped(file_parts(self.folder, self.manifest, name), dtype)[: math.prod(shape)].reshape(shape)
 
     def _check_index(self, i: int) -> None:
         if not 0 <= i < self.num_states:
@@ -380,7 +380,7 @@ def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environ
     if verify:
         space.verify()
     if space.environment is not None:
-        check_environment(folder, space.environment, manifest)
+        check_components(folder, space.environment, manifest)
         if space.has_chance:
             _check_outcome_rules(space, space.environment)
         else:

@@ -51,14 +51,14 @@ _FIXED, _SHARED, _READ = 0x10, 0x01, 0x01  # MAP_FIXED, MAP_SHARED, PROT_READ
 
 
 def check_files(folder: Path, manifest: dict[str, Any]) -> None:
-    """Raise StateSpaceCorrupted if a file is missing, or shorter than committed; of shards see `parts_of`."""
+    """Raise StateSpaceCorrupted if a file is missing, or shorter than committed; of shards see `file_parts`."""
     if not (folder / SHARDS).exists():
         return check_lengths(folder, manifest)
     for name in manifest["arrays"]:
-        parts_of(folder, manifest, name)
+        file_parts(folder, manifest, name)
 
 
-def parts_of(folder: Path, manifest: dict[str, Any], name: str) -> list[Path]:
+def file_parts(folder: Path, manifest: dict[str, Any], name: str) -> list[Path]:
     """Paths of the files that make up a file of a state space, in order: itself, or its ranges in shards.
 
     Raises:
@@ -123,7 +123,7 @@ def mapped(parts: Sequence[Path], dtype: str | np.dtype) -> np.ndarray:
     return array.view(dtype)
 
 
-def blocks_of(parts: Sequence[Path], size: int) -> Iterator[bytes]:
+def byte_blocks(parts: Sequence[Path], size: int) -> Iterator[bytes]:
     """The bytes of files in blocks of `size`, which may begin in one and end in another."""
     left = bytearray()
     for part in parts:
@@ -142,7 +142,7 @@ def blocks_of(parts: Sequence[Path], size: int) -> Iterator[bytes]:
 _BLOCK_ENTRIES = 1 << 17
 
 
-def check_environment(folder: Path, env: Environment, manifest: dict[str, Any]) -> None:
+def check_components(folder: Path, env: Environment, manifest: dict[str, Any]) -> None:
     """Raise StateSpaceMismatch if actions or components of a state differ from the environment's."""
     expected = {"actions": list(env.actions), "names": list(env.components.names), "outcomes": int(env.outcomes)}
     stored = {
@@ -261,7 +261,7 @@ def stored_outcomes(folder: Path, manifest: dict[str, Any]) -> OutcomeRows:
         PROBABILITIES: of_outcomes,
     }
     maps = {
-        name: mapped(parts_of(folder, manifest, name), dtype_of(arrays[name]["dtype"])).reshape(shape)
+        name: mapped(file_parts(folder, manifest, name), dtype_of(arrays[name]["dtype"])).reshape(shape)
         for name, shape in shapes.items()
         if name in arrays
     }
@@ -338,7 +338,7 @@ def check_outcome_rules(
         state = tuple(unpack_states(layout, states[i : i + 1])[0].tolist())
         try:
             ended = bool(env.is_terminal(state))
-            expected = [_outcomes_of(env, state, a, ended) for a in range(env.num_actions)]
+            expected = [_outcomes_by_rules(env, state, a, ended) for a in range(env.num_actions)]
         except Exception as error:
             raise StateSpaceMismatch(
                 f"{folder}: was built with other rules: those of this {env.name} fail in state {state}: {error!r}; "
@@ -351,12 +351,13 @@ def check_outcome_rules(
             if not agree or ended != bool(bits[i // 8] >> (i % 8) & 1):
                 raise StateSpaceMismatch(
                     f"{folder}: was built with other rules: from state {state} action {env.actions[action]!r} leads to "
-                    f"{_text(next_states, probabilities)}, by the rules of this {env.name} to {_text(wanted, p)}; "
+                    f"{_text_of_outcomes(next_states, probabilities)}, by the rules of this {env.name} "
+                    f"to {_text_of_outcomes(wanted, p)}; "
                     f"build in another folder, and raise `version` when you change rules"
                 )
 
 
-def _outcomes_of(env: Environment, state: tuple, action: int, ended: bool) -> tuple[list[tuple], np.ndarray]:
+def _outcomes_by_rules(env: Environment, state: tuple, action: int, ended: bool) -> tuple[list[tuple], np.ndarray]:
     """(next states, probabilities) of the possible outcomes of an action, by the rules."""
     if ended:
         return [state], np.ones(1)
@@ -365,5 +366,5 @@ def _outcomes_of(env: Environment, state: tuple, action: int, ended: bool) -> tu
     return [env.next_state(state, action, outcome) for outcome in possible], np.array(probabilities)[possible]
 
 
-def _text(states: list[tuple], probabilities: np.ndarray) -> str:
+def _text_of_outcomes(states: list[tuple], probabilities: np.ndarray) -> str:
     return ", ".join(f"{state} ({p:.6g})" for state, p in zip(states, probabilities.tolist(), strict=True))

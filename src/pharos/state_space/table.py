@@ -221,7 +221,7 @@ class SpilledTable:
         looked_up = self._table.look_up(keys, indices, first, self._order, self._slots)
         from pharos.kernels import hash_table
 
-        hash_table.number(keys, indices, successors, self.states, self.appended, progress)
+        hash_table.number_states(keys, indices, successors, self.states, self.appended, progress)
         self._table.assign_numbers(looked_up, indices, self._order, self._slots)
 
 

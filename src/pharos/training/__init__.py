@@ -18,10 +18,10 @@ if TYPE_CHECKING:
         PolicyRecorder,
         Snapshots,
         StepBudget,
+        end_process,
         errors_in_one_line,
         generate,
         generated_curve,
-        uniform_policy,
     )
     from pharos.training.curve import GAIN_TOLERANCE, Curve, Evaluation, RegretCurve, evaluate_agent
     from pharos.training.execution import (

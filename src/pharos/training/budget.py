@@ -23,6 +23,7 @@ curve. What looks like a mistake and is no error is a note (`PolicyRecorder.note
 import contextlib
 import copy
 import os
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -258,7 +259,7 @@ class Snapshots:
             if len(tables) == 1 and self._num_checked < CHECKED:
                 self._num_checked += 1
                 for _ in range(min(max(1, FEW // count), AGAIN)):
-                    _check_again(tables[0], _answer(answers, policy, observations, count))
+                    _check_same_answers(tables[0], _answer(answers, policy, observations, count))
         return np.concatenate(tables)
 
     def _observations(self) -> Iterator[tuple[int, Any]]:
@@ -295,7 +296,7 @@ def _answer(answers: PolicyAnswers, policy: PolicyLike, observations: Any, count
         ) from error
 
 
-def _check_again(table: np.ndarray, again: np.ndarray) -> None:
+def _check_same_answers(table: np.ndarray, again: np.ndarray) -> None:
     """Raise ParameterError for a policy whose second answer is another one than the first."""
     differ = np.abs(table - again).max(axis=1) > SAME
     if differ.any():
@@ -327,7 +328,7 @@ class PolicyRecorder:
         self.budget = StepBudget(steps, interval)
         self.env = CountedEnv(task, self.budget, seed)
         self.count = 0
-        self.in_force: PolicyLike | Evaluation = uniform_policy(task)
+        self.in_force: PolicyLike | Evaluation = uniform_choice(task.mdp)
         self.ended = 0, 0.0
         self.at_point: Callable[[int], object] = self._remember
         self._points = deque([*range(interval, steps, interval), steps])  # to come
@@ -449,6 +450,16 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
     return recorder.curve()
 
 
+def end_process(agent: str, limit: int) -> NoReturn:
+    """End this process: what catches BudgetSpent around `step`, and goes on, cannot be ended otherwise."""
+    sys.stderr.write(
+        f"pharos: agent {agent} went on for {IGNORED:,} steps after its {limit:,}; expected its loop to end: catch no "
+        f"BudgetSpent (`except:`, `except BaseException`) around step\n"
+    )
+    sys.stderr.flush()
+    os._exit(1)
+
+
 @contextlib.contextmanager
 def errors_in_one_line(agent: str, file: str | None) -> Iterator[None]:
     """Raise PharosError, which names the agent and the line of its file, for what its code raises, SystemExit included.
@@ -503,8 +514,3 @@ def not_stepped(steps: int) -> ParameterError:
         f"learn has a policy other than uniform play, and 0 of its {steps:,} steps were counted; expected it to step "
         f"the environment that it was given, or copies of it; {SEVERAL}"
     )
-
-
-def uniform_policy(task: Task) -> np.ndarray:
-    """(S, A) probabilities of uniform play."""
-    return uniform_choice(task.mdp)

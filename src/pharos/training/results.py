@@ -406,7 +406,7 @@ def _digests(folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): digest_of_file(path) for path in files}
 
 
-def _digest(record: Mapping[str, Any]) -> str:
+def _record_digest(record: Mapping[str, Any]) -> str:
     """Digest of a record that may hold infinities and NaN."""
     return digest_of_bytes(json.dumps(record, sort_keys=True).encode())
 
@@ -433,7 +433,7 @@ class Checkpoint:
         partial.mkdir(parents=True)
         learner.save(partial)
         record = {"id": self.id, "rows": rows, "seconds": seconds, "files": _digests(partial)}
-        (partial / "curve.json").write_text(json.dumps({**record, "digest": _digest(record)}))
+        (partial / "curve.json").write_text(json.dumps({**record, "digest": _record_digest(record)}))
         for path in (*partial.rglob("*"), partial):  # the older one goes only when this one is on the disk
             sync(path)
         old = self.folder.with_name(f"{self.folder.name}.old")
@@ -461,7 +461,7 @@ class Checkpoint:
                 record = {"id": self.id, "digest": ""}
             if record.get("id") == self.id:
                 digest = record.pop("digest", None)  # which an older pharos did not write
-                if digest is not None and (digest != _digest(record) or record["files"] != _digests(folder)):
+                if digest is not None and (digest != _record_digest(record) or record["files"] != _digests(folder)):
                     raise FileFormatError(
                         f"{folder}: cannot be resumed from: it was changed after it was written; {ANEW}"
                     )

@@ -98,11 +98,11 @@ class Shapes:
         entry = config.to_dict()
         key = json.dumps([entry.get(name) for name in SEEN], sort_keys=True)
         if key not in self._shapes:
-            self._shapes[key] = _shape(config, key)
+            self._shapes[key] = _run_shape(config, key)
         return self._shapes[key]
 
 
-def _shape(config: RunConfig, unknown: str) -> RunShape:
+def _run_shape(config: RunConfig, unknown: str) -> RunShape:
     try:
         env = config.make_environment(trust=True)
         sizes = env.num_actions, float(np.prod(env.components.size.astype(float)))

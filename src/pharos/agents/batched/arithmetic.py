@@ -220,4 +220,4 @@ def fused_adam() -> Callable[[Sequence[Tensor], Tensor], None] | None:
         from pharos.agents.batched import fused
     except ImportError:
         return None
-    return fused.adam
+    return fused.adam_on_gpu

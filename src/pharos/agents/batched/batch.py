@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import torch
 
-from pharos.agents.agent import joined_states, state_of
+from pharos.agents.agent import joined_states, learner_state
 from pharos.agents.batched.arithmetic import is_gpu
 from pharos.agents.batched.lane import RunPolicy
 from pharos.agents.batched.runs import BatchRun, group_key, lane_width, lane_widths
@@ -95,7 +95,7 @@ class Batch:
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Restore a state that `state` returned, in a batch of the same runs."""
         for k, lane in enumerate(self.lanes):
-            lane.restore(state_of(state, k))
+            lane.restore(learner_state(state, k))
 
 
 def make_batch(agent: str, runs: Sequence[BatchRun], *, device: str = "cpu", threads: int | None = None) -> Batch:

@@ -31,7 +31,7 @@ def step_of_adam(parameters, gradients, means, squares, plans, length, size: tl.
         tl.store(parameters + index, old - step * mean / (tl.sqrt(square) + eps), mask=inside)
 
 
-def adam(state: Sequence[Tensor], plans: Tensor) -> None:
+def adam_on_gpu(state: Sequence[Tensor], plans: Tensor) -> None:
     """A step for each run whose step is not 0; state: (parameters, gradients, means, squares) (W, P), plans (W, 5)."""
     width, length = state[0].shape
     step_of_adam[(width, triton.cdiv(length, BLOCK))](*state, plans, length, BLOCK)

@@ -21,8 +21,8 @@ from pharos.agents.batched.networks import (
     aligned_zeros,
     flat_view,
     input_indices,
-    names_of,
     pad,
+    parameter_names,
 )
 from pharos.agents.batched.runs import BLOCK, BatchRun, ObservationSource, as_networks_see, is_small, resolved
 from pharos.kernels import batched as kernels
@@ -107,7 +107,7 @@ class ObservationTable:
         """
         target = flat_view(out).numpy()
         if self._table is not None:
-            kernels.look_up(self._table.numpy(), self._begins, states.array.reshape(len(target), -1), target)
+            kernels.look_up_rows(self._table.numpy(), self._begins, states.array.reshape(len(target), -1), target)
         else:
             for i, view in enumerate(self.views):
                 runs = np.flatnonzero(self.which == i)
@@ -421,7 +421,7 @@ class Lane(Generic[Net]):
     def restore_network(self, i: int, parameters: Mapping[str, np.ndarray]) -> None:
         """Restore parameters of run i that `stored` returned, in a lane of observations of one shape."""
         for shape in self.network.parameters.shapes:
-            own = shape.own(parameters[names_of(shape.name)[0]])
+            own = shape.own(parameters[parameter_names(shape.name)[0]])
             self.values[shape.name][i] = torch.from_numpy(np.ascontiguousarray(own)).view(shape.shape)
 
     def as_stored(self, views: Values, i: int) -> dict[str, np.ndarray]:
@@ -431,7 +431,7 @@ class Lane(Generic[Net]):
         for shape in shapes:
             part = views[shape.name][i].cpu().numpy()[tuple(slice(n) for n in shape.shape)]
             arrays[shape.name] = np.array(shape.stored(part), order="C")
-        return {name: value for own_name, value in arrays.items() for name in names_of(own_name)}
+        return {name: value for own_name, value in arrays.items() for name in parameter_names(own_name)}
 
 
 class RunPolicy:
@@ -548,7 +548,7 @@ class BatchedEpisodes:
         if self._sets is not None:
             choices, actions, chances = actions, np.empty_like(actions), self._none
             sets = self._sets.of_episodes(self.state)
-            kernels.execute_in_sets(self.keys, step, self._chances, sets, self.previous, choices, actions)
+            kernels.execute_runs_in_sets(self.keys, step, self._chances, sets, self.previous, choices, actions)
         setting = (self.keys, step, chances, self._limits, self._gammas)
         episodes = (self.state, self.previous, self.elapsed, self.running, self.discount, self.episodes, self.returns)
         transition = (self.next_state, self.reward, self.flags)

@@ -397,7 +397,7 @@ def picture_layers(parameters: Parameters, name: str, shape: tuple[int, ...]) ->
     return [small, LinearLayer(parameters, f"{name}.layers.1", small.outputs, FEATURES, RELU, pixels=small.pixels)]
 
 
-def extractor(
+def extractor_layers(
     parameters: Parameters, name: str, shape: tuple[int, ...], is_image: bool, device: str
 ) -> list[NetworkLayer]:
     """The layers from an observation to 128 features: SmallMLP, or SmallCNN with one or three convolutions."""
@@ -441,7 +441,7 @@ def sizes_of(net_arch: NetArch, head: str = "pi") -> list[int]:
     return list(net_arch.get(head, ())) if isinstance(net_arch, dict) else list(net_arch)
 
 
-def names_of(name: str) -> list[str]:
+def parameter_names(name: str) -> list[str]:
     """All names of a parameter in Stable-Baselines3; parameters of shared parts have several."""
     extractors = [name]
     if name.startswith("features_extractor."):
@@ -478,7 +478,7 @@ class QNetworks:
     ):
         self.parameters = parameters = Parameters()
         sizes = sizes_of(net_arch)
-        layers = extractor(parameters, "q_net.features_extractor", shape, is_image, device)
+        layers = extractor_layers(parameters, "q_net.features_extractor", shape, is_image, device)
         layers += hidden(parameters, "q_net.q_net", sizes, RELU)
         last = LinearLayer(parameters, f"q_net.q_net.{2 * len(sizes)}", [FEATURES, *sizes][-1], num_actions, NONE)
         self.stack = Stack([*layers, last])
@@ -509,7 +509,7 @@ class ActorCritics:
         self, shape: tuple[int, ...], is_image: bool, net_arch: NetArch, num_actions: int, device: str = "cpu"
     ):
         self.parameters = parameters = Parameters()
-        self.trunk = Stack(extractor(parameters, "features_extractor", shape, is_image, device))
+        self.trunk = Stack(extractor_layers(parameters, "features_extractor", shape, is_image, device))
         actor, critic = sizes_of(net_arch, "pi"), sizes_of(net_arch, "vf")
         actor_layers = hidden(parameters, "mlp_extractor.policy_net", actor, TANH)
         critic_layers = hidden(parameters, "mlp_extractor.value_net", critic, TANH)

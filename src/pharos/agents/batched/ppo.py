@@ -142,7 +142,7 @@ class PPOLane(Lane[ActorCritics]):
         for buffer, part in zip(update.minibatch, minibatch, strict=True):
             buffer.array[:] = part
         if self.shared["normalize_advantage"] and size > 1:
-            kernels.normalize(update.minibatch[3].array)
+            kernels.normalize_advantages(update.minibatch[3].array)
         update.forward()
         if self.shared["target_kl"] is not None:
             wait(self.device)

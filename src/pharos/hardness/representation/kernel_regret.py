@@ -405,7 +405,7 @@ def kernel_learning_time(
         best = q.max(axis=1, keepdims=True, where=np.isfinite(q), initial=-np.inf)
         advantage = np.where(np.isfinite(q), q - best, 0.0)
         eigenvalues, energy = _spectrum(kernel, advantage, weights)
-        return _time(eigenvalues / eigenvalues.sum(), energy)
+        return _learning_time(eigenvalues / eigenvalues.sum(), energy)
 
     return _spectral("kernel_learning_time", mdp, representation, schedule, horizon, time, progress or str)
 
@@ -513,7 +513,7 @@ def _spectral(
 
     def of(count: int) -> float:
         report(f"the spectrum of {min(count, len(observations)):,} observations")
-        indices, share = _drawn(weights, count)
+        indices, share = _sampled_indices(weights, count)
         rows = observations.representatives[indices]
         return function(representation.kernel(rows, rows).astype(np.float64), share, q[indices])
 
@@ -524,7 +524,7 @@ def _spectral(
     return Spectral(name, value, count, len(observations), error, conventions)
 
 
-def _drawn(weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _sampled_indices(weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """(indices, their weights): all if there are at most `count`, else drawn evenly along the sum of weights."""
     if len(weights) <= count:
         return np.arange(len(weights)), weights / weights.sum()
@@ -543,7 +543,7 @@ def _spectrum(kernel: np.ndarray, values: np.ndarray, weights: np.ndarray) -> tu
     return np.maximum(eigenvalues, FLOOR * eigenvalues[-1]), energy
 
 
-def _time(eigenvalues: np.ndarray, energy: np.ndarray) -> float:
+def _learning_time(eigenvalues: np.ndarray, energy: np.ndarray) -> float:
     total = energy.sum()
     if total <= 1e-24:
         raise UndefinedMeasure("kernel_learning_time: every action is optimal everywhere")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.visitation import Propagation, drawn, standard_occupancy
+from pharos.hardness.visitation import Propagation, drawn_indices, standard_occupancy
 from pharos.mdp import TabularMDP, mdp_within, states_within, uniform_choice, whole_number
 from pharos.regret import regret_scale
 from pharos.solvers import Solution, chain, evaluate_policy, uniform_value, value_iteration
@@ -523,7 +523,7 @@ class IdealisedLearner:
             landmarks = LANDMARKS
         if not landmarks or landmarks >= len(observed):
             return [Exact(kernel, observed)], None
-        sample = observed[drawn(self.weights, landmarks)]
+        sample = observed[drawn_indices(self.weights, landmarks)]
         parts = (sample, sample[: landmarks // 2])
         return (Landmarks(kernel, observed, some) for some in parts), landmarks  # one at a time
 

@@ -293,7 +293,7 @@ class SampledLearner(IdealisedLearner):
             self.report(f"step {step:,} of {schedule.steps:,} of a walk")
             if step in looks:
                 values = np.empty((count, num_actions))
-                kernels.values(kernel, learnt, values)
+                kernels.kernel_values(kernel, learnt, values)
                 yield values
             if step % schedule.period == 0 and step + schedule.period > schedule.learning_starts:
                 for old, new in zip(target, learnt, strict=True):
