@@ -216,7 +216,7 @@ def _pairs(contents: Contents) -> Element | None:
         "Pairs",
         "One world in two ways, and the regret in both. The score of the axis is 1 less what the second task costs, so "
         "an agent that fails both loses nothing: read it only if the first is learnt.",
-        table(heads, rows, numeric=range(3, len(heads))),
+        html_table(heads, rows, numeric=range(3, len(heads))),
     )
 
 
