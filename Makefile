@@ -2,6 +2,8 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
+unexport PYTHONDONTWRITEBYTECODE  # else each of some hundred processes compiles the texts of all packages that it imports
+
 .PHONY: quickstart test test-fast test-long test-jax lint docs article clean
 
 .venv/.ok: pyproject.toml setup.py constraints.txt

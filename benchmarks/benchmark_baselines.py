@@ -4,6 +4,7 @@ Ten seeds of named agents (A2C five), 2 to 6 s of one core a run; three of those
 
 python benchmarks/benchmark_baselines.py --out DIR                  all of them; what is finished in DIR stays
 python benchmarks/benchmark_baselines.py --out DIR --only dqn       one of them
+python benchmarks/benchmark_baselines.py --out DIR --suite v2 --seeds 3 --only dqn    of another suite, with fewer seeds
 
 A baseline, src/pharos/benchmark/baselines/SUITE/NAME.safetensors, is results.safetensors of `pharos benchmark run`, and
 nothing else: `pharos benchmark run --agent dqn --set double=true --name double_dqn --out DIR/double_dqn` gives that of
@@ -22,7 +23,7 @@ from pharos.errors import AllRunsFailed
 
 FEWER_SEEDS = {"a2c": 5, "qrdqn": 3, "recurrent_ppo": 3}
 LEFT_OUT = {
-    "q_learning": ("memory",),  # its table has a row for each state, whatever is seen
+    "q_learning": ("memory", "representation", "hidden"),  # its table has a row for each state, whatever is seen
     "qrdqn": ("exploration", "estimation", "credit", "memory"),  # not run yet
     "recurrent_ppo": ("core",),  # minutes a run where chance makes many histories
 }
@@ -49,9 +50,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for the runs, one below it for each baseline")
     parser.add_argument("--only", action="append", help="name of a baseline; several times for more")
     parser.add_argument("--suite", default="v1")
+    parser.add_argument("--seeds", type=int, help="at most; those of the protocol, a2c, qrdqn and recurrent_ppo fewer")
     parser.add_argument("--workers", type=int)
     options = parser.parse_args()
     suite = benchmark.load_suite(options.suite)
+    most = options.seeds or suite.protocol.seeds
     agents, axes = settings(suite), [CORE, *(ladder.axis for ladder in suite.ladders)]
     for name in options.only or agents:
         if name not in agents:
@@ -65,7 +68,7 @@ def main() -> None:
                 suite,
                 out=out,
                 tasks=[axis for axis in axes if axis not in LEFT_OUT.get(name, ())],
-                seeds=range(FEWER_SEEDS.get(name, suite.protocol.seeds)),
+                seeds=range(min(most, FEWER_SEEDS.get(name, most))),
                 name=name,
                 hyperparameters=hyperparameters,
                 workers=options.workers,

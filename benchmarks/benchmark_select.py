@@ -188,6 +188,19 @@ def log10_states(task, learnt):
     return math.log10(learnt.space.num_states)
 
 
+def copies_bits(task, learnt):
+    """log2 of the states that are not terminal / those of the smallest MDP that cannot be told from this one."""
+    from pharos.bisimulation import minimize
+
+    acts = ~np.asarray(learnt.mdp.terminal, bool)
+    return math.log2(acts.sum() / len(np.unique(minimize(learnt.mdp).classes[acts])))
+
+
+def unit_decades(task, learnt):
+    """Powers of 10 by which the unit of rewards is away from 1."""
+    return abs(math.log10(float(task.chance.get("scale_rewards", 1.0))))
+
+
 def advantage_lag(task, learnt):
     """Longest mean delay, in steps, between an action that loses something and what it loses.
 
@@ -265,6 +278,8 @@ LEVELS = {
     "exploration_bits": exploration_bits,
     "noise_over_gap": noise_over_gap,
     "log10_states": log10_states,
+    "copies_bits": copies_bits,
+    "unit_decades": unit_decades,
     "advantage_lag": advantage_lag,
     "network_less_table": network_less_table,
     "memory_steps": memory_steps,

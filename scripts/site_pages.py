@@ -32,6 +32,7 @@ MORE = {  # pages that say more of a class
     **dict.fromkeys(("mini_grid_empty", "mini_grid_rooms"), "worlds.md#colosseums-grids"),
     **dict.fromkeys(("deep_sea", "catch", "memory_chain", "umbrella_chain", "discounting_chain"), "worlds.md#bsuite"),
     **dict.fromkeys(("endless_sea", "corner_grid"), "worlds.md#chains-rivers-and-seas"),
+    "delayed_choice": "worlds.md#delayed-choice",
     "game_2048": "worlds.md#2048",
 }
 CHANGES = {  # class -> version of the rules -> what changed

@@ -86,6 +86,11 @@ GAMES = {
         {"delays": "1,2,4", "mapping_seed": 1},
         ["wait for 2", *["wait for 4"] * 3],
     ),
+    "delayed_choice_of_a_noisy_cue": (
+        "delayed_choice/noisy",
+        {"length": 3, "lag": 1, "num_actions": 3, "cues": 1, "irrelevant_bits": 2},
+        ["action 0", "action 2", "action 0"],
+    ),
 }
 
 

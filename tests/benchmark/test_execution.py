@@ -89,6 +89,7 @@ def test_the_oracle_has_no_regret_and_random_play_all_of_it(suite, tmp_path):
         assert said["core"]["value"] == found.score.value and said["agent"] == name
 
 
+@pytest.mark.long
 def test_a_run_answers_with_scores_intervals_and_the_steps_that_were_used(suite, tmp_path):
     """Of 300 steps an agent that stops after 20 uses 20; Q-learning uses all."""
     write_suite(suite, tmp_path / "small.yaml")
@@ -482,7 +483,7 @@ def test_a_run_that_has_ended_may_leave_threads_behind(suite, file, tmp_path, mo
     assert not benchmark.run(f"{file}:learn", suite, out=tmp_path / "out", seeds=range(2), tasks="sea").missing
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_class_for_stable_baselines3_has_a_process_for_each_run(suite, tmp_path):
     pytest.importorskip("stable_baselines3")
     text = "import os\nfrom stable_baselines3 import DQN\n\nmade = []\n\n\nclass Mine(DQN):\n"

@@ -30,6 +30,7 @@ SMALL = (  # beside them, spaces of at most 120 states
     *("river_swim", *(f"river_swim/{name}" for name in ("strehl-littman", "osband", "colosseum"))),
     *("deep_sea", "deep_sea/10x10", "deep_sea/10x10-stochastic", "endless_sea", "endless_sea/10x10"),
     *("umbrella_chain", "umbrella_chain/length-10", "discounting_chain/delays-10"),
+    *("delayed_choice", "delayed_choice/length-8", "delayed_choice/noisy"),
     *("game_2048/2x2", "game_2048/2x2-to-32"),
     *("sliding_tiles/2x2", "sokoban", "sokoban/corridor", "sokoban/corner"),
     *(f"mini_grid/{name}" for name in ("empty-5x5", "empty-6x6", "empty-random-5x5", "empty-random-6x6")),

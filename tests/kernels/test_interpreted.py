@@ -77,7 +77,7 @@ import pickle, sys
 from pathlib import Path
 from pharos.rules.interpreted import InterpretedExpansion
 from pharos.system import compiling
-compiling.SMALL = 1 << 24
+compiling.SMALL_STATES = 1 << 24
 import test_interpreted
 found = test_interpreted.answers(Path({str(tmp_path / "interpreted")!r}))
 sys.stdout.buffer.write(pickle.dumps((found, test_interpreted.compiled_kernels())))

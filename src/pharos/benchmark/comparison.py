@@ -155,8 +155,8 @@ def compare(
         mine, other = axis_score(ladder, x), axis_score(ladder, y)
         if mine is not None and other is not None:
             axes[ladder.axis] = mine.frontier, other.frontier
-            names = sorted(task.name for task in ladder.tasks if task.name in common)
-            differences[ladder.axis] = _difference(x, y, names)
+            weights = ladder.weights(common)
+            differences[ladder.axis] = _difference(x, y, sorted(weights), weights if ladder.pairs else None)
     units = {ladder.axis: ladder.unit for ladder in suite.ladders}
     return Comparison(
         ours.agent,
@@ -213,12 +213,13 @@ def power(
     if difference is not None and not difference > 0:
         raise ParameterError(f"difference {difference}; expected a number above 0, such as 0.05")
     runs = run_scores(results)
-    families = {"core": suite.core, **{ladder.axis: ladder.tasks for ladder in suite.ladders}}
+    core = [task.name for task in suite.core if task.name in runs]
+    families = {"core": {name: 1.0 / len(core) for name in core}}
+    families |= {ladder.axis: ladder.weights(runs) for ladder in suite.ladders}
     scores = {}
-    for family, tasks in families.items():
-        own = [runs[task.name] for task in tasks if task.name in runs]
-        if own:
-            variances = np.array([np.var(each, ddof=1) for each in own]) / len(own) ** 2
+    for family, weights in families.items():
+        if weights:
+            variances = np.array([np.var(runs[name], ddof=1) * weight**2 for name, weight in weights.items()])
             least = {number: float(least_difference(variances, number)) for number in SEEDS}
             error = math.sqrt(variances.sum() / len(results.seeds))
             scores[family] = Power(error, least, None if difference is None else _seeds_for(variances, difference))
@@ -259,11 +260,28 @@ def frontier_difference(ours: ConfidenceInterval, theirs: ConfidenceInterval) ->
     )
 
 
-def _difference(x: Mapping[str, np.ndarray], y: Mapping[str, np.ndarray], names: Sequence[str]) -> Difference:
+def _difference(
+    x: Mapping[str, np.ndarray],
+    y: Mapping[str, np.ndarray],
+    names: Sequence[str],
+    pair_weights: Mapping[str, float] | None = None,
+) -> Difference:
+    """Difference of mean scores; with weights of pairs that of 1 less what is lost by the second tasks.
+
+    The improvement of pairs is that on their second tasks.
+    """
     one, other = [x[name] for name in names], [y[name] for name in names]
+    weights = [1.0 / len(names)] * len(names)
     first, second = float(mean_of_means(*one)), float(mean_of_means(*other))
-    error, degrees = standard_error([*one, *other], [1.0 / len(names)] * (2 * len(names)))
+    if pair_weights is not None:
+        weights = [pair_weights[name] for name in names]
+        first, second = (
+            1.0 + float(sum(w * own.mean() for w, own in zip(weights, each, strict=True))) for each in (one, other)
+        )
+    error, degrees = standard_error([*one, *other], weights * 2)
     p_value = welch_p_value(first - second, error, degrees)
+    if pair_weights is not None:
+        one, other = ([own for own, w in zip(each, weights, strict=True) if w > 0] for each in (one, other))
     probability = float(probability_of_improvement(one, other))
     return Difference(
         ours=first,

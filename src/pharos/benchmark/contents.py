@@ -45,6 +45,10 @@ PHRASES = {
     "representation": "copes with representations that cost",
     "memory": "remembers",
     "scale": "scales to",
+    "exploration_free": "explores free ways of",
+    "exploration_costly": "explores costly ways of",
+    "large_rewards": "stands rewards larger by",
+    "small_rewards": "stands rewards smaller by",
 }
 PREDICTORS = {
     "dqn": "the idealised DQN",

@@ -9,7 +9,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from pharos.benchmark.charts import frontier_text
-from pharos.benchmark.comparison import BETTER, LEAST, NEGLIGIBLE, UNDECIDED, WORSE, Comparison, Difference
+from pharos.benchmark.comparison import (
+    BETTER,
+    LEAST,
+    NEGLIGIBLE,
+    UNDECIDED,
+    WORSE,
+    AxisComparison,
+    Comparison,
+    Difference,
+)
 from pharos.benchmark.contents import (
     PREDICTORS,
     Contents,
@@ -81,9 +90,14 @@ def without_verdict(contents: Contents) -> dict[str, list[str]]:
 
 
 def is_worse_everywhere(comparison: Comparison) -> bool:
-    """Whether the core and all axes, two or more, are worse."""
-    verdicts = [each.score.verdict for each in comparison.axes.values()]
+    """Whether the core and all ladders, two or more, are worse; pairs hold an agent against itself."""
+    verdicts = [each.score.verdict for each in ladders_of(comparison).values()]
     return comparison.core is not None and len(verdicts) > 1 and {comparison.core.verdict, *verdicts} == {WORSE}
+
+
+def ladders_of(comparison: Comparison) -> dict[str, AxisComparison]:
+    """The axes that are ladders, on which more than one rung was run; no pairs."""
+    return {axis: each for axis, each in comparison.axes.items() if not math.isnan(each.frontiers[0].value)}
 
 
 def fall_everywhere(contents: Contents) -> str:
@@ -91,7 +105,7 @@ def fall_everywhere(contents: Contents) -> str:
     if (near := nearest(contents)) is None or not is_worse_everywhere(contents.comparisons[near[0]]):
         return ""
     return (
-        f"Falls everywhere: the core and all {len(contents.comparisons[near[0]].axes)} axes are below "
+        f"Falls everywhere: the core and all {len(ladders_of(contents.comparisons[near[0]]))} axes are below "
         f"{contents.beside[near[0]].name}'s. Look for a bug first; axes say nothing before it is mended."
     )
 

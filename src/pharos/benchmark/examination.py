@@ -15,15 +15,18 @@ import numpy as np
 
 from pharos.agents import CLASS, agents, algorithm, form_of, generator_of, is_known, make_model
 from pharos.benchmark.suite import BenchmarkTask, Protocol
-from pharos.errors import ParameterError, UnknownName
+from pharos.errors import ParameterError, TimeLimit, UnknownName
 from pharos.policies import PolicyLike, SB3Model
+from pharos.system.interrupts import time_limit
 from pharos.system.sources import find_source, load_source
+from pharos.system.workers import Terminated
 from pharos.training import (
     BudgetSpent,
     CountedEnv,
     PolicyRecorder,
     StepBudget,
     Task,
+    end_process,
     errors_in_one_line,
     evaluate_agent,
     generate,
@@ -90,6 +93,7 @@ class Examination:
             another state, relative to the deviation of answers between states.
         wavering: largest change of its answers if it is asked again, in another order.
         regret: of the last policy, 0 optimal and 1 as uniform play; late_regret: of the returns of the last fifth.
+        notes: sentences on what looks like a mistake of its loop, by kind.
     """
 
     name: str
@@ -106,6 +110,7 @@ class Examination:
     wavering: float
     regret: float
     late_regret: float
+    notes: Mapping[str, str] = field(default_factory=dict)
 
 
 @cache
@@ -211,7 +216,7 @@ class Witness(PolicyRecorder):
         if self.answers is None:
             raise ParameterError(
                 f"world {self.name}, seed {self.seed}: no policy came in the last {LATE:.0%} of {self.budget.limit:,} "
-                f"steps; expected one at the end: yield policy"
+                f"steps, of which it used {self.budget.steps:,}; expected one at the end: yield policy"
             )
         task, log, shape = self.task, self.log, self.world.rewards.shape
         table = np.asarray(self.in_force, np.float64)
@@ -240,6 +245,7 @@ class Witness(PolicyRecorder):
             wavering,
             float(regret(evaluate_agent(policy, task).value, reference, normalized_by="uniform")),
             float(late_regret),
+            {kind: text for kind, text in self.notes().items() if kind != "late policy"},
         )
 
 
@@ -330,6 +336,7 @@ def examine(
     worlds: Sequence[str] = NAMES,
     seeds: Sequence[int] = (0, 1),
     steps: int = PROTOCOL.steps,
+    timeout: float | None = None,
     tell: Callable[[float, str], object] = lambda share, text: None,
 ) -> list[Examination]:
     """Train an agent on small worlds, in this process, and write down all that there is to see.
@@ -337,10 +344,11 @@ def examine(
     Args:
         agent, hyperparameters: as `learner_of` takes them.
         worlds: of NAMES. seeds: of the runs of each. steps: of each run.
+        timeout: seconds after which a run is ended; None: never. Counted in the main thread alone, not on Windows.
         tell: called with the share that is done, and a text.
     Raises:
         ParameterError: it is no agent, or it yields no policy.
-        PharosError: its code raises something, SystemExit included.
+        PharosError: its code raises something, SystemExit included. TimeLimit: a run took longer than was allowed.
     Cost: `len(worlds) * len(seeds)` runs, and values of some hundred states.
     """
     learn, file = learner_of(agent, hyperparameters), _file_of(agent)
@@ -349,7 +357,18 @@ def examine(
         for seed in seeds:
             tell(len(examinations) / (len(worlds) * len(seeds)), f"{name}, seed {seed}")
             witness = Witness(name, seed, steps)
-            with np.errstate(all="ignore"), errors_in_one_line(str(agent), file):  # of an agent that diverges
-                generate(learn, witness, seed)
+            witness.budget.give_up = partial(end_process, str(agent), steps)
+            try:
+                with time_limit(timeout, OutOfTime), np.errstate(all="ignore"), errors_in_one_line(str(agent), file):
+                    generate(learn, witness, seed)
+            except OutOfTime:
+                raise TimeLimit(
+                    f"agent {agent} on {name}, seed {seed}: took longer than {timeout:g} s; it was ended: raise the "
+                    f"timeout, or look for a loop without an end"
+                ) from None
             examinations.append(witness.examination())
     return examinations
+
+
+class OutOfTime(Terminated):
+    """The time of a run is over; `except Exception` of an agent does not catch it."""

@@ -94,8 +94,8 @@ class AxisScore:
 
     Attributes:
         unit: of the frontier.
-        score: mean over the rungs, in [0, 1].
-        frontier: level at which the mean normalised regret crosses 0.5; NaN if one rung alone was run.
+        score: mean over the rungs, in [0, 1]; of pairs 1 less the mean loss, the score of the first less the second's.
+        frontier: level at which the mean normalised regret crosses 0.5; NaN of pairs, and if one rung alone was run.
         lowest: score on the first rung; NaN if it was not run.
         fall: `lowest` less the mean score on the rungs above it: what the axis adds to the difficulty of its world.
     """
@@ -182,10 +182,13 @@ def axis_score(ladder: "Ladder", runs: Mapping[str, np.ndarray]) -> AxisScore | 
     Args:
         runs: task name -> (seeds,) scores of its runs.
     """
-    rungs = [task for task in ladder.tasks if task.name in runs]
-    if not rungs:
+    weights = ladder.weights(runs)
+    if not weights:
         return None
+    rungs = [task for task in ladder.tasks if task.name in weights]
     own = [runs[task.name] for task in rungs]
+    if ladder.pairs:
+        return AxisScore(ladder.axis, ladder.unit, _contrast(own, list(weights.values()), 1.0), UNKNOWN)
     levels = np.array([task.level for task in rungs], np.float64)
     several = len(rungs) > 1
     return AxisScore(
@@ -201,9 +204,13 @@ def _fall(rungs: Sequence[np.ndarray]) -> ConfidenceInterval:
     """Mean on the first rung less the mean over the others, with Student's interval; NaN with one rung."""
     if len(rungs) < 2:
         return UNKNOWN
-    weights = [1.0, *[-1.0 / (len(rungs) - 1)] * (len(rungs) - 1)]
-    value = float(sum(weight * own.mean() for weight, own in zip(weights, rungs, strict=True)))
-    return ConfidenceInterval(*statistics.student_interval(value, *statistics.standard_error(rungs, weights)))
+    return _contrast(rungs, [1.0, *[-1.0 / (len(rungs) - 1)] * (len(rungs) - 1)])
+
+
+def _contrast(strata: Sequence[np.ndarray], weights: Sequence[float], constant: float = 0.0) -> ConfidenceInterval:
+    """A constant and the weighted sum of means over runs, with Student's interval."""
+    value = constant + float(sum(weight * own.mean() for weight, own in zip(weights, strata, strict=True)))
+    return ConfidenceInterval(*statistics.student_interval(value, *statistics.standard_error(strata, weights)))
 
 
 def check_suite(results: "AgentResults", suite: "Suite", whose: str = "") -> None:

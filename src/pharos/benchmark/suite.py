@@ -15,7 +15,7 @@ world: two libraries had a deep_sea whose actions meant other things. So a task 
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -36,6 +36,8 @@ V1 = "50d45f848f991081acf6b8ce6a5c532614ebc2139ea50d148094ea50894b1086"
 EARLIER = {"3a1d2bb3986015bb807c596528212e8ea9f8c6579252bc3f53c70a8e596665fe": V1}
 """Digest of protocol and tasks alone, which results of earlier checkouts name -> digest of the suite that has them."""
 CORE = "core"
+PAIRS = "pairs"
+"""Measure of an axis of pairs: one world in two ways, and how much worse an agent is at the second."""
 BITS = 40
 """Of a mantissa that enter a digest, 12 digits: what compilers and processors may round differently is beyond."""
 SAMPLED = 4096
@@ -162,12 +164,12 @@ class BenchmarkTask:
 
 @dataclass(frozen=True)
 class Ladder:
-    """One world that gets harder along one quantity.
+    """One world that gets harder along one quantity; or pairs of tasks.
 
     Attributes:
         axis: such as "exploration". unit: of the levels, such as "bits". quantity: what a level is, in words.
-        tasks: with increasing levels.
-        measure: by which `benchmarks/benchmark_select.py` finds the levels.
+        tasks: with increasing levels; of pairs first and second in turn, with levels 0 and 1.
+        measure: by which `benchmarks/benchmark_select.py` finds the levels; "pairs" where tasks are pairs.
     """
 
     axis: str
@@ -175,6 +177,23 @@ class Ladder:
     quantity: str
     tasks: tuple[BenchmarkTask, ...]
     measure: str = ""
+
+    @property
+    def pairs(self) -> tuple[tuple[BenchmarkTask, BenchmarkTask], ...]:
+        """Pairs of tasks, of which the second is the first made harder; none of a ladder that gets harder."""
+        return tuple(zip(self.tasks[::2], self.tasks[1::2], strict=True)) if self.measure == PAIRS else ()
+
+    def weights(self, names: Container[str]) -> dict[str, float]:
+        """Weight in the score of the axis of each task that is in `names`.
+
+        Of rungs equal ones, whose sum is 1. Of pairs 1 / n and -1 / n, of the second and the first task of each of n
+        whole pairs; the sum is 0.
+        """
+        if self.measure != PAIRS:
+            run = [task.name for task in self.tasks if task.name in names]
+            return {name: 1.0 / len(run) for name in run}
+        whole = [pair for pair in self.pairs if all(task.name in names for task in pair)]
+        return {task.name: sign / len(whole) for pair in whole for task, sign in zip(pair, (-1.0, 1.0), strict=True)}
 
 
 @dataclass(frozen=True)
@@ -263,11 +282,13 @@ def suite_of(entry: object, whose: str) -> Suite:
     keys = [each.name for each in fields(Suite)]
     if not isinstance(entry, dict) or {*entry, "quick"} != {*keys}:
         raise FileFormatError(f"{whose}: is no suite; expected the entries {', '.join(keys)}")
-    ladders = []
+    ladders: list[Ladder] = []
     for each in _list(entry["ladders"], f"{whose}: ladders"):
         of = f"{whose}: ladder {each.get('axis')}"
         tasks = _tasks(each.get("tasks"), str(each.get("axis")), of)
         ladders.append(replace(parse_record(Ladder, {**each, "tasks": ()}, of, ("measure",)), tasks=tasks))
+        if ladders[-1].measure == PAIRS and len(tasks) % 2:
+            raise FileFormatError(f"{of}: has {len(tasks)} tasks; expected pairs")
     settings = entry["hyperparameters"]
     if not isinstance(settings, dict) or not all(isinstance(each, dict) for each in settings.values()):
         raise FileFormatError(f"{whose}: hyperparameters are {str(settings)[:60]}; expected some of each baseline")

@@ -82,6 +82,7 @@ BUILT_IN = (  # in the order in which they are listed
     BuiltIn("memory_chain", "MemoryChain", "length-10 bits-4"),
     BuiltIn("umbrella_chain", "UmbrellaChain", "length-10 length-100"),
     BuiltIn("discounting_chain", "DiscountingChain", "bonus-1 bonus-100 delays-10"),
+    BuiltIn("delayed_choice", "DelayedChoice", "length-8 copies-16 noisy"),
     BuiltIn("game_2048", "Game2048", "2x2 2x3 3x3 2x2-to-32 3x3-to-64 3x3-to-256 3x3-to-512 3x3-to-1024"),
 )
 

@@ -18,11 +18,11 @@ lists the differences in arithmetic.
 """
 
 import numpy as np
-from numba import float32, njit, uint32, uint64
+from numba import float32, uint32, uint64
 from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at
-from pharos.kernels.kernel_cache import kernel
+from pharos.kernels.kernel_cache import inlined, kernel
 from pharos.kernels.outcomes import drawn_outcome, outcome, size_of
 from pharos.kernels.stepping import (
     delayed_reward,
@@ -42,7 +42,7 @@ MASK = 0xFFFFFFFF
 UNIT = 2.0**-32
 
 
-@njit(forceinline=True)
+@inlined
 def philox(c0, c1, c2, c3, key):
     """Four words (uint64 below 2^32) of the counter (c0, c1, c2, c3) and a key of 64 bits, its low word first."""
     c0, c1, c2, c3 = uint64(c0), uint64(c1), uint64(c2), uint64(c3)
@@ -59,13 +59,13 @@ def philox(c0, c1, c2, c3, key):
     return c0, c1, c2, c3
 
 
-@njit(forceinline=True)
+@inlined
 def unit(word):
     """A word as a number in (0, 1): the middle of its interval of length 2^-32."""
     return (np.float64(word) + 0.5) * UNIT
 
 
-@njit(forceinline=True)
+@inlined
 def below(word, n):
     """A word as an integer in [0, n), n < 2^32."""
     return np.int64((uint64(word) * uint64(n)) >> uint64(32))

@@ -18,10 +18,10 @@ components".
 """
 
 import numpy as np
-from numba import njit, types, uint64
+from numba import types, uint64
 
 from pharos.kernels.interpreted import interpreted_first, overload
-from pharos.kernels.kernel_cache import kernel
+from pharos.kernels.kernel_cache import inlined, kernel
 from pharos.kernels.outcomes import expectation, fetch_values, outcome, outcome_numbers, size_of
 
 # Orders ---------------------------------------------------------------------------------------------------------------
@@ -266,7 +266,7 @@ def optimal_backup(transitions, table, palette, gamma, uniform, choice, v, out, 
             out[uint64(s)] = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
 
 
-@njit(forceinline=True)
+@inlined
 def _sticky_values(transitions, table, palette, gamma, weights, choice, v, actions, q, s):
     """q[a] = r(s, a) + gamma v(next, a). Returns (q of the choice, sum of q of available actions)."""
     total = 0.0
@@ -358,7 +358,7 @@ def sticky_backup(transitions, table, palette, gamma, weights, choice, v, out, a
                     out[uint64(s), b] = as_first(weights, best, total / set_size(weights, s, actions))
 
 
-@njit(forceinline=True)
+@inlined
 def _policy_value(transitions, table, palette, gamma, weights, policy, v, actions, s):
     """sum_a (chosen policy[s, a] + uniform / A) q(s, a): the backup of v at s."""
     chosen_weight, uniform_share = weights[0], weights[2] / set_size(weights, s, actions)
@@ -391,7 +391,7 @@ def policy_backup(transitions, table, palette, gamma, weights, policy, v, out, a
             out[s] = _policy_value(transitions, table, palette, gamma, weights, policy, v, actions, s)
 
 
-@njit(forceinline=True)
+@inlined
 def _sticky_policy_values(transitions, table, palette, gamma, weights, policy, v, actions, q, values, s):
     """values[b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b); q (A,) scratch."""
     chosen_weight, previous_weight, uniform_weight = weights[0], weights[1], weights[2]

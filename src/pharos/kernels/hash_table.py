@@ -27,11 +27,11 @@ from typing import Any
 import numba.extending
 import numpy as np
 from llvmlite import ir
-from numba import int64, njit, types, uint64
+from numba import int64, types, uint64
 from numba.core import cgutils
 
 from pharos.kernels.interpreted import in_python, interpreted_first
-from pharos.kernels.kernel_cache import kernel
+from pharos.kernels.kernel_cache import inlined, kernel
 
 intrinsic: Any = numba.extending.intrinsic  # whose types would hide those of the functions that it makes
 _BATCH = 32  # states whose slots are fetched from memory at the same time
@@ -92,7 +92,7 @@ def store_released(typing_context, table, slot, index):
     return types.void(table, types.int64, types.int64), codegen
 
 
-@njit(forceinline=True)
+@inlined
 def mixed(h):
     """A 64-bit mixer (two rounds of multiply and xor-shift): every input bit reaches the high bits of the result."""
     h ^= h >> uint64(32)
@@ -102,13 +102,13 @@ def mixed(h):
     return h
 
 
-@njit(forceinline=True)
+@inlined
 def slot_of(h, capacity):
     """The slot of hash h in a table of `capacity` slots, a multiple of 65536 below 2^40: floor(h / 2^64 * capacity)."""
     return int64(((h >> uint64(24)) * (uint64(capacity) >> uint64(16))) >> uint64(24))
 
 
-@njit(forceinline=True)
+@inlined
 def hash_of_row(states, i):
     """The hash of states[i], a row of words."""
     h = mixed(states[i, 0])
@@ -343,7 +343,7 @@ _FEW = 1 << 12  # candidates that are not worth sorting
 _NEW = uint64(1 << 63)
 
 
-@njit(forceinline=True)
+@inlined
 def _slot_for(entries, keys, j):
     """(slot, its entry) of keys[j]: its slot, or the free one in which it belongs, whose entry is 0."""
     capacity, words = entries.shape[0], keys.shape[1]
@@ -360,7 +360,7 @@ def _slot_for(entries, keys, j):
         slot = slot + 1 if slot + 1 < capacity else 0
 
 
-@njit(forceinline=True)
+@inlined
 def _enter(entries, slot, keys, j, entry):
     """Put keys[j] and its `entry`, the last word, into a slot."""
     words = keys.shape[1]

@@ -51,7 +51,7 @@ def in_python(meaning: Callable) -> Callable:
 def interpreted_first(*counted: str) -> Callable:
     """Decorator of a kernel: its calls are interpreted as long as they are small together, then compiled.
 
-    They are small until they have counted COMPILING times `compiling.SMALL` entries, or 1 / LOADING of it if the
+    They are small until they have counted COMPILING times `compiling.SMALL_STATES` entries, or 1 / LOADING of it if the
     compiled kernel is on disk, as loading takes so much less than compiling.
 
     Args:

@@ -131,9 +131,36 @@ def kernel(function: Callable | None = None, /, *, makes_arrays: bool = True, **
     """
     if function is None:
         return partial(kernel, makes_arrays=makes_arrays, **options)
-    dispatcher = numba.njit(nogil=True, _nrt=makes_arrays, **options)(function)
+    compiled = called_by_kernels if function.__name__.startswith("_") else called_by_python
+    dispatcher = compiled(nogil=True, _nrt=makes_arrays, **options)(function)
     dispatcher._cache = cache_in(_folder(), f"{function.__module__.rpartition('.')[2]}.{function.__name__}")
     return dispatcher
+
+
+called_by_python: Any = partial(numba.njit, no_cfunc_wrapper=True)
+"""`numba.njit` of a function that Python calls, and C does not."""
+
+
+def called_by_kernels(function: Callable | None = None, /, **options: object) -> Callable:
+    """Decorator of a function that kernels call and Python does not: `numba.njit` without the ways in from outside, a
+    sixth of compiling.
+
+    Raises:
+        TypeError: Python calls it.
+    """
+    if function is None:
+        return partial(called_by_kernels, **options)
+    dispatcher = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)(function)
+
+    def refuse(*arguments: object) -> None:
+        raise TypeError(f"{function.__name__} is called by kernels alone; expected a call of its text, `.py_func`")
+
+    dispatcher._insert, dispatcher._compile_for_args = lambda *overload: None, refuse  # else its calls end the process
+    return dispatcher
+
+
+inlined = called_by_kernels(forceinline=True)
+"""Decorator of a function that becomes part of the kernels that call it."""
 
 
 @cache

@@ -7,15 +7,15 @@ previous, uniform), with sets behind, see kernels/bellman.py.
 """
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from pharos.kernels.bellman import set_has, set_size
 from pharos.kernels.interpreted import interpreted_first, overload
-from pharos.kernels.kernel_cache import kernel
+from pharos.kernels.kernel_cache import inlined, kernel
 from pharos.kernels.outcomes import outcome, outcome_numbers, size_of
 
 
-@njit(forceinline=True)
+@inlined
 def _mass(now, s):
     """Probability of being in s, whatever the previous action."""
     mass = 0.0
@@ -46,7 +46,7 @@ def _mass_as_first(policy, weights, now, s, a):
     return in_sets
 
 
-@njit(forceinline=True)
+@inlined
 def _execute(policy, weights, now, s, mass, executed):
     """executed[a] = the probability of being in s and executing a.
 

@@ -28,7 +28,7 @@ import operator
 
 import numba.extending
 import numpy as np
-from numba import from_dtype, int64, njit, types, uint64
+from numba import from_dtype, int64, types, uint64
 from numba.core import cgutils
 from numba.extending import (
     NativeValue,
@@ -41,7 +41,7 @@ from numba.extending import (
 
 from pharos.kernels.hash_table import mixed, prefetch, slot_of
 from pharos.kernels.interpreted import interpreted_first, overload
-from pharos.kernels.kernel_cache import kernel
+from pharos.kernels.kernel_cache import inlined, kernel
 from pharos.system.arrays import PACKED, PackedIndices
 
 # Indices of 40 bits ---------------------------------------------------------------------------------------------------
@@ -484,7 +484,7 @@ def enter(palette, size, table):
         table[slot] = code
 
 
-@njit(forceinline=True)
+@inlined
 def _is(palette, code, bits, first, n):
     """Whether the entry of the palette with this code has the probabilities bits[first : first + n]."""
     if n < palette.shape[1] and palette[code, n] != 0:

@@ -12,11 +12,11 @@ W[a] + q[a, c] for features F and a diagonal.
 from typing import NamedTuple
 
 import numpy as np
-from numba import float64, njit, types, uint64
+from numba import float64, types, uint64
 from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at, set_has
-from pharos.kernels.kernel_cache import kernel
+from pharos.kernels.kernel_cache import inlined, kernel
 from pharos.kernels.outcomes import drawn, drawn_outcome, is_table, outcome, size_of
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)  # when an environment that has ended is reset
@@ -77,7 +77,7 @@ class EnvironmentBatch(NamedTuple):
     probabilities: np.ndarray
 
 
-@njit(forceinline=True)
+@inlined
 def uniform_number(rng, i):
     """A uniform number in [0, 1) of stream i: SplitMix64 (Steele, Lea and Flood 2014) on the counter rng[i]."""
     rng[i] += uint64(0x9E3779B97F4A7C15)
@@ -94,25 +94,25 @@ def next_number(rng):
     return uniform_number(rng, 0)
 
 
-@njit(forceinline=True)
+@inlined
 def integer_below(rng, i, n):
     """A uniform integer in [0, n) of stream i."""
     return min(int(uniform_number(rng, i) * n), n - 1)
 
 
-@njit(forceinline=True)
+@inlined
 def normal_by_numbers(u, v):
     """A standard normal number from two uniform ones, u > 0 (Box and Muller 1958)."""
     return np.sqrt(-2.0 * np.log(u)) * np.cos(2.0 * np.pi * v)
 
 
-@njit(forceinline=True)
+@inlined
 def normal_number(rng, i):
     """A standard normal number of stream i."""
     return normal_by_numbers(1.0 - uniform_number(rng, i), uniform_number(rng, i))
 
 
-@njit(forceinline=True)
+@inlined
 def delayed_reward(pending, elapsed, earned, is_last):
     """Reward paid at a step if rewards come D steps late, and all at once at the end of an episode.
 
@@ -153,7 +153,7 @@ def flip_coins(rng, out):
             out[i, j] = 1.0 if uniform_number(rng, i) < 0.5 else 0.0
 
 
-@njit(forceinline=True)
+@inlined
 def executed_by_number(choice, previous, chance, num_actions, u):
     """The executed action, by one uniform number u in [0, 1): the choice, then the previous action, then a uniform one.
 
@@ -170,7 +170,7 @@ def executed_by_number(choice, previous, chance, num_actions, u):
     return min(int((u - chance[0] - chance[1]) / chance[2] * num_actions), num_actions - 1)
 
 
-@njit(forceinline=True)
+@inlined
 def executed_of_set(choice, previous, chance, is_available, u):
     """`executed_by_number` in a state with some actions only, is_available (A,) bool.
 
@@ -213,7 +213,7 @@ def execute_in_sets(rng, choices, previous, ended, chance, sets, executed):
             executed[i] = executed_of_set(choices[i], previous[i], chance, sets[i], uniform_number(rng, i))
 
 
-@njit(forceinline=True)
+@inlined
 def redrawn_action(choice, previous, chance, num_actions, rng, s):
     """The executed action in state s, by numbers of the stream rng (1,): a uniform action takes a second one.
 
@@ -249,7 +249,7 @@ def _action_of_set(chance, num_actions, rng, s):
     return drawn_of_set
 
 
-@njit(forceinline=True)
+@inlined
 def executed_action(choice, previous, chance, num_actions, rng, i):
     """The executed action of stream i; nothing is drawn if the choice is always executed."""
     if chance[0] >= 1.0:
@@ -257,13 +257,13 @@ def executed_action(choice, previous, chance, num_actions, rng, i):
     return executed_by_number(choice, previous, chance, num_actions, uniform_number(rng, i))
 
 
-@njit(forceinline=True)
+@inlined
 def has_no_effect(chance, rng, i):
     """Whether the executed action of stream i changes nothing; nothing is drawn if every action has an effect."""
     return chance[4] > 0.0 and uniform_number(rng, i) < chance[4]
 
 
-@njit(forceinline=True)
+@inlined
 def start_by_number(cumulative, u):
     """The number of a start state, by one uniform number u in [0, 1) and the cumulated probabilities."""
     k = 0
@@ -272,7 +272,7 @@ def start_by_number(cumulative, u):
     return k
 
 
-@njit(forceinline=True)
+@inlined
 def drawn_start(cumulative, rng, i):
     """The number of a start state; nothing is drawn if there is one."""
     return start_by_number(cumulative, uniform_number(rng, i)) if len(cumulative) > 1 else 0
@@ -509,7 +509,7 @@ def _product(x, y):
     return total
 
 
-@njit(forceinline=True)
+@inlined
 def _q_value(kernel, learned, c, a):
     """Q(c, a), of the tabular part and the features."""
     _, features, _ = kernel
@@ -517,7 +517,7 @@ def _q_value(kernel, learned, c, a):
     return q[a, c] + _product(features[c], weights[a]) if features.shape[1] > 0 else q[a, c]
 
 
-@njit(forceinline=True)
+@inlined
 def _likeness(kernel, c, d):
     """K(c, d), the kernel of two observations."""
     matrix, features, diagonal = kernel
@@ -527,7 +527,7 @@ def _likeness(kernel, c, d):
     return own + _product(features[c], features[d])
 
 
-@njit(forceinline=True)
+@inlined
 def _gradient_step(kernel, learned, c, a, step):
     """Q(., a) += step K(., c): a gradient step on Q(c, a)."""
     matrix, features, diagonal = kernel

@@ -28,7 +28,7 @@ import numpy as np
 from numba.extending import overload
 
 from pharos.environments import Environment
-from pharos.kernels.kernel_cache import cache_in, folder_of_rules
+from pharos.kernels.kernel_cache import cache_in, called_by_kernels, called_by_python, folder_of_rules, inlined
 
 Function = Callable[..., Any]
 """A function that Numba compiles, or has compiled."""
@@ -139,15 +139,15 @@ class Compiler:
 
     def inlined(self, function: Function) -> Function:
         """Compile a function that becomes part of its callers."""
-        return numba.njit(forceinline=True)(self._named(function))
+        return inlined(self._named(function))
 
     def function(self, function: Function) -> Function:
         """Compile a function that kernels call."""
-        return numba.njit(nogil=True)(self._named(function))
+        return called_by_kernels(self._named(function), nogil=True)
 
     def kernel(self, function: Function) -> Function:
         """Compile a function that Python calls; the compiled form is kept on disk."""
-        kernel: Any = numba.njit(nogil=True)(self._named(function))
+        kernel = called_by_python(nogil=True)(self._named(function))
         kernel._cache = cache_in(folder_of_rules(), f"{self.name}.{function.__name__}")
         return kernel
 
@@ -210,7 +210,7 @@ class _RuleCompiler:
         )
         clone.__kwdefaults__ = function.__kwdefaults__
         clone.__qualname__, clone.__module__ = function.__qualname__, __name__
-        self._done[function] = numba.njit(forceinline=True)(clone)
+        self._done[function] = inlined(clone)
         return self._done[function]
 
     def _compiled_among(self, values: Mapping[str, object]) -> CompiledRules:

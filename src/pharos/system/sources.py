@@ -1,8 +1,8 @@
 """Code of the user's own: a class or a function that is named as `module:Name` or `file.py:Name`.
 
-A name in a command or a script of the user is trusted: `load(find(name))` imports it. A name in a file that somebody
-else may have written (a run.json, a study's folder, a packed study) is not: `resolve` returns what this process has
-already imported under that name, and imports nothing by itself unless it is told to trust the file.
+A name in a command or a script of the user is trusted: `load_source(find_source(name))` imports it. A name in a file
+that somebody else may have written (a run.json, a study's folder, a packed study) is not: `resolve` returns what this
+process has already imported under that name, and imports nothing by itself unless it is told to trust the file.
 """
 
 import importlib

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         PolicyRecorder,
         Snapshots,
         StepBudget,
+        end_process,
         errors_in_one_line,
         generate,
         generated_curve,

@@ -23,6 +23,7 @@ curve. What looks like a mistake and is no error is a note (`PolicyRecorder.note
 import contextlib
 import copy
 import os
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -447,6 +448,16 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
     recorder = PolicyRecorder(task, steps=steps, interval=steps // evaluations, seed=seed)
     generate(learn, recorder, seed)
     return recorder.curve()
+
+
+def end_process(agent: str, limit: int) -> NoReturn:
+    """End this process: what catches BudgetSpent around `step`, and goes on, cannot be ended otherwise."""
+    sys.stderr.write(
+        f"pharos: agent {agent} went on for {IGNORED:,} steps after its {limit:,}; expected its loop to end: catch no "
+        f"BudgetSpent (`except:`, `except BaseException`) around step\n"
+    )
+    sys.stderr.flush()
+    os._exit(1)
 
 
 @contextlib.contextmanager

@@ -5,12 +5,10 @@ seed alone.
 """
 
 import math
-import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +17,7 @@ from pharos.errors import ParameterError
 from pharos.mdp import uniform_choice
 from pharos.policies import PolicyLike
 from pharos.solvers import GainInterval
-from pharos.training.budget import IGNORED, PolicyRecorder, errors_in_one_line, generate
+from pharos.training.budget import PolicyRecorder, end_process, errors_in_one_line, generate
 from pharos.training.curve import Evaluation, evaluate_agent
 from pharos.training.jax_agents import compiled_curves
 from pharos.training.results import write_policy
@@ -33,7 +31,7 @@ class GeneratorLearner(PolicyRecorder):
         config = run.config
         super().__init__(run.task, steps=config.steps, interval=config.evaluation_interval, seed=config.seed)
         self.run, self.function = run, learn
-        self.budget.give_up = self._give_up
+        self.budget.give_up = partial(end_process, self.run.config.agent, self.budget.limit)
 
     @property
     def episodes(self) -> np.ndarray:
@@ -63,15 +61,6 @@ class GeneratorLearner(PolicyRecorder):
         """The file with the code of the function."""
         source = self.run.config.sources.get("agent")
         return source.file if source else getattr(getattr(self.function, "__code__", None), "co_filename", None)
-
-    def _give_up(self) -> NoReturn:
-        """End this process: what catches BudgetSpent around `step`, and goes on, cannot be ended otherwise."""
-        sys.stderr.write(
-            f"pharos: agent {self.run.config.agent} went on for {IGNORED:,} steps after its {self.budget.limit:,}; "
-            f"expected its loop to end: catch no BudgetSpent (`except:`, `except BaseException`) around step\n"
-        )
-        sys.stderr.flush()
-        os._exit(1)
 
     def policy(self, i: int) -> PolicyLike | Evaluation:
         return self.in_force
