@@ -29,7 +29,7 @@ from pharos.cli import answers
 from pharos.system import compiling
 
 compiling.announces = False  # else what a test finds on standard error depends on what was compiled before
-answers.TOLD_AFTER = math.inf  # or on how busy the machine is
+answers.SLOW_AFTER = math.inf  # or on how busy the machine is
 
 for name, derandomize in (("fixed", True), ("explore", False)):
     settings.register_profile(
@@ -40,15 +40,15 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 
 HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
 
-INTERPRETED_BELOW = compiling.SMALL
-INTERPRETED = {"benchmark", "interaction", "training"}
+INTERPRETED_BELOW = compiling.SMALL_STATES
+INTERPRETED = {"agents", "benchmark", "interaction", "training"}
 """Folders whose worlds are interpreted where a user's would be, as their tests are of what comes after. Elsewhere the
 small worlds of tests are of compiled code."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    compiling.SMALL = INTERPRETED_BELOW if item.path.relative_to(HERE).parts[0] in INTERPRETED else 0
+    compiling.SMALL_STATES = INTERPRETED_BELOW if item.path.relative_to(HERE).parts[0] in INTERPRETED else 0
 
 
 gc.disable()

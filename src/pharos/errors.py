@@ -30,7 +30,7 @@ import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-LONGEST = 2000
+LONGEST_MESSAGE = 2000
 """Characters of a message: one that quotes more is cut in the middle."""
 
 
@@ -42,8 +42,8 @@ class PharosError(Exception):
 
 
 def _cut(text: str) -> str:
-    half = LONGEST // 2
-    return text if len(text) <= LONGEST else f"{text[: half - 5]} ... {text[-half:]}"
+    half = LONGEST_MESSAGE // 2
+    return text if len(text) <= LONGEST_MESSAGE else f"{text[: half - 5]} ... {text[-half:]}"
 
 
 class ParameterError(PharosError, ValueError):

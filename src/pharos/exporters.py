@@ -165,7 +165,7 @@ def _screens(mdp: TabularMDP, order: np.ndarray) -> dict[str, np.ndarray]:
     if mdp.folder is None or not mdp_files.is_folder(mdp.folder):
         return {}
     manifest = mdp_files.read_mdp_manifest(mdp.folder)
-    if manifest.get(mdp_files.OBSERVATIONS) != "image":
+    if manifest.get(mdp_files.SHOWN_NAME) != "image":
         return {}
     shown = mdp_files.read_observations(mdp.folder, manifest)
     assert shown is not None

@@ -17,7 +17,7 @@ from pharos.benchmark.contents import (
     learning_curve,
     learning_sentence,
     number,
-    residuals,
+    residual_tasks,
     sentence,
     unclipped_regret,
 )
@@ -148,9 +148,9 @@ def test_core_tasks_stand_beside_the_nearest_baseline_the_worst_first(contents):
 )
 def test_residuals_are_tasks_that_theory_solves_and_the_agent_does_not(agent, predictor, tasks):
     own = contents_of(results(agent, MINE), beside=[], predictor=predictor, suite=SUITE)
-    names = [task.name for task, _, _ in residuals(own)]
+    names = [task.name for task, _, _ in residual_tasks(own)]
     assert set(names) == set(tasks) | ({"exploration-8"} if "credit-16" in tasks else set())
-    excess = [own.value - expected for _, own, expected in residuals(own)]
+    excess = [own.value - expected for _, own, expected in residual_tasks(own)]
     assert excess == sorted(excess, reverse=True) and all(each > 0.2 for each in excess)
 
 

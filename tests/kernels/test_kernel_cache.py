@@ -25,7 +25,7 @@ ONE_KERNEL = """
 import json, sys
 import numpy as np
 from pharos.system import compiling
-compiling.SMALL = 0
+compiling.SMALL_STATES = 0
 from pharos.kernels import bellman
 v = np.zeros(3)
 bellman.chain_values(np.array([1, -1]), np.ones(2), 0.5, v, np.zeros(2, np.int64))

@@ -88,7 +88,7 @@ class RunSettings:
 
     Attributes:
         workers: processes at once.
-        checkpoints: folder of those of the batched engine.
+        checkpoints: folder of checkpoints of the batched engine.
         tell: called with the progress.
         timeout: seconds after which a run that has its process is ended; None: never.
     """
@@ -119,7 +119,7 @@ class RunResult:
 
     Attributes:
         curve: (evaluations,) normalised regret. exact: whether all of it is.
-        steps: of the environment, as it counted them, else those of the protocol.
+        steps: of the environment, as it counted them, else of the protocol.
         notes: sentences on what looks like a mistake, by kind.
         policies: facts on the policies, by `policy_facts` of training/curve.py; empty if they are unknown.
     """
@@ -138,8 +138,8 @@ class Form:
     Attributes:
         label: of the agent, for tables. kind: of form, as in the table above.
         hyperparameters: all that are known; one setting for all tasks.
-        source: where code of the user's own comes from.
-        checksum: SHA-256 of that file, or of the text of a function that is in none; empty where pharos has the code.
+        source: origin of the user's own code.
+        checksum: SHA-256 of that file, or of the text of a function that is in none; empty if pharos has the code.
         errors: of runs that could not write their own, by folder.
     """
 
@@ -187,7 +187,7 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
 
     Args:
         agent: a name, `module:Name`, `file.py:Name`, or a generator function.
-        hyperparameters: go before those of the suite, and these before the agent's own.
+        hyperparameters: override the suite's hyperparameters, which override the agent's.
     Raises:
         UnknownName, ParameterError: there is no such agent, file or hyperparameter.
         MissingExtra: the library that it needs is not installed.
@@ -216,7 +216,7 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
 
 
 def sha256(file: str | os.PathLike) -> str:
-    """SHA-256 of a file; empty where there is none."""
+    """SHA-256 of a file; empty if there is none."""
     return hashlib.sha256(Path(file).read_bytes()).hexdigest() if Path(file).is_file() else ""
 
 
@@ -451,7 +451,7 @@ def _loaded(code: Source | bytes) -> Any:
 def _seed(seed: int) -> None:
     """Seed the global random numbers of Python, NumPy and, if the agent has loaded it, PyTorch.
 
-    A process that was forked has those of the process that it was forked from.
+    A forked process starts with the random numbers of the process that it was forked from.
     """
     random.seed(seed)
     np.random.seed(seed % (1 << 32))  # noqa: TID251  (of the agent's own code, which is its own affair)
@@ -516,7 +516,7 @@ class Apart(Execution[Job]):
 
     Args:
         form: whose jobs they are; it keeps errors of runs that could not write their own.
-        groups: of jobs; those of a group that are finished run again if one is not.
+        groups: of jobs; finished jobs of a group run again if one of it is not finished.
         body: function(*arguments[folder of the first job], jobs, send), which writes the folders of all runs and sends
             for each (its folder, None, an error message, or the OSError of writing).
         fail: fail(job, reason) writes the folder of a run whose process could not.

@@ -222,8 +222,8 @@ def ladder_panel(
 
     Args:
         levels: of the rungs, which stand equally far apart; between them the frontier is interpolated.
-        lines: for each agent its normalised regret on each rung, None where it did not run.
-        theory: of the idealised learner, None where it was not predicted.
+        lines: for each agent its normalised regret on each rung, None if it did not run.
+        theory: of the idealised learner, None if it was not predicted.
         frontier: of the first agent, in units of `levels`.
         unit: label of the horizontal axis.
     """
@@ -307,7 +307,9 @@ def regret_axis(left: float, right: float, top: float, bottom: float) -> list[El
     return shapes + [label(left - 5, y + 4, name, "end", "faint") for name, y in heights.items()]
 
 
-def plane(points: Sequence[tuple[str, float, float, float]], below: str, beside: Sequence[str], title: str) -> Element:
+def scatter(
+    points: Sequence[tuple[str, float, float, float]], below: str, beside: Sequence[str], title: str
+) -> Element:
     """Tasks as dots: (name, x, y, regret in [0, 1]), the darker the less regret, in a scale for all eyes.
 
     Args:
@@ -369,7 +371,7 @@ def shortened(text: str, letters: int) -> str:
 
 
 def ends(interval: ConfidenceInterval) -> tuple[float, float]:
-    """The ends of an interval, for drawing: both at the value where one seed leaves none."""
+    """The ends of an interval, for drawing: both at the value if one seed leaves none."""
     return (interval.value, interval.value) if np.isnan(interval.low) else (interval.low, interval.high)
 
 

@@ -232,7 +232,7 @@ def _as_floats(value: object) -> object:
         return {name: _as_floats(item) for name, item in value.items()}
     if isinstance(value, list):
         return [_as_floats(item) for item in value]
-    return float(value) + 0.0 if isinstance(value, int | float) else value  # 0.0, where it is -0.0
+    return float(value) + 0.0 if isinstance(value, int | float) else value  # 0.0, if it is -0.0
 
 
 def _check_code(config: RunConfig, trust: bool) -> None:

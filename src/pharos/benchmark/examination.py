@@ -1,8 +1,8 @@
 """An agent trained on twelve small worlds, with all that there is to see of it: the material of `pharos diagnose`.
 
-Each run ends in an `Examination`: the world as arrays, how often the agent took which action where while it learnt, and
-what its last policy answers about every state. A policy may offer `q_values(observations)`, (N, A), or
-`values(observations)`, (N,); those of Stable-Baselines3 are asked without being told how.
+Each run ends in an `Examination`: the world as arrays, how often the agent took which action in which state while it
+learnt, and what its last policy answers about every state. A policy may offer `q_values(observations)`, (N, A), or
+`values(observations)`, (N,); policies of Stable-Baselines3 are asked in their own way.
 """
 
 import contextlib
@@ -85,7 +85,7 @@ class Examination:
     Attributes:
         name: of the world. seed: of the run.
         world: as arrays.
-        visits: (S, A) steps by state and action; late, last: those of the last fifth and of the last fortieth.
+        visits: (S, A) steps by state and action; late, last: in the last fifth and in the last fortieth.
         cuts: (S, A) steps after which the time limit ended the episode.
         policy: (S, A) probabilities of the last policy.
         q: (S, A) and v: (S,), if it offers them.
@@ -277,9 +277,10 @@ def table_examination(name: str, seed: int, steps: int, setting: Mapping[str, An
 
 
 def value_functions(policy: Any) -> tuple[Callable[[Any], np.ndarray] | None, Callable[[Any], np.ndarray] | None]:
-    """Functions of observations to (N, A) values of actions and to (N,) values of states; None where it has none.
+    """Functions of observations to (N, A) values of actions and to (N,) values of states; None if it has none.
 
-    A method of an object that offers them, such as `policy` of a class with act and observe, has those of its object.
+    A method of an object that offers them, such as `policy` of a class with act and observe, has the functions of its
+    object.
     """
     if not (hasattr(policy, "q_values") or hasattr(policy, "values")):
         policy = getattr(policy, "__self__", policy)

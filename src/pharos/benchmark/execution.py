@@ -21,11 +21,11 @@ import numpy as np
 from pharos.agents import COMPILED
 from pharos.benchmark.agents import Form, Job, RunSettings, Tell, agent_form
 from pharos.benchmark.results import FILE, AgentResults
-from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, score
+from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, equal_seeds, score
 from pharos.benchmark.suite import CORE, EARLIER, BenchmarkTask, Suite, load_suite
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError, PharosError, UnknownName
 from pharos.system import storage
-from pharos.system.wording import in_one_line, pluralize
+from pharos.system.wording import in_one_line
 from pharos.system.workers import usable_workers
 from pharos.training import versions
 
@@ -85,8 +85,8 @@ def run(  # noqa: PLR0913
 ) -> Outcome:
     """Run an agent on the tasks of a suite, with one setting for all of them.
 
-    Finished runs in `out` are kept, so that the same call goes on where it was killed, and to the same bytes of
-    results; runs of the batched engine and of tables go on from their last checkpoint, others begin anew.
+    Finished runs in `out` are kept, so that the same call resumes after an interruption, and ends with the same bytes
+    of results. Runs of the batched engine and of tables resume from their last checkpoint, others begin anew.
 
     Args:
         agent: a name (q_learning, dqn, ppo, a2c; oracle, random), `module:Class` or `file.py:Class` with
@@ -99,7 +99,7 @@ def run(  # noqa: PLR0913
             made of it is preliminary.
         tasks: "core", axes and names of tasks; None: all.
         name: label of the agent in tables; its own when not given.
-        hyperparameters: of all tasks; they go before those of the suite and the agent.
+        hyperparameters: of all tasks; they override those that the suite and the agent have.
         workers: processes; as many as processors when not given. Changes no result.
         timeout: seconds after which a run of the user's own code, or of Stable-Baselines3, is ended, and failed; None:
             never.
@@ -109,11 +109,12 @@ def run(  # noqa: PLR0913
             agent, setting or suite. AllRunsFailed: no run has finished. FolderLocked: another process is at it.
     Cost: of v1, 30,000 steps a task and seed; of large, 600,000.
     """
-    folder = Path(out).absolute()  # an agent may change the directory where its file is loaded
+    folder = Path(out).absolute()  # an agent may change the directory when its file is loaded
     suite = suite if isinstance(suite, Suite) else load_suite(suite)
     form = agent_form(agent, suite, hyperparameters)
     protocol = suite.protocol
-    numbers = [int(seed) for seed in (range(protocol.seeds) if seeds is None else seeds)]
+    default = range(suite.quick_seeds if quick else protocol.seeds)
+    numbers = [int(seed) for seed in (default if seeds is None else seeds)]
     numbers = numbers[: suite.quick_seeds if quick else None]
     if not numbers or len(set(numbers)) < len(numbers) or min(numbers) < 0:
         raise ParameterError(f"seeds are {numbers}; expected whole numbers of at least 0, each once")
@@ -258,15 +259,3 @@ def mean_facts(facts: Sequence[Mapping[str, Any]], curves: np.ndarray) -> dict[s
         regrets = [np.mean(each.get("greedy_regret", curve)) for each, curve in zip(facts, curves, strict=True)]
         means["greedy_score"] = float(np.mean(1.0 - np.clip(regrets, 0.0, 1.0)))
     return means
-
-
-def equal_seeds(curves: Mapping[str, np.ndarray]) -> str:
-    """A sentence if all seeds have equal curves on more than a third of the tasks where any run learns, else ""."""
-    several = [curve for curve in curves.values() if len(curve) > 1 and (curve != curve[:1, :1]).any()]
-    equal = sum((curve == curve[0]).all() for curve in several)
-    if not several or equal <= len(several) / 3:
-        return ""
-    return (
-        f"all seeds have the same curve on {equal} of {pluralize(len(several), 'task')}, so intervals over seeds say "
-        f"nothing; expected learn to use its seed: random numbers, weights, the first reset"
-    )

@@ -1,6 +1,6 @@
 """The report of an agent's results: one HTML file that loads and runs nothing, and LaTeX for a paper.
 
-Frontiers and scores stand beside those of baselines; what differs is said in words only where an interval says so. Of
+Frontiers and scores stand beside the baselines'; a difference is said in words only if an interval shows it. Of
 theory the page has two things: the dashed line on each ladder, and residuals, tasks that an idealised learner solves
 and the agent does not. The page is a tree of elements, so that every text in it is escaped.
 """
@@ -22,8 +22,8 @@ from pharos.benchmark.charts import (
     ladder_panel,
     learning_panel,
     legend,
-    plane,
     radar,
+    scatter,
     section,
 )
 from pharos.benchmark.comparison import EQUAL_SEEDS, LEAST, UNKNOWN, WORSE, compare_groups
@@ -42,7 +42,7 @@ from pharos.benchmark.contents import (
     listed,
     number,
     regret_of,
-    residuals,
+    residual_tasks,
     run_warnings,
     seeds_text,
     sentence,
@@ -54,6 +54,7 @@ from pharos.benchmark.diagnosis import (
     SHIPPED,
     fall_everywhere,
     falls,
+    gaps,
     groups_of,
     is_own,
     lowest_rungs,
@@ -92,11 +93,11 @@ def report(
     Args:
         results: folder of a run, file, shipped baseline by name, or results read.
         out: the page, one self-contained file of HTML.
-        beside: agents to stand beside it, as `results`; None: those of dqn, ppo and q_learning that are shipped.
+        beside: agents to stand beside it, as `results`; None: dqn, ppo and q_learning, if shipped.
         latex: whether to write a table and a paragraph on methods beside the page, with the ending .tex.
         predictor: idealised learner that the agent is compared with: "dqn", "ppo", "table", "both" (the larger regret
-            of dqn and ppo) or "none"; None: by the agent's name, and "both" where that says nothing.
-        suite: the one that `results` are of, where that is not shipped.
+            of dqn and ppo) or "none"; None: by the agent's name, and "both" if that says nothing.
+        suite: the one that `results` are of, if that is not shipped.
     Raises:
         ParameterError: there are no such results, they are of another suite, or the predictor is none of these.
     Cost: less than a second.
@@ -287,6 +288,19 @@ def _policies(contents: Contents) -> Element | None:
     )
 
 
+def _gaps(contents: Contents) -> Element | None:
+    rows = gaps(contents)
+    if not rows:
+        return None
+    heads = ["generator", "training levels", "score on these", "on held-out levels", "gap"]
+    heads += [f"gap of {each.name}" for each in contents.beside]
+    return section(
+        "Levels seen and held out",
+        "The gap is the normalised regret on held-out levels less that on the levels of training, by seed.",
+        html_table(heads, rows, numeric=range(1, len(heads))),
+    )
+
+
 def _groups(contents: Contents) -> Element | None:
     if (near := nearest(contents)) is None:
         return None
@@ -332,7 +346,9 @@ def _plane(contents: Contents) -> Element | None:
         "What makes a task hard, and where the agent fails",
         "Each dot is a task, placed by what theory predicts before any run: to the right, even a learner with a table "
         "needs longer; above, a network loses more than a table. The colour is the agent's regret.",
-        captioned("", plane(points, below, beside, "tasks by predicted difficulty, coloured by regret"), class_="wide"),
+        captioned(
+            "", scatter(points, below, beside, "tasks by predicted difficulty, coloured by regret"), class_="wide"
+        ),
     )
 
 
@@ -368,7 +384,7 @@ def _residuals(contents: Contents) -> Element | None:
         return section(title, "No idealised learner is known for this kind of agent.")
     if all(contents.predicted(task) is None for task in contents.suite.tasks):
         return None
-    rows = residuals(contents)
+    rows = residual_tasks(contents)
     means = PREDICTORS[contents.predictor]
     text = (
         f"Tasks where the regret is more than {RESIDUAL:g} above that of {means}, predicted before any run. Theory "
@@ -439,6 +455,7 @@ SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
     _ladders,
     _pairs,
     _words,
+    _gaps,
     _policies,
     _core,
     _groups,

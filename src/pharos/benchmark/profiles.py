@@ -34,11 +34,11 @@ BROKEN = 0.5  # mean regret of an agent of which no check and no fault says what
 
 @dataclass(frozen=True)
 class Symptom:
-    """A reading that is unlike that of any healthy agent.
+    """A reading that no healthy agent has.
 
     Attributes:
         reading: its name. is_high: whether it is wrong above the limit, not below.
-        margin: beyond the most extreme healthy agent. beyond: what it is beyond besides, wherever healthy agents are.
+        margin: beyond the most extreme healthy agent. beyond: what it is beyond besides, whatever healthy agents have.
         wrong: sentence, with {value} for `show(reading)`. advice: what to look at.
         faults: of the library that it is a sign of, the most likely first.
         kind: of agents that it is a symptom of; empty: of all.

@@ -1,6 +1,6 @@
 """Results of an agent in a benchmark: a curve of normalised regret for each task and seed, in one small file.
 
-The layout is that of `system/sealed.py`: the record as JSON, and under the name of each task a float64 array (seeds,
+The layout follows `system/sealed.py`: the record as JSON, and under the name of each task a float64 array (seeds,
 evaluations), with digests of all. The same results give the same bytes.
 """
 

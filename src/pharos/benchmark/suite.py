@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from pharos.benchmark import levels
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
 from pharos.mdp import ChanceSetting, TabularMDP
 from pharos.system import storage
@@ -76,12 +77,13 @@ class BenchmarkTask:
 
     Attributes:
         name: unique in its suite, and fit for a file name (`check_name`), since runs are written below it.
-        environment, parameters: as `pharos.make` takes them. observation, observation_options: as `pharos.observe`.
+        environment, parameters: as `pharos.make` takes them; or "levels", with those of `levels_of`.
+        observation, observation_options: as `pharos.observe`.
         chance: the kinds of `ChanceSetting` that are not 0.
-        axis: "core", or that of its ladder.
+        axis: "core", or the axis of its ladder.
         level: on a ladder: the measured quantity, in the ladder's unit; None in the core.
         predicted: by `pharos.predict`, normalised regret, 0 optimal and 1 uniform play: "dqn", "ppo", and "table",
-            that of the DQN with a table; some may be missing.
+            for the DQN with a table; some may be missing.
         value_optimal, value_uniform: at the start, of the optimal policy and of uniform play.
         digest: SHA-256 of the task as it was frozen; see `digest_of_task`.
         seconds: processor time of one run of a baseline that was measured, by its name; a guide.
@@ -127,9 +129,12 @@ class BenchmarkTask:
                 f"task {self.name}: gamma is 1 without a horizon, so regret may be infinite, and no score a mean of "
                 f"it; give a horizon, or gamma < 1"
             )
+        if self.environment == levels.LEVELS:
+            world: tuple[Any, ...] = (levels.levels_of(**self.parameters),)
+        else:
+            world = self.environment, self.parameters
         return Task.of(
-            self.environment,
-            self.parameters,
+            *world,
             observation=self.observation,
             observation_options=dict(self.observation_options),
             chance=ChanceSetting.from_dict(self.chance),
@@ -236,7 +241,7 @@ class Suite:
         return {task.name: task for task in self.tasks}
 
     def task(self, name: str) -> BenchmarkTask:
-        """The task of this name; UnknownName where there is none."""
+        """The task of this name; UnknownName if there is none."""
         if name not in self._by_name:
             raise UnknownName(f"task of suite {self.name}", name, self._by_name)
         return self._by_name[name]

@@ -153,7 +153,7 @@ def verify(
 
     Args:
         suite: of runs of a suite, or several that it may be; v1 when not given. Its tasks are the ones on this
-            installation, not those of the file.
+            installation, not the tasks in the file.
         trust: whether code that an entry names may be imported: an environment, observation or agent that is no part
             of pharos or Stable-Baselines3. It comes from this machine; no file holds any.
         values: filled with the values of each task of an entry, for the entries that follow.

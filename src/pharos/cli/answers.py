@@ -95,13 +95,13 @@ class _Trimmed:
         return self.stream.write(re.sub(r" +(?=\n)", "", text))
 
 
-TOLD_AFTER, TOLD_AT_LEAST_EVERY = 10.0, 60.0  # seconds of work after which a line says what is going on, and again
+SLOW_AFTER, TOLD_AT_LEAST_EVERY = 10.0, 60.0  # seconds of work after which a line says what is going on, and again
 
 
 class SlowWork:
     """Lines on standard error on work that takes long, if no terminal shows its progress.
 
-    The first comes after `TOLD_AFTER` seconds, the next ones when it has taken twice as long, and every
+    The first comes after `SLOW_AFTER` seconds, the next ones when it has taken twice as long, and every
     `TOLD_AT_LEAST_EVERY` seconds in the end.
 
     Attributes:
@@ -110,7 +110,7 @@ class SlowWork:
 
     def __init__(self, what: str, clock: Callable[[], float] = time.monotonic):
         self.what, self.text = what, ""
-        self._clock, self._began, self._due = clock, clock(), TOLD_AFTER
+        self._clock, self._began, self._due = clock, clock(), SLOW_AFTER
 
     def tell_if_due(self) -> None:
         """Write a line if the time for one has come."""

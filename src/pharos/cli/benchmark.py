@@ -56,7 +56,7 @@ COMPUTED = (
     *("states", "episodes"),
 )
 """Numbers of one task."""
-LONG = 600  # minutes
+LONG_MINUTES = 600  # minutes
 
 
 @app.command("show")
@@ -415,7 +415,7 @@ def _print(suite: "Suite") -> None:
     if any(task.predicted for task in suite.tasks):
         notes.append("Regret as predicted before any run: 0 is optimal, 1 is uniform play.")
     if minutes := _minutes(suite):
-        unit, size = ("Hours", 60) if max(minutes.values()) > LONG else ("Minutes", 1)
+        unit, size = ("Hours", 60) if max(minutes.values()) > LONG_MINUTES else ("Minutes", 1)
         times = ", ".join(f"{agent.upper()} {value / size:.0f}" for agent, value in minutes.items())
         notes.append(f"{unit} of one processor, all seeds, as shipped: {times}")
     protocol = suite.protocol

@@ -89,7 +89,7 @@ def _is_there(folder: Path) -> bool:
 # Count ----------------------------------------------------------------------------------------------------------------
 
 
-SMALL = 10_000  # states, so that solving takes no time
+MOST_QUICK_STATES = 10_000  # states, so that solving takes no time
 
 
 def count(target: Target, *, building: Building) -> Answer:
@@ -149,7 +149,7 @@ def counts_of(space: "StateSpace") -> dict[str, int]:
         "num_actions": space.num_actions,
         "num_transitions": rows - space.num_terminal_states * space.num_actions,
         "depth": space.depth,
-        "has_regret": space.num_states > SMALL or _has_regret(space.mdp(gamma=0.99)),
+        "has_regret": space.num_states > MOST_QUICK_STATES or _has_regret(space.mdp(gamma=0.99)),
     }
 
 

@@ -109,7 +109,7 @@ def solve(
         "compiling_seconds": compiling.seconds(),
         "gamma": solution.gamma,
         "horizon": solution.horizon,
-        **{name: getattr(chance, name) for name in ACTING},
+        **{name: getattr(chance, name) for name in CHANCE_OPTIONS},
         "tolerance": solving.tolerance,
         "dtype": solving.dtype,
         "processes": int(processes) if processes.isdigit() and processes != "1" else ranks,
@@ -203,7 +203,7 @@ def _how_it_was_answered(
     return {
         "seconds": time.perf_counter() - began,
         "compiling_seconds": compiling.seconds(),
-        **{each: getattr(chance, each) for each in ACTING},
+        **{each: getattr(chance, each) for each in CHANCE_OPTIONS},
         "tolerance": tolerance,
         "num_states": mdp.num_states,
         "num_actions": mdp.num_actions,
@@ -279,8 +279,8 @@ def save(path: Path, solution: "Solution") -> None:
 # Evaluate -------------------------------------------------------------------------------------------------------------
 
 
-POLICIES = ("optimal", "uniform", "worst")
-ACTING = ("sticky", "random", "lazy")
+NAMED_POLICIES = ("optimal", "uniform", "worst")
+CHANCE_OPTIONS = ("sticky", "random", "lazy")
 
 
 @dataclass(frozen=True)
@@ -319,14 +319,14 @@ def evaluate(
     """
     from pharos.regret import ReferenceValues, regret
 
-    decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
+    decisions = None if policy in NAMED_POLICIES else read_policy(policy, trust=trust)
     source, of_command = "given", (gamma, horizon)
     if decisions is not None and decisions.task is not None:
-        own, names = decisions.task, ("gamma", "horizon", *ACTING)
+        own, names = decisions.task, ("gamma", "horizon", *CHANCE_OPTIONS)
         overridden = {name for name in names if context.get_parameter_source(name).name == "COMMANDLINE"}  # type: ignore[union-attr]
         gamma = gamma if "gamma" in overridden else own.gamma
         horizon = horizon if "horizon" in overridden else own.horizon_steps
-        chance = replace(chance, **{name: getattr(own.chance, name) for name in {*ACTING} - overridden})
+        chance = replace(chance, **{name: getattr(own.chance, name) for name in {*CHANCE_OPTIONS} - overridden})
         source = "the run's own" if not overridden else f"the run's own, but for {', '.join(sorted(overridden))}"
     goal = target
     if goal.is_imported and Path(policy).expanduser().is_dir():  # what was learnt on the environment of the table
@@ -337,7 +337,7 @@ def evaluate(
     if objective == "average":
         return averaged(goal, mdp, policy, decisions, tolerance, chance, source)
     with progress_line("evaluating"):
-        values = {name: _worth_of_named(mdp, name, tolerance) for name in POLICIES}
+        values = {name: _worth_of_named(mdp, name, tolerance) for name in NAMED_POLICIES}
         if decisions is None:
             worth = values[policy]
         elif _sees_frames(goal, decisions):
@@ -346,9 +346,9 @@ def evaluate(
             worth = _worth_of_given(goal, mdp, decisions, chance, tolerance)
     is_network = decisions is not None and "observation" in decisions.observer_options
     rounding = ", for the probabilities that its network computes in 32 bits" if is_network else ""
-    best, uniform, worst = (values[name].value for name in POLICIES)
+    best, uniform, worst = (values[name].value for name in NAMED_POLICIES)
     every = [*values.values(), worth]
-    reference = ReferenceValues(best, uniform, worst, max(values[name].error_bound for name in POLICIES))
+    reference = ReferenceValues(best, uniform, worst, max(values[name].error_bound for name in NAMED_POLICIES))
     lost, relative, against_worst = (
         regret(worth.value, reference, normalized_by=name) for name in (None, "uniform", "worst")
     )
@@ -367,7 +367,7 @@ def evaluate(
         "seconds": sum(each.seconds for each in every),
         "gamma": mdp.gamma,
         "horizon": mdp.horizon,
-        **{name: getattr(chance, name) for name in ACTING},
+        **{name: getattr(chance, name) for name in CHANCE_OPTIONS},
         "setting": source,
         "policy_dtype": "float32" if is_network else None,
     }
@@ -416,7 +416,7 @@ def averaged(
         "uniform_gain_at_start": uniform.gain._asdict(),
         "worst_gain_at_start": worst.gain._asdict(),
         "seconds": time.perf_counter() - began,
-        **{name: getattr(chance, name) for name in ACTING},
+        **{name: getattr(chance, name) for name in CHANCE_OPTIONS},
         "setting": source,
     }
     facts = [
@@ -532,7 +532,7 @@ def read_policy(name: str, *, trust: bool = False) -> Given:
             return Given(agent, {}, task)
         return Given(agent, {"observation": task.observation, "observation_options": task.observation_options}, task)
     if path.suffix.lower() not in (".npy", ".npz"):
-        raise UnknownName("policy", name, [*POLICIES, "FILE.npy", "RUN_DIR"])
+        raise UnknownName("policy", name, [*NAMED_POLICIES, "FILE.npy", "RUN_DIR"])
     if not path.is_file():
         raise ParameterError(f"--policy {name}: no such file")
     try:

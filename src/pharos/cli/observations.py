@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 MOST_SOLVED = 5_000_000
 
 # What is counted when nothing is asked for
-COUNTED: tuple[tuple[str, dict[str, Any]], ...] = (
+COUNTED_OBSERVATIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("vector", {}),
     ("one_hot", {}),
     ("index", {}),
@@ -51,7 +51,7 @@ def observations(
     """
     if option and not observation:
         raise ParameterError("--option goes with --observation NAME")
-    choices = tuple((name, dict(option)) for name in observation) if observation else COUNTED
+    choices = tuple((name, dict(option)) for name in observation) if observation else COUNTED_OBSERVATIONS
     space = target.space(building)
     env = space.environment
     if env is None:

@@ -12,7 +12,7 @@ import typer
 
 from pharos.cli.answers import Answer, complain, print_json, progress_line
 from pharos.cli.command import Commands
-from pharos.cli.evaluate import POLICIES, read_policy, solution_of
+from pharos.cli.evaluate import NAMED_POLICIES, read_policy, solution_of
 from pharos.cli.options import (
     Building,
     Chance,
@@ -75,12 +75,12 @@ def value(
         raise ParameterError(f"--over is {over!r}; expected two variables, such as row,column")
     rest: Literal["start"] | None = "start" if "start" in (fix or ()) else None
     fixed = parse_parameters([text for text in fix or () if text != "start"])
-    decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
+    decisions = None if policy in NAMED_POLICIES else read_policy(policy, trust=trust)
     mdp = target.mdp(gamma=gamma, horizon=horizon, chance=chance)
     from pharos import plots
 
     solution = solution_of(mdp, policy, decisions, 1e-6)
-    title = f"{target.title}, {policy if policy in POLICIES else Path(policy).name}"
+    title = f"{target.title}, {policy if policy in NAMED_POLICIES else Path(policy).name}"
     if chance:
         title += f", {chance.in_words()}"
     facts = {"policy": policy, "value_at_start": solution.value_at_start, "gamma": mdp.gamma, "horizon": mdp.horizon}

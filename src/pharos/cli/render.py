@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pharos.environments import Environment, State
 
 
-POLICIES = ("auto", "optimal", "uniform")
+PLAYED_POLICIES = ("auto", "optimal", "uniform")
 AUTOMATIC_STATES = 20_000_000  # "auto" solves what is not larger
 
 
@@ -62,8 +62,8 @@ def render(
     suffix = out.suffix.lower() if out else ""
     if observation != "text" and observation not in (renderers := observations.renderers()):
         raise UnknownName("observation to render", observation, [*renderers, "text"])
-    if policy not in POLICIES:
-        raise UnknownName("policy", policy, POLICIES)
+    if policy not in PLAYED_POLICIES:
+        raise UnknownName("policy", policy, PLAYED_POLICIES)
     env = target.found_environment()
     start = find_state(target, env, state)
     if steps is None:
@@ -162,7 +162,7 @@ def _optimal(target: Target, gamma: float, max_states: int | None) -> Callable[[
 
 ESCAPES = {"[A": "up", "[B": "down", "[C": "right", "[D": "left", "OA": "up", "OB": "down", "OC": "right", "OD": "left"}
 SIGNS = {"up": "↑", "left": "←", "down": "↓", "right": "→", "space": "space"}
-QUIT, AGAIN, BACK = "q", "r", "u"
+QUIT, NEW_GAME, UNDO = "q", "r", "u"
 
 
 def play(target: Target, *, state: str | None = None, seed: Seed | None = None) -> Answer:
@@ -216,9 +216,9 @@ class Game:
 
     def press(self, key: str) -> None:
         """Execute the command of a key: an action, AGAIN (restart), BACK (undo one step); other keys do nothing."""
-        if key == AGAIN:
+        if key == NEW_GAME:
             self.state, self.history = self.start, []
-        elif key == BACK and self.history:
+        elif key == UNDO and self.history:
             self.state = self.history.pop()[0]
         elif key in self.keys and not self.over:
             action = self.keys[key]
@@ -247,7 +247,7 @@ def _picture(game: Game) -> "RenderableType":
     for key, action in game.keys.items():
         names.setdefault(action, []).append(SIGNS.get(key, key))
     does = [f"{'/'.join(sorted(shown, key=len))} {game.env.actions[action]}" for action, shown in names.items()]
-    help_line = Text("   ".join([*does, f"{BACK} undo", f"{AGAIN} restart", f"{QUIT} quit"]), style="dim")
+    help_line = Text("   ".join([*does, f"{UNDO} undo", f"{NEW_GAME} restart", f"{QUIT} quit"]), style="dim")
     return Group(line, Text(), colored_text(game.env, game.state), Text(), help_line)
 
 

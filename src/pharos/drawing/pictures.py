@@ -94,8 +94,11 @@ def check_state(env: Environment, state: Sequence[int]) -> None:
 # Pictures -------------------------------------------------------------------------------------------------------------
 
 
-HEIGHT, WIDTH = 720, 960  # pixels that a picture takes at most, if its cells are not smaller than CELLS[0] for it
-CELLS = (8, 16, 24, 32, 40, 48, 64)  # pixels of a cell; multiples of 8, so that sprites of 8 x 8 stay sharp
+PICTURE_HEIGHT, PICTURE_WIDTH = (
+    720,
+    960,
+)  # most pixels of a picture, unless its cells would be below CELL_SIZES[0]
+CELL_SIZES = (8, 16, 24, 32, 40, 48, 64)  # pixels of a cell; multiples of 8, so that sprites of 8 x 8 stay sharp
 LEAST_PICTURE = 400  # pixels of the longer side of a picture that a class has of its own
 NIGHT, INK = (16, 18, 24), (226, 228, 232)
 
@@ -112,7 +115,7 @@ def human(env: Environment, state: Sequence[int], *, cell: int | None = None) ->
     planes = planes_of(env, state)
     if (own := env.picture(state)) is not None:
         return enlarged(own, LEAST_PICTURE)
-    cell = cell or fitting_cell(planes.shape[1], planes.shape[2], HEIGHT, WIDTH)
+    cell = cell or fitting_cell(planes.shape[1], planes.shape[2], PICTURE_HEIGHT, PICTURE_WIDTH)
     canvas = empty_grid(env, cell)
     court = without_margin(canvas, (cell // 2,) * 4)
     for plane, (name, layer) in zip(planes, env.layers.items(), strict=True):
@@ -193,9 +196,9 @@ def enlarged(picture: np.ndarray, at_least: int) -> np.ndarray:
 
 
 def fitting_cell(rows: int, columns: int, height: int, width: int) -> int:
-    """Pixels of a cell, the most with which a grid and its margins fit; CELLS[0] if none does."""
-    fits = [cell for cell in CELLS if (rows + 1) * cell <= height and (columns + 1) * cell <= width]
-    return fits[-1] if fits else CELLS[0]
+    """Pixels of a cell, the most with which a grid and its margins fit; CELL_SIZES[0] if none does."""
+    fits = [cell for cell in CELL_SIZES if (rows + 1) * cell <= height and (columns + 1) * cell <= width]
+    return fits[-1] if fits else CELL_SIZES[0]
 
 
 # Episodes -------------------------------------------------------------------------------------------------------------
@@ -301,7 +304,7 @@ def _ice(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
 # Of complex images ----------------------------------------------------------------------------------------------------
 
 ASPHALT, PAVEMENT, KERB, WHITE, YELLOW = (142, 142, 142), (170, 170, 170), (96, 96, 96), (214, 214, 214), (210, 210, 64)
-WALL = (142, 142, 142)
+WALL_COLOR = (142, 142, 142)
 
 
 def _asphalt(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
@@ -324,7 +327,7 @@ def _asphalt(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None
 def _walls(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     """A black court inside grey walls, open at the bottom."""
     top, right, _, left = margin
-    picture[:] = WALL
+    picture[:] = WALL_COLOR
     picture[top:, left : picture.shape[1] - right] = 0
 
 

@@ -20,7 +20,7 @@ from pharos.system import mdp_files, sources
 from pharos.system.sources import Source
 
 _CLASS_NAMES = {entry.name: entry.class_name for entry in BUILT_IN}
-_MODULES = {entry.name: entry.file for entry in BUILT_IN}
+_FILES_BY_NAME = {entry.name: entry.file for entry in BUILT_IN}
 _IMPORTED = {"imported": "ImportedWorld"}  # named by its folder, so it stands in no list
 _OWN = _CLASS_NAMES | _IMPORTED
 _REGISTERED: dict[str, type[Environment]] = {}
@@ -85,7 +85,7 @@ def classes() -> dict[str, type[Environment]]:
 
 
 def _built_in(name: str) -> type[Environment]:
-    return getattr(importlib.import_module(f"pharos.environments.{_MODULES.get(name, name)}"), _OWN[name])
+    return getattr(importlib.import_module(f"pharos.environments.{_FILES_BY_NAME.get(name, name)}"), _OWN[name])
 
 
 def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:

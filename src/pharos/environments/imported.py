@@ -17,8 +17,8 @@ from pharos.system.arrays import OutcomeRows, rounding_of_sums
 from pharos.system.distinct_rows import DistinctRows
 
 TIME_LIMIT = 1000  # of an MDP that has no horizon, and whose source has no limit
-MOST_ENTRIES = 1 << 28  # of a table of outcomes, written out
-DIGITS = (
+MOST_TABLE_ENTRIES = 1 << 28  # of a table of outcomes, written out
+DIGIT_SPRITES = (
     ("###", "#.#", "#.#", "#.#", "###"),
     (".#.", "##.", ".#.", ".#.", "###"),
     ("###", "..#", "###", "#..", "###"),
@@ -50,7 +50,7 @@ class ImportedWorld(Environment):
     version = 1
     numbered_by = ("state",)
     is_filled = True
-    layers = {"digit": Layer(tuple("0123456789"), (226, 228, 232), sprite=DIGITS)}
+    layers = {"digit": Layer(tuple("0123456789"), (226, 228, 232), sprite=DIGIT_SPRITES)}
 
     def validate(self) -> None:
         if not isinstance(self.folder, str) or not self.folder:
@@ -66,12 +66,12 @@ class ImportedWorld(Environment):
         for entry, is_optional in (("num_states", 0), ("num_actions", 0), ("horizon", 1), ("time_limit", 1)):
             value = self.manifest.get(entry)
             if not (is_optional and value is None) and (type(value) is not int or value < 1):
-                raise FileFormatError(f"{self.folder}: {entry} is {value!r}; expected an integer; {mdp_files.AGAIN}")
+                raise FileFormatError(f"{self.folder}: {entry} is {value!r}; expected an integer; {mdp_files.REIMPORT}")
         names = self.manifest.get("actions")
         if names is not None and not (
             isinstance(names, list) and len(names) == self.manifest["num_actions"] and all(map(is_name, names))
         ):
-            raise FileFormatError(f"{self.folder}: actions are {names!r}; expected their names; {mdp_files.AGAIN}")
+            raise FileFormatError(f"{self.folder}: actions are {names!r}; expected their names; {mdp_files.REIMPORT}")
 
     @cached_property
     def manifest(self) -> Mapping[str, Any]:
@@ -99,7 +99,7 @@ class ImportedWorld(Environment):
             knows_outcomes = set(mdp_files.PAID) <= set(self.manifest["arrays"])
             return probabilities, rewards + (0.0 if knows_outcomes else mdp_files.rounding_of(self.manifest))
         except ValueError as error:
-            raise FileFormatError(f"{self.folder}: {error}; {mdp_files.AGAIN}") from None
+            raise FileFormatError(f"{self.folder}: {error}; {mdp_files.REIMPORT}") from None
 
     @property
     def outcomes(self) -> int:  # type: ignore[override]
@@ -146,7 +146,7 @@ class ImportedWorld(Environment):
 
         Codes of a grid are shown as colours.
         """
-        kind, shown = self.manifest.get(mdp_files.OBSERVATIONS), self.recorded
+        kind, shown = self.manifest.get(mdp_files.SHOWN_NAME), self.recorded
         if kind not in ("image", "grid") or shown is None or shown.ndim != 4 or shown.shape[-1] != 3:
             return None
         if kind == "image":
@@ -226,7 +226,9 @@ class ImportedWorld(Environment):
         try:
             return mdp_files.read_arrays(self.folder, self.manifest)
         except (KeyError, ValueError) as error:
-            raise FileFormatError(f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.AGAIN}") from None
+            raise FileFormatError(
+                f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.REIMPORT}"
+            ) from None
 
     @cached_property
     def _table(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -234,7 +236,9 @@ class ImportedWorld(Environment):
         try:
             table = written_out(*table_outcomes(self._arrays, states, actions), states, actions, self._paid)
         except (ValueError, IndexError, TypeError, OverflowError) as error:
-            raise FileFormatError(f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.AGAIN}") from None
+            raise FileFormatError(
+                f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.REIMPORT}"
+            ) from None
         return table
 
     @property
@@ -261,7 +265,7 @@ def table_outcomes(
     if mdp_files.TABLE[0] in arrays:
         successors = arrays[mdp_files.TABLE[0]].reshape(number)
         return np.arange(number), successors, np.ones(number)
-    if mdp_files.OUTCOMES[0] in arrays:
+    if mdp_files.OUTCOME_ARRAYS[0] in arrays:
         stored = OutcomeRows(**{name: array for name, array in arrays.items() if name in OutcomeRows.NAMES})
         return stored.possible(np.arange(number))
     data, indices, indptr = (arrays[name] for name in mdp_files.MATRIX)
@@ -299,10 +303,10 @@ def written_out(
     counts = np.bincount(rows, minlength=states * actions)
     has_end = bool((successors == -1).any())
     most, count = int(counts.max()), states + has_end
-    if count * actions * most > MOST_ENTRIES:
+    if count * actions * most > MOST_TABLE_ENTRIES:
         raise ParameterError(
             f"the table has {count:,} states, {actions} actions and up to {most:,} outcomes of each; expected at most "
-            f"{MOST_ENTRIES:,} numbers in all: it can be solved and measured, but not stepped"
+            f"{MOST_TABLE_ENTRIES:,} numbers in all: it can be solved and measured, but not stepped"
         )
     # Tables with K columns, filled up with probability 0
     index = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)

@@ -84,9 +84,9 @@ class DiscountedVisits:
 
 
 LONGEST_PATH = 2_000  # steps that are shown
-MOST_STARTS = 100  # start states that are listed
+MOST_LISTED_STARTS = 100  # start states that are listed
 LISTED = 48  # states of a layer that are listed at a time
-WORST = 24  # states that are listed where a policy goes wrong
+MOST_WORST_STATES = 24  # states that are listed where a policy goes wrong
 ERRORS_PER_TIE = 2.5  # the gap of a tie is at most this times the bound on errors of values, see hardness.gaps
 
 
@@ -396,7 +396,7 @@ class Exploration:
         steps = self.path(policy, start)["steps"]
         number_of = next((i for i, step in enumerate(steps) if step[-1] > self.tie_tolerance), None)
         lost, visits, actions = self.visits.losses(policy)
-        worst = np.argsort(-lost, kind="stable")[:WORST]
+        worst = np.argsort(-lost, kind="stable")[:MOST_WORST_STATES]
         worst = worst[lost[worst] > self.tie_tolerance * 1e-3]
         best, value = (self.solutions[name].value_at_start for name in (OPTIMAL, policy))
         return {
@@ -412,7 +412,7 @@ class Exploration:
         """Page metadata: title, sizes, policies, map axes."""
         from pharos.explorer.pages import about_maps
 
-        mdp, starts = self.mdp, np.argsort(-self.mdp.start_probabilities, kind="stable")[:MOST_STARTS]
+        mdp, starts = self.mdp, np.argsort(-self.mdp.start_probabilities, kind="stable")[:MOST_LISTED_STARTS]
         return {
             "title": self.title,
             "num_states": mdp.num_states,
@@ -449,7 +449,7 @@ def float_or_none(value: float | np.floating) -> float | None:
 # Picture --------------------------------------------------------------------------------------------------------------
 
 
-LONGEST = 720  # pixels of the longer side of a drawing, if cells are not the smallest for it
+LONGEST_SIDE = 720  # pixels of the longer side of a drawing, if cells are not the smallest for it
 
 
 def _states_of(mdp: TabularMDP, space: StateSpace | None) -> States:
@@ -505,7 +505,7 @@ def kit_of(env: Environment) -> dict[str, Any]:
         `layers`, their names.
     """
     rows, columns = env.grid()
-    cell = fitting_cell(rows, columns, LONGEST, LONGEST)
+    cell = fitting_cell(rows, columns, LONGEST_SIDE, LONGEST_SIDE)
     tiles = [
         [url_of(tile(name, layer, value + 1, cell) * (1, 1, 1, 255)) for value in range(num_values(layer))]
         for name, layer in env.layers.items()

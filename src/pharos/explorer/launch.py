@@ -33,9 +33,9 @@ from pharos.state_space import StateSpace, build, load
 from pharos.training import ChanceSetting, Task, load_agent, read_record
 
 HOST = "127.0.0.1"
-NAMES = (HOST, "localhost")  # that a Host header may have
+HOST_NAMES = (HOST, "localhost")  # that a Host header may have
 LONGEST_QUERY = 8192  # characters
-SECONDS = 30  # of waiting for the next bytes of a request
+REQUEST_SECONDS = 30  # of waiting for the next bytes of a request
 FREE_SECONDS = 5  # of waiting for the place of a connection that was ended
 MOST_CONNECTIONS = 64  # at once; a thread each
 
@@ -66,7 +66,7 @@ class Explorer:
         self._http.owner = self
         self.port = int(self._http.server_address[1])
         self.url = f"http://{HOST}:{self.port}/{self.token}/"
-        self.hosts = frozenset(f"{name}:{self.port}" for name in NAMES)
+        self.hosts = frozenset(f"{name}:{self.port}" for name in HOST_NAMES)
         self._page = explorer_page(exploration).encode()
         self._thread = threading.Thread(
             target=self._http.serve_forever, args=(0.2,), name="pharos explorer", daemon=True
@@ -188,7 +188,7 @@ class _Http(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    timeout = SECONDS
+    timeout = REQUEST_SECONDS
     server: _Http
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "pharos", ""
@@ -262,7 +262,7 @@ class _Handler(BaseHTTPRequestHandler):
 # Launch ---------------------------------------------------------------------------------------------------------------
 
 
-RECORD = "run.json"
+RUN_RECORD = "run.json"
 GAMMA = 0.99
 """The discount, where none is given: values of states need one, as they belong to no number of steps to go."""
 
@@ -329,7 +329,7 @@ def exploration_of(
         in_one_page: whether it is for a page of its own; what is too large for that is refused before it is solved.
     """
     chance = chance or ChanceSetting()
-    if isinstance(target, str | os.PathLike) and (Path(target) / RECORD).is_file():
+    if isinstance(target, str | os.PathLike) and (Path(target) / RUN_RECORD).is_file():
         return _of_run(Path(target), learnt, gamma, chance, trust, title, progress)
     title = title or (target if isinstance(target, str) else "")
     if isinstance(target, str) and (class_called(target.partition("/")[0]) or not Path(target).exists()):

@@ -28,9 +28,9 @@ from pharos.mdp import TabularMDP
 from pharos.state_space import build
 from pharos.system import storage
 
-BLOCK = 1 << 18  # states that are looked at in one go
-MEAN, LEAST, MOST, SUM = "mean", "least", "most", "sum"
-HOW = (MEAN, LEAST, MOST, SUM)
+STATES_AT_ONCE = 1 << 18  # states that are looked at in one go
+MEAN, LEAST_VALUE, MOST_VALUE, SUM = "mean", "least", "most", "sum"
+HOW = (MEAN, LEAST_VALUE, MOST_VALUE, SUM)
 GROUPS = {"column", "x"}, {"row", "y"}  # words in the names of variables that are drawn first, across and down
 
 
@@ -103,8 +103,8 @@ def heat_map(
     across, down = axes[x], axes[y]
     slices = {names.index(name): value for name, value in fixed.items()}
     cells = _Cells(down.count, across.count)
-    for start in range(0, world.mdp.num_states, BLOCK):
-        block = slice(start, min(start + BLOCK, world.mdp.num_states))
+    for start in range(0, world.mdp.num_states, STATES_AT_ONCE):
+        block = slice(start, min(start + STATES_AT_ONCE, world.mdp.num_states))
         states = np.flatnonzero(world.states.matching(slices, block))
         if not states.size:
             continue
@@ -142,7 +142,7 @@ class _Cells:
             shown = np.where(self.least == self.most, self.least, -1.0)
         else:
             means = self.sum / np.maximum(self.known, 1)
-            shown = {MEAN: means, LEAST: self.least, MOST: self.most, SUM: self.sum}[how]
+            shown = {MEAN: means, LEAST_VALUE: self.least, MOST_VALUE: self.most, SUM: self.sum}[how]
         listed = [float_or_none(value) if there else None for value, there in zip(shown, is_known, strict=True)]
         numbers = shown[is_known]
         return {
@@ -184,9 +184,9 @@ def _first_axes(axes: Mapping[str, Axis]) -> list[str]:
 
 MOST_POSITIONS = 10_000  # states, under sticky actions times previous ones, that a page of its own holds
 MOST_BYTES = 64 << 20  # of such a page
-TRIES = 6  # named instances that are built to find one that fits
+MOST_INSTANCES = 6  # named instances that are built to find one that fits
 SCRIPTS = ("source.js", "drawing.js", "maps.js", "panels.js", "main.js")
-DIGITS = 12  # significant ones of a number in a page of its own
+SIGNIFICANT_DIGITS = 12  # significant ones of a number in a page of its own
 
 
 @cache
@@ -267,10 +267,10 @@ def check_page_size(mdp: TabularMDP, title: str, env: Environment | None = None)
 def smaller_instance(env: Environment, most: int) -> str:
     """Instance of the same class with at most `most` states, in words: `frozen_lake/8x8 has 64`; empty without one.
 
-    The largest of the first TRIES named instances; else the same environment with one whole-number parameter as much
-    smaller as needed, by bisection. Cost: builds of at most `most` states.
+    The largest of the first MOST_INSTANCES named instances; else the same environment with one whole-number parameter
+    as much smaller as needed, by bisection. Cost: builds of at most `most` states.
     """
-    named = [f"{env.name}/{name}" for name in type(env).instances][:TRIES]
+    named = [f"{env.name}/{name}" for name in type(env).instances][:MOST_INSTANCES]
     sizes = {name: size for name in named if (size := _num_states(partial(make, name), most))}
     if sizes:
         name = max(sizes, key=sizes.__getitem__)
@@ -322,4 +322,4 @@ def _shortened(data: object) -> Any:
         return {name: _shortened(value) for name, value in data.items()}
     if isinstance(data, list | tuple):
         return [_shortened(value) for value in data]
-    return float(f"{data:.{DIGITS}g}") if isinstance(data, float) else data
+    return float(f"{data:.{SIGNIFICANT_DIGITS}g}") if isinstance(data, float) else data

@@ -18,8 +18,8 @@ from pharos.policies import Observer, PolicyAnswers, PolicyLike, TabularAgent, e
 from pharos.solvers import Solution
 from pharos.state_space import StateSpace
 
-MOST = 128  # intervals of an axis
-ROW = 24  # values of an only variable that make one row
+MOST_AXIS_CELLS = 128  # intervals of an axis
+ROW_CELLS = 24  # values of an only variable that make one row
 
 
 class States(Protocol):
@@ -175,23 +175,23 @@ def axes_of(states: States) -> dict[str, Axis]:
 
 def _folded(name: str, low: int, size: int) -> tuple[Axis, Axis]:
     """The axes across and down of the only variable."""
-    if size <= ROW:
+    if size <= ROW_CELLS:
         return Axis(name, 0, low, low, size), Axis("all", 0, low, 0, 1, 1, size)
-    side = min(MOST, math.ceil(math.sqrt(size)))
+    side = min(MOST_AXIS_CELLS, math.ceil(math.sqrt(size)))
     rows = Axis(f"{name} div {side}", 0, low, 0, *_intervals(-(-size // side)), side)
     return Axis(f"{name} mod {side}", 0, low, 0, side, 1, 1, side), rows
 
 
 def _intervals(size: int) -> tuple[int, int]:
     """(number of intervals, values in each)."""
-    width = -(-size // MOST)
+    width = -(-size // MOST_AXIS_CELLS)
     return -(-size // width), width
 
 
 # Layers ---------------------------------------------------------------------------------------------------------------
 
 
-BLOCK = 1 << 16  # states whose successors are looked at in one go
+STATES_PER_BLOCK = 1 << 16  # states whose successors are looked at in one go
 BARS = 200  # of the drawing of all layers
 
 
@@ -253,8 +253,8 @@ def _ends(dynamics: Dynamics, num_starts: int) -> np.ndarray:
 def _largest_successors(dynamics: Dynamics) -> np.ndarray:
     result = np.empty(dynamics.num_states, np.int64)
     table = dynamics.deterministic_table()
-    for start in range(0, dynamics.num_states, BLOCK):
-        states = np.arange(start, min(start + BLOCK, dynamics.num_states))
+    for start in range(0, dynamics.num_states, STATES_PER_BLOCK):
+        states = np.arange(start, min(start + STATES_PER_BLOCK, dynamics.num_states))
         if table is not None:
             result[states] = table[start : states[-1] + 1].max(axis=1)
             continue

@@ -21,9 +21,9 @@ import numpy.typing as npt
 
 from pharos.errors import RuleError
 
-MOST_DRAWS = 200
+MOST_PATH_DRAWS = 200
 """Draws with several outcomes in one step; more are taken for a rejection that never ends."""
-MOST_OUTCOMES = 3_000
+MOST_DRAW_OUTCOMES = 3_000
 """Ways in which the draws of one step may come out."""
 HIDDEN = ("pharos/importers/", "/numpy/", "site-packages/jax/", "<frozen", "<string>", "/random.py", "/functools.py")
 """Parts of the paths of files that are no code of an environment."""
@@ -62,7 +62,7 @@ class DrawTree:
         refusal: of the last draw that was refused, which the environment's code may have caught.
     """
 
-    def __init__(self, most: int = MOST_OUTCOMES):
+    def __init__(self, most: int = MOST_DRAW_OUTCOMES):
         self.most = most
         self.probability = ONE
         self.sampler: python_random.Random | None = None
@@ -125,9 +125,11 @@ class DrawTree:
             return live[0]
         if self.sampler is not None:
             return self.sampler.choices(live, [float(weights[i]) for i in live])[0]
-        if self._depth >= MOST_DRAWS:
+        if self._depth >= MOST_PATH_DRAWS:
             raise self.refused(
-                placed(f"more than {MOST_DRAWS} draws in one step: rejection sampling, which may never end", here())
+                placed(
+                    f"more than {MOST_PATH_DRAWS} draws in one step: rejection sampling, which may never end", here()
+                )
                 + "; start from one layout with a seed (--seed 0), or draw among what is accepted"
             )
         if self._depth == len(self._choices):

@@ -15,14 +15,14 @@ from pharos.mdp import Names, OutcomeTable, Residual, TabularMDP, checked_sets, 
 from pharos.system import distinct_rows, mdp_files, storage
 from pharos.system.distinct_rows import DistinctRows
 from pharos.system.mdp_files import (
-    AGAIN,
-    COMMON,
-    FORMAT,
-    MANIFEST,
+    COMMON_ARRAYS,
     MATRIX,
-    OBSERVATIONS,
-    OUTCOMES,
+    MDP_FORMAT,
+    MDP_MANIFEST,
+    OUTCOME_ARRAYS,
     PAID,
+    REIMPORT,
+    SHOWN_NAME,
     TABLE,
     is_folder,
 )
@@ -42,10 +42,10 @@ class ImportedOutcomes(NamedTuple):
     rewards: np.ndarray
 
 
-IMAGE, GRID, VECTOR = "image", "grid", "vector"
+IMAGE_OBSERVATION, GRID_OBSERVATION, VECTOR_OBSERVATION = "image", "grid", "vector"
 BUILDING = ".building"
 """Folder, within that of an MDP, of what an import that is not finished has so far."""
-OBSERVED = {IMAGE: 4, GRID: 4, VECTOR: 2}
+OBSERVED = {IMAGE_OBSERVATION: 4, GRID_OBSERVATION: 4, VECTOR_OBSERVATION: 2}
 """Kinds of observations that a source may show -> dimensions of their array."""
 FOREIGN = ": is not empty and holds no imported MDP; choose another folder"
 
@@ -98,14 +98,14 @@ def save(
         if _is_foreign(folder):
             raise ParameterError(f"{folder}{FOREIGN}")
         if not is_folder(folder):  # a mark, so that a killed import is repeated there
-            storage.replace_json(folder / MANIFEST, {"format": FORMAT, "format_version": "unfinished"})
+            storage.replace_json(folder / MDP_MANIFEST, {"format": MDP_FORMAT, "format_version": "unfinished"})
         checksums = _written(folder, arrays)
-        stored = {} if rows is None else {mdp_files.ROWS: mdp_files.write_rows(folder, rows)}
+        stored = {} if rows is None else {mdp_files.ROWS_NAME: mdp_files.write_rows(folder, rows)}
         names, name_arrays = _names_of(mdp)
         if names:
-            description[mdp_files.NAMES] = {**names, "arrays": _written(folder, name_arrays)}
+            description[mdp_files.NAMES_NAME] = {**names, "arrays": _written(folder, name_arrays)}
         manifest = {
-            "format": FORMAT,
+            "format": MDP_FORMAT,
             "format_version": version,
             "source": source,
             "num_states": mdp.num_states,
@@ -115,10 +115,10 @@ def save(
             "arrays": checksums,
             **description,
             **stored,
-            **({mdp_files.RESIDUAL: list(mdp.residual)} if any(mdp.residual) else {}),
-            **({mdp_files.ROUNDING: mdp.reward_table.rounding} if mdp.reward_table.rounding else {}),
+            **({mdp_files.RESIDUAL_NAME: list(mdp.residual)} if any(mdp.residual) else {}),
+            **({mdp_files.ROUNDING_NAME: mdp.reward_table.rounding} if mdp.reward_table.rounding else {}),
         }
-        storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
+        storage.replace_json(folder / MDP_MANIFEST, storage.sealed(manifest))
         (folder / storage.LOCK).unlink()  # whoever waits for it replaces what is whole
     return folder
 
@@ -232,14 +232,14 @@ def _description(
     if time_limit is not None:
         description["time_limit"] = whole_number(time_limit, "time_limit", "a number of steps of at least 1")
     if shown is not None:
-        kind = observed or (IMAGE if shown.ndim == 4 else VECTOR)
+        kind = observed or (IMAGE_OBSERVATION if shown.ndim == 4 else VECTOR_OBSERVATION)
         fits = kind in OBSERVED and shown.ndim == OBSERVED[kind] and len(shown) == mdp.num_states and all(shown.shape)
-        if not fits or (shown.dtype.kind not in "biuf" if kind == VECTOR else shown.dtype != np.uint8):
+        if not fits or (shown.dtype.kind not in "biuf" if kind == VECTOR_OBSERVATION else shown.dtype != np.uint8):
             raise ParameterError(
                 f"observations have shape {shown.shape} and type {shown.dtype}; expected {mdp.num_states} images "
                 f"(S, H, W, 3) uint8, grids (S, columns, rows, C) uint8, or vectors (S, N)"
             )
-        description[OBSERVATIONS] = kind
+        description[SHOWN_NAME] = kind
     return description
 
 
@@ -267,7 +267,7 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
         digests = [storage.digest_of_bytes(np.ascontiguousarray(each).data) for each in name_arrays.values()]
         contents += [names, digests, mdp.names.actions]
     contents += [*mdp.residual] if any(mdp.residual) else []
-    contents += [mdp_files.ROUNDING, mdp.reward_table.rounding] if mdp.reward_table.rounding else []
+    contents += [mdp_files.ROUNDING_NAME, mdp.reward_table.rounding] if mdp.reward_table.rounding else []
     folder = imported / storage.digest_of_json(contents)
     return make("imported", folder=os.fspath(folder if is_folder(folder) else save(mdp, folder)))
 
@@ -307,7 +307,7 @@ def load(folder: str | os.PathLike) -> TabularMDP:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, MemoryError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise FileFormatError(f"{folder}: the imported MDP is damaged: {reason}; {AGAIN}") from None
+        raise FileFormatError(f"{folder}: the imported MDP is damaged: {reason}; {REIMPORT}") from None
     return replace(mdp, folder=folder, residual=residual, reward_table=rewards, names=names)
 
 
@@ -330,8 +330,8 @@ def _filled_mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
     options = {"gamma": manifest["gamma"], "horizon": manifest["horizon"], "initial": initial}
     if TABLE[0] in arrays:
         return TabularMDP.from_arrays(arrays[TABLE[0]], rewards, terminal=arrays["terminal"], **options)
-    if OUTCOMES[0] in arrays:
-        others = (*COMMON, *PAID, mdp_files.AVAILABLE)
+    if OUTCOME_ARRAYS[0] in arrays:
+        others = (*COMMON_ARRAYS, *PAID, mdp_files.AVAILABLE)
         parts = {name: array for name, array in arrays.items() if name not in others}
         dynamics = OutcomeTable(num_actions=rewards.shape[1], **parts)
         dynamics.check()

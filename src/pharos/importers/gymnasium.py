@@ -531,8 +531,8 @@ def matrices(
 # MiniGrid -------------------------------------------------------------------------------------------------------------
 
 
-MOST_STATES = 1_000_000
-DONE = 6  # the action that most tasks ignore
+MOST_MINIGRID_STATES = 1_000_000
+NO_OP = 6  # the action that most tasks ignore
 _NOT_STATE = frozenset(
     [
         "step_count",
@@ -561,7 +561,7 @@ def minigrid(
     actions: Sequence[int] | None = None,
     gamma: float = 1.0,
     horizon: int | None = MINIGRID_STEPS,
-    max_states: int = MOST_STATES,
+    max_states: int = MOST_MINIGRID_STATES,
     remember_carried: bool = False,
 ) -> TabularMDP:
     """Return the MDP of a MiniGrid environment, by stepping the environment from every state that can be reached.
@@ -611,7 +611,7 @@ def minigrid_recording(
         What is carried is not to be seen.
     """
     driver = _Driver(env, seed, remember_carried)
-    table, rewards = driver.explore(None, MOST_STATES)
+    table, rewards = driver.explore(None, MOST_MINIGRID_STATES)
     names = tuple(action.name for action in driver.env.actions)[: table.shape[1]]
     grids = np.stack([driver.image(state) for state in driver.snapshots])
     mdp = TabularMDP.from_arrays(table, rewards, gamma=1.0, horizon=horizon)
@@ -623,7 +623,7 @@ def minigrid_grids(
     *,
     seed: int = 0,
     actions: Sequence[int] | None = None,
-    max_states: int = MOST_STATES,
+    max_states: int = MOST_MINIGRID_STATES,
     remember_carried: bool = False,
 ) -> np.ndarray:
     """Return the observation of each state of `minigrid` with the same arguments, as in `minigrid_recording`.
@@ -676,7 +676,7 @@ class _Driver:
         if not actions or not set(actions) <= set(range(num_actions)) or len(set(actions)) < len(actions):
             raise ParameterError(f"actions are {actions}; expected different ones from 0 to {num_actions - 1}")
         try:
-            return self._explore(actions, max_states, drop_done=selection is None and num_actions == DONE + 1)
+            return self._explore(actions, max_states, drop_done=selection is None and num_actions == NO_OP + 1)
         finally:
             vars(self.env).pop("gen_obs", None)
 
@@ -709,8 +709,8 @@ class _Driver:
             reward_rows.append(pay)
         # Without the action `done` if it does nothing in any state
         table, rewards = np.array(rows, np.int64), np.array(reward_rows)
-        if drop_done and (table[:, DONE] == np.arange(len(table))).all() and (rewards[:, DONE] == 0).all():
-            table, rewards = table[:, :DONE], rewards[:, :DONE]
+        if drop_done and (table[:, NO_OP] == np.arange(len(table))).all() and (rewards[:, NO_OP] == 0).all():
+            table, rewards = table[:, :NO_OP], rewards[:, :NO_OP]
         return table, rewards
 
     def step(self, action: int, state: int) -> tuple[float, bool]:

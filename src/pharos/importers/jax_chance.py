@@ -23,11 +23,11 @@ from pharos.importers.chance import DrawError, here, placed
 
 Traced: TypeAlias = Any
 """An array of JAX or a tree of such, traced or not, or a number."""
-MOST_DRAWS = 64
+MOST_TRACED_DRAWS = 64
 """Draws of one step."""
-KEYS = ("key", "PRNGKey", "split", "fold_in", "clone", "key_data", "wrap_key_data", "key_impl")
+KEY_FUNCTIONS = ("key", "PRNGKey", "split", "fold_in", "clone", "key_data", "wrap_key_data", "key_impl")
 """Functions that draw nothing."""
-BITS = frozenset(["random_bits", "random_gamma", "threefry2x32", "rng_bit_generator", "rng_uniform"])
+BIT_DRAWS = frozenset(["random_bits", "random_gamma", "threefry2x32", "rng_bit_generator", "rng_uniform"])
 """Operations of draws that were not replaced."""
 
 
@@ -69,9 +69,9 @@ class TracedFunction:
                 return jax.tree.map(jnp.asarray, function(key, *rest)), tuple(tape.shares)
 
         with jax.disable_jit():  # what was compiled before would keep its draws
-            start = jax.random.key(0), jnp.zeros(MOST_DRAWS, jnp.int32)
+            start = jax.random.key(0), jnp.zeros(MOST_TRACED_DRAWS, jnp.int32)
             traced, shapes = jax.make_jaxpr(program, return_shape=True)(*start, *arguments)
-        if BITS & _operations(traced.jaxpr):
+        if BIT_DRAWS & _operations(traced.jaxpr):
             raise DrawError(f"{what} draws by other ways than the functions of jax.random, which cannot be followed")
         sizes = [draw.size for draw in tape.draws]
         if math.prod(sizes) > most:
@@ -80,7 +80,7 @@ class TracedFunction:
             advice = "; start from one state with a seed (--seed 0)" if what == "reset()" else ""
             raise DrawError(f"{what} has more than {most:,} outcomes ({words}){advice}")
         combinations = list(itertools.product(*map(range, sizes)))
-        self.tapes = np.zeros((len(combinations), MOST_DRAWS), np.int32)
+        self.tapes = np.zeros((len(combinations), MOST_TRACED_DRAWS), np.int32)
         self.tapes[:, : len(sizes)] = np.array(combinations, np.int32).reshape(len(combinations), len(sizes))
         self.weights = [
             math.prod(
@@ -124,8 +124,8 @@ class Tape:
     def one_of(self, name: str, key: Traced, weights: Sequence[Fraction] | Any) -> Traced:
         """Traced number of the outcome of a draw with these probabilities, fractions or a traced vector."""
         words = placed(f"{name}()", here())
-        if len(self.draws) == MOST_DRAWS:
-            raise DrawError(f"drew more than {MOST_DRAWS} times in one step, at last {words}")
+        if len(self.draws) == MOST_TRACED_DRAWS:
+            raise DrawError(f"drew more than {MOST_TRACED_DRAWS} times in one step, at last {words}")
         if any(type(each).__name__ == "BatchTracer" for each in (key, weights)):
             raise DrawError(f"drew {words} under jax.vmap, one draw for many; draw an array with shape=")
         value = self.values[len(self.draws)]
@@ -169,7 +169,7 @@ def _replaced(tape: Tape) -> Iterator[None]:
     draws: dict[str, Callable[..., Any]] = {name: globals()[f"_{name}"] for name in names}
     patches: list[tuple[Any, str, Any]] = [(jax.lax, "cond", _both), (jax.lax, "switch", _all_branches)]
     for name, original in vars(jax.random).items():
-        if name in KEYS:
+        if name in KEY_FUNCTIONS:
             patches.append((jax.random, name, _concretely(original)))
         elif not name.startswith("_") and callable(original) and not isinstance(original, type):
             patches.append((jax.random, name, _drawing(name, original, draws.get(name), tape)))

@@ -34,7 +34,7 @@ from pharos.importers.stepped_environment import (
 )
 from pharos.system.wording import capped
 
-OUTCOMES = 4_096
+OUTCOMES_AT_ONCE = 4_096
 """Outcomes that one call of the program computes, about."""
 MOST_AT_ONCE = 512
 WALKERS = 64
@@ -194,7 +194,7 @@ class JaxEnvironment:
             raise UnknownName(f"field of the states of {self.name}", name, names)
         tapes, actions = jnp.asarray(self._step.tapes), jnp.asarray(self.actions)
         each = len(tapes) * len(actions)
-        self.at_once = min(max(OUTCOMES // each, 4), MOST_AT_ONCE)
+        self.at_once = min(max(OUTCOMES_AT_ONCE // each, 4), MOST_AT_ONCE)
         mapped = jax.vmap(jax.vmap(jax.vmap(self._step.run, (0, None, None)), (None, None, 0)), (None, 0, None))
         self._program = jax.jit(lambda states: mapped(tapes, states, actions))
         self._single = jax.jit(self._step.run)

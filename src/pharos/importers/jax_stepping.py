@@ -8,10 +8,10 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from pharos.errors import MissingExtra, ParameterError
-from pharos.importers.chance import MOST_OUTCOMES
+from pharos.importers.chance import MOST_DRAW_OUTCOMES
 from pharos.importers.search import SteppedStates
 from pharos.importers.stepped_environment import Payment, SteppingOptions
-from pharos.importers.stepping import MOST_STATES, SteppingRun, StepRecording
+from pharos.importers.stepping import MOST_STEPPED_STATES, SteppingRun, StepRecording
 from pharos.mdp import TabularMDP, whole_number
 from pharos.system.wording import in_one_line
 
@@ -48,8 +48,8 @@ def jax_stepping(  # noqa: PLR0913  (options of one import)
     reward: Payment | None = None,
     gamma: float | None = None,
     horizon: int | None = None,
-    max_states: int = MOST_STATES,
-    max_outcomes: int = MOST_OUTCOMES,
+    max_states: int = MOST_STEPPED_STATES,
+    max_outcomes: int = MOST_DRAW_OUTCOMES,
     check: bool = True,
     progress: Callable[[SteppedStates, float, bool], None] | None = None,
 ) -> tuple[TabularMDP, StepRecording]:

@@ -22,9 +22,9 @@ from pharos.system import distinct_rows, storage
 from pharos.system.distinct_rows import DistinctRows, RowCollector
 from pharos.system.workers import end_cleanly, end_with_parent, without_main
 
-FORMAT, MANIFEST = "pharos layers", "manifest.json"
+LAYERS_FORMAT, LAYERS_MANIFEST = "pharos layers", "manifest.json"
 END = -1
-BLOCK = 16
+STATES_PER_JOB = 16
 """States that a process expands at a time."""
 LARGEST_STATE = 1 << 24
 
@@ -329,7 +329,7 @@ class Team:
 
     def expanded(self, task: LayerTask, states: Sequence[bytes]) -> Iterator[tuple[int, list[ConsoleStep]]]:
         """Yield (states done, steps) of the blocks of a layer, in order."""
-        blocks = [states[first : first + BLOCK] for first in range(0, len(states), BLOCK)]
+        blocks = [states[first : first + STATES_PER_JOB] for first in range(0, len(states), STATES_PER_JOB)]
         done = 0
         for block, steps in zip(blocks, self._steps(task, blocks), strict=True):
             done += len(block)
@@ -373,11 +373,11 @@ class KeptLayers:
 
     def restore(self, search: LayerSearch, most: int) -> None:
         """Put the layers that lie there, at most so many, into a new search, up to the first damaged one."""
-        path = self.folder / MANIFEST
+        path = self.folder / LAYERS_MANIFEST
         if not path.exists():
             return
         manifest = storage.read_json(path)
-        if not isinstance(manifest, dict) or manifest.get("format") != FORMAT or not storage.is_intact(manifest):
+        if not isinstance(manifest, dict) or manifest.get("format") != LAYERS_FORMAT or not storage.is_intact(manifest):
             return
         if manifest["identity"] != self.identity:
             before, now = manifest["identity"], self.identity
@@ -442,8 +442,8 @@ class KeptLayers:
             np.savez(target, allow_pickle=False, **arrays)
         self._written = len(search.collector.chunks)
         self.digests = [*self.digests[:depth], storage.digest_of_file(file)]
-        manifest = {"format": FORMAT, "identity": self.identity, "layers": self.digests}
-        storage.replace_json(self.folder / MANIFEST, storage.sealed(manifest))
+        manifest = {"format": LAYERS_FORMAT, "identity": self.identity, "layers": self.digests}
+        storage.replace_json(self.folder / LAYERS_MANIFEST, storage.sealed(manifest))
 
 
 def join_chunks(parts: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:

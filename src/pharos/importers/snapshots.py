@@ -28,7 +28,7 @@ from pharos.importers.chance import (
     DrawTree,
     RandomNumber,
 )
-from pharos.importers.wrappers import LIBRARIES, SILENT, Stepped, wrapper_name
+from pharos.importers.wrappers import SILENT, WRAPPER_LIBRARIES, Stepped, wrapper_name
 from pharos.system.wording import capped
 
 GENERATORS = (np.random.Generator, np.random.RandomState, np.random.BitGenerator, python_random.Random)
@@ -44,7 +44,7 @@ DROPPED = SILENT | {"OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatist
 LIMITS = ("_max_episode_steps", "max_episode_steps")
 OUTSIDE = ("pygame", "pyglet", "matplotlib", "weakref", "threading", "logging", "_thread")
 """Libraries whose objects are no state: windows, figures, locks."""
-PLAIN = frozenset([int, float, bool, str, bytes, type(None), complex])
+PLAIN_TYPES = frozenset([int, float, bool, str, bytes, type(None), complex])
 CONTAINERS = frozenset([dict, list, set, frozenset, np.ndarray])
 HEAP_TYPE = 1 << 9
 """Flag of classes that are written in Python."""
@@ -59,7 +59,7 @@ def bare(env: Stepped) -> tuple[Stepped, int | None]:
     current, inner = env, getattr(env, "unwrapped", env)
     while current is not inner and hasattr(current, "env"):
         kind = type(current)
-        if kind.__module__.split(".")[0] in LIBRARIES and kind.__name__ in DROPPED:
+        if kind.__module__.split(".")[0] in WRAPPER_LIBRARIES and kind.__name__ in DROPPED:
             if kind.__name__ == "TimeLimit":
                 limits += [int(vars(current)[name]) for name in LIMITS if vars(current).get(name) is not None]
             if above is None:
@@ -236,7 +236,7 @@ class EnvironmentSnapshots:
     def _reference(self, value: object) -> object:
         """Name of an object that is outside a snapshot; None for the others."""
         kind = type(value)
-        if kind in PLAIN:
+        if kind in PLAIN_TYPES:
             return None
         number = self._numbers.get(id(value))
         if number is not None:
@@ -384,7 +384,7 @@ class _Feeder:
     def feed(self, value: object) -> None:
         """Write a value."""
         kind = type(value)
-        if kind in PLAIN:
+        if kind in PLAIN_TYPES:
             self.put(f"{kind.__name__}{value!r};".encode())
         elif kind is tuple:
             self._feed_items("(", value)
@@ -424,7 +424,7 @@ class _Feeder:
 
     def _feed_items(self, head: str, items: Any) -> None:
         self.put(f"{head}{len(items)}:".encode())
-        if set(map(type, items)) <= PLAIN:
+        if set(map(type, items)) <= PLAIN_TYPES:
             self.put(repr(list(items)).encode())
             return
         for item in items:
@@ -443,7 +443,7 @@ class _Feeder:
             self._feed_array(value)
         elif isinstance(value, dict):
             self.put(f"{{{type(value).__name__}{len(value)}:".encode())
-            if {*map(type, value), *map(type, value.values())} <= PLAIN:
+            if {*map(type, value), *map(type, value.values())} <= PLAIN_TYPES:
                 self.put(repr(list(value.items())).encode())
                 return
             for name, item in value.items():
@@ -578,7 +578,7 @@ def _tame(value: object, generator: BranchingGenerator) -> None:
 
 def _is_plain(value: Any) -> bool:
     """Whether a value holds nothing but numbers, texts and containers of them, so that a copy is as good as itself."""
-    if type(value) in PLAIN or isinstance(value, np.generic):
+    if type(value) in PLAIN_TYPES or isinstance(value, np.generic):
         return True
     if type(value) is np.ndarray:
         return not value.dtype.hasobject and not isinstance(value.base, np.ndarray)

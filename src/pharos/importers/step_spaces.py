@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.importers.folder import IMAGE, VECTOR
+from pharos.importers.folder import IMAGE_OBSERVATION, VECTOR_OBSERVATION
 from pharos.importers.wrappers import Stepped, as_integer
 from pharos.system.wording import capped
 
@@ -122,4 +122,4 @@ class SpaceRecorder:
         array = np.stack(rows)
         if array.dtype.kind in "iu" and array.size and array.min() >= 0 and array.max() <= 255:
             array = array.astype(np.uint8)
-        return array, IMAGE if self._is_image else VECTOR
+        return array, IMAGE_OBSERVATION if self._is_image else VECTOR_OBSERVATION

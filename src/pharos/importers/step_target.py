@@ -15,7 +15,7 @@ from pharos.errors import FolderLocked, ParameterError, RuleError
 from pharos.importers.folder import BUILDING, check_free, save
 from pharos.importers.jax_stepping import GymnaxEnvironment, PgxEnvironment, jax_source
 from pharos.importers.search import SteppedStates
-from pharos.importers.step_checkpoint import SECONDS, StepCheckpoint
+from pharos.importers.step_checkpoint import LAYER_SECONDS, StepCheckpoint
 from pharos.importers.stepped_environment import SteppedEnvironment
 from pharos.importers.stepping import SteppingOptions, SteppingRun, StepRecording
 from pharos.importers.wrappers import Stepped
@@ -25,7 +25,7 @@ from pharos.system.wording import in_one_line
 
 JAX = "jax:"
 ENTRY_POINTS = "gymnasium.envs"
-FORMAT = 1
+TARGET_FORMAT = 1
 """Of the files of an unfinished import; raised when states get other keys."""
 
 
@@ -167,7 +167,7 @@ class StepTarget:
         max_outcomes: int,
         gamma: float | None = None,
         progress: Callable[[SteppedStates, float, bool], None] | None = None,
-        seconds: float = SECONDS,
+        seconds: float = LAYER_SECONDS,
         **options: Any,
     ) -> tuple[TabularMDP, StepRecording]:
         """Import the environment into a folder, or finish an import that was begun there.
@@ -207,7 +207,7 @@ class StepTarget:
         packages = ["gymnasium", *["jax", "gymnax", "pgx"] * (self.source_of is jax_source)]
         codes = {"factory": self.factory, "key": self.key, "reward": self.reward}
         return {
-            "format": FORMAT,
+            "format": TARGET_FORMAT,
             "target": self.words,
             "code": {name: code.source.checksum for name, code in codes.items() if isinstance(code, NamedCode)},
             "seed": options.seed,

@@ -16,7 +16,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, PharosError, RuleError, UnknownName
 from pharos.importers import side_effects
-from pharos.importers.chance import MOST_OUTCOMES, DrawError, DrawTree, line_of_code, placed
+from pharos.importers.chance import MOST_DRAW_OUTCOMES, DrawError, DrawTree, line_of_code, placed
 from pharos.importers.fresh_play import FreshPlay
 from pharos.importers.search import Arrival, Expansions, ExpansionsHere, SteppedStates
 from pharos.importers.side_effects import SideEffects
@@ -61,7 +61,7 @@ class SteppingOptions:
     key: Callable[[Stepped], Hashable] | None = None
     reward: Payment | None = None
     actions: tuple[Any, ...] | None = None
-    max_outcomes: int = MOST_OUTCOMES
+    max_outcomes: int = MOST_DRAW_OUTCOMES
     copied: frozenset[str] = frozenset()
 
 

@@ -51,7 +51,7 @@ def in_python(meaning: Callable) -> Callable:
 def interpreted_first(*counted: str) -> Callable:
     """Decorator of a kernel: its calls are interpreted as long as they are small together, then compiled.
 
-    They are small until they have counted COMPILING times `compiling.SMALL` entries, or 1 / LOADING of it if the
+    They are small until they have counted COMPILING times `compiling.SMALL_STATES` entries, or 1 / LOADING of it if the
     compiled kernel is on disk, as loading takes so much less than compiling.
 
     Args:
@@ -69,8 +69,8 @@ def interpreted_first(*counted: str) -> Callable:
             nonlocal count
             read = [arguments[i] for i in indices] or [each for each in arguments if not isinstance(each, int)]
             count += sum(map(_entries, read))
-            is_small = count < compiling.SMALL // LOADING or (
-                count < COMPILING * compiling.SMALL and not is_on_disk(kernel)
+            is_small = count < compiling.SMALL_STATES // LOADING or (
+                count < COMPILING * compiling.SMALL_STATES and not is_on_disk(kernel)
             )
             return quiet if is_small else compiled(*arguments)
 

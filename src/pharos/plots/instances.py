@@ -20,7 +20,7 @@ from pharos.drawing import NIGHT, enlarged, image, save_gif
 from pharos.errors import ParameterError, UnknownName
 from pharos.interaction import GymEnv
 from pharos.observations import render as render_state
-from pharos.plots.style import COLORS, INK, plain_log, single, styled
+from pharos.plots.style import INK_COLOR, LINE_COLORS, plain_log, single, styled
 from pharos.policies import PolicyAnswers, PolicyLike, TabularAgent
 from pharos.system.wording import pluralize
 
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
     from pharos.training import Task
 
 
-ARROWS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
+ARROW_VECTORS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
 
 
-CELLS = ("row", "column")
+ROW_AND_COLUMN = ("row", "column")
 MOST_LETTERS = 40  # a side: beyond it, letters in cells are too small to read
 
 
@@ -48,7 +48,7 @@ def value_map(
     space: "StateSpace",
     solution: "Solution",
     *,
-    over: tuple[str, str] = CELLS,
+    over: tuple[str, str] = ROW_AND_COLUMN,
     fix: Mapping[str, int] | None = None,
     rest: Literal["start"] | None = None,
     title: str = "",
@@ -93,7 +93,7 @@ def value_map(
     drawn.colorbar(image, ax=axis, shrink=0.8, label="value").outline.set_visible(False)
     # The actions of the policy in each cell
     lengths, letters = _lengths(solution), _letters(space.environment.actions)
-    draws_actions = over == CELLS or max(size) <= MOST_LETTERS
+    draws_actions = over == ROW_AND_COLUMN or max(size) <= MOST_LETTERS
     low, high = _range_of(values)
     for s, (row, column) in zip(shown, cells, strict=True):
         value = values[row, column]
@@ -101,12 +101,14 @@ def value_map(
         color = "#101216" if dark else "#f4f5f7"
         if terminal[s]:
             if draws_actions:
-                axis.text(column, row, _reward_on_entering(mdp, s), ha="center", va="center", color=INK, fontsize=9)
+                axis.text(
+                    column, row, _reward_on_entering(mdp, s), ha="center", va="center", color=INK_COLOR, fontsize=9
+                )
         elif not draws_actions:
             continue
         elif np.isnan(value) or lengths[s].min() == lengths[s].max():
             axis.plot(column, row, "o", color=color, markersize=3)
-        elif over == CELLS:
+        elif over == ROW_AND_COLUMN:
             _draw_arrows(axis, (column, row), space.environment.actions, lengths[s], color, letters)
         else:
             text = "".join(letters[int(action)] for action in np.flatnonzero(lengths[s] > 0.02))
@@ -117,7 +119,7 @@ def value_map(
             Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="#D55E00", linewidth=1.6)
         )
     axis.set(xticks=[], yticks=[], title=textwrap.fill(title, max(24, int(9 * drawn.get_figwidth()))))
-    if over != CELLS:
+    if over != ROW_AND_COLUMN:
         key = "   ".join(f"{letter} {name}" for letter, name in zip(letters, space.environment.actions, strict=True))
         axis.set(ylabel=over[0], xlabel=f"{over[1]}\n{key}" if draws_actions and len(letters) <= 12 else over[1])
         axis.set_yticks(*_ticks(size[0], first[0]))
@@ -135,12 +137,12 @@ def _draw_arrows(
     each action that leads nowhere."""
     column, row = cell
     indices = [int(action) for action in np.flatnonzero(lengths > 0.02)]
-    if still := "".join(letters[action] for action in indices if actions[action] not in ARROWS):
+    if still := "".join(letters[action] for action in indices if actions[action] not in ARROW_VECTORS):
         axis.text(column, row, still, ha="center", va="center", color=color, fontsize=8)
     for action in indices:
-        if actions[action] not in ARROWS:
+        if actions[action] not in ARROW_VECTORS:
             continue
-        x, y = ARROWS[actions[action]]
+        x, y = ARROW_VECTORS[actions[action]]
         head: dict[str, object] = {"arrowstyle": "->", "color": color, "lw": 1.3, "shrinkA": 0, "shrinkB": 0}
         length = 0.1 + 0.26 * lengths[action]
         back = length if len(indices) == 1 else 0.0
@@ -166,9 +168,9 @@ def _ticks(count: int, first: int) -> tuple[list[int], list[str]]:
 def _extent(space: "StateSpace", over: tuple[str, str], cells: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
     """(the values in the first row and column, the number of rows and columns)."""
     assert space.environment is not None
-    if over == CELLS:
+    if over == ROW_AND_COLUMN:
         components = space.environment.components
-        which = [components.names.index(name) for name in CELLS]
+        which = [components.names.index(name) for name in ROW_AND_COLUMN]
         return components.low[which], tuple(components.size[which].tolist())
     low, high = cells.min(axis=0), cells.max(axis=0)
     return low, (int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1)
@@ -179,7 +181,7 @@ def _cells(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N,) the states of the slice, (N, 2) their values of the two variables."""
     names, environment = space.component_names, space.manifest["environment"]
-    if over == CELLS and not set(CELLS) <= set(names):
+    if over == ROW_AND_COLUMN and not set(ROW_AND_COLUMN) <= set(names):
         raise ParameterError(
             f"{environment}: a state has {', '.join(names[:4])}; expected row and column alone, or others beside them "
             f"to fix: say which two to draw over, such as --over {','.join(names[:2])} (over=(...) in Python)"
@@ -209,7 +211,7 @@ def _cells(
     free = [name for name in others if name not in fix and np.ptp(states[shown, names.index(name)])]
     if free:
         slices = " ".join(f"--fix {name}={start[name]}" for name in free[:4])
-        expected = "row and column alone" if over == CELLS else f"{' and '.join(over)} alone"
+        expected = "row and column alone" if over == ROW_AND_COLUMN else f"{' and '.join(over)} alone"
         raise ParameterError(
             f"{environment}: a state has {', '.join(names[:6])}; expected {expected}: "
             f"fix the others, such as {slices} (fix={{...}} in Python), or --fix start (rest='start')"
@@ -242,7 +244,7 @@ def _reward_on_entering(mdp: "TabularMDP", terminal: int) -> str:
 # Planes of hardness ---------------------------------------------------------------------------------------------------
 
 
-MARKERS = "os^Dv<>P*X"
+PLOT_MARKERS = "os^Dv<>P*X"
 
 
 @styled
@@ -272,13 +274,17 @@ def hardness_plane(
         number = classes.index(name.split("/")[0])
         low, high = _range(name, report, visitation)
         gaps = _range(name, report, estimation)[1]
-        color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
+        color, marker = LINE_COLORS[number % len(LINE_COLORS)], PLOT_MARKERS[number % len(PLOT_MARKERS)]
         axis.plot([low, high], [gaps, gaps], color=color, linewidth=2)
         axis.plot((low * high) ** 0.5, gaps, marker, color=color, markersize=6, markeredgecolor="white")
         points[name] = ((low * high) ** 0.5, gaps)
     for number, cls in enumerate(classes):
         axis.plot(
-            [], [], MARKERS[number % len(MARKERS)], color=COLORS[number % len(COLORS)], label=cls.replace("_", " ")
+            [],
+            [],
+            PLOT_MARKERS[number % len(PLOT_MARKERS)],
+            color=LINE_COLORS[number % len(LINE_COLORS)],
+            label=cls.replace("_", " "),
         )
     axis.set(xscale="log", yscale="log", xlabel=visitation.replace("_", " "), ylabel=estimation.replace("_", " "))
     axis.margins(0.18)
@@ -375,7 +381,7 @@ def growth(spaces: Mapping[str, "StateSpace"], *, axes: "Axes | None" = None) ->
         raise ParameterError("no state spaces to draw; give at least one")
     drawn, axis = single(axes, (5.6, 3.6))
     for number, (label, space) in enumerate(spaces.items()):
-        within, color = states_by_depth(space).cumsum(), COLORS[number % len(COLORS)]
+        within, color = states_by_depth(space).cumsum(), LINE_COLORS[number % len(LINE_COLORS)]
         distance = np.arange(1, len(within) + 1)
         axis.plot(distance, within, color=color, label=f"{label}: {pluralize(space.num_states, 'state')}")
         axis.plot(distance[-1:], within[-1:], "o", color=color, markersize=5)

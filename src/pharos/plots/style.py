@@ -22,17 +22,17 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 # Okabe and Ito's colours, which people distinguish whatever their sight; the colours of classes are in their `look`
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MORE_COLORS = ("#CC79A7", "#E69F00", "#F0E442", "#999999")
 OBSERVATION_COLORS = {TABULAR_OBSERVATION: "#009E73", "vector": "#0072B2", "simple_image": "#D55E00"}
-INK, GRID, DIAGONAL = "#23262d", "#e3e5e8", "#888888"
+INK_COLOR, GRID_COLOR, DIAGONAL = "#23262d", "#e3e5e8", "#888888"
 DPI, PAGE_DPI = 160, 120
 DATES: dict[str, Any] = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 
 def style(dark: bool = False) -> dict[Any, Any]:
     """Matplotlib settings of a figure on light or dark ground."""
-    ink, ground, grid = ("#d8dbe2", "#1b1e24", "#3a3f4a") if dark else (INK, "#ffffff", GRID)
+    ink, ground, grid = ("#d8dbe2", "#1b1e24", "#3a3f4a") if dark else (INK_COLOR, "#ffffff", GRID_COLOR)
     return {
         "figure.facecolor": ground, "axes.facecolor": ground, "savefig.facecolor": ground,
         "text.color": ink, "axes.labelcolor": ink, "axes.edgecolor": ink, "xtick.color": ink, "ytick.color": ink,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pharos.rules.interaction import InteractionKernels
 
 Rows = np.ndarray | tuple[np.ndarray, np.ndarray]  # terminal, or (terminal, probabilities)
-COUNTED = np.empty(0, np.int64)
+NO_RANKS = np.empty(0, np.int64)
 """No ranks of outcomes: those of a state and action are all its possible ones, in their order."""
 
 explored: set[type[Environment]] = set()
@@ -153,7 +153,7 @@ class CompiledRewards(_Compiled):
             self._rewards_of(states, np.empty((1, env.num_actions), np.int32), terminal, 0, 0)
         else:
             nothing = np.empty(0, np.int64)
-            self._expected_rewards_of(states, (nothing, nothing, np.empty(0)), terminal, 0, 0, COUNTED, None)
+            self._expected_rewards_of(states, (nothing, nothing, np.empty(0)), terminal, 0, 0, NO_RANKS, None)
 
     def threads(self, workers: int) -> int:
         return workers
@@ -161,7 +161,7 @@ class CompiledRewards(_Compiled):
     def block(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
         return self._rewards_or_error("block", self._rewards_of, states, successors, terminal, start, stop)
 
-    def expected_block(self, states, outcomes, terminal, start, stop, ranks=COUNTED, largest=None) -> np.ndarray:
+    def expected_block(self, states, outcomes, terminal, start, stop, ranks=NO_RANKS, largest=None) -> np.ndarray:
         return self._rewards_or_error(
             "expected_block", self._expected_rewards_of, states, outcomes, terminal, start, stop, ranks, largest
         )

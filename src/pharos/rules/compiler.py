@@ -38,10 +38,10 @@ Constructor = Callable[..., tuple[object, ...]]
 """The class of `self` in compiled rules, a named tuple."""
 RULES = ("transition", "is_terminal", "reward", "draw")
 _COLOURS = re.compile("\x1b\\[[0-9;]*m")  # Numba writes them if colorama is installed
-_HERE = Path(__file__).parent
-_KERNELS = _HERE.parent / "kernels"
+_RULES_FOLDER = Path(__file__).parent
+_KERNELS = _RULES_FOLDER.parent / "kernels"
 _MACHINERY = (
-    *(_HERE / name for name in ("compiler.py", "exploration.py", "interaction.py", "packed_view.py")),
+    *(_RULES_FOLDER / name for name in ("compiler.py", "exploration.py", "interaction.py", "packed_view.py")),
     *(_KERNELS / name for name in ("hash_table.py", "stepping.py")),
 )
 

@@ -21,7 +21,7 @@ from pharos.rules.compiler import CompiledRules, Compiler, Constructor, Function
 from pharos.rules.packed_view import fault, get_word, packed_view, read_only_view, set_word
 from pharos.system.arrays import SUM_TOLERANCE
 
-BATCH = 16  # states expanded before their successors are looked up: enough look-ups to hide the memory's latency
+LOOKUP_BATCH = 16  # states expanded before their successors are looked up: enough look-ups to hide the memory's latency
 
 
 class ExpansionKernels(NamedTuple):
@@ -167,8 +167,8 @@ def explore_kernel(
         While one batch is looked up, the next one is expanded already if it is known: memory has that long to
         answer.
         """
-        keys = np.empty((2, BATCH * A, W), np.uint64)
-        slots = np.empty((2, BATCH * A), np.int64)
+        keys = np.empty((2, LOOKUP_BATCH * A, W), np.uint64)
+        slots = np.empty((2, LOOKUP_BATCH * A), np.int64)
         capacity = table.shape[0]
         first, count = progress[FIRST], progress[COUNT]
         level_end, depth = progress[LEVEL_END], progress[DEPTH]
@@ -176,8 +176,8 @@ def explore_kernel(
         while True:
             # size of the next batch; 0 at the end, or if its successors might not fit
             n = 0
-            if count + 2 * BATCH * A <= room:
-                n = max(0, min(BATCH, count - first - waiting, last - first - waiting))
+            if count + 2 * LOOKUP_BATCH * A <= room:
+                n = max(0, min(LOOKUP_BATCH, count - first - waiting, last - first - waiting))
             if n == 0 and waiting == 0:
                 break
             # expand the next batch into one buffer
@@ -237,12 +237,12 @@ def expand_and_find_kernel(
         has none; row i belongs to state base + i. The table is only read. Another thread may insert meanwhile: a state
         that it inserts is found or not, and the thread that numbers the states searches on from the slot.
         """
-        slots = np.empty((2, BATCH * A), np.int64)
+        slots = np.empty((2, LOOKUP_BATCH * A), np.int64)
         capacity = table.shape[0]
         waiting, buffer = 0, 0
-        for batch in range(start, stop + BATCH, BATCH):
+        for batch in range(start, stop + LOOKUP_BATCH, LOOKUP_BATCH):
             # expand the next batch into one buffer
-            n = max(0, min(BATCH, stop - batch))
+            n = max(0, min(LOOKUP_BATCH, stop - batch))
             if n > 0:
                 part = keys[(batch - base) * A : (batch - base + n) * A]
                 slots_of_batch, row = slots[buffer], batch - base
@@ -251,7 +251,7 @@ def expand_and_find_kernel(
                     return
             buffer = 1 - buffer
             # look up the successors of the batch before it
-            before = batch - BATCH
+            before = batch - LOOKUP_BATCH
             first = (before - base) * A
             for j in range(waiting * A):
                 slot = slots[buffer, j]

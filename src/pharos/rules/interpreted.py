@@ -228,9 +228,9 @@ def _outcome(env: Environment, state: tuple[int, ...], action: int, outcome: int
     return out
 
 
-BLOCK = 4096  # states whose successors are Python objects at a time
+EXPANDED_AT_ONCE = 4096  # states whose successors are Python objects at a time
 _MOST_FILES = 1 << 16
-_SHARE = 64  # states that are worth sending to another process
+_WORTH_SENDING = 64  # states that are worth sending to another process
 
 
 class InterpretedExpansion:
@@ -248,7 +248,7 @@ class InterpretedExpansion:
 
     def explore(self, states, successors, terminal, probabilities, table, base, last, room, progress) -> None:
         first, count = int(progress[FIRST]), int(progress[COUNT])
-        stop = min(last, count, first + min(BLOCK, (room - count) // self.branches))
+        stop = min(last, count, first + min(EXPANDED_AT_ONCE, (room - count) // self.branches))
         rows = slice(first - base, stop - base)
         keys = np.empty(((stop - first) * self.branches, self.layout.num_words), np.uint64)
         indices = np.empty(len(keys), np.int64)
@@ -256,8 +256,8 @@ class InterpretedExpansion:
         insert_missing(table, states, keys, indices, successors[rows], progress)
 
     def expand_and_find(self, states, start, stop, base, keys, indices, terminal, probabilities, table) -> None:
-        for first in range(start, stop, BLOCK):
-            last = min(first + BLOCK, stop)
+        for first in range(start, stop, EXPANDED_AT_ONCE):
+            last = min(first + EXPANDED_AT_ONCE, stop)
             rows = slice(first - base, last - base)
             part = slice(rows.start * self.branches, rows.stop * self.branches)
             self._expand(states[first:last], keys[part], terminal[rows], probabilities[rows])
@@ -401,7 +401,7 @@ class Interpreters:
 
     def branches(self, states: np.ndarray) -> Branches:
         """`interpreted_branches` of states (N, D) int64, shared between the processes if they are many."""
-        shares = min(len(self._connections) + 1, len(states) // _SHARE)
+        shares = min(len(self._connections) + 1, len(states) // _WORTH_SENDING)
         if shares < 2:
             return interpreted_branches(self.env, states.tolist())
         parts = np.array_split(states, shares)

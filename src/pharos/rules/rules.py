@@ -21,7 +21,7 @@ import numpy as np
 from pharos.environments import Environment
 from pharos.kernels.stepping import EnvironmentBatch, Setting
 from pharos.rules.compiled import (
-    COUNTED,
+    NO_RANKS,
     CompiledAges,
     CompiledDrawing,
     CompiledExpansion,
@@ -109,7 +109,7 @@ class TransitionRewards(Protocol):
         terminal: np.ndarray,
         start: int,
         stop: int,
-        ranks: np.ndarray = COUNTED,
+        ranks: np.ndarray = NO_RANKS,
         largest: np.ndarray | None = None,
     ) -> np.ndarray:
         """Expected rewards (stop - start, A) of states [start, stop), with chance.
@@ -223,7 +223,7 @@ class Rules:
         """Rewards of the transitions of `num_states` states in all; few are interpreted."""
         from pharos.rules.interpreted import InterpretedRewards
 
-        is_small = num_states * self.env.num_actions * self.env.outcomes < compiling.SMALL // 4
+        is_small = num_states * self.env.num_actions * self.env.outcomes < compiling.SMALL_STATES // 4
         return InterpretedRewards(self.env, self.layout) if is_small else self.rewards
 
     @cached_property
@@ -249,7 +249,7 @@ class Rules:
         if not self.env.has_sets:
             return None
         out = np.empty((len(states), self.env.num_actions), np.bool_)
-        is_small = out.size < compiling.SMALL // 4
+        is_small = out.size < compiling.SMALL_STATES // 4
         if is_small and "stepping" not in vars(self):
             from pharos.rules.stepping import InterpretedStepping
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 # Instances with more states are not counted for a report
-MOST_STATES = 100_000
+MOST_COUNTED_STATES = 100_000
 
 
 def aliasing_table(
@@ -44,7 +44,7 @@ def aliasing_table(
     for run in study.runs:
         key = (run.instance, run.cell["observation"])
         number = num_states.get(run.instance, np.inf)
-        if key in rows or key[1] == TABULAR_OBSERVATION or not number <= MOST_STATES:
+        if key in rows or key[1] == TABULAR_OBSERVATION or not number <= MOST_COUNTED_STATES:
             continue
         if progress is not None:
             progress(f"states that share an observation: {', '.join(key)}")

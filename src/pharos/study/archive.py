@@ -20,11 +20,11 @@ from pharos.training import run_id
 if TYPE_CHECKING:
     import pyarrow as pa
 
-FORMAT = 1
+ARCHIVE_FORMAT = 1
 CURVE_COLUMNS = ("step",)
-_STUDY, _FORMAT, _DIGESTS = b"pharos.study", b"pharos.format", b"pharos.digests"
-_AGAIN = "fetch or pack it again"
-EARLIER = {
+_STUDY, _FORMAT_KEYS, _DIGESTS = b"pharos.study", b"pharos.format", b"pharos.digests"
+_FETCH_AGAIN = "fetch or pack it again"
+EARLIER_HYPERPARAMETERS = {
     "dqn": {
         "breakout": {
             "vector": {
@@ -78,7 +78,11 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
     text = study.to_yaml(folder=".")
     runs = zip(ids, records, curves, strict=True)
     digests = {"study": storage.digest_of_json(text), "runs": {id: _digest(id, *rest) for id, *rest in runs}}
-    metadata = {_STUDY: text.encode(), _FORMAT: str(FORMAT).encode(), _DIGESTS: json.dumps(digests).encode()}
+    metadata = {
+        _STUDY: text.encode(),
+        _FORMAT_KEYS: str(ARCHIVE_FORMAT).encode(),
+        _DIGESTS: json.dumps(digests).encode(),
+    }
     file = Path(file)
     file.parent.mkdir(parents=True, exist_ok=True)
     training.write_table(file, pa.table(columns).replace_schema_metadata(metadata), follow=True)
@@ -131,7 +135,7 @@ def unpack(
         id, record = row.pop("id"), row.pop("record")
         run = id, _checked(file, id, record, wanted if into is None else None), _curve(file, id, row, table.schema)
         if digests is not None and digests["runs"].get(id) != _digest(id, record, run[2]):
-            raise ResultCorrupted(f"{file}: run {id} was changed after it was packed; {_AGAIN}")
+            raise ResultCorrupted(f"{file}: run {id} was changed after it was packed; {_FETCH_AGAIN}")
         runs.append(run)
     write_specification(target, directory)
     added = sum(_write(directory, *run) for run in runs if run[0] in wanted)
@@ -145,14 +149,14 @@ def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
     it."""
     if not file.exists():
         raise ParameterError(f"{file}: no such file")
-    table = training.read_table(file, _AGAIN)
+    table = training.read_table(file, _FETCH_AGAIN)
     metadata = table.schema.metadata or {}
     if _STUDY not in metadata or not {"id", "record"} <= set(table.column_names):
         raise FileFormatError(f"{file}: not a packed study; expected a file made by `pharos study pack`")
-    if metadata.get(_FORMAT) != str(FORMAT).encode():
+    if metadata.get(_FORMAT_KEYS) != str(ARCHIVE_FORMAT).encode():
         raise FileFormatError(
-            f"{file}: format {metadata.get(_FORMAT, b'?').decode(errors='replace')} of packed studies; "
-            f"this version of pharos reads {FORMAT}"
+            f"{file}: format {metadata.get(_FORMAT_KEYS, b'?').decode(errors='replace')} of packed studies; "
+            f"this version of pharos reads {ARCHIVE_FORMAT}"
         )
     try:
         text = metadata[_STUDY].decode()
@@ -162,7 +166,7 @@ def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
         ):
             raise ValueError("its study, or the list of its runs, was changed after it was packed")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ResultCorrupted(f"{file}: its description cannot be read: {error}; {_AGAIN}") from None
+        raise ResultCorrupted(f"{file}: its description cannot be read: {error}; {_FETCH_AGAIN}") from None
     return text, table, digests
 
 
@@ -170,7 +174,7 @@ def _study(file: Path, text: str, table: "pa.Table", trust: bool) -> Specificati
     """The packed study, with the defaults of hyperparameters that the library had when it was packed."""
     study = parse(text, str(file), folder=file.absolute().parent, trust=trust)
     if not study.defaults and not set(table["id"].to_pylist()) <= {run.id for run in study.runs}:
-        defaults = yaml.safe_dump({"defaults": EARLIER})
+        defaults = yaml.safe_dump({"defaults": EARLIER_HYPERPARAMETERS})
         return parse(f"{text}\n{defaults}", str(file), folder=file.absolute().parent, trust=trust)
     return study
 
@@ -179,7 +183,7 @@ def _rows(file: Path, table: "pa.Table") -> list[dict[str, Any]]:
     try:
         return table.to_pylist()
     except (ValueError, TypeError) as error:  # text that is none
-        raise ResultCorrupted(f"{file}: its rows cannot be read: {error}; {_AGAIN}") from None
+        raise ResultCorrupted(f"{file}: its rows cannot be read: {error}; {_FETCH_AGAIN}") from None
 
 
 def _digest(id: str, record: str, curve: "pa.Table") -> str:
@@ -195,7 +199,7 @@ def _checked(file: Path, id: str, record: str, ids: set[str] | None) -> dict[str
         if not storage.is_intact(entry):
             raise ValueError("it was changed after it was written")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ResultCorrupted(f"{file}: the record of run {id} cannot be read: {error}; {_AGAIN}") from None
+        raise ResultCorrupted(f"{file}: the record of run {id} cannot be read: {error}; {_FETCH_AGAIN}") from None
     if (ids is not None and id not in ids) or run_id(config) != id:
         raise FileFormatError(f"{file}: run {id} is not one of the study, or its configuration was changed")
     if status != _worker.FINISHED:
@@ -214,7 +218,7 @@ def _curve(file: Path, id: str, row: dict[str, list | None], schema: "pa.Schema"
             {name: pa.array(values, schema.field(name).type.value_type) for name, values in columns.items()}
         )
     except (ValueError, TypeError, AttributeError, pa.ArrowException) as error:
-        raise FileFormatError(f"{file}: the curve of run {id} cannot be read: {error}; {_AGAIN}") from None
+        raise FileFormatError(f"{file}: the curve of run {id} cannot be read: {error}; {_FETCH_AGAIN}") from None
 
 
 def _write(directory: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> bool:

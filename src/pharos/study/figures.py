@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 
 LINES = {"q_learning": "-", "dqn": "-", "ppo": "--"}
-OBSERVATIONS = {TABULAR_OBSERVATION: "", VECTOR: "vector", IMAGE: "image"}
+OBSERVATION_WORDS = {TABULAR_OBSERVATION: "", VECTOR: "vector", IMAGE: "image"}
 # More lines of runs than this are not told apart in one panel: the page does not offer them
-MOST_RUNS = 120
+MOST_CURVE_RUNS = 120
 # Significant digits of the numbers in the page
-DIGITS = 5
+CURVE_DIGITS = 5
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Curves:
         for panel in self.panels:
             num_runs = sum(len(line.runs) for line in panel.lines)
             panels.append(
-                {"title": panel.title, "lines": [_numbers(line, num_runs <= MOST_RUNS) for line in panel.lines]}
+                {"title": panel.title, "lines": [_numbers(line, num_runs <= MOST_CURVE_RUNS) for line in panel.lines]}
             )
         about = {"x": self.x_label, "y": self.y_label, "share": self.share, "runs": self.draws_runs}
         return json.dumps({**about, "panels": panels}, separators=(",", ":"), allow_nan=False)
@@ -109,13 +109,13 @@ def _numbers(line: Line, runs: bool) -> dict[str, Any]:
 
 def _short(values: np.ndarray) -> list[float | int | None]:
     """The values with DIGITS significant digits, whole ones as integers; null for what is not finite."""
-    texts = [f"{value:.{DIGITS}g}" if np.isfinite(value) else "null" for value in np.asarray(values, np.float64)]
+    texts = [f"{value:.{CURVE_DIGITS}g}" if np.isfinite(value) else "null" for value in np.asarray(values, np.float64)]
     return [None if text == "null" else int(float(text)) if float(text).is_integer() else float(text) for text in texts]
 
 
 def line_label(agent: str, observation: str) -> str:
     """Label of an agent and its observation: `DQN, image`, `tabular Q-learning`."""
-    words = OBSERVATIONS.get(observation, observation)
+    words = OBSERVATION_WORDS.get(observation, observation)
     return f"{agent_label(agent)}, {words}" if words else agent_label(agent)
 
 
@@ -343,7 +343,7 @@ def _fits(fits: Sequence[Fit], regret: str) -> "Figure | None":
 
 
 # As the paper orders them
-COLUMNS = (("ppo", IMAGE), ("ppo", VECTOR), ("dqn", IMAGE), ("dqn", VECTOR))
+RETURN_COLUMNS = (("ppo", IMAGE), ("ppo", VECTOR), ("dqn", IMAGE), ("dqn", VECTOR))
 TITLES = {"ppo": "PPO", "dqn": "DQN", IMAGE: "IMAGE", VECTOR: "MINIMAL"}
 CHANCES = {"plain": "None", "random": "random", "sticky": "stick"}
 
@@ -371,8 +371,8 @@ def returns_table(cells: "pd.DataFrame", environment: str) -> str:
     wide = wide_returns(cells, environment, lambda row: _entry(row["return"], row["return_deviation"])).fillna("--")
     keys = list(wide)
     titles = [(latex_text(agent_label(agent)), latex_text(in_words(name))) for agent, name in keys]
-    if {key for key in keys if key[1] != TABULAR_OBSERVATION} == set(COLUMNS):
-        keys, titles = list(COLUMNS), [(TITLES[agent], TITLES[name]) for agent, name in COLUMNS]
+    if {key for key in keys if key[1] != TABULAR_OBSERVATION} == set(RETURN_COLUMNS):
+        keys, titles = list(RETURN_COLUMNS), [(TITLES[agent], TITLES[name]) for agent, name in RETURN_COLUMNS]
     rows = []
     for instance, chance in wide.index:
         kind = chance if "," in chance else CHANCES.get(chance.split()[0], chance)

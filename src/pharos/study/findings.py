@@ -17,13 +17,13 @@ from pharos.system.wording import in_words
 if TYPE_CHECKING:
     import pandas as pd
 
-LEVEL = 0.05  # of every test; each stands alone, without a correction for their number
-COLUMNS = ["finding", "of", "paper", "ours", "evidence", "effect", "lower", "upper", "p", "power", "verdict"]
+SIGNIFICANCE_LEVEL = 0.05  # of every test; each stands alone, without a correction for their number
+FINDING_COLUMNS = ["finding", "of", "paper", "ours", "evidence", "effect", "lower", "upper", "p", "power", "verdict"]
 # By the paper's sections 4.2 and 4.1
 _HARDER = {"simple_grid": "image", "frozen_lake": "image", "breakout": "vector", "freeway": "vector"}
 _OBSERVATIONS = {"image": ("dqn", IMAGE), "vector": ("dqn", VECTOR)}
 _SLOWER = {"simple_grid": "DQN", "frozen_lake": "DQN", "breakout": "table", "freeway": "table"}
-_LEARNERS = {"table": ("q_learning", TABULAR_OBSERVATION), "DQN": ("dqn", VECTOR)}
+_FINDING_LEARNERS = {"table": ("q_learning", TABULAR_OBSERVATION), "DQN": ("dqn", VECTOR)}
 _PRINTED_AGREEMENT = 0.81
 # R2 that the paper prints: of one model, of those by representation and by class together, with vectors and with images
 _PRINTED_R2 = {"single": 0.09, "representation": 0.48, "class": 0.65, "vector": 0.6, "image": 0.3}
@@ -70,11 +70,11 @@ def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) ->
         for environment, harder in _HARDER.items()
     ]
     rows += [
-        _compared(cells, "the learner with more regret", environment, slower, _LEARNERS)
+        _compared(cells, "the learner with more regret", environment, slower, _FINDING_LEARNERS)
         for environment, slower in _SLOWER.items()
     ]
     rows += [_single(models), *_nested(models), _vectors_explained_better(models, resamples), _agreement(cells)]
-    return pd.DataFrame(rows, columns=COLUMNS)
+    return pd.DataFrame(rows, columns=FINDING_COLUMNS)
 
 
 def _row(
@@ -88,7 +88,7 @@ def _row(
     power: float = math.nan,
     effect: Effect = (math.nan, math.nan, math.nan),
 ) -> dict[str, Any]:
-    return dict(zip(COLUMNS, (finding, of, paper, ours, evidence, *effect, p, power, verdict), strict=True))
+    return dict(zip(FINDING_COLUMNS, (finding, of, paper, ours, evidence, *effect, p, power, verdict), strict=True))
 
 
 def _power_of_mean(effect: float, deviation: float, number: int) -> float:
@@ -112,8 +112,8 @@ def _power_of_f(added: int, free: int, r_squared: float, without: float = 0.0) -
 
     shift = (r_squared - without) / (1 - r_squared) * (added + free + 1)
     if shift <= 0:
-        return LEVEL
-    return float(stats.ncf.sf(stats.f.isf(LEVEL, added, free), added, free, shift))
+        return SIGNIFICANCE_LEVEL
+    return float(stats.ncf.sf(stats.f.isf(SIGNIFICANCE_LEVEL, added, free), added, free, shift))
 
 
 def _nothing(finding: str, of: str, paper: str, why: str) -> dict[str, Any]:
@@ -153,14 +153,14 @@ def _signed_ranks(differences: np.ndarray) -> tuple[Effect, float]:
     for rank in range(1, len(differences) + 1):
         chances = (np.pad(chances, (0, rank)) + np.pad(chances, (rank, 0))) / 2
     tail = np.cumsum(chances)
-    excluded = int((tail <= LEVEL / 2).sum())
+    excluded = int((tail <= SIGNIFICANCE_LEVEL / 2).sum())
     ends = (averages[excluded - 1], averages[-excluded]) if excluded else (-math.inf, math.inf)
     p = min(1.0, 2 * float(tail[min((averages >= 0).sum(), (averages <= 0).sum())]))
     return (float(np.median(averages)), float(ends[0]), float(ends[1])), p
 
 
 def _verdict(agrees: bool, p: float) -> str:
-    if not p < LEVEL:
+    if not p < SIGNIFICANCE_LEVEL:
         return "undecided"
     return "agrees" if agrees else "disagrees"
 
@@ -245,7 +245,7 @@ def _share(statistic: float, added: int, free: int) -> Effect:
         shift = float(optimize.brentq(excess, 0.0, highest))
         return shift / (shift + added + free + 1)
 
-    return added * statistic / (added * statistic + free), end(1 - LEVEL / 2), end(LEVEL / 2)
+    return added * statistic / (added * statistic + free), end(1 - SIGNIFICANCE_LEVEL / 2), end(SIGNIFICANCE_LEVEL / 2)
 
 
 def _single(models: Models) -> dict[str, Any]:
@@ -263,7 +263,7 @@ def _single(models: Models) -> dict[str, Any]:
     evidence = f"F({parameters - 1}, {number - parameters}) = {statistic:.1f} of task means"
     evidence += f"; R² {fit.cross_validated_r_squared:.2f} for tasks not seen"
     verdict = "agrees"
-    if p < LEVEL:
+    if p < SIGNIFICANCE_LEVEL:
         verdict = "disagrees"
         by_class = models.class_alone
         if by_class is not None and by_class > fit.r_squared / 2:

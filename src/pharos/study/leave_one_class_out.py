@@ -40,11 +40,11 @@ TENTH = 0.1
 RESAMPLES = 1000
 PERMUTATIONS = 4999
 CONTROL = "tabular_regret"
-IMAGES, VECTOR = ("simple_image", "complex_image", "recorded"), "vector"
+IMAGES, VECTOR_NAME = ("simple_image", "complex_image", "recorded"), "vector"
 TABULAR, SCALE, CLASSES = "tabular measures", "random play", "class alone"
-TABLES = ("tabular_regret", "tabular_regret_played", "policy_tabular_regret", "clipped_tabular_regret")
+TABULAR_PREDICTORS = ("tabular_regret", "tabular_regret_played", "policy_tabular_regret", "clipped_tabular_regret")
 """Learners without a kernel."""
-BASELINES = (CLASSES, SCALE, TABULAR, "exploration_time", "num_states", *TABLES)
+BASELINE_MODELS = (CLASSES, SCALE, TABULAR, "exploration_time", "num_states", *TABULAR_PREDICTORS)
 P_VALUES = ("p_rho", "p_agreement", "p_slope")
 
 
@@ -98,7 +98,9 @@ def models_of(frame: "pd.DataFrame", predictors: Sequence[str], measures: Sequen
         measures: tabular ones; each alone too, if there are no predictions.
     """
     models = [
-        Model(name, (name,), name in BASELINES) for name in predictors if name in frame and frame[name].notna().any()
+        Model(name, (name,), name in BASELINE_MODELS)
+        for name in predictors
+        if name in frame and frame[name].notna().any()
     ]
     if not models:
         models = [Model(name, (name,), True) for name in measures]
@@ -321,7 +323,7 @@ def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[st
     if noise is not None:
         row["agreement_ceiling"] = pairs.ceiling(y, noise)
     names = cells.frame["observation"].to_numpy()
-    is_vector = names == VECTOR
+    is_vector = names == VECTOR_NAME
     is_image = np.array([name.split("(")[0] in IMAGES for name in names])
     first, second = pairs.first, pairs.second
     of_both = pairs.only((is_image[first] & is_vector[second]) | (is_vector[first] & is_image[second]))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 MOST_PANELS = 24
 # Predictors and curves of the idealised learners; the first that there is counts.
-LEARNERS = ("clipped_regret_evaluated", "policy_regret", "kernel_regret")
+LEARNER_COLUMNS = ("clipped_regret_evaluated", "policy_regret", "kernel_regret")
 CURVES = ("clipped_curve", "policy_curve", "curve")
 LONGEST_TITLE = 34
 
@@ -127,8 +127,8 @@ def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame") -> "Figure | 
 
 def _learner(part: "pd.DataFrame") -> str:
     """The predictor that an agent is held against."""
-    has = (name for name in LEARNERS if name in part and part[name].notna().any())
-    return next(has, LEARNERS[-1])
+    has = (name for name in LEARNER_COLUMNS if name in part and part[name].notna().any())
+    return next(has, LEARNER_COLUMNS[-1])
 
 
 def _spread(groups: list[Any], max_panels: int = MOST_PANELS) -> list[Any]:

@@ -72,7 +72,7 @@ GIVEN = "given"
 STUDY_FILE = "study.yaml"
 
 
-_PARTS: dict[Loc, type[BaseModel]] = {
+_SPECIFICATION_PARTS: dict[Loc, type[BaseModel]] = {
     (): Specification,
     ("hardness",): Hardness,
     ("blocks",): Block,
@@ -339,7 +339,7 @@ def _messages(error: ValidationError, name: str, root: object) -> str:
             loc = loc[:-1]
         key = str(loc[-1]) if loc else ""
         if problem["type"] == "extra_forbidden":
-            part = _PARTS.get(tuple(part for part in loc[:-1] if isinstance(part, str)))
+            part = _SPECIFICATION_PARTS.get(tuple(part for part in loc[:-1] if isinstance(part, str)))
             message = str(UnknownName("key", key, part.model_fields if part else ()))
         elif problem["type"] == "missing":
             message = f"the key {key!r} is missing"

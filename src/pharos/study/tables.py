@@ -35,17 +35,17 @@ if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
 
 
-PLAIN = {"sticky": 0.0, "random": 0.0}
+NO_CHANCE = {"sticky": 0.0, "random": 0.0}
 # A proven interval enters as one number if its upper end is at most so many times its lower end
-WIDEST = 2
+WIDEST_FACTOR = 2
 # Part of the evaluations at the end over which the return is averaged
-LAST = 0.1
-NUMBERS = ("cumulative_regret", "normalized_regret", "final_value", "value_optimal", "value_uniform")
+LAST_SHARE = 0.1
+RUN_NUMBERS = ("cumulative_regret", "normalized_regret", "final_value", "value_optimal", "value_uniform")
 """Entries that the result of every run has, numbers or null."""
 POINTS = ("step", "episodes", "value", "cumulative_expected_regret", "normalized_regret", "mean_return")
 DATE = "%Y-%m-%dT%H:%M:%SZ"
 # Numbers beyond this are no results, and no figure can hold them
-LARGEST = 1e100
+LARGEST_VALUE = 1e100
 
 
 @dataclass(frozen=True)
@@ -136,9 +136,9 @@ def _warned(runs: FinishedRuns) -> FinishedRuns:
 def _result_of(record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """The entries of a result that are one number or text each; NaN for null."""
     result = {name: value for name, value in record["result"].items() if not isinstance(value, dict | list)}
-    for name in NUMBERS:
+    for name in RUN_NUMBERS:
         value = result.get(name, "nothing")
-        if isinstance(value, bool) or not isinstance(value, int | float | None) or abs(value or 0) > LARGEST:
+        if isinstance(value, bool) or not isinstance(value, int | float | None) or abs(value or 0) > LARGEST_VALUE:
             raise FileFormatError(f"{folder / 'run.json'}: {name} is {str(value)[:30]}; expected a number below 1e100")
     return {name: float("nan") if value is None else value for name, value in result.items()}
 
@@ -203,7 +203,7 @@ def _last_return(curve: "pd.DataFrame") -> float:
     ended = np.diff(curve["episodes"].to_numpy(), prepend=0)
     returns = curve["mean_return"].to_numpy(float)
     is_defined = np.isfinite(returns) & (ended > 0)
-    last = max(1, int(len(returns) * LAST))
+    last = max(1, int(len(returns) * LAST_SHARE))
     is_defined[: len(returns) - last] &= not is_defined[-last:].any()
     return float(np.average(returns[is_defined], weights=ended[is_defined])) if is_defined.any() else float("nan")
 
@@ -248,7 +248,7 @@ def hardness_table(
             continue
         if progress is not None:
             progress(f"hardness of {run.instance}, {run.chance}")
-        plain = {**run.config, "chance": PLAIN}
+        plain = {**run.config, "chance": NO_CHANCE}
         own = _measured(study, directory, run.config)
         without = _measured(study, directory, plain) if run.chance != "plain" else own
         rows[key] = {"environment": run.cell["environment"], "instance": run.instance, "chance": run.chance}
@@ -264,7 +264,7 @@ def hardness_cost(study: Specification, directory: Path, tasks: Container[tuple[
     missing: dict[Path, int] = {}
     for run in study.runs:
         if (run.instance, run.chance) in tasks:
-            for config in (run.config, {**run.config, "chance": PLAIN}):
+            for config in (run.config, {**run.config, "chance": NO_CHANCE}):
                 cache, dependencies = ResultCache(directory / "hardness"), _dependencies(study, config)
                 stored = (cache.get(dependencies) or {"measures": {}})["measures"]
                 missing[cache.file(dependencies)] = sum(name not in stored for name in study.hardness.measures)
@@ -290,7 +290,11 @@ def _row_of_measures(names: Sequence[str], own: Mapping[str, Any], plain: Mappin
 
 def _usable(measure: dict[str, Any]) -> dict[str, Any]:
     """The measure, or the reason against it: a proven interval that is too wide to be one number."""
-    if measure.get("value") is None or measure.get("exact", True) or measure["upper"] <= WIDEST * measure["lower"]:
+    if (
+        measure.get("value") is None
+        or measure.get("exact", True)
+        or measure["upper"] <= WIDEST_FACTOR * measure["lower"]
+    ):
         return measure
     return {"value": None, "why": f"only {measure['lower']:g} to {measure['upper']:g} is proven within the budget"}
 

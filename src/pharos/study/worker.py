@@ -25,7 +25,7 @@ from pharos.system.wording import in_one_line
 
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 # Seconds in a record that no run can take: ten thousand years
-LONGEST = 3e11
+LONGEST_SECONDS = 3e11
 
 BATCHES = "batches"
 EXIT_BUSY = 75
@@ -66,7 +66,7 @@ def run_record(folder: Path) -> dict[str, Any] | None:
     if record.get("status") not in (FINISHED, FAILED):
         raise FileFormatError(f"{file}: is not the record of a run that is over")
     seconds = record.get("seconds")
-    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 <= seconds < LONGEST:
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 <= seconds < LONGEST_SECONDS:
         raise FileFormatError(f"{file}: seconds are {str(seconds)[:20]}; expected how long the run took")
     if record["status"] == FINISHED:
         if not isinstance(record.get("result"), dict):

@@ -33,7 +33,7 @@ Where = int | np.integer | slice | np.ndarray | tuple[int | slice | np.ndarray |
 """What an array is indexed by."""
 
 # Entries that are unpacked at a time.
-_BLOCK = 1 << 20
+_ENTRIES_AT_ONCE = 1 << 20
 
 
 class PackedIndices:
@@ -138,7 +138,7 @@ def read_only(array: T) -> T:
 
 def index_blocks(indices: Indices) -> Iterator[tuple[int, np.ndarray]]:
     """(first row, some rows), from the first one on: some million entries at a time, unpacked if they are packed."""
-    rows = max(1, _BLOCK * len(indices) // max(1, indices.size))
+    rows = max(1, _ENTRIES_AT_ONCE * len(indices) // max(1, indices.size))
     for first in range(0, len(indices), rows):
         yield first, np.asarray(indices[first : first + rows])
 

@@ -20,7 +20,7 @@ from pharos.errors import ParameterError
 from pharos.system import storage
 from pharos.system.storage import compiled_folders
 
-SMALL = 1 << 16
+SMALL_STATES = 1 << 16
 """Entries below which rules and kernels are interpreted, as compiling takes longer (benchmarks/startup.py); 0: none."""
 
 TOLD_AFTER, TOLD_EVERY = 2.0, 10.0

@@ -20,7 +20,7 @@ from pharos.system import storage
 CHUNK_BYTES = 1 << 20
 """Size of a chunk before it is deflated: the least that is read for one row."""
 CACHED_BYTES = 1 << 26
-LEVEL = 6
+COMPRESSION_LEVEL = 6
 
 
 class DistinctRows:
@@ -211,7 +211,7 @@ def deflate_rows(rows: np.ndarray) -> bytes:
     flat = np.ascontiguousarray(rows).reshape(len(rows), -1).view(np.uint8)
     differences = flat.copy()
     differences[1:] ^= flat[0]
-    return zlib.compress(differences.tobytes(), LEVEL)
+    return zlib.compress(differences.tobytes(), COMPRESSION_LEVEL)
 
 
 def inflate_rows(chunk: bytes, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:

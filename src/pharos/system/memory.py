@@ -86,12 +86,12 @@ def _of_files(statistics: Path) -> int:
 
 
 # Bytes that are always taken from memory; beyond them, the share of what is free that one array may take.
-SMALL, SHARE = 1 << 26, 4
+SMALL_BYTES, MEMORY_SHARE = 1 << 26, 4
 # The same of values, all of which are read and written in each sweep.
 SHARE_OF_VALUES = 1.5
-_BLOCK = 1 << 24
+_BYTES_AT_ONCE = 1 << 24
 # Rows of a mapped array that are swept while the next ones are read.
-RANGE = 1 << 22
+RANGE_ROWS = 1 << 22
 # Rows of one that memory has no room for: they are read at a time, into one of two arrays.
 PIECE = 1 << 19
 # Advice of Linux 5.4 that Python has no name for: these pages may go first.
@@ -129,7 +129,7 @@ def huge_pages(length: int, dtype: np.dtype) -> np.ndarray:
     return np.frombuffer(memory, dtype)
 
 
-def large_zeros(shape: tuple[int, ...], dtype: DTypeLike, share: float = SHARE) -> np.ndarray:
+def large_zeros(shape: tuple[int, ...], dtype: DTypeLike, share: float = MEMORY_SHARE) -> np.ndarray:
     """An array of zeros: in memory, or, if it would take more than 1 / share of what is free, a mapped file.
 
     The file is in the cache's folder and has no name: it is gone with the array, whatever becomes of the process.
@@ -153,9 +153,9 @@ def large_zeros(shape: tuple[int, ...], dtype: DTypeLike, share: float = SHARE) 
         ) from error
 
 
-def fits(size: int, share: float = SHARE) -> bool:
+def fits(size: int, share: float = MEMORY_SHARE) -> bool:
     """Whether so many bytes are at most 1 / share of what is free, or few."""
-    return size <= SMALL or size <= available_memory() / share
+    return size <= SMALL_BYTES or size <= available_memory() / share
 
 
 def mapped_file(folder: Path, size: int) -> mmap.mmap:
@@ -173,27 +173,27 @@ def append_zeros(file: BinaryIO, size: int) -> None:
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file.fileno(), file.tell(), size)
     else:
-        for start in range(0, size, _BLOCK):
-            file.write(bytes(min(_BLOCK, size - start)))
+        for start in range(0, size, _BYTES_AT_ONCE):
+            file.write(bytes(min(_BYTES_AT_ONCE, size - start)))
         file.flush()
 
 
 def ranges_from_the_end(rows: object, low: int, high: int, have_room: bool = False) -> Iterator[tuple[int, int]]:
     """Ranges [start, stop) that make up [low, high), the last one first: how rows are swept from the last to the first.
 
-    Rows in memory are one range. Of a mapped array, `RANGE` rows are swept while the system reads the rows before them:
-    it reads ahead by itself from the first byte to the last, but not the other way round. If
-    the rows fill memory, unless these `have_room` in it, those that were swept go before anything else: values, which
-    may be mapped as well, are needed all the time.
+    Rows in memory are one range. Of a mapped array, `RANGE_ROWS` rows are swept while the system reads the rows before
+    them: it reads ahead by itself from the first byte to the last, but not the other way round. If the rows fill
+    memory, unless these `have_room` in it, those that were swept go before anything else: values, which may be mapped
+    as well, are needed all the time.
     """
     rows = rows.packed if isinstance(rows, PackedIndices) else rows
     if not isinstance(rows, np.memmap):
         yield low, high
         return
     fills_memory = not have_room and 2 * rows.nbytes > available_memory()
-    for stop in range(high, low, -RANGE):
-        start = max(stop - RANGE, low)
-        _advise(rows, max(start - RANGE, low), start, getattr(mmap, "MADV_WILLNEED", None))
+    for stop in range(high, low, -RANGE_ROWS):
+        start = max(stop - RANGE_ROWS, low)
+        _advise(rows, max(start - RANGE_ROWS, low), start, getattr(mmap, "MADV_WILLNEED", None))
         yield start, stop
         if fills_memory and sys.platform == "linux":
             _advise(rows, start, stop, _COLD)

@@ -18,7 +18,7 @@ from pharos.errors import FileFormatError
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
-SHOWN = 60  # letters of a wrong entry, in errors
+SHOWN_LETTERS = 60  # letters of a wrong entry, in errors
 
 
 def docstring_entries(documented: object) -> dict[str, str]:
@@ -135,11 +135,13 @@ def parse_record(cls: type[T], entry: object, source: str, optional: Collection[
     """
     names = [each.name for each in _fields(cls)]
     if not isinstance(entry, Mapping):
-        raise FileFormatError(f"{source} is {repr(entry)[:SHOWN]}; expected {', '.join(names)}")
+        raise FileFormatError(f"{source} is {repr(entry)[:SHOWN_LETTERS]}; expected {', '.join(names)}")
     missing = [name for name in names if name not in entry and name not in optional]
     unknown = [name for name in entry if name not in names]
     if missing or unknown:
-        wrong = f"lacks {', '.join(missing)}" if missing else f"has the unknown entry {str(unknown[0])[:SHOWN]!r}"
+        wrong = (
+            f"lacks {', '.join(missing)}" if missing else f"has the unknown entry {str(unknown[0])[:SHOWN_LETTERS]!r}"
+        )
         raise FileFormatError(f"{source} {wrong}; expected {', '.join(names)}")
     hints = get_type_hints(cls)
     return cls(**{name: _checked(value, hints[name], f"{source}: {name}") for name, value in entry.items()})
@@ -153,7 +155,7 @@ def _checked(value: object, hint: object, source: str) -> object:
     is_number = isinstance(value, bool) and bool not in kinds  # Python counts truths as numbers
     if kind is not Any and (is_number or not isinstance(value, kinds)):
         expected = getattr(hint, "__name__", hint) if not inner or kind is types.UnionType else "an object"
-        raise FileFormatError(f"{source} is {repr(value)[:SHOWN]}; expected {expected}")
+        raise FileFormatError(f"{source} is {repr(value)[:SHOWN_LETTERS]}; expected {expected}")
     if isinstance(value, Mapping) and kind is Mapping and inner[1] is not Any:
         return {name: _checked(each, inner[1], f"{source}: {name}") for name, each in value.items()}
     return value

@@ -92,7 +92,7 @@ def find_source(name: str, folder: str | Path | None = None) -> Source:
     if where.endswith(".py"):
         path = base / Path(where).expanduser()
         if not path.is_file():
-            raise ParameterError(f"{name!r}: there is no file {path}; {_EXPECTED}")
+            raise ParameterError(f"{name!r}: there is no file {path}; {_EXPECTED_REFERENCE}")
         return Source(f"{path.name}:{attribute}", str(path.resolve()), _checksum(path))
     inside = base.joinpath(*where.split("."))
     for candidate in (inside.with_suffix(".py"), inside / "__init__.py"):
@@ -101,9 +101,9 @@ def find_source(name: str, folder: str | Path | None = None) -> Source:
     try:
         spec = importlib.util.find_spec(where)
     except Exception as error:  # of the module's parents
-        raise ParameterError(f"{name!r}: {_in_a_line(error)}; {_EXPECTED}") from error
+        raise ParameterError(f"{name!r}: {_in_a_line(error)}; {_EXPECTED_REFERENCE}") from error
     if spec is None:
-        raise ParameterError(f"{name!r}: No module named {where!r}; {_EXPECTED}")
+        raise ParameterError(f"{name!r}: No module named {where!r}; {_EXPECTED_REFERENCE}")
     origin = spec.origin if spec.has_location and spec.origin else ""
     return Source(name, origin, _checksum(origin))
 
@@ -120,7 +120,7 @@ def load_source(source: Source) -> Any:
         module = _module_of_file(source) if source.module is None else _module_called(source)
         target = getattr(module, source.attribute, None) if source.attribute else None
     except (Exception, SystemExit) as error:  # a script may end while it is loaded
-        raise ParameterError(f"{source.name!r}: {_in_a_line(error)}; {_EXPECTED}") from error
+        raise ParameterError(f"{source.name!r}: {_in_a_line(error)}; {_EXPECTED_REFERENCE}") from error
     _LOADED[source.name] = (source, target)
     return target
 
@@ -156,7 +156,7 @@ def resolve(source: Source, *, trust: bool = False, strict: bool = False) -> Any
     now = source
     if not Path(source.file).is_file():
         if source.module is None:
-            raise ParameterError(f"{source.name!r}: there is no file {source.file}; {_EXPECTED}")
+            raise ParameterError(f"{source.name!r}: there is no file {source.file}; {_EXPECTED_REFERENCE}")
         now = find_source(source.name, folder=Path(sys.prefix))  # installed here, elsewhere than there
     now = Source(source.name, now.file, _checksum(now.file))
     if now.checksum != source.checksum:
@@ -198,7 +198,7 @@ def announced(name: str) -> Source | None:
     return source if source is not None and not source.file else None
 
 
-_EXPECTED = "expected 'module:Name' or 'file.py:Name'"
+_EXPECTED_REFERENCE = "expected 'module:Name' or 'file.py:Name'"
 
 
 def _tell_change(source: Source, now: Source, strict: bool) -> None:

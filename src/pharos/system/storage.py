@@ -40,11 +40,11 @@ except ImportError:  # Windows
 LOCK = "lock"
 CLAIM = "lock.claim"
 """File that stands in for a lock where the file system has none: the process that makes it holds the folder."""
-WAITING_SECONDS = 0.2
+LOCK_POLL_SECONDS = 0.2
 CLAIM_ATTEMPTS = 200
 
 DIGEST = "digest"
-BLOCK_BYTES = 1 << 24
+DIGEST_BLOCK_BYTES = 1 << 24
 
 _HELD = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 _UNSUPPORTED = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL)
@@ -328,7 +328,7 @@ def waiting_lock(
             if not is_announced:
                 on_wait(f"{folder}: another process is {activity} there; waiting until it is done")
                 is_announced = True
-            time.sleep(WAITING_SECONDS)
+            time.sleep(LOCK_POLL_SECONDS)
 
 
 def _flock(file: TextIO, folder: Path, error: type[PharosError], activity: str) -> bool:
@@ -508,7 +508,7 @@ def digest_of_bytes(data: bytes | memoryview) -> str:
     return xxhash.xxh3_128_hexdigest(data)
 
 
-def digest_of_file(path: str | os.PathLike, block_bytes: int = BLOCK_BYTES) -> str:
+def digest_of_file(path: str | os.PathLike, block_bytes: int = DIGEST_BLOCK_BYTES) -> str:
     """XXH3-128 of a file, read in blocks."""
     digest = xxhash.xxh3_128()
     check_regular(path)

@@ -13,7 +13,7 @@ except ImportError as error:
     raise MissingExtra("reading YAML", "pyyaml", "study") from error
 
 # Limit that keeps aliases from standing for millions of entries
-MOST_NODES = 1_000_000
+MOST_YAML_NODES = 1_000_000
 
 
 class Loader(yaml.SafeLoader):
@@ -82,9 +82,11 @@ def _check_nodes(root: "yaml.Node", name: str) -> None:
         elif isinstance(node, yaml.SequenceNode):
             children = node.value
         total = 1 + sum(map(size, children))
-        if total > MOST_NODES:
+        if total > MOST_YAML_NODES:
             line = node.start_mark.line + 1
-            raise ParameterError(f"{name}:{line}: stands for more than {MOST_NODES:,} entries, aliases written out")
+            raise ParameterError(
+                f"{name}:{line}: stands for more than {MOST_YAML_NODES:,} entries, aliases written out"
+            )
         sizes[id(node)] = total
         return total
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Figures = Mapping[str, Mapping[str, bytes] | None]
 # A column of texts up to this long is not broken over lines
-SHORT = 30
+SHORT_TEXT = 30
 
 
 class Section:
@@ -102,7 +102,7 @@ def data_table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> R
     for name in data.columns:
         is_number = data[name].dtype.kind in "fiu"
         longest = data[name].astype(str).str.len().max() if len(data) else 0
-        kind = "n" if is_number else "s" if longest <= SHORT else "t"
+        kind = "n" if is_number else "s" if longest <= SHORT_TEXT else "t"
         columns.append(Column(in_words(str(name)), kind))
         digits_of.append(0 if is_number and _is_whole(data[name].to_numpy(float)) else digits)
     rows = [
