@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pharos
 from pharos import hardness, importers
-from pharos.hardness.effective_horizon import TIE, LargeHorizon, NodeHorizon, parts_of
+from pharos.hardness.effective_horizon import OPTIMAL_TIE, LargeHorizon, NodeHorizon, horizon_fields
 from pharos.mdp import sticky_actions
 
 CORRIDOR = Path(__file__).parents[1] / "tests" / "data" / "bridge" / "key-corridor-s3r1.npz"
@@ -51,10 +51,12 @@ def small():
         print(f"  {found}")
     lake = pharos.build(pharos.make("frozen_lake", size=40, seed=0)).mdp(gamma=1.0)
     slow, _ = timed(
-        f"lake of {lake.num_states} states, T = 200, vectorized", lambda: parts_of(NodeHorizon.of_steps(lake, 200))
+        f"lake of {lake.num_states} states, T = 200, vectorized",
+        lambda: horizon_fields(NodeHorizon.of_steps(lake, 200)),
     )
     fast, _ = timed(
-        f"lake of {lake.num_states} states, T = 200, compiled", lambda: parts_of(LargeHorizon(lake, 200, TIE))
+        f"lake of {lake.num_states} states, T = 200, compiled",
+        lambda: horizon_fields(LargeHorizon(lake, 200, OPTIMAL_TIE)),
     )
     print(f"  compiled {slow / fast:.1f} times as fast")
 

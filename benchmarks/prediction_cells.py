@@ -225,7 +225,7 @@ def pilots(file, write=False):
 def draw(file, picture):
     """Predicted against observed on the second sealed set, a panel for each agent."""
     from pharos.plots import save
-    from pharos.plots.style import COLORS, GRID, panels, styled
+    from pharos.plots.style import GRID_COLOR, LINE_COLORS, panels, styled
 
     @styled
     def by_agent():
@@ -233,11 +233,11 @@ def draw(file, picture):
         drawn, axes = panels(2, 3.4, 3.3)
         for axis, agent in zip(axes, primary_predictors(), strict=True):
             cells = frame[(frame["agent"] == agent) & (frame["study"] == "sealed-2")]
-            axis.plot([0, 1.8], [0, 1.8], color=GRID, zorder=0)
+            axis.plot([0, 1.8], [0, 1.8], color=GRID_COLOR, zorder=0)
             for number, (name, some) in enumerate(cells.groupby(cells["observation"].str.split("[(,]").str[0])):
                 label = name.replace("_", " ")
                 axis.scatter(
-                    some["predicted"], some["observed"], 14, COLORS[number], label=label, alpha=0.8, linewidth=0
+                    some["predicted"], some["observed"], 14, LINE_COLORS[number], label=label, alpha=0.8, linewidth=0
                 )
             axis.set(
                 xlim=(0, 1.8), ylim=(0, 1.8), xlabel="predicted regret", title=f"{agent.upper()}, {len(cells)} cells"

@@ -2,10 +2,13 @@
 
 python scripts/atari_page.py                 all games
 python scripts/atari_page.py pong freeway    these alone; the other rows stay as they are
+python scripts/atari_page.py --runs FOLDER   the table of runs beside their predictions, from finished runs in FOLDER
 
-Needs ale-py. Pictures are screens of an optimal play; the tables stay in a temporary folder.
+Needs ale-py for games. Pictures are screens of an optimal play; the tables stay in a temporary folder.
 """
 
+import csv
+import json
 import re
 import sys
 import tempfile
@@ -25,6 +28,7 @@ GAMES = {  # horizon, and other options of the import
     "seaquest": (7, {}),
     "tennis": (3, {}),
     "space_invaders": (5, {"noops": 120}),
+    "ms_pacman": (6, {"noops": 240}),
 }
 COLUMNS = "game, T, states, merged to, screens, actions, optimum, random, diameter, effective horizon, play"
 HEAD = f"| {COLUMNS.replace(', ', ' | ')} |"
@@ -69,6 +73,9 @@ def row(game: str) -> str:
 
 
 def main() -> None:
+    if sys.argv[1:2] == ["--runs"]:
+        write_runs(Path(sys.argv[2]))
+        return
     for name in sys.argv[1:] or GAMES:
         line = row(name)
         print(line, flush=True)
@@ -82,6 +89,43 @@ def put(name: str, line: str) -> None:
     rows = {match[1]: match[0] for match in re.finditer(r"^\| `(\w+)`.*$", lines, re.MULTILINE)} | {name: line}
     ordered = "\n".join(rows[game] for game in GAMES if game in rows)
     PAGE.write_text(f"{before}{HEAD}\n{'|---' * HEAD.count(' | ')}|---|\n{ordered}\n\n{after}")
+
+
+STUDY = PAGE.parent / "studies" / "atari"
+RESULTS = ("normalized_regret", "final_regret", "final_value", "value_optimal", "value_uniform")
+RUNS = "| game | agent | seeds | predicted, and its interval | observed: mean, least and most | last policy |"
+
+
+def write_runs(folder: Path) -> None:
+    """runs.csv of the study, one row a finished run, and its table on the page."""
+    rows = []
+    for file in sorted(folder.glob("*/run.json")):
+        record = json.loads(file.read_text())
+        if record["status"] == "finished":
+            config, result = record["config"], record["result"]
+            game = Path(config["parameters"]["folder"]).name
+            numbers = [f"{result[name]:.6f}" for name in RESULTS]
+            rows.append([game, config["agent"], config["seed"], *numbers, f"{record['seconds']:.0f}"])
+    with (STUDY / "runs.csv").open("w", newline="") as stream:
+        table = csv.writer(stream, lineterminator="\n")
+        table.writerow(["game", "agent", "seed", *RESULTS, "seconds"])
+        table.writerows(rows)
+    before, _, rest = PAGE.read_text().partition(RUNS)
+    after = rest.partition("\n\n")[2]
+    with (STUDY / "predictions.csv").open() as stream:
+        lines = [line for cell in csv.DictReader(stream) if (line := line_of(cell, rows))]
+    PAGE.write_text("\n".join([before + RUNS, "|---" * RUNS.count(" | ") + "|---|", *lines, "", after]))
+
+
+def line_of(cell: dict[str, str], rows: list[list]) -> str:
+    """The line of a game and an agent: prediction beside runs; empty if there is none."""
+    own = [row for row in rows if row[:2] == [cell["game"], cell["agent"]]]
+    if not own:
+        return ""
+    regrets, last = [float(row[3]) for row in own], [float(row[4]) / (float(row[6]) - float(row[7])) for row in own]
+    predicted = f"{float(cell['predicted_regret']):.2f} ({float(cell['low']):.2f} to {float(cell['high']):.2f})"
+    observed = f"{np.mean(regrets):.2f} ({min(regrets):.2f} to {max(regrets):.2f})"
+    return f"| `{cell['game']}` | {cell['agent']} | {len(own)} | {predicted} | {observed} | {np.mean(last):.2f} |"
 
 
 if __name__ == "__main__":

@@ -54,15 +54,15 @@ COUNTED = {  # instance -> states, and the page that tells how they were counted
 }
 NOT_COMPUTED = {  # instance -> why its values are not there
     "breakout/20x10x1-3rows": "V\\* is 3.580966, within 2.2e-8: 1,328 s, and 10.4 GiB of memory beside mapped files "
-    "([performance](../evidence/performance.md)); the uniform and the worst policy were not solved",
-    "breakout/30x10x1-3rows": "V\\* is 2.212515, within 4.5e-9 ([performance](../evidence/performance.md)); the "
+    "([performance](../evidence/performance.md)). The uniform and the worst policy were not solved",
+    "breakout/30x10x1-3rows": "V\\* is 2.212515, within 4.5e-9 ([performance](../evidence/performance.md)). The "
     "uniform and the worst policy were not solved",
-    "sliding_tiles/3x4": "enumerated once ([302 s of a processor, 5.8 GB of files](../large-runs.md)); not solved",
-    "game_2048/3x3": "541,821,326 possible outcomes, 33 minutes to enumerate; undiscounted the optimum is worth "
-    "5,468.49 ([2048](../evidence/worlds.md#2048)); the uniform and the worst policy were not solved",
+    "sliding_tiles/3x4": "enumerated once ([302 s of a processor, 5.8 GB of files](../large-runs.md)), not solved",
+    "game_2048/3x3": "541,821,326 possible outcomes, 33 minutes to enumerate. Undiscounted, the optimum is worth "
+    "5,468.49 ([2048](../evidence/worlds.md#2048)). The uniform and the worst policy were not solved",
     **{
-        f"game_2048/3x3-to-{target}": f"tens of millions of states with up to 16 outcomes; the optimum wins "
-        f"with probability {chance} ([2048](../evidence/worlds.md#2048)); the uniform and the worst policy were not "
+        f"game_2048/3x3-to-{target}": f"tens of millions of states with up to 16 outcomes. The optimum wins "
+        f"with probability {chance} ([2048](../evidence/worlds.md#2048)). The uniform and the worst policy were not "
         "solved"
         for target, chance in ((512, 0.736774), (1024, 0.011338))
     },
@@ -74,9 +74,9 @@ LIVE = {  # page -> the explorer that it shows
 MARK = "<!-- The site has it live here: scripts/site_pages.py, explorer. -->"
 POLICIES = ("optimal", "uniform", "worst")
 VALUES = (
-    "Values at the start are those of the optimal, the uniformly random and the worst policy. *Discounted*: by 0.99, "
-    "without a limit. *Of an episode*: undiscounted, of as many steps as its limit; a dash where states, actions and "
-    "steps multiply to more than 10^10, so that it was not computed. Each is within 1e-6, rounded to six digits."
+    "You read values at the start, of the optimal, the uniformly random and the worst policy. *Discounted*: by 0.99, "
+    "without a limit. *Of an episode*: undiscounted, of as many steps as its limit. There is a dash if states, actions "
+    "and steps multiply to more than 10^10: then it was not computed. Each is within 1e-6, rounded to six digits."
 )
 UNKNOWN = "–"
 VALUES_HEAD = (
@@ -116,9 +116,9 @@ def environments() -> dict[str, str]:
     pages = {f"environments/{name}.md": page_of(cls, stored, gallery.get(name, "")) for name, cls in classes().items()}
     cards = [card_of(cls, stored, gallery.get(name, "")) for name, cls in classes().items()]
     index = (
-        "# Environments\n\nEvery state of these can be enumerated, so that the optimum, the hardness and the regret of "
-        "an agent are numbers. Each is a class with parameters; the named instances are those of the paper, of "
-        "Gymnasium, of MiniGrid and of bsuite. Your own: [adding an environment](../adding-an-environment.md).\n\n"
+        "# Environments\n\nEvery state of these can be enumerated, so the optimum, the hardness and the regret of your "
+        "agent are numbers. Each is a class with parameters. The named instances are known from the paper, Gymnasium, "
+        "MiniGrid and bsuite. If you want your own: [adding an environment](../adding-an-environment.md).\n\n"
         '<div class="cards" markdown="0">\n' + "\n".join(cards) + "\n</div>\n"
     )
     return {"environments/index.md": index, "environments/values.md": values_of_all(stored), **pages}
@@ -131,7 +131,7 @@ def values_of_all(stored: Mapping[str, dict]) -> str:
         [
             "# Values of every instance",
             "",
-            f"{VALUES} Instances whose values were not computed for this page stand below. The same in JSON: "
+            f"{VALUES} Instances whose values were not computed for this page are listed below. The same in JSON: "
             "[environments.json](../environments.json).",
             "",
             VALUES_HEAD,
@@ -139,7 +139,7 @@ def values_of_all(stored: Mapping[str, dict]) -> str:
             "",
             "## Without values",
             "",
-            "`pharos solve` computes them, [as far as memory and disk go](../evidence/performance.md).",
+            "Use `pharos solve` to compute them, [as far as memory and disk go](../evidence/performance.md).",
             "",
             "| instance | states | why |",
             "|---|---|---|",
@@ -356,7 +356,10 @@ def baseline_board() -> str:
 
 def reference() -> dict[str, str]:
     """A page for each package, with an entry for every name that it publishes."""
-    pages, lines = {}, ["# API", "", "In the order of the data flow; names are imported from where the page says.", ""]
+    pages, lines = (
+        {},
+        ["# API", "", "In the order of the data flow. Import names from the package that the page says.", ""],
+    )
     shown: dict[str, str] = {}  # where it is defined -> under which name it has its entry
     for page, (title, module_name) in PACKAGES.items():
         module = importlib.import_module(module_name)
@@ -410,7 +413,7 @@ def first_sentence(text: str) -> str:
 def tutorials(folder: Path) -> dict[str, str | bytes]:
     """Notebooks as pages, with what their cells print and draw."""
     pages: dict[str, str | bytes] = {}
-    lines = ["# Tutorials", "", "Notebooks, executed by the tests. Each takes a few minutes.", ""]
+    lines = ["# Tutorials", "", "Notebooks, executed by the tests. Each takes you a few minutes.", ""]
     for path in sorted(folder.glob("*.ipynb")):
         text, pictures = notebook(json.loads(path.read_text(encoding="utf-8")), path.stem)
         pages[f"tutorials/{path.stem}.md"] = text

@@ -81,7 +81,7 @@ class Batch:
     def policy(self, i):
         return Policy(self.runs[i].mdp.num_actions, int(abs(self.walk[i, 0]) * 100))
 
-    def greedy_actions(self, places):
+    def greedy_actions(self, indices):
         return None  # they are asked about observations
 
     def best_actions(self, states):

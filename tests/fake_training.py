@@ -95,7 +95,7 @@ def specification(name="fake", **given):
 def attempt(run, folder):
     """Execute one run of a study in this process: how it ended."""
     runner = partial(worker.run_alone, train)
-    (end,) = worker.attempt(runner, [run.config], [run.id], Path(folder))
+    (end,) = worker.attempt_run(runner, [run.config], [run.id], Path(folder))
     return end
 
 

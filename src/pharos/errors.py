@@ -3,7 +3,7 @@
     PharosError
     ├── ParameterError (ValueError)     a parameter, name or option is wrong: nothing was computed  (exit code 2)
     │   ├── UnknownName                 no such environment, measure, observation, agent ...: nearest match suggested
-    │   └── UntrustedCode               a file names code of somebody else, which is executed only where it is trusted
+    │   └── UntrustedCode               a file names code of somebody else, which is executed only if it is trusted
     ├── RuleError                       an environment's rules broke their contract, for a named state and action
     ├── StateSpaceError                 something is wrong with a folder that holds a state space
     │   ├── StateSpaceTooLarge          more states than `max_states`
@@ -30,7 +30,7 @@ import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-LONGEST = 2000
+LONGEST_MESSAGE = 2000
 """Characters of a message: one that quotes more is cut in the middle."""
 
 
@@ -42,8 +42,8 @@ class PharosError(Exception):
 
 
 def _cut(text: str) -> str:
-    half = LONGEST // 2
-    return text if len(text) <= LONGEST else f"{text[: half - 5]} ... {text[-half:]}"
+    half = LONGEST_MESSAGE // 2
+    return text if len(text) <= LONGEST_MESSAGE else f"{text[: half - 5]} ... {text[-half:]}"
 
 
 class ParameterError(PharosError, ValueError):
@@ -61,7 +61,7 @@ class UnknownName(ParameterError):
 
 
 class UntrustedCode(ParameterError):
-    """A file names code, a module or a Python file, which is executed only where it is trusted."""
+    """A file names code, a module or a Python file, which is executed only if it is trusted."""
 
 
 class RuleError(PharosError):

@@ -85,9 +85,9 @@ Outcome = tuple[float, int, float, bool]
 def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
     """Return P[s][a] = [(probability, next state, reward, terminated), ...], as Gymnasium's toy texts have it.
 
-    A state has the actions that are available there. The implicit end becomes one more state S, where there is one.
-    Random actions are written out as outcomes. Each outcome has its own reward where the MDP is of an environment and
-    has its rewards; else the expected one of what is executed.
+    A state has the actions that are available there. The implicit end becomes one more state S, if there is one.
+    Random actions are written out as outcomes. Each outcome has its own reward if the MDP is of an environment and
+    has its rewards; otherwise the expected reward of what is executed.
 
     Raises:
         ParameterError: under sticky actions the state is a pair, which this table has no room for.
@@ -164,12 +164,12 @@ def _screens(mdp: TabularMDP, order: np.ndarray) -> dict[str, np.ndarray]:
     """Distinct images of a folder and the image of each state; nothing if there are none."""
     if mdp.folder is None or not mdp_files.is_folder(mdp.folder):
         return {}
-    manifest = mdp_files.read_manifest(mdp.folder)
-    if manifest.get(mdp_files.OBSERVATIONS) != "image":
+    manifest = mdp_files.read_mdp_manifest(mdp.folder)
+    if manifest.get(mdp_files.SHOWN_NAME) != "image":
         return {}
-    shown = mdp_files.read_rows(mdp.folder, manifest)
+    shown = mdp_files.read_observations(mdp.folder, manifest)
     assert shown is not None
-    rows = shown if isinstance(shown, distinct_rows.DistinctRows) else distinct_rows.collected(shown)
+    rows = shown if isinstance(shown, distinct_rows.DistinctRows) else distinct_rows.collect_rows(shown)
     return {
         "screens": rows.distinct(np.arange(rows.num_distinct)),
         "screen_mapping": rows.index[order].astype(np.int64),

@@ -6,7 +6,7 @@ run ranks as threads.
 
 Halos are borders of ranges of rows, one range for each rank: the rows of other ranks that a rank reads. Their values
 come in messages from those ranks alone that have some of them. They travel while the ranks compute: the values of the
-high rows of a range, all but the lowest eighth, may be sent before those of the low ones are known.
+high rows of a range, all but the lowest eighth, may be sent before the values of the low rows are known.
 """
 
 import ctypes
@@ -28,8 +28,8 @@ from pharos import errors
 from pharos.errors import MissingExtra, ParameterError, PharosError
 from pharos.system import compiling
 
-NUMBERS = 3  # most numbers that a rank sends to all others with the header of an exchange
-_ROWS = 1 << 20  # most rows that rank 0 sends to each rank in one exchange
+MOST_NUMBERS = 3  # most numbers that a rank sends to all others with the header of an exchange
+_ROWS_AT_ONCE = 1 << 20  # most rows that rank 0 sends to each rank in one exchange
 
 
 class RankFailed(PharosError):
@@ -96,10 +96,10 @@ class Rank(ABC):
 
     def scatter_rows(self, array: np.ndarray | None, cuts: np.ndarray, into: np.ndarray) -> None:
         """Send rank q the rows [cuts[q], cuts[q + 1]) of an array that rank 0 alone has, into its first rows."""
-        for first in range(0, int(np.diff(cuts).max()), _ROWS):
+        for first in range(0, int(np.diff(cuts).max()), _ROWS_AT_ONCE):
             parts = None
             if array is not None:
-                stops = np.minimum(cuts[:-1] + first + _ROWS, cuts[1:])
+                stops = np.minimum(cuts[:-1] + first + _ROWS_AT_ONCE, cuts[1:])
                 parts = [np.array(array[cuts[q] + first : max(stops[q], 0)]) for q in range(self.size)]
             rows = self.scatter(parts, into)
             into[first : first + len(rows)] = rows
@@ -117,7 +117,7 @@ class Rank(ABC):
         return self.exchange([array] * self.size)
 
     def allgather_numbers(self, *numbers: float) -> np.ndarray:
-        """(P, K) float64: a few numbers (at most `NUMBERS`) of each rank, at all of them."""
+        """(P, K) float64: a few numbers (at most `MOST_NUMBERS`) of each rank, at all of them."""
         return np.array(self.allgather(np.array(numbers, np.float64)))
 
 
@@ -160,7 +160,7 @@ def error_of(text: str, rank: int) -> PharosError:
 # Halos ----------------------------------------------------------------------------------------------------------------
 
 
-_LOW = 8  # one part in so many of a range is sent last
+_LOW_SHARE = 8  # one part in so many of a range is sent last
 
 
 def cuts_of(num_rows: int, ranks: int) -> np.ndarray:
@@ -185,11 +185,11 @@ class Halo:
         self.of_rank = [slice(borders[q], borders[q + 1]) for q in range(rank.size)]
         self.wanted = rank.exchange([rows[part] - cuts[q] for q, part in enumerate(self.of_rank)])
         self._rank = rank
-        lows = np.diff(cuts) // _LOW
+        lows = np.diff(cuts) // _LOW_SHARE
         self.low = int(lows[rank.rank])
         if not any((rows >= self.low).any() for rows in self.wanted):
             self.low = int(cuts[rank.rank + 1] - cuts[rank.rank])
-        self._low_borders = np.searchsorted(rows, cuts[:-1] + lows)  # where the high rows of each rank begin in `rows`
+        self._low_borders = np.searchsorted(rows, cuts[:-1] + lows)  # index of each rank's first high row in `rows`
         self._received: np.ndarray | None = None
 
     def __len__(self) -> int:
@@ -205,7 +205,8 @@ class Halo:
     # While messages travel: receive, then send all or high and low ones, then finish --------------------------------
 
     def receive(self, like: np.ndarray, in_two: bool = False) -> None:
-        """Begin to receive values of the halo, rows like those of `like`; in one message from each rank, or in two."""
+        """Begin to receive values of the halo, rows like the rows of `like`; in one message from each rank, or in
+        two."""
         received = self._received
         if received is None or received.dtype != like.dtype or received.shape[1:] != like.shape[1:]:
             self._received = received = np.empty((len(self), *like.shape[1:]), like.dtype)
@@ -224,11 +225,11 @@ class Halo:
         self._send(values, self.low, len(values))
 
     def send_low(self, values: np.ndarray) -> None:
-        """Begin to send the values of the low rows that others read, after those of the high ones."""
+        """Begin to send the values of the low rows that others read, after the high ones."""
         self._send(values, 0, self.low)
 
     def finish(self, into: np.ndarray) -> None:
-        """Wait for the values (H, ...) of the halo, where some are to be received, and write them to `into`."""
+        """Wait for the values (H, ...) of the halo, if some are to be received, and write them to `into`."""
         self._rank.finish()
         if self._received is not None:
             into[...] = self._received
@@ -250,8 +251,8 @@ _LAUNCHERS = (
     ("MV2_COMM_WORLD_RANK", "MV2_COMM_WORLD_SIZE"),
 )
 _FAILED = -1
-_VALUES, _NOTICE = 0, 1  # tags of messages
-_LOOKS = 100  # tests of pending messages before other processes get the processor
+_VALUE_TAGS, _NOTICE = 0, 1  # tags of messages
+_RANK_LOOKS = 100  # tests of pending messages before other processes get the processor
 _BANNER = "=   BAD TERMINATION OF ONE OF YOUR APPLICATION PROCESSES"  # of MPICH, between lines of =
 _STARTED = "PHAROS_STARTED"  # variable of processes that pharos itself has started under mpiexec
 
@@ -268,7 +269,7 @@ def check_processes(processes: int | str) -> None:
 
 
 def check_ranks(num_states: int, ranks: int) -> None:
-    """Raise a ParameterError where there are more ranks than states."""
+    """Raise a ParameterError if there are more ranks than states."""
     if ranks > max(num_states, 1):
         raise ParameterError(f"{ranks} processes for {num_states} states; expected at most one for each state")
 
@@ -344,7 +345,7 @@ def _end_with_parent() -> None:
 
 
 def launched() -> tuple[int, int]:
-    """(rank, size) of this process among those that a launcher has started; (0, 1) where none has.
+    """(rank, size) of this process among the processes that a launcher has started; (0, 1) if none has.
 
     MPI is not loaded.
     """
@@ -420,7 +421,7 @@ class _Mpi(Rank):
 
     def _headers(self, rows: np.ndarray, numbers: Sequence[float] = ()) -> np.ndarray:
         """Exchange headers: numbers of rows, or _FAILED, and `numbers`; returns the first entry of each rank's."""
-        sent, received = np.zeros((2, self.size, 1 + NUMBERS), np.int64)
+        sent, received = np.zeros((2, self.size, 1 + MOST_NUMBERS), np.int64)
         sent[:, 0] = rows
         sent[:, 1 : 1 + len(numbers)] = np.array(numbers, np.float64).view(np.int64)
         self._world.Alltoall(sent, received)
@@ -429,11 +430,11 @@ class _Mpi(Rank):
 
     def send(self, to: int, array: np.ndarray) -> None:
         self._kept.append(np.ascontiguousarray(array))
-        self._requests.append(self._world.Isend(self._kept[-1], to, _VALUES))
+        self._requests.append(self._world.Isend(self._kept[-1], to, _VALUE_TAGS))
 
     def receive(self, source: int, into: np.ndarray) -> None:
         self._kept.append(into)
-        self._requests.append(self._world.Irecv(into, source, _VALUES))
+        self._requests.append(self._world.Irecv(into, source, _VALUE_TAGS))
 
     def progress(self) -> None:
         self._library.Request.Testall(self._requests)
@@ -442,7 +443,7 @@ class _Mpi(Rank):
         looks = 0
         while not self._library.Request.Testall(self._requests):
             looks += 1
-            if looks % _LOOKS == 0:
+            if looks % _RANK_LOOKS == 0:
                 time.sleep(0)
                 if self._world.Iprobe(self._library.ANY_SOURCE, _NOTICE):
                     self._counts(np.zeros(self.size, np.int64))  # raises, as at the failed rank and all others

@@ -42,8 +42,8 @@ def regret_scale(optimal: ArrayLike, reference: ArrayLike, error_bound: float = 
         optimal, reference: numbers or arrays; values from the start, in return.
         error_bound: of each of the two.
     Returns:
-        A float or an array, in return. NaN where it is not above max(1e-12, 2 `error_bound`): there the reference
-        policy is itself optimal, as far as the values can tell, and regret has no scale. NaN where it is infinite, too.
+        A float or an array, in return. NaN if it is not above max(1e-12, 2 `error_bound`): then the reference
+        policy is itself optimal, as far as the values can show, and regret has no scale. NaN also if it is infinite.
     Source: 1 - regret / scale is the normalised score of Mnih et al. (2015), with the exact optimum in the place of a
         human. The threshold is ours.
     """
@@ -64,7 +64,7 @@ class ReferenceValues:
     """Values from the start of the policies that regret is measured against.
 
     Attributes:
-        optimal, uniform, worst: of the optimal, the uniformly random and the worst policy; `worst` may be NaN where
+        optimal, uniform, worst: of the optimal, the uniformly random and the worst policy; `worst` may be NaN if
             unknown.
         error_bound: each is within this of the true value.
     """
@@ -76,11 +76,11 @@ class ReferenceValues:
 
     @staticmethod
     def of(task: "HasReference") -> "ReferenceValues":
-        """Reference values of a task; its space is built and solved where it is not yet."""
+        """Reference values of a task; its space is built and solved if it is not yet."""
         return task.reference
 
     def spread(self, reference: str = "uniform") -> float:
-        """V* - V of the reference policy, "uniform" or "worst"; NaN where it is too small to divide by.
+        """V* - V of the reference policy, "uniform" or "worst"; NaN if it is too small to divide by.
 
         Raises:
             ParameterError: another reference.
@@ -108,7 +108,7 @@ def regret(
         values: of the task.
         normalized_by: None; or "uniform" or "worst", the policy whose regret is 1.
     Returns:
-        A float or an array; in units of return, or without where normalised. NaN where it cannot be normalised, since
+        A float or an array; in units of return, or without if normalised. NaN if it cannot be normalised, because
         the reference policy is itself optimal (within the errors of the values). Values with errors may give as much
         less than 0.
     Raises:

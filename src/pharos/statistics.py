@@ -175,7 +175,7 @@ def mean_interval(strata: Strata, bounds: tuple[float, float] = UNBOUNDED) -> tu
 def interquartile_interval(strata: Strata, bounds: tuple[float, float] = UNBOUNDED) -> tuple[float, float, float]:
     """Return (`interquartile_mean`, low, high), with Student's 95 % interval; NaN without strata.
 
-    The standard error is that of twice the mean of runs winsorised at the pooled quartiles, over runs within strata.
+    The standard error is computed for twice the mean of runs winsorised at the pooled quartiles, over runs in strata.
 
     Source: Tukey and McLaughlin (1963), Less vulnerable confidence and significance procedures for location.
     """
@@ -195,7 +195,7 @@ def fieller_interval(levels: np.ndarray, strata: Strata, target: float) -> tuple
     It holds the levels at which Student's interval of the interpolated mean contains the target, with limits made
     increasing, as the mean is: the upper limit at a level is the smallest from there on, the lower one the largest up
     to there. So it runs from the last level whose upper limit is below the target to the first one whose lower limit is
-    above it; where the first lies behind the second, between them. Both ends are roots, found to rounding between
+    above it; if the first lies behind the second, between them. Both ends are roots, found to rounding between
     neighbours of 256 points of a segment.
 
     Args:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pharos.agents import joined_states, state_of
+from pharos.agents import joined_states, learner_state
 
 
 def test_names_begin_with_the_number_of_the_learner():
@@ -11,5 +11,5 @@ def test_names_begin_with_the_number_of_the_learner():
     assert list(joined)[:3] == ["0/q", "0/rng/key", "1/q"]
     assert len(joined) == 24
     for i, state in enumerate(states):
-        assert list(state_of(joined, i)) == ["q", "rng/key"]
-        assert all((state_of(joined, i)[name] == array).all() for name, array in state.items())
+        assert list(learner_state(joined, i)) == ["q", "rng/key"]
+        assert all((learner_state(joined, i)[name] == array).all() for name, array in state.items())

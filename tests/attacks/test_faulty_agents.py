@@ -323,7 +323,22 @@ def through_a_study(count, folder):
     ]
 
 
-@pytest.mark.parametrize("door", ["train", "tune", "study"])
+def through_diagnose(k, folder):
+    """(exit code, standard error, notes) of the k-th agent on twelve worlds."""
+    done = run("diagnose", f"mine.py:run_{k}", "--steps", 300, "--seeds", 1, "--json")
+    readings = set() if done.exit_code else {each["reading"] for each in json.loads(done.stdout)["findings"]}
+    return done.exit_code, done.stderr, readings & {words for _, words in NOTES.values()}
+
+
+DIAGNOSED = {
+    **dict.fromkeys(["never yields", "stops early"], "refused"),  # no policy at the end
+    "yields at the end": "unchanged",  # which is all that is judged
+    "half precision": "refused",  # its four actions, where a world has others
+}
+"""Outcomes of `diagnose` that are others than in `benchmark run`."""
+
+
+@pytest.mark.parametrize("door", ["train", "tune", "study", "diagnose"])
 def test_faulty_agents_through_other_doors(tmp_path, monkeypatch, count, door):
     """An error in one line with the agent's words, a note, or a finished run, as in the benchmark."""
     tables = {"errors": ERRORS, "notes": NOTES, "harmless": {name: (code, "") for name, code in HARMLESS.items()}}
@@ -333,15 +348,19 @@ def test_faulty_agents_through_other_doors(tmp_path, monkeypatch, count, door):
     if door == "study":
         ends = through_a_study(len(cases), tmp_path)
     else:
-        ends = [(through_train if door == "train" else through_tune)(k, tmp_path) for k in range(len(cases))]
+        through = {"train": through_train, "tune": through_tune, "diagnose": through_diagnose}[door]
+        ends = [through(k, tmp_path) for k in range(len(cases))]
     tally = Tally()
     for (kind, name, _, words), (code, text, notes) in zip(cases, ends, strict=True):
         holds = code == 0 and (
             notes is None or notes <= {"late policy"} if kind == "harmless" else words in (notes or words)
         )
+        special = DIAGNOSED.get(name) if door == "diagnose" else None
         if kind == "errors":
             holds = code != 0 and text.count("\n") == 1 and text.startswith("pharos: ") and words in text
-        outcome = "unchanged" if notes is None and not code else OUTCOMES[kind]
+        elif special:
+            holds = (code != 0 and text.count("\n") == 1) if special == "refused" else code == 0 and not notes
+        outcome = special or ("unchanged" if notes is None and not code else OUTCOMES[kind])
         tally.note(name, outcome if holds else "failed", f"exit {code}, {text[-1000:]}, notes {notes}")
     count(f"{tally.total} faulty agents through {door}: {tally}")
     tally.check()

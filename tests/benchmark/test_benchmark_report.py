@@ -17,7 +17,7 @@ from pharos.benchmark.contents import (
     learning_curve,
     learning_sentence,
     number,
-    residuals,
+    residual_tasks,
     sentence,
     unclipped_regret,
 )
@@ -148,9 +148,9 @@ def test_core_tasks_stand_beside_the_nearest_baseline_the_worst_first(contents):
 )
 def test_residuals_are_tasks_that_theory_solves_and_the_agent_does_not(agent, predictor, tasks):
     own = contents_of(results(agent, MINE), beside=[], predictor=predictor, suite=SUITE)
-    names = [task.name for task, _, _ in residuals(own)]
+    names = [task.name for task, _, _ in residual_tasks(own)]
     assert set(names) == set(tasks) | ({"exploration-8"} if "credit-16" in tasks else set())
-    excess = [own.value - expected for _, own, expected in residuals(own)]
+    excess = [own.value - expected for _, own, expected in residual_tasks(own)]
     assert excess == sorted(excess, reverse=True) and all(each > 0.2 for each in excess)
 
 
@@ -355,7 +355,7 @@ def test_names_of_tasks_show_what_the_task_is(contents):
     assert "<title>hard: deep_sea; observation vector; no chance added; regret 0.90</title>" in text
 
 
-def test_without_ladders_the_sentence_begins_with_the_core_and_its_place():
+def test_of_a_suite_without_ladders_the_sentence_begins_with_the_core_and_its_place():
     four = [BenchmarkTask(name, "deep_sea", digest=name) for name in "abcd"]
     suite = Suite("small", SUITE.protocol, tuple(four), (), "d1")
 
@@ -366,8 +366,7 @@ def test_without_ladders_the_sentence_begins_with_the_core_and_its_place():
     text = sentence(contents_of(of("mine", 0.4, 0.6, 0.7, 0.3), beside=beside, suite=suite))
     assert text == (
         "Core score 0.50 (0.49 to 0.51) on 4 tasks, below DQN's 0.80, above PPO's 0.10 on 2 tasks in common, not shown "
-        "to differ from x's 0.50, beside y's 0.55 on 1 task in common; worst on c, b and a. The ladders were not run, "
-        "so there are no frontiers."
+        "to differ from x's 0.50, beside y's 0.55 on 1 task in common; worst on c, b and a."
     )
 
 

@@ -10,7 +10,7 @@ from naive import benchmark as naive
 from pharos import benchmark
 from pharos.benchmark import AgentResults, compare, power
 from pharos.benchmark.comparison import compare_groups
-from pharos.benchmark.contents import contents_of, residuals
+from pharos.benchmark.contents import contents_of, residual_tasks
 from pharos.benchmark.diagnosis import fall_everywhere, falls, groups_of, strengths, without_verdict
 from pharos.benchmark.page import page
 from pharos.benchmark.properties import known_properties, properties_of, purpose_of
@@ -285,13 +285,13 @@ def test_residuals_of_the_shipped_agent_are_those_of_theory_and_those_of_a_fault
     text = residual_section(page(contents_of(replace(real, agent="mine.py:PPO", curves=curves))))
     own, theirs = text.split("Theory is too hopeful")
     assert "look for a bug here" in own and ">umbrella_chain-8<" in own and own.count("<tr>") == 2
-    assert theirs.count("<tr>") == 1 + len(residuals(contents_of("ppo")))
+    assert theirs.count("<tr>") == 1 + len(residual_tasks(contents_of("ppo")))
 
 
 @pytest.mark.long
 def test_the_kind_is_asked_for_where_the_name_does_not_say_it():
     results = replace(AgentResults.read("dqn"), agent="mine.py:learn", record={})
-    counts = {each: len(residuals(contents_of(results, predictor=each))) for each in ("dqn", "ppo", "table")}
+    counts = {each: len(residual_tasks(contents_of(results, predictor=each))) for each in ("dqn", "ppo", "table")}
     text = residual_section(page(contents_of(results)))
     assert "does not say its kind" in text and "--predictor dqn, ppo, table or none" in text
     others = f"Others would list {counts['dqn']} beside the idealised DQN, {counts['ppo']} beside the idealised PPO and"

@@ -20,7 +20,7 @@ from pharos import benchmark, evaluate_policy
 from pharos.benchmark import BenchmarkTask, BudgetSpent, Ladder, Protocol, Suite, write_suite
 from pharos.benchmark.suite import EARLIER, digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
-from pharos.system.sources import find, load
+from pharos.system.sources import find_source, load_source
 from pharos.training import generated_curve, write_curve
 
 PROTOCOL = Protocol(steps=300, evaluations=3, seeds=2)
@@ -89,6 +89,7 @@ def test_the_oracle_has_no_regret_and_random_play_all_of_it(suite, tmp_path):
         assert said["core"]["value"] == found.score.value and said["agent"] == name
 
 
+@pytest.mark.long
 def test_a_run_answers_with_scores_intervals_and_the_steps_that_were_used(suite, tmp_path):
     """Of 300 steps an agent that stops after 20 uses 20; Q-learning uses all."""
     write_suite(suite, tmp_path / "small.yaml")
@@ -482,7 +483,7 @@ def test_a_run_that_has_ended_may_leave_threads_behind(suite, file, tmp_path, mo
     assert not benchmark.run(f"{file}:learn", suite, out=tmp_path / "out", seeds=range(2), tasks="sea").missing
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_class_for_stable_baselines3_has_a_process_for_each_run(suite, tmp_path):
     pytest.importorskip("stable_baselines3")
     text = "import os\nfrom stable_baselines3 import DQN\n\nmade = []\n\n\nclass Mine(DQN):\n"
@@ -631,7 +632,7 @@ def test_the_dqn_of_cleanrl_learns_with_ten_other_lines(tmp_path):
     example = Path(__file__).parents[2] / "docs" / "examples" / "cleanrl_dqn.py"
     assert example.read_text().count("  # pharos") == 10
     for task, steps in ((TASKS[0], 4500), (replace(TASKS[0], observation="simple_image"), 1500)):
-        _, curve = curve_of(load(find(f"{example}:learn")), task, steps=steps)
+        _, curve = curve_of(load_source(find_source(f"{example}:learn")), task, steps=steps)
         assert [row["step"] for row in curve.rows] == [0, steps // 3, 2 * steps // 3, steps]
         assert steps < 4500 or curve.rows[-1]["normalized_regret"] < 0.1
 
@@ -642,7 +643,7 @@ def test_the_ppo_of_the_page_learns_with_four_environments_that_share_the_budget
     example = Path(__file__).parents[2] / "docs" / "examples" / "cleanrl_ppo.py"
     assert "[env.copy] * args.num_envs" in example.read_text() and example.read_text().count("  # pharos") == 6
     for task, steps in ((TASKS[0], 9000), (replace(TASKS[0], observation="simple_image"), 1500)):
-        _, curve = curve_of(load(find(f"{example}:learn")), task, steps=steps)
+        _, curve = curve_of(load_source(find_source(f"{example}:learn")), task, steps=steps)
         assert curve.counted_steps == steps and len(curve.rows) == 4
         assert steps < 9000 or curve.rows[-1]["normalized_regret"] < 0.2
 

@@ -7,19 +7,28 @@ import pytest
 
 from command_line import answer, run
 from pharos.benchmark import diagnose, faults
-from pharos.benchmark.examination import NAMES
-from pharos.benchmark.faults import FAULTS, HEALTHY
+from pharos.benchmark.agent_diagnosis import diagnosis_of_results, findings_of, meanings
+from pharos.benchmark.contents import contents_of
+from pharos.benchmark.diagnosis_page import profile_rows
+from pharos.benchmark.examination import NAMES, solved, value_functions
+from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY, batch_of
 from pharos.benchmark.profiles import (
     HEALTHY_ONES,
     SYMPTOMS,
     Profile,
     accuracy,
     failed,
+    families,
+    judged,
     kind_of,
     likeness,
-    meanings,
     shipped,
+    strangeness,
 )
+from pharos.benchmark.results import AgentResults
+from pharos.benchmark.suite import load_suite
+from pharos.errors import TimeLimit
+from pharos.training import PolicyRecorder
 from refusals import failing
 
 
@@ -127,7 +136,7 @@ def test_a_lost_feature_is_said_in_words_and_in_json(tmp_path):
     assert json.dumps(said)
     done = run("diagnose", name, "--steps", 400, "--seeds", 1)
     assert done.exit_code == 0 and "Nearest known agents" in done.stdout
-    assert run("diagnose", "q_learning").exit_code == 2
+    assert run("diagnose", "nope").exit_code == 2
 
 
 def test_a_page_that_cannot_be_written_is_refused_before_anything_is_trained(tmp_path, monkeypatch):
@@ -162,3 +171,158 @@ def test_a_function_of_python_is_diagnosed_and_only_in_some_worlds():
     assert diagnosis.kind == "ppo" and set(diagnosis.scores) == {"still", "umbrella"}
     assert diagnosis.readings["gamma"] < 0.7
     assert str(diagnosis).startswith("# Diagnosis of ")
+
+
+def test_an_agent_far_from_all_others_is_like_none_of_them():
+    rng = np.random.default_rng(2)
+    known, means = library(rng)
+    for fault, mean in means.items():
+        assert not judged({f"x{k}": float(x) for k, x in enumerate(mean)}, known).is_strange, fault
+    far = {f"x{k}": -1.0 for k in range(6)}
+    # by hand: the nearest mean, in deviations within faults, at most 4 each
+    rows = {fault: np.array([[*each.readings.values()] for each in known if each.fault == fault]) for fault in means}
+    within = np.concatenate([own - own.mean(axis=0) for own in rows.values()])
+    units = np.sqrt((within**2).sum(axis=0) / 15) + 0.05 * np.concatenate([*rows.values()]).std(axis=0) + 1e-3
+    squares = [np.mean(np.minimum(np.abs((own.mean(axis=0) + 1) / units), 4) ** 2) for own in rows.values()]
+    assert strangeness(far, known) == pytest.approx(min(squares) * 4 / 5)
+    answer = judged(far, known)
+    assert answer.is_strange and answer.fault is None
+
+
+def test_each_fault_has_one_family_and_families_share_what_is_not_health():
+    names = [fault for _, faults in FAMILIES.values() for fault in faults]
+    assert sorted(names) == sorted(set(meanings("")))
+    shares = likeness(shipped()[0].readings, [each for each in shipped() if each.kind == "dqn"])
+    assert sum(families(shares).values()) == pytest.approx(1 - shares[HEALTHY])
+
+
+def test_signs_of_the_fault_that_is_said_come_first():
+    """A wrong discount moves values at the time limit as well; its own sign is what is told."""
+    known = [each for each in shipped() if each.kind == "dqn"]
+    for each in (each for each in known if each.fault == "gamma_half"):
+        answer = judged(each.readings, [other for other in known if other is not each])
+        assert answer.fault == "gamma_half" and answer.findings[0].reading == "gamma"
+
+
+def test_of_faults_that_the_table_lacks_seven_in_ten_are_unknown_or_of_the_right_family():
+    right = [accuracy(kind) for kind in FAULTS]
+    assert sum(each.unknown for each in right) / 2 > 0.7 and min(each.unknown for each in right) > 0.65
+
+
+def test_a_wrong_reshape_mixes_observations_of_a_batch_and_leaves_one_alone():
+    rows = np.arange(12.0).reshape(4, 3)
+    mixed = batch_of(rows, "frames_reshaped")
+    assert sorted(mixed.ravel()) == sorted(rows.ravel()) and (mixed[0] == [0, 3, 6]).all()
+    assert (batch_of(rows[:1], "frames_reshaped") == rows[:1]).all() and batch_of(rows, HEALTHY) is rows
+
+
+def test_an_agent_that_loops_without_a_step_is_ended(tmp_path):
+    file = tmp_path / "mine.py"
+    body = "    while True:\n        try:\n            pass\n        except Exception:\n            pass\n    yield\n"
+    file.write_text(f"def learn(env, steps, seed):\n{body}")
+    done = run("diagnose", f"{file}:learn", "--timeout", 0.2)
+    assert done.exit_code == 1 and done.stderr == (
+        f"pharos: agent {file}:learn on lake, seed 0: took longer than 0.2 s; it was ended: raise the timeout, or look "
+        f"for a loop without an end\n"
+    )
+    with pytest.raises(TimeLimit):
+        diagnose(f"{file}:learn", timeout=0.2)
+
+
+# Finished runs --------------------------------------------------------------------------------------------------------
+
+
+def worse(names, by=0.5, **more):
+    """The shipped DQN with seeds of its own, and more regret on some tasks."""
+    rng, shipped_dqn = np.random.default_rng(3), AgentResults.read("dqn")
+    curves = {
+        name: np.clip(curve + rng.normal(0, 0.01, (len(curve), 1)) + by * (name in names), 0, 1)
+        for name, curve in shipped_dqn.curves.items()
+    }
+    return AgentResults("my dqn", "v1", shipped_dqn.digest, shipped_dqn.seeds, curves, more)
+
+
+def readings_of(results):
+    return [each.reading for each in findings_of(contents_of(results))]
+
+
+def test_a_run_of_a_shipped_agent_shows_no_symptom():
+    for name in ("dqn", "ppo"):
+        whole = AgentResults.read(name)
+        half = {task: curve[:5] for task, curve in whole.curves.items()}
+        results = AgentResults(f"my {name}", "v1", whole.digest, whole.seeds[:5], half)
+        assert readings_of(results) == []
+        said = diagnosis_of_results(contents_of(results))
+        assert said.kind == name and not said.readings and set(said.scores) == set(half)
+        assert said.is_healthy and said.verdict == "Nothing is wrong that these results and checks can see."
+
+
+def test_groups_of_tasks_that_lose_alone_are_named():
+    suite = load_suite("v1")
+    vectors = [task.name for task in suite.core if task.observation == "vector"]
+    assert readings_of(worse(vectors)) == ["vector"]
+    assert readings_of(worse([task.name for task in suite.core])) == []  # no group is spared
+    ladder = next(ladder for ladder in suite.ladders if ladder.axis == "credit")
+    assert readings_of(worse([task.name for task in ladder.tasks])) == ["credit"]
+    assert readings_of(worse([task.name for task in suite.tasks])) == ["everywhere"]
+
+
+def test_what_policies_are_like_is_a_symptom():
+    core = [task.name for task in load_suite("v1").core]
+    score = 1 - AgentResults.read("dqn").curves[core[0]].mean()
+    fixed = {name: {"one_action": 0.95, "deterministic": 1.0} for name in core}
+    assert readings_of(worse((), policies=fixed)) == ["one_action"]
+    noisy = {core[0]: {"one_action": 0.5, "deterministic": 0.0, "greedy_score": score + 0.3}}
+    assert readings_of(worse((), policies=noisy)) == ["noise"]
+
+
+def test_a_finished_run_is_diagnosed_without_training(tmp_path, monkeypatch):
+    monkeypatch.setattr("pharos.benchmark.examination.generate", failing(AssertionError("it was trained")))
+    vectors = [task.name for task in load_suite("v1").core if task.observation == "vector"]
+    worse(vectors, notes={"same seed": {"lake, seed 0": "3 resets had one seed"}}).write(tmp_path / "run.safetensors")
+    page = tmp_path / "page.html"
+    said = answer("diagnose", "--results", tmp_path / "run.safetensors", "--out", page)
+    assert [each["reading"] for each in said["findings"]] == ["warning", "vector"] and not said["healthy"]
+    assert "3 resets had one seed" in said["verdict"] and "seen as vector" in page.read_text(encoding="utf-8")
+    assert run("diagnose", "--results", tmp_path / "run.safetensors").exit_code == 0
+    for words in ((), ("dqn", "--results", "dqn"), ("--results", tmp_path)):
+        assert run("diagnose", *words).exit_code == 2
+
+
+def test_the_plot_has_the_readings_that_differ_most():
+    known, means = library(np.random.default_rng(4))
+    numbers = {f"x{k}": float(x) for k, x in enumerate(means["fault-2"])}
+    names, rows = profile_rows(numbers, known, ["fault-2"])
+    assert names[0] == "x2" and sorted(names) == sorted(numbers)
+    for name, (own, other) in zip(names, rows, strict=True):
+        healthy, faulty = (np.mean([x.readings[name] for x in known if x.fault == f]) for f in (HEALTHY, "fault-2"))
+        assert (own - other) * (numbers[name] - faulty) >= 0
+        if abs(faulty - healthy) > 1e-9:
+            assert own / other == pytest.approx((numbers[name] - healthy) / (faulty - healthy))
+
+
+@pytest.mark.long
+def test_the_table_of_pharos_is_diagnosed_and_its_discount_read_from_its_values():
+    assert diagnose("q_learning").is_healthy
+    short = diagnose("q_learning", hyperparameters={"gamma": 0.5}, worlds=["lake", "umbrella", "road"])
+    assert short.findings[0].reading == "gamma" and 0.4 < 1 - 10 ** -short.readings["gamma"] < 0.6
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["DQN", "PPO"])
+def test_values_of_models_of_stable_baselines3_are_those_of_their_networks(name):
+    import stable_baselines3
+    import torch
+
+    task, _, observations = solved("lake")
+    env = PolicyRecorder(task, steps=64, interval=64, seed=0).env
+    model = getattr(stable_baselines3, name)("MlpPolicy", env, seed=0, device="cpu")
+    q_values, values = value_functions(model)
+    tensor = torch.as_tensor(observations).float()
+    with torch.no_grad():
+        if name == "DQN":
+            assert values is None and np.allclose(q_values(observations), model.q_net(tensor).numpy())
+        else:
+            assert q_values is None and np.allclose(
+                values(observations), model.policy.predict_values(tensor).numpy()[:, 0]
+            )

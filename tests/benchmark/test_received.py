@@ -136,6 +136,7 @@ def _renamed(task, name):
 # Files that are none, and YAML that is none ---------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_suite_that_is_a_pipe_or_a_device_is_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe.yaml")
     (tmp_path / "zero.yaml").symlink_to("/dev/zero")

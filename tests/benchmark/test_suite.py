@@ -109,7 +109,7 @@ def leaves(entry, path=()):
         yield from leaves(value, (*path, key)) if isinstance(value, dict | list) else [(*path, key)]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_digest_covers_every_value_of_the_file(entry):
     paths = list(leaves(entry))
     assert len(paths) > 500

@@ -221,7 +221,7 @@ def test_a_progress_bar_says_what_happens_before_anything_is_counted(monkeypatch
 
 
 def test_slow_work_is_told_after_ten_seconds_and_ever_more_seldom(monkeypatch, capsys):
-    monkeypatch.setattr(answers, "TOLD_AFTER", 10.0)
+    monkeypatch.setattr(answers, "SLOW_AFTER", 10.0)
     now = [0.0]
     work = answers.SlowWork("measuring", clock=lambda: now[0])
     work.text = "diameter  between 3 and 9"
@@ -236,7 +236,7 @@ def test_slow_work_is_told_after_ten_seconds_and_ever_more_seldom(monkeypatch, c
 
 def test_work_outside_a_terminal_is_watched_while_it_lasts(monkeypatch, capsys):
     told = threading.Event()
-    monkeypatch.setattr(answers, "TOLD_AFTER", 0.0)
+    monkeypatch.setattr(answers, "SLOW_AFTER", 0.0)
     monkeypatch.setattr(answers, "complain", lambda line: told.set() if "far along" in line else None)
     with answers.progress_line("measuring") as tell:
         tell("far along")

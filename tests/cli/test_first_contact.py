@@ -69,7 +69,7 @@ def test_the_first_listing_of_the_readme_is_what_is_printed(tmp_path):
 def test_a_space_too_large_to_measure_is_compiled_for_all_the_same(tmp_path, monkeypatch):
     from pharos.cli import cache
 
-    monkeypatch.setattr(cache, "LARGEST", 5)
+    monkeypatch.setattr(cache, "LARGEST_WARMED", 5)
     cache._use(pharos.make("simple_grid/4x4-plain"), ChanceSetting())
 
 

@@ -265,7 +265,7 @@ def test_collected_rows_are_those_of_the_array(values, in_chunk):
     assert rows[np.arange(len(values))].tobytes() == values.tobytes()
     assert rows.num_distinct == len({row.tobytes() for row in values})
     few = int(index[: len(values) // 2].max(initial=0)) + 1
-    short = distinct_rows.shortened(rows.with_index(index[: len(values) // 2]), few)
+    short = distinct_rows.shorten_rows(rows.with_index(index[: len(values) // 2]), few)
     assert short[np.arange(len(values) // 2)].tobytes() == values[: len(values) // 2].tobytes()
     assert short.num_distinct == few and short.num_chunks == -(-few // in_chunk)
 

@@ -9,7 +9,7 @@ from PIL import Image
 
 from pharos import Layer, drawing, make
 from pharos.cli.render import Game
-from pharos.drawing import SHAPES, episode, human, planes_of, shade, text_drawing
+from pharos.drawing import SHAPES, episode, human, letter_color, planes_of, text_drawing
 from pharos.errors import ParameterError, UnknownName
 from pharos.observations import RENDERERS, render
 from refusals import refusal
@@ -110,9 +110,9 @@ def test_a_sprite_for_each_value_and_shades_from_light_to_dark():
     assert dim[0, 7].tolist() == dim[7, 0].tolist() != [90, 80, 10]  # the ground shows through
     assert bright[0, 7].tolist() == [250, 240, 90]
     assert bright[0, 0].sum() > bright[0, 7].sum() > bright[7, 0].sum()
-    assert shade((100, 100, 100), "#") == shade((100, 100, 100), "5") == (100, 100, 100)
-    assert shade((100, 100, 100), "1") == (224, 224, 224)
-    assert shade((100, 100, 100), "9") == (20, 20, 20)
+    assert letter_color((100, 100, 100), "#") == letter_color((100, 100, 100), "5") == (100, 100, 100)
+    assert letter_color((100, 100, 100), "1") == (224, 224, 224)
+    assert letter_color((100, 100, 100), "9") == (20, 20, 20)
 
 
 def test_an_episode_ends_with_the_state_it_reaches():

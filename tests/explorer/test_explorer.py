@@ -16,7 +16,7 @@ from naive import mdp as naive_mdp
 from patience import PATIENCE, wait_for
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, UnknownName
-from pharos.explorer import Exploration, Explorer, Learnt, exploration_of, page, write
+from pharos.explorer import Exploration, Explorer, Learnt, exploration_of, explorer_page, write
 from pharos.explorer.exploration import Pictures
 from pharos.explorer.launch import MOST_CONNECTIONS
 from pharos.explorer.pages import contents, heat_map, quantities, quantity, smaller_instance
@@ -192,7 +192,7 @@ def test_states_without_variables_are_drawn_by_their_number(sticky):
 @pytest.mark.parametrize("size", [25, 100, 30_000])
 def test_many_states_without_variables_fill_rows(size):
     x, y = axes_of(NumberedStates(size)).values()
-    places = y.places(np.arange(size)) * x.count + x.places(np.arange(size))
+    places = y.indices(np.arange(size)) * x.count + x.indices(np.arange(size))
     assert (np.diff(np.unique(places)) == 1).all() and x.count <= 128 and y.count <= 128
     assert np.bincount(places).max() == y.width  # one state a cell, where there are cells enough
     assert size > 128**2 or y.width == 1
@@ -212,7 +212,7 @@ def test_a_page_of_its_own_holds_every_position_and_loads_nothing(lake, tmp_path
 
 def test_a_title_is_text_and_never_markup(lake, tmp_path):
     title = '</script><img src=x onerror="alert(1)">'
-    text = page(Exploration(lake.mdp, title=title), contents(Exploration(lake.mdp, title=title)))
+    text = explorer_page(Exploration(lake.mdp, title=title), contents(Exploration(lake.mdp, title=title)))
     assert "<img src=x" not in text and text.count("</script>") == 2
 
 
@@ -351,7 +351,7 @@ def test_slow_clients_hold_no_places_of_others(served):
         slow = [stack.enter_context(socket.create_connection(at, timeout=PATIENCE)) for _ in range(MOST_CONNECTIONS)]
         for client in slow:
             client.sendall(b"GET / HT")
-        wait_for(lambda: not server.places._value and len(server.incomplete) == MOST_CONNECTIONS)
+        wait_for(lambda: not server.connections._value and len(server.incomplete) == MOST_CONNECTIONS)
         for _ in range(15):
             assert ask(served, path)[0] == 200
             for client in slow:
@@ -359,7 +359,7 @@ def test_slow_clients_hold_no_places_of_others(served):
                     client.sendall(b"T")
         with contextlib.suppress(ConnectionError):  # it was ended with or without a last word
             assert slow[0].recv(1) == b""
-    wait_for(lambda: server.places._value == MOST_CONNECTIONS)
+    wait_for(lambda: server.connections._value == MOST_CONNECTIONS)
     assert not server.incomplete and ask(served, path)[0] == 200
 
 

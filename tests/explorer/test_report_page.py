@@ -12,7 +12,7 @@ import pytest
 
 from patience import PATIENCE
 from pharos.study.figures import Curves, Line, Panel, lines, regret_curves
-from pharos.study.report.page import Section, image, render, table
+from pharos.study.report.page import Section, data_table, figure_image, render_page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -116,8 +116,8 @@ def test_a_reader_points_at_curves_hides_lines_and_sorts_tables(tmp_path):
     )
     drawn = {"regret": {"light": b"light", "dark": b"dark", "curves": curves.to_json().encode()}}
     data = pd.DataFrame({"agent": ["a10", "a9", "a1"], "iqm": ["≈ 0.5", "1,234", "–"]})
-    sections = [Section("Regret", "regret", figure=image(drawn, "regret", "caption"), table=table(data))]
-    page = render("a study", "", sections)
+    sections = [Section("Regret", "regret", figure=figure_image(drawn, "regret", "caption"), table=data_table(data))]
+    page = render_page("a study", "", sections)
     used = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page).replace("</body>", USED + "</body>")
     (tmp_path / "used.html").write_text(used)
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]

@@ -48,7 +48,7 @@ def test_sweeps_give_the_distances_of_searches(mdp, restart, dtype, is_mapped):
     expected = np.where(np.isinf(d), graph.far, d).astype(dtype)
     found = np.empty(graph.num_nodes, dtype)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(memory, "RANGE", 5)
+        patch.setattr(memory, "RANGE_ROWS", 5)
         for node in range(graph.num_nodes):
             forward = graph.search_forward(node, found)
             assert (found == expected[node]).all()

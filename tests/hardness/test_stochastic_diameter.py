@@ -356,11 +356,11 @@ def test_residuals_count_their_rounding():
         high = rng.random(size) * 10.0 ** rng.integers(0, 12)
         low = rng.uniform(-1, 1, size) * high * 2.0**-54
         high[times.goal] = low[times.goal] = 0.0
-        above, below, _ = hitting.residuals(*arguments, high, None, times.policy, None, None)
+        above, below, _ = hitting.residual_bounds(*arguments, high, None, times.policy, None, None)
         exact = changes([Fraction(float(value)) for value in high])
         assert -Fraction(below) <= min(exact) and max(exact) <= Fraction(above)
         residual, error = np.zeros(size), np.zeros(size)
-        hitting.residuals(*arguments, high, low, times.policy, residual, error)
+        hitting.residual_bounds(*arguments, high, low, times.policy, residual, error)
         exact = changes([Fraction(float(one)) + Fraction(float(two)) for one, two in zip(high, low, strict=True)])
         for n, change in enumerate(exact, start=1):
             assert abs(change - Fraction(float(residual[n]))) <= Fraction(float(error[n]))

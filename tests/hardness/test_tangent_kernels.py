@@ -25,17 +25,17 @@ def agents_network(space, net_arch, policy):
     from stable_baselines3.common.torch_layers import create_mlp
     from torch import nn
 
-    from pharos.agents.sb3 import extractor
+    from pharos.agents.sb3 import extractor_class
 
     if policy == "pytorch":
-        features = extractor(space)(space)
+        features = extractor_class(space)(space)
         return nn.Sequential(features, *create_mlp(features.features_dim, 1, net_arch))
     made = ActorCriticPolicy(
         space,
         spaces.Discrete(2),
         lambda _: 1e-3,
         net_arch=net_arch,
-        features_extractor_class=extractor(space),
+        features_extractor_class=extractor_class(space),
         activation_fn=nn.Tanh if policy == "tanh" else nn.ReLU,
     )
     return nn.Sequential(made.features_extractor, made.mlp_extractor.value_net, made.value_net)
@@ -110,7 +110,7 @@ def test_blocks_give_the_same_kernel_as_one_by_one(name, monkeypatch):
     whole = tangent_kernel(network, x)
     assert (whole == whole.T).all()
     np.testing.assert_allclose(tangent_kernel(network, x[:2], x[2:]), whole[:2, 2:], rtol=1e-6)
-    monkeypatch.setattr("pharos.hardness.representation.networks.BLOCK", 4)
+    monkeypatch.setattr("pharos.hardness.representation.networks.PAIR_BLOCK", 4)
     np.testing.assert_allclose(tangent_kernel(network, x), whole, rtol=1e-6)
     assert np.linalg.eigvalsh(whole.astype(float)).min() > 0
 

@@ -177,9 +177,9 @@ def step_of(learner):
     """(state, what is paid) of a step: (-1, ...) at the end."""
     learner.q[:] = -1e9
     learner.q[np.arange(4), POLICY] = 0.0
-    state = 0 if learner.place[0] < 0 else int(learner.place[0])
+    state = 0 if learner.cursor[0] < 0 else int(learner.cursor[0])
     learner.learn(1)
-    return int(learner.place[0]), float(learner.q[state, POLICY[state]])
+    return int(learner.cursor[0]), float(learner.q[state, POLICY[state]])
 
 
 def by_q_learning(knobs, space):
@@ -267,7 +267,7 @@ def pay_one_by_one(knobs, space, steps, limit):
 def pay_by_q_learning(knobs, space, steps, limit):
     agent = learner(knobs, space, limit)
     for _ in range(50 * steps):
-        state = max(agent.place[0], 0)
+        state = max(agent.cursor[0], 0)
         after, pay = step_of(agent)
         yield np.array([state]), np.array([pay]), np.array([after < 0])
 

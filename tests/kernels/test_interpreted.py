@@ -77,7 +77,7 @@ import pickle, sys
 from pathlib import Path
 from pharos.rules.interpreted import InterpretedExpansion
 from pharos.system import compiling
-compiling.SMALL = 1 << 24
+compiling.SMALL_STATES = 1 << 24
 import test_interpreted
 found = test_interpreted.answers(Path({str(tmp_path / "interpreted")!r}))
 sys.stdout.buffer.write(pickle.dumps((found, test_interpreted.compiled_kernels())))
@@ -110,13 +110,13 @@ def test_much_work_is_compiled(monkeypatch):
             result += x[i]
         return result
 
-    monkeypatch.setattr(compiling, "SMALL", 100)
+    monkeypatch.setattr(compiling, "SMALL_STATES", 100)
     x = np.full(30, 0.1)
     assert [(total(x), bool(total.signatures)) for _ in range(7)] == [(sum(x), False)] * 6 + [(sum(x), True)]
 
 
 def test_rules_that_are_compiled_already_are_hardly_interpreted_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(compiling, "SMALL", 1 << 14)
+    monkeypatch.setattr(compiling, "SMALL_STATES", 1 << 14)
     env = pharos.make("breakout", height=7, columns=5, brick_rows=1)
     pharos.build(env, tmp_path / "first", progress=False)
     asked = []
@@ -131,4 +131,4 @@ def test_rules_that_are_compiled_already_are_hardly_interpreted_again(tmp_path, 
     assert not asked
     monkeypatch.setattr("pharos.rules.rules.explored", set())  # as in another process, which finds them on disk
     space = pharos.build(env, tmp_path / "third", progress=False)
-    assert 0 < sum(asked) < compiling.SMALL // 16 // space.num_actions < space.num_states
+    assert 0 < sum(asked) < compiling.SMALL_STATES // 16 // space.num_actions < space.num_states

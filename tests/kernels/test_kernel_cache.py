@@ -17,7 +17,7 @@ from numba.extending import overload
 
 import pharos
 from patience import PATIENCE
-from pharos.kernels.kernel_cache import kernel
+from pharos.kernels.kernel_cache import called_by_kernels, kernel
 from pharos.system import compiling
 
 PACKAGE = Path(pharos.__file__).parent
@@ -25,7 +25,7 @@ ONE_KERNEL = """
 import json, sys
 import numpy as np
 from pharos.system import compiling
-compiling.SMALL = 0
+compiling.SMALL_STATES = 0
 from pharos.kernels import bellman
 v = np.zeros(3)
 bellman.chain_values(np.array([1, -1]), np.ones(2), 0.5, v, np.zeros(2, np.int64))
@@ -68,6 +68,17 @@ def test_kernels_are_kept_by_their_texts_in_the_cache_alone(tmp_path):
     assert len(folders_of(cache)) == 3 and folders_of(cache) > kept | {"kernels-young"}
     assert one_kernel(places[0], cache) == 0
     assert files == [{path.relative_to(place) for path in place.rglob("*")} for place in places]
+
+
+def test_python_is_refused_by_a_function_of_kernels_alone():
+    @called_by_kernels
+    def twice(x):
+        return 2 * x
+
+    assert numba.njit(lambda x: twice(x) + 1)(3) == 7
+    with pytest.raises(TypeError, match=r"^twice is called by kernels alone; expected a call of its text, `.py_func`$"):
+        twice(3)
+    assert twice.py_func(3) == 6
 
 
 @pytest.mark.slow

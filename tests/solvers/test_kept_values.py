@@ -42,7 +42,7 @@ def ring(size: int = 400, gamma: float = 0.99) -> TabularMDP:
 @pytest.fixture
 def no_memory(monkeypatch):
     """Whatever is large is in a mapped file, and nothing is small."""
-    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "SMALL_BYTES", 0)
     monkeypatch.setattr(memory, "available_memory", lambda: 0)
 
 
@@ -68,7 +68,7 @@ class RecordingFile(io.BytesIO):
 
 def test_zeros_are_written_in_blocks_where_the_system_cannot_take_their_room(monkeypatch):
     monkeypatch.delattr(os, "posix_fallocate", raising=False)
-    monkeypatch.setattr(memory, "_BLOCK", 64)
+    monkeypatch.setattr(memory, "_BYTES_AT_ONCE", 64)
     file = RecordingFile()
     file.write(b"header")
     memory.append_zeros(file, 150)
@@ -81,7 +81,7 @@ def test_values_in_files_are_those_in_memory_to_the_last_bit(tmp_path, monkeypat
     kept = value_iteration(mdp, values=tmp_path / "values.npy")
     assert (kept.x == expected.x).all() and kept.sweeps == expected.sweeps and kept.error_bound == expected.error_bound
     assert (np.load(tmp_path / "values.npy", mmap_mode="r") == expected.x).all()
-    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "SMALL_BYTES", 0)
     monkeypatch.setattr(memory, "available_memory", lambda: 0)
     assert (value_iteration(mdp).x == expected.x).all()
 
@@ -89,7 +89,7 @@ def test_values_in_files_are_those_in_memory_to_the_last_bit(tmp_path, monkeypat
 def test_large_values_are_swept_in_memory_and_end_in_their_file(tmp_path, monkeypatch):
     mdp, path = ring(), tmp_path / "values.npy"
     whole = value_iteration(mdp)
-    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "SMALL_BYTES", 0)
 
     def look(sweeps, _):
         assert not np.load(path).any()  # what is swept is elsewhere
@@ -148,7 +148,7 @@ def test_pieces_make_up_all_rows_once(tmp_path, monkeypatch, size):
 def test_gaps_with_values_in_files_are_those_in_memory_to_the_last_bit(tmp_path, monkeypatch):
     mdp = ring()
     expected = hardness.gaps(mdp)
-    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "SMALL_BYTES", 0)
     monkeypatch.setattr(memory, "available_memory", lambda: 0)
     assert hardness.gaps(mdp).to_dict() == expected.to_dict()
     names = ["sum_of_reciprocal_gaps", "minimal_gap"]
@@ -342,7 +342,7 @@ def test_a_file_of_values_is_refused_if_the_mdp_has_a_horizon(tmp_path):
 
 
 def test_rows_that_fill_memory_are_all_swept_and_stay_what_they_are(tmp_path, monkeypatch, no_memory):
-    monkeypatch.setattr(memory, "RANGE", 1000)
+    monkeypatch.setattr(memory, "RANGE_ROWS", 1000)
     rows = np.arange(30_000, dtype=np.int32).reshape(-1, 3)
     rows.tofile(tmp_path / "rows.bin")
     mapped = np.memmap(tmp_path / "rows.bin", np.int32, "r", shape=rows.shape)

@@ -25,7 +25,7 @@ def sealed(folder):
         data = (folder / name).read_bytes()
         blocks = [data[i : i + 2**24] for i in range(0, len(data), 2**24)]
         entry |= {"bytes": len(data), "checksums": [xxhash.xxh3_128_hexdigest(block) for block in blocks]}
-    manifest["digest"] = manifests.digest_of(manifest)
+    manifest["digest"] = manifests.manifest_digest(manifest)
     path.write_text(json.dumps(manifest))
 
 
@@ -128,7 +128,7 @@ def test_start_probabilities_that_are_none_are_found(probability, folder):
 )
 def test_a_manifest_that_says_what_cannot_be_is_refused(change, folder):
     manifest = json.loads((folder / "manifest.json").read_text()) | change
-    manifest["digest"] = manifests.digest_of(manifest)
+    manifest["digest"] = manifests.manifest_digest(manifest)
     (folder / "manifest.json").write_text(json.dumps(manifest))
     refused(folder, r"manifest\.json: .*; delete the folder and build again")
 
@@ -178,7 +178,7 @@ def test_changed_rules_are_noticed_in_each_of_64_states(folder):
 def test_checksums_left_out_are_missed(folder):
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["arrays"]["successors.bin"]["checksums"] = []
-    manifest["digest"] = manifests.digest_of(manifest)
+    manifest["digest"] = manifests.manifest_digest(manifest)
     (folder / "manifest.json").write_text(json.dumps(manifest))
     refused(folder, r"successors\.bin: 0 checksums for \d+ bytes")
 

@@ -30,7 +30,7 @@ from pharos.state_space import manifest as manifests
 from pharos.state_space import manifest as writing
 from pharos.state_space import search
 from pharos.system import arrays, memory
-from pharos.system.arrays import INT40, PACKED, PackedIndices, blocks_of, holds_end
+from pharos.system.arrays import INT40, PACKED, PackedIndices, holds_end, index_blocks
 from rank_threads import threads
 from strategies import deterministic_mdps, examples, outcome_mdps
 from worlds import ChanceWorld
@@ -72,8 +72,8 @@ def test_it_reads_like_an_array_of_64_bits(plain, data):
     assert (np.asarray(indices.rows(low, high)) == plain[low:high]).all()
     assert np.asarray(indices, np.float64).dtype == np.float64
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(arrays, "_BLOCK", data.draw(st.integers(1, 7)))
-        parts = list(blocks_of(indices))
+        patch.setattr(arrays, "_ENTRIES_AT_ONCE", data.draw(st.integers(1, 7)))
+        parts = list(index_blocks(indices))
     assert [first for first, _ in parts] == np.cumsum([0, *(len(part) for _, part in parts)])[:-1].tolist()
     assert (np.concatenate([part for _, part in parts]) == plain).all()
     indices[low:high] = plain[low:high] // 2
@@ -226,7 +226,7 @@ def test_a_part_has_the_same_next_states_whatever_the_width_and_the_blocks(state
     plain = np.random.default_rng(seed).integers(-1, states, (states, actions))
     start, stop = sorted(data.draw(st.tuples(st.integers(0, states), st.integers(0, states))))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(arrays, "_BLOCK", data.draw(st.integers(1, 40)))
+        patch.setattr(arrays, "_ENTRIES_AT_ONCE", data.draw(st.integers(1, 40)))
         patch.setattr(arrays, "INT32_STATES", data.draw(st.sampled_from([0, 2**31 - 1])))
         local, halo = Table(PackedIndices.of(plain)).part(start, stop)
     halo = halo.tolist()
@@ -424,7 +424,7 @@ def test_steps_through_a_space_are_the_same(world, spaces):
 @pytest.mark.long
 def test_mapped_files_are_read_ahead(spaces, monkeypatch):
     asked = []
-    monkeypatch.setattr(memory, "RANGE", 1000)
+    monkeypatch.setattr(memory, "RANGE_ROWS", 1000)
     monkeypatch.setattr(memory, "_advise", lambda array, *place: asked.append((array.dtype, *place[:2])))
     successors = pharos.load(spaces("breakout")[1].folder).successors
     ranges = [*memory.ranges_from_the_end(successors, 0, 5439)]

@@ -10,8 +10,8 @@ from numba import njit
 
 from pharos.environments import Components
 from pharos.errors import ParameterError
-from pharos.kernels.hash_table import fill, fill_more, fill_range, find, mixed, slot_of
-from pharos.rules.layout import AT_ONCE, layout_of, pack, unpack
+from pharos.kernels.hash_table import fill, fill_more, fill_range, find_states, mixed, slot_of
+from pharos.rules.layout import AT_ONCE, layout_of, pack_states, unpack_states
 from pharos.rules.packed_view import clear_fault, fault, get_word, packed_view, set_word
 from strategies import examples
 
@@ -48,16 +48,16 @@ def packed_by_hand(components: Components, state) -> list[int]:
 def test_packing_is_what_the_format_says(ranges, seed):
     components = components_of(ranges)
     layout, states = layout_of(components), states_of(components, seed)
-    assert pack(layout, states).tolist() == [packed_by_hand(components, state) for state in states]
+    assert pack_states(layout, states).tolist() == [packed_by_hand(components, state) for state in states]
 
 
 @examples(200, ranges, st.integers(0, 2**32))
 def test_unpacking_gives_back_what_was_packed(ranges, seed):
     components = components_of(ranges)
     layout, states = layout_of(components), states_of(components, seed)
-    assert (unpack(layout, pack(layout, states)) == states).all()
+    assert (unpack_states(layout, pack_states(layout, states)) == states).all()
     many = np.tile(states, (AT_ONCE * len(ranges) // len(states) + 1, 1))  # component by component
-    assert (unpack(layout, pack(layout, many)) == many).all()
+    assert (unpack_states(layout, pack_states(layout, many)) == many).all()
 
 
 def test_a_component_never_straddles_two_words():
@@ -70,8 +70,8 @@ def test_a_component_never_straddles_two_words():
 def test_a_component_with_one_value_takes_no_bits():
     layout = layout_of(components_of([(7, 1), (-3, 1), (0, 2)]))
     assert layout.num_words == 1
-    assert pack(layout, np.array([[7, -3, 1]])).tolist() == [[1]]
-    assert unpack(layout, np.array([[1]], np.uint64)).tolist() == [[7, -3, 1]]
+    assert pack_states(layout, np.array([[7, -3, 1]])).tolist() == [[1]]
+    assert unpack_states(layout, np.array([[1]], np.uint64)).tolist() == [[7, -3, 1]]
 
 
 # The compiled view ---------------------------------------------------------------------------------------------------
@@ -115,13 +115,13 @@ few = st.lists(
 def test_the_compiled_view_reads_and_writes_components(ranges, seed, data):
     components = components_of(ranges)
     layout, state = layout_of(components), states_of(components, seed, 1)[0].tolist()
-    packed = pack(layout, np.array([state]))[0]
+    packed = pack_states(layout, np.array([state]))[0]
     index = data.draw(st.integers(-len(state), len(state) - 1))
     value = data.draw(st.integers(int(components.low[index]), int(components.high[index])))
     assert read_component(layout.tables, packed, index) == (state[index], 0)
     words, found, cleared, source = copy_through_views(layout.tables, packed, index, value)
     state[index] = value
-    assert words.tolist() == pack(layout, np.array([state]))[0].tolist()
+    assert words.tolist() == pack_states(layout, np.array([state]))[0].tolist()
     assert (found, cleared, source) == (0, 0, 0)
 
 
@@ -130,24 +130,24 @@ def test_the_compiled_view_reads_and_writes_components(ranges, seed, data):
 def test_a_value_out_of_range_is_noted_and_leaves_the_neighbours_alone(ranges, seed, data):
     components = components_of(ranges)
     layout, state = layout_of(components), states_of(components, seed, 1)[0].tolist()
-    packed = pack(layout, np.array([state]))[0]
+    packed = pack_states(layout, np.array([state]))[0]
     index = data.draw(st.integers(0, len(state) - 1))
     low, high = int(components.low[index]), int(components.high[index])
     value = data.draw(st.integers(-(2**63), low - 1) | st.integers(high + 1, 2**63 - 1))
     words, found, cleared, _ = copy_through_views(layout.tables, packed, index, value)
     assert (found, cleared) == (1 + index, 0)
     others = np.arange(len(state)) != index
-    assert (unpack(layout, words[None])[0][others] == np.array(state)[others]).all()
+    assert (unpack_states(layout, words[None])[0][others] == np.array(state)[others]).all()
 
 
 @pytest.mark.parametrize("index", (3, -4, 10**9, -(10**9)))
 def test_a_component_that_does_not_exist_is_noted(index):
     layout = layout_of(components_of([(0, 4), (2, 8), (-1, 3)]))
-    packed = pack(layout, np.array([[1, 5, 0]]))[0]
+    packed = pack_states(layout, np.array([[1, 5, 0]]))[0]
     assert read_component(layout.tables, packed, index)[1] == 1 + 3
     words, found, _, _ = copy_through_views(layout.tables, packed, index, 1)
     assert found in (1, 1 + 3)
-    assert unpack(layout, words[None])[0, 1:].tolist() == [5, 0]
+    assert unpack_states(layout, words[None])[0, 1:].tolist() == [5, 0]
 
 
 # The table of states -------------------------------------------------------------------------------------------------
@@ -177,7 +177,7 @@ def test_what_is_in_the_table_is_found_and_nothing_else(words, count, seed):
     fill(table, states, len(states))
     assert sorted(table[table >= 0].tolist()) == list(range(len(states)))
     out = np.empty(len(keys), np.int64)
-    find(table, states, keys, out)
+    find_states(table, states, keys, out)
     assert out.tolist() == [*range(len(states)), *[-1] * len(others)]
 
 
@@ -186,7 +186,7 @@ def test_a_full_table_wraps_around():
     table = np.full(1 << 16, -1, np.int32)
     fill(table, keys, len(keys))
     out = np.empty(len(keys), np.int64)
-    find(table, keys, keys, out)
+    find_states(table, keys, keys, out)
     assert (out == np.arange(len(keys))).all()
 
 
@@ -208,7 +208,7 @@ def test_a_table_filled_part_by_part_holds_every_state_once(parts, count):
         fill_more(table, states, indices)
     assert sorted(table[table >= 0].tolist()) == list(range(count))
     out = np.empty(len(keys), np.int64)
-    find(table, states, keys, out)
+    find_states(table, states, keys, out)
     assert out.tolist() == [*range(count), *[-1] * len(others)]
 
 

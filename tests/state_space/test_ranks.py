@@ -22,7 +22,7 @@ from pharos.errors import MissingExtra, ParameterError, RuleError, StateSpaceErr
 from pharos.kernels import hash_table
 from pharos.ranks import Halo, RankFailed, cuts_of, run_spmd
 from pharos.state_space import ranked_table, search
-from pharos.state_space.manifest import Plan, lock
+from pharos.state_space.manifest import Plan, lock_build
 from pharos.state_space.progress import reporter
 from pharos.state_space.search import Options, journal_of
 from rank_threads import Killed, fails_at, loop
@@ -55,8 +55,8 @@ def build_by_threads(env, folder, size, *, wide=0, rows=64, disturb=lambda rank:
         disturb(rank)
         ranked_table.answer(plan, rank, None)
 
-    with pytest.MonkeyPatch.context() as patch, lock(folder), reporter(False, env) as report:
-        patch.setattr(ranked_table, "ROWS", rows)
+    with pytest.MonkeyPatch.context() as patch, lock_build(folder), reporter(False, env) as report:
+        patch.setattr(ranked_table, "SUPERSTEP_ROWS", rows)
         patch.setattr(search, "CHUNK", 8 * rows)
         manifest = pharos.state_space.read_manifest(folder)
         with loop(size, answer) as rank:
@@ -154,9 +154,9 @@ def test_owners_keep_the_first_place_whatever_the_order_of_arrival(seed, words):
     for order in (np.arange(60), rng.permutation(60)):
         table = np.full(1 << 16, -1, np.int32)
         keys, numbers, entries = np.empty((200, words), np.uint64), np.empty(200, np.int64), np.empty(60, np.int64)
-        count = hash_table.claim(table, keys, numbers, 0, known, np.zeros(3, np.int64), np.empty(3, np.int64))
+        count = hash_table.claim_entries(table, keys, numbers, 0, known, np.zeros(3, np.int64), np.empty(3, np.int64))
         numbers[:count] = np.arange(count)  # these have their numbers already
-        count = hash_table.claim(table, keys, numbers, count, asked[order], places[order], entries)
+        count = hash_table.claim_entries(table, keys, numbers, count, asked[order], places[order], entries)
         assert (keys[entries] == asked[order]).all()
         assert count == len(first)
         for entry in range(count):

@@ -79,7 +79,7 @@ def test_runs_that_are_missing_or_failed_are_no_rows(tmp_path):
     fake_training.attempt(first, tmp_path)
     (tmp_path / "partial" / second.id).mkdir(parents=True)
     _worker.write_failure(tmp_path / "partial" / second.id, second.config, second.id, "no", 1.0)
-    _worker.publish(tmp_path / "partial" / second.id, tmp_path, second.id)
+    _worker.publish_run(tmp_path / "partial" / second.id, tmp_path, second.id)
     assert list(study.table(SPECIFICATION, tmp_path)["id"]) == [first.id]
 
 

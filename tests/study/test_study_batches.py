@@ -211,7 +211,7 @@ def kept_study(seeds):
 def test_kept_values_are_those_of_the_task_to_the_last_bit(config):
     assert _batches.stored_values(config) is None
     found = _batches.solve(config)
-    task = _batches.task_of(config)
+    task = _batches.task_of_config(config)
     assert found == {"reference": asdict(task.reference), "return_range": list(task.return_range)}
     assert _batches.stored_values(config) == found == _batches.solve(config)
 
@@ -220,7 +220,7 @@ def test_a_run_with_kept_values_ends_with_the_same_files(config, tmp_path):
     train_config(config, tmp_path / "alone")
     _execution.prepare_instance(config)
     assert _batches.stored_values(config) is not None
-    _execution.train(config, tmp_path / "prepared")
+    _execution.train_run(config, tmp_path / "prepared")
     for name in ("curve.csv", "policy.npy"):
         assert (tmp_path / "alone" / name).read_bytes() == (tmp_path / "prepared" / name).read_bytes()
     results = [json.loads((tmp_path / name / "run.json").read_text())["result"] for name in ("alone", "prepared")]

@@ -91,10 +91,10 @@ def test_online_the_mode_is_left_to_the_package(opened, monkeypatch):
 
 
 def test_runs_that_differ_in_more_than_their_names_are_told_apart(tmp_path):
-    from pharos.study.logs import named
+    from pharos.study.logs import named_runs
 
     blocks = [SPECIFICATION["blocks"][0] | {"steps": steps} for steps in (40, 80)]
-    names = [name for _, name in named(study.specification(SPECIFICATION | {"blocks": blocks}))]
+    names = [name for _, name in named_runs(study.specification(SPECIFICATION | {"blocks": blocks}))]
     assert len(set(names)) == len(names) == 8
 
 

@@ -14,10 +14,10 @@ from command_line import process
 from edits import edited_json
 from pharos import study
 from pharos.study import worker as _worker
-from pharos.study.execution import claim
+from pharos.study.execution import write_specification
 from pharos.study.figures import representations, same_steps
-from pharos.study.report import files, number
-from pharos.study.report.page import table
+from pharos.study.report import files, number_text
+from pharos.study.report.page import data_table
 from pharos.system.wording import latex_text
 
 HARDNESS = {"measures": ["sum_of_reciprocal_gaps", "diameter"], "budget": 5}
@@ -36,13 +36,13 @@ def written(tmp_path_factory):
     """(folder, StudyReport) of a study with one failed and one missing run."""
     folder = tmp_path_factory.mktemp("study")
     spec = fake_training.specification("lakes", steps=400, evaluations=8, seeds=2, hardness=HARDNESS, **CELLS)
-    claim(spec, folder)
+    write_specification(spec, folder)
     for run in spec.runs[2:]:
         fake_training.attempt(run, folder)
     failed = spec.runs[0]
     (folder / "partial" / failed.id).mkdir()
     _worker.write_failure(folder / "partial" / failed.id, failed.config, failed.id, "ValueError: <no>", 1.0)
-    _worker.publish(folder / "partial" / failed.id, folder, failed.id)
+    _worker.publish_run(folder / "partial" / failed.id, folder, failed.id)
     return folder, study.report(folder)
 
 
@@ -173,7 +173,7 @@ def test_runs_of_different_length_or_without_regret_leave_a_report(tmp_path):
 
 
 def test_numbers_are_short():
-    assert [number(x) for x in (0.0, 0.12345, 12.3456, 1234567.0, 1e-5, 3e9, -0.5)] == [
+    assert [number_text(x) for x in (0.0, 0.12345, 12.3456, 1234567.0, 1e-5, 3e9, -0.5)] == [
         "0.000", "0.123", "12.346", "1,234,567", "1.00e-05", "3.00e+09", "-0.500",
     ]  # fmt: skip
 
@@ -341,7 +341,7 @@ def test_a_report_says_which_images_hide_something(tmp_path, sketched):
 
 def test_columns_that_say_nothing_are_left_out_of_a_table():
     rows = pd.DataFrame({"model": ["single", "class"], "notes": ["", ""], "left_out": ["", "diameter"], "R2": [0.5, 0]})
-    shown = table(rows)
+    shown = data_table(rows)
     assert [column.title for column in shown.columns] == ["model", "left out", "R2"]
     assert shown.rows == [["single", "", "0.500"], ["class", "diameter", "0.000"]]
 

@@ -12,7 +12,7 @@ from pharos import study
 from pharos.errors import FileFormatError, ParameterError
 from pharos.interaction import Interaction
 from pharos.mdp import ChanceSetting
-from pharos.system.records import flat, meanings, read, split, takes
+from pharos.system.records import docstring_entries, flat, parse_record, split_options, takes
 
 
 @flat
@@ -38,19 +38,19 @@ def test_fields_of_a_part_are_keywords_and_attributes():
 
 
 def test_options_are_split_by_whose_they_are():
-    trip, rest = split(Trip, {"length": 3, "random": 0.1, "height": 12})
+    trip, rest = split_options(Trip, {"length": 3, "random": 0.1, "height": 12})
     assert trip.chance.random == 0.1 and rest == {"height": 12}
     with pytest.raises(ParameterError, match="random=2; expected a finite number from 0 to 1"):
-        split(Interaction, {"random": 2})
+        split_options(Interaction, {"random": 2})
 
 
 def test_what_an_option_means_stands_in_the_docstring():
-    assert meanings(Trip) == {
+    assert docstring_entries(Trip) == {
         "length": "of the way, in metres.",
         "width": "of the way, in metres.",
         "chance": "on the way.",
     }
-    assert set(meanings(ChanceSetting)) == set(ChanceSetting.__dataclass_fields__)
+    assert set(docstring_entries(ChanceSetting)) == set(ChanceSetting.__dataclass_fields__)
 
 
 def test_the_signature_of_a_function_shows_the_options_that_it_takes():
@@ -103,10 +103,10 @@ ENTRY = {
 
 def test_a_record_has_the_values_of_its_entries():
     expected = Record("a", 1, None, True, Place(2), {"numpy": "2"}, {"start": Place(3)}, [1])
-    record = read(Record, ENTRY, "a record")
+    record = parse_record(Record, ENTRY, "a record")
     assert record == expected and type(record.share) is int
     few = {name: value for name, value in ENTRY.items() if name != "places"}
-    assert read(Record, few, "a record", optional=("places",)).places == {}
+    assert parse_record(Record, few, "a record", optional=("places",)).places == {}
 
 
 @pytest.mark.parametrize(
@@ -128,11 +128,11 @@ def test_a_record_has_the_values_of_its_entries():
 )
 def test_an_entry_of_another_type_is_named_with_what_was_expected(change, message):
     with pytest.raises(FileFormatError, match=f"^{message}"):
-        read(Record, {**ENTRY, **change}, "a record")
+        parse_record(Record, {**ENTRY, **change}, "a record")
 
 
 def test_what_lacks_entries_or_is_no_object_is_refused():
     with pytest.raises(FileFormatError, match=r"^a record lacks name; expected name, share, horizon"):
-        read(Record, {name: value for name, value in ENTRY.items() if name != "name"}, "a record")
+        parse_record(Record, {name: value for name, value in ENTRY.items() if name != "name"}, "a record")
     with pytest.raises(FileFormatError, match=r"^a record is \[\]; expected name, share"):
-        read(Record, [], "a record")
+        parse_record(Record, [], "a record")

@@ -89,7 +89,7 @@ def test_at_each_evaluation_the_policy_counts_that_was_yielded_last_at_that_step
 
 def test_a_run_has_the_curve_that_the_same_function_has_in_the_benchmark(mine, tmp_path):
     train(mine, GRID, observation="one_hot", steps=300, evaluation_interval=100, seed=3, sticky=0.25, out="run")
-    learn = sources.load(sources.find(mine))
+    learn = sources.load_source(sources.find_source(mine))
     task = Task.of(GRID, observation="one_hot", sticky=0.25)
     curve = generated_curve(learn, task, steps=300, evaluations=3, seed=3)
     (tmp_path / "other").mkdir()

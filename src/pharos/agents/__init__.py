@@ -12,7 +12,7 @@ from pharos.agents.agent import (
     RunShape,
     agents,
     joined_states,
-    state_of,
+    learner_state,
 )
 from pharos.agents.hyperparameters import hyperparameters
 from pharos.agents.idealised import (
@@ -38,7 +38,7 @@ from pharos.agents.registry import agent_called, primary_predictors
 from pharos.agents.sb3 import (
     algorithm,
     check_hyperparameters,
-    extractor,
+    extractor_class,
     is_known,
     make_model,
 )

@@ -28,7 +28,7 @@ POLICY, NETWORK = "policy.npy", "agent"
 """What was learnt, in the folder of a run: a table, or a folder with a network."""
 TABULAR_OBSERVATION = "index"
 """What tabular agents see."""
-TABLES = 16  # runs of one program that learn tables
+TABLES_AT_ONCE = 16  # runs of one program that learn tables
 # Entries of a configuration that decide about rewards and states, and about observations
 WORLD = ("environment", "parameters", "gamma", "sources")
 OBSERVATIONS = ("environment", "parameters", "observation", "observation_options", "sources")
@@ -75,7 +75,7 @@ class LearningRun(Protocol):
         config: its `pharos.training.RunConfig`.
         task: its task, which is made when it is first used.
         algorithm: name of the agent, or a class or function of the user's own.
-        hyperparameters: all that are known, those of the configuration first.
+        hyperparameters: all that are known, the configuration's first.
         world_mdp: states and rewards without chance and horizon.
     """
 
@@ -161,7 +161,7 @@ class Learner(Protocol):
     def policy(self, i: int) -> PolicyLike:
         """The policy of run i, as `evaluate_agent` takes it; or its value, if the learner knows that."""
 
-    def greedy_actions(self, places: Sequence[int]) -> dict[int, np.ndarray] | None:
+    def greedy_actions(self, indices: Sequence[int]) -> dict[int, np.ndarray] | None:
         """(S,) greedy actions by run; None if no policy is a table of states."""
 
     def save(self, folder: Path) -> None:
@@ -333,7 +333,7 @@ class TableBasedAgent(Agent):
         return self.name, run.config.environment
 
     def width(self, run: PlannedRun, device: str) -> int:
-        return TABLES
+        return TABLES_AT_ONCE
 
     def prepare(self, run: LearningRun, device: str, *, is_single: bool) -> Hashable | None:
         if is_single or not is_small_table(run.task.mdp):
@@ -394,9 +394,9 @@ class Tables(ArrayLearner):
     def policy(self, i: int) -> PolicyLike:
         return self.tables[i]
 
-    def greedy_actions(self, places: Sequence[int]) -> dict[int, np.ndarray]:
-        """(S,) greedy actions by place; runs whose policy depends on the previous action are left out."""
-        tables = {i: self.tables[i].policy_table() for i in places}
+    def greedy_actions(self, indices: Sequence[int]) -> dict[int, np.ndarray]:
+        """(S,) greedy actions by index of the run; runs whose policy depends on the previous action are left out."""
+        tables = {i: self.tables[i].policy_table() for i in indices}
         return {i: table for i, table in tables.items() if table.ndim == 1}
 
     def state(self) -> dict[str, np.ndarray]:
@@ -409,7 +409,7 @@ class Tables(ArrayLearner):
             self.tables[0].restore(state)
             return
         for i, table in enumerate(self.tables):
-            table.restore(state_of(state, i))
+            table.restore(learner_state(state, i))
 
     def publish(self, i: int, folder: Path) -> None:
         """Write the greedy policy, as POLICY."""
@@ -424,7 +424,7 @@ def joined_states(states: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.nd
     return {f"{i}/{name}": array for i, state in enumerate(states) for name, array in state.items()}
 
 
-def state_of(joined: Mapping[str, np.ndarray], i: int) -> dict[str, np.ndarray]:
+def learner_state(joined: Mapping[str, np.ndarray], i: int) -> dict[str, np.ndarray]:
     """State of learner i."""
     prefix = f"{i}/"
     return {name[len(prefix) :]: array for name, array in joined.items() if name.startswith(prefix)}
@@ -457,7 +457,7 @@ def read_policy_table(folder: Path) -> np.ndarray:
 
 def new_agent(folder: Path) -> Path:
     """The empty folder NETWORK of a run; an older one is removed, so that no link in it is written through."""
-    place = storage.inside(folder, NETWORK)
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir(parents=True)
-    return place
+    target = storage.inside(folder, NETWORK)
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir(parents=True)
+    return target

@@ -126,7 +126,7 @@ class IdealisedActorCritic(Idealised):
     """The idealised actor-critic: `kernel_policy_regret`.
 
     Attributes:
-        gae_lambda, clip_range: of the agent where its hyperparameters do not say; no clip_range: it has no clipping.
+        gae_lambda, clip_range: of the agent if its hyperparameters do not say; no clip_range: it has no clipping.
     """
 
     kind: str = "ppo"

@@ -24,7 +24,7 @@ from pharos.agents.agent import POLICY, Learner, LearningRun, read_policy_table
 from pharos.agents.sb3 import DeepAgent, is_known
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.policies import PolicyLike
-from pharos.system.sources import Source, announce, announced, find, load
+from pharos.system.sources import Source, announced, find_source, load_source, register_source
 
 CLASS, GENERATOR, COMPILED = "class", "generator", "jax"
 STEPPED = ("act", "observe", "policy")
@@ -32,12 +32,12 @@ MADE_WITH = ("observation_space", "action_space", "num_envs", "seed")
 FUNCTIONS = "a function learn(env, steps, seed), or learn(env, params, steps, key) of JAX"
 
 FunctionLearner = Callable[[Sequence[LearningRun], Callable[..., Any]], Any]
-_LEARNERS: dict[str, FunctionLearner] = {}
+_FUNCTION_LEARNERS: dict[str, FunctionLearner] = {}
 
 
 def register_form(form: str, learner: FunctionLearner) -> None:
     """Say who trains the functions of a form; `pharos.training` does, as their policies are evaluated there."""
-    _LEARNERS[form] = learner
+    _FUNCTION_LEARNERS[form] = learner
 
 
 def form_of(name: str, code: object) -> str:
@@ -114,14 +114,14 @@ def agent_source(
         ParameterError: it cannot be imported, or is no agent.
     """
     if not isinstance(agent, str):
-        source = announce(agent)
+        source = register_source(agent)
         form_of(source.name, agent)
         return source
     if is_known(agent):
         return None
-    source = announced(agent) or find(agent, folder)
+    source = announced(agent) or find_source(agent, folder)
     if check:
-        form_of(source.name, load(source))
+        form_of(source.name, load_source(source))
     return source
 
 
@@ -138,7 +138,7 @@ class OwnAgent(DeepAgent):
     def library_default(self, name: str) -> object:
         source = agent_source(self.name)
         assert source is not None
-        code = load(source)
+        code = load_source(source)
         if form_of(self.name, code) == CLASS:
             return super().library_default(name)
         parameter = inspect.signature(code).parameters.get(name)
@@ -163,7 +163,7 @@ class OwnAgent(DeepAgent):
                 f"agent {self.name!r} is a function, which has no logs of TensorBoard; leave tensorboard out"
             )
         assert not isinstance(code, str)
-        return _LEARNERS[form](runs, code)
+        return _FUNCTION_LEARNERS[form](runs, code)
 
     def load(self, folder: Path, run: LearningRun) -> PolicyLike:
         if form_of(self.name, run.algorithm) == CLASS:

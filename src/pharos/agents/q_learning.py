@@ -12,7 +12,7 @@ from pharos.errors import ParameterError, UnknownName
 from pharos.mdp import TabularMDP
 from pharos.system.arrays import read_only
 
-DEFAULTS: dict[str, Any] = {
+Q_LEARNING_DEFAULTS: dict[str, Any] = {
     "learning_rate": 0.1,
     "visits_exponent": 0.0,
     "gamma": 0.99,
@@ -30,7 +30,7 @@ class QLearning:
 
         Q(s, a) += alpha (r + gamma max_b Q(s', b) - Q(s, a))
 
-    There is no next value where the episode ended in a terminal state.
+    There is no next value if the episode ended in a terminal state.
 
     An episode that the time limit cuts off is not an end of that kind: the next value is used. Under chance the update
     belongs to the chosen action, as the agent does not know which one was executed.
@@ -71,7 +71,7 @@ class QLearning:
         rows = mdp.num_states * ((mdp.num_actions + 1) if self.options["sees_previous_action"] else 1)
         self.q = np.full((rows, mdp.num_actions), float(self.options["initial_q"]))
         self.visits = np.zeros((rows, mdp.num_actions), np.int64)
-        self.place = np.array([-1, 0, 0, 0, 0], np.int64)
+        self.cursor = np.array([-1, 0, 0, 0, 0], np.int64)
         self.sums = np.array([0.0, 1.0, 0.0])
         self.word = np.array([np.random.SeedSequence(self.seed).generate_state(1, np.uint64)[0]], np.uint64)
         self.reward_noise, self.pending = float(reward_noise), np.zeros(int(reward_delay))
@@ -80,12 +80,12 @@ class QLearning:
     @property
     def steps(self) -> int:
         """Steps so far."""
-        return int(self.place[3])
+        return int(self.cursor[3])
 
     @property
     def episodes(self) -> int:
         """Number of finished episodes so far."""
-        return int(self.place[4])
+        return int(self.cursor[4])
 
     @property
     def sum_of_returns(self) -> float:
@@ -121,7 +121,7 @@ class QLearning:
             schedule,
             self.q,
             self.visits,
-            self.place,
+            self.cursor,
             self.sums,
             self.word,
             self.reward_noise,
@@ -134,7 +134,7 @@ class QLearning:
     def policy_table(self) -> np.ndarray:
         """The greedy policy: (S,) actions, the first among equals.
 
-        (S, A + 1, A) probabilities where previous actions are seen.
+        (S, A + 1, A) probabilities if previous actions are seen.
 
         In the second form [s, b] is the policy after executing b, b = A standing for no previous action.
         """
@@ -149,7 +149,7 @@ class QLearning:
 
     def state(self) -> dict[str, np.ndarray]:
         """State of the learner for `restore`, as plain arrays."""
-        arrays = {"q": self.q, "visits": self.visits, "place": self.place, "sums": self.sums, "word": self.word}
+        arrays = {"q": self.q, "visits": self.visits, "place": self.cursor, "sums": self.sums, "word": self.word}
         if len(self.pending):
             arrays["pending"] = self.pending
         return arrays | ({"noise_word": self.noise_word} if self.reward_noise else {})
@@ -166,11 +166,11 @@ class QLearning:
 
 
 def checked_options(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """All hyperparameters: DEFAULTS with changes. UnknownName, ParameterError: one is unknown or out of range."""
-    unknown = set(changes) - set(DEFAULTS)
+    """Q_LEARNING_DEFAULTS with changes. UnknownName, ParameterError: one is unknown or out of range."""
+    unknown = set(changes) - set(Q_LEARNING_DEFAULTS)
     if unknown:
-        raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], DEFAULTS)
-    options = {**DEFAULTS, **changes}
+        raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], Q_LEARNING_DEFAULTS)
+    options = {**Q_LEARNING_DEFAULTS, **changes}
     ranges = {
         "learning_rate": (0.0, 1.0),
         "visits_exponent": (0.0, 1.0),
@@ -205,7 +205,7 @@ class QLearningAgent(TableBasedAgent):
     """Q-learning as an agent that has a name."""
 
     def library_default(self, name: str) -> object:
-        return DEFAULTS.get(name)
+        return Q_LEARNING_DEFAULTS.get(name)
 
     def check(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
         checked_options(hyperparameters)
@@ -214,7 +214,7 @@ class QLearningAgent(TableBasedAgent):
         task, chance = run.task, run.task.scaled_chance
         # In another unit of rewards a table learns the same policies, from values and with noise in that unit
         scale = chance.reward_scale
-        initial = {"initial_q": scale * float(run.hyperparameters.get("initial_q", DEFAULTS["initial_q"]))}
+        initial = {"initial_q": scale * float(run.hyperparameters.get("initial_q", Q_LEARNING_DEFAULTS["initial_q"]))}
         return QLearning(
             task.mdp,
             total_steps=run.config.steps,

@@ -15,7 +15,7 @@ register(A2C)
 
 
 def agent_called(name: str) -> Agent:
-    """The agent of a name; any other name is that of a class or function, of a library or the user's own."""
+    """The agent of a name; any other name belongs to a class or function, of a library or the user's own."""
     kind = DeepAgent if is_known(name) else OwnAgent
     return agents().get(name) or kind(name=name, title=name.rpartition(":")[2], path=name)
 

@@ -37,7 +37,7 @@ from pharos.agents.agent import (
 from pharos.environments import Environment
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.policies import PolicyLike, deep_policy
-from pharos.system.sources import find, is_reference, load
+from pharos.system.sources import find_source, is_reference, load_source
 
 if TYPE_CHECKING:
     from stable_baselines3.common.buffers import ReplayBuffer
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from pharos.agents.batched import Batch, BatchRun
     from pharos.interaction import SB3VecEnv
 
-FEATURES = 128
+EXTRACTED_FEATURES = 128
 LEAST_ONE = ("n_envs", "n_steps", "n_epochs", "batch_size", "buffer_size", "train_freq", "target_update_interval")
 SHARES = ("gamma", "gae_lambda", "tau", "exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
 POSITIVE = ("learning_rate", "clip_range", "max_grad_norm")
@@ -83,7 +83,7 @@ def algorithm(agent: str | Callable[..., Any]) -> type:
     if not colon:
         raise UnknownName("agent", agent, agents())
     if not is_known(path):
-        return _class(agent, load(find(path)))
+        return _class(agent, load_source(find_source(path)))
     try:
         target = getattr(importlib.import_module(module), name)
         from stable_baselines3.common.base_class import BaseAlgorithm
@@ -119,7 +119,7 @@ def check_hyperparameters(
     """Refuse hyperparameters that the algorithm lacks, and values that it would accept silently or fail with late.
 
     Args:
-        also: names that the engine adds to those of the algorithm.
+        also: names that the engine adds to the algorithm's.
     Raises:
         UnknownName: with the nearest name that it has. ParameterError: a number out of its range, or something else for
             one; or RL Zoo's wrappers.
@@ -141,7 +141,7 @@ def check_hyperparameters(
 
 
 def check_masks(agent: str | Callable[..., Any], env: Environment) -> None:
-    """Refuse an algorithm that needs action masks where all actions are available, and one without where not all are.
+    """Refuse an algorithm that needs action masks if all actions are available, and one without if not all are.
 
     Raises:
         ParameterError: with what to do.
@@ -166,7 +166,7 @@ def _title(agent: str | Callable[..., Any]) -> str:
 
 
 def _expected(name: str, value: object) -> str | None:
-    """Expected type of a hyperparameter where `value` has another one; schedules and the like pass."""
+    """Expected type of a hyperparameter if `value` has another one; schedules and the like pass."""
     if not isinstance(value, int | float | str):
         return None
     number = value if not isinstance(value, bool | str) else math.nan
@@ -183,7 +183,7 @@ def _expected(name: str, value: object) -> str | None:
     return None
 
 
-def extractor(space: Any) -> type:
+def extractor_class(space: Any) -> type:
     """The class of feature extractor for an observation space."""
     from stable_baselines3.common.torch_layers import CombinedExtractor
 
@@ -221,8 +221,8 @@ def make_model(
         wrong = options["policy_kwargs"]
         raise ParameterError(f"agent {_title(agent)!r}: policy_kwargs is {wrong!r}; expected a mapping")
     network = {
-        "features_extractor_class": extractor(env.observation_space),
-        "net_arch": options.pop("net_arch", [FEATURES]),
+        "features_extractor_class": extractor_class(env.observation_space),
+        "net_arch": options.pop("net_arch", [EXTRACTED_FEATURES]),
         **options.pop("policy_kwargs", {}),
     }
     policy = "MultiInputPolicy" if hasattr(env.observation_space, "spaces") else "MlpPolicy"
@@ -371,7 +371,7 @@ def _batch_run(run: LearningRun) -> "BatchRun":
         seed=config.seed,
         key=int(config.id, 16),
         gamma=config.gamma,
-        # Where the rules have chance, rewards belong to outcomes, not to pairs
+        # If the rules have chance, rewards belong to outcomes, not to pairs
         outcome_rewards=run.shared("rewards", WORLD, lambda: rewards_of_outcomes(space) if space.has_chance else None),
         chance=chance,
         staying=staying,
@@ -415,12 +415,12 @@ class Networks(ArrayLearner):
         """Write the network, as `Deep` reads it, with the names of parameters in the policy of Stable-Baselines3."""
         import torch
 
-        place = new_agent(folder)
+        target = new_agent(folder)
         parameters = self.parameters(i).items()
         policy = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters}
-        torch.save({"policy": policy}, place / "parameters.pt")
+        torch.save({"policy": policy}, target / "parameters.pt")
         counters = {"num_timesteps": int(self.batch.steps), "episodes": int(self.episodes[i])}
-        (place / "model.json").write_text(json.dumps({"counters": counters, "returns": float(self.returns[i])}))
+        (target / "model.json").write_text(json.dumps({"counters": counters, "returns": float(self.returns[i])}))
 
 
 class Deep:
@@ -453,7 +453,7 @@ class Deep:
     def policy(self, i: int) -> PolicyLike:
         return self.agent
 
-    def greedy_actions(self, places: Sequence[int]) -> None:
+    def greedy_actions(self, indices: Sequence[int]) -> None:
         return None
 
     def learn(self, points: Sequence[int], at_point: AtPoint) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from pharos.system import lazy
 
 if TYPE_CHECKING:
+    from pharos.benchmark.agent_diagnosis import Diagnosis, diagnose
     from pharos.benchmark.check import AgentCheck, check_agent
     from pharos.benchmark.comparison import AxisComparison, Comparison, Difference, Power, compare, power
     from pharos.benchmark.entry import Claim, Entry
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from pharos.benchmark.limits import Limits
     from pharos.benchmark.loop import LoopRun, TaskEnv, task
     from pharos.benchmark.page import report
-    from pharos.benchmark.profiles import Diagnosis, diagnose
     from pharos.benchmark.ranking import Board, board, reason
     from pharos.benchmark.results import AgentResults, baselines, read_results
     from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, score

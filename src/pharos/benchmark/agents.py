@@ -39,7 +39,8 @@ from pharos.agents import (
 )
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
-from pharos.system.sources import Source, find, is_reference, load, source_of
+from pharos.solvers import uniform_policy
+from pharos.system.sources import Source, find_source, is_reference, load_source, source_of
 from pharos.system.wording import capped, in_one_line, line_in
 from pharos.system.workers import Terminated, Workers
 from pharos.training import (
@@ -64,7 +65,6 @@ from pharos.training import (
     regret,
     run_id,
     train_configs,
-    uniform_policy,
     write_curve,
     write_policy,
     write_record,
@@ -88,7 +88,7 @@ class RunSettings:
 
     Attributes:
         workers: processes at once.
-        checkpoints: folder of those of the batched engine.
+        checkpoints: folder of checkpoints of the batched engine.
         tell: called with the progress.
         timeout: seconds after which a run that has its process is ended; None: never.
     """
@@ -119,7 +119,7 @@ class RunResult:
 
     Attributes:
         curve: (evaluations,) normalised regret. exact: whether all of it is.
-        steps: of the environment, as it counted them, else those of the protocol.
+        steps: of the environment, as it counted them, else of the protocol.
         notes: sentences on what looks like a mistake, by kind.
         policies: facts on the policies, by `policy_facts` of training/curve.py; empty if they are unknown.
     """
@@ -138,8 +138,8 @@ class Form:
     Attributes:
         label: of the agent, for tables. kind: of form, as in the table above.
         hyperparameters: all that are known; one setting for all tasks.
-        source: where code of the user's own comes from.
-        checksum: SHA-256 of that file, or of the text of a function that is in none; empty where pharos has the code.
+        source: origin of the user's own code.
+        checksum: SHA-256 of that file, or of the text of a function that is in none; empty if pharos has the code.
         errors: of runs that could not write their own, by folder.
     """
 
@@ -187,7 +187,7 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
 
     Args:
         agent: a name, `module:Name`, `file.py:Name`, or a generator function.
-        hyperparameters: go before those of the suite, and these before the agent's own.
+        hyperparameters: override the suite's hyperparameters, which override the agent's.
     Raises:
         UnknownName, ParameterError: there is no such agent, file or hyperparameter.
         MissingExtra: the library that it needs is not installed.
@@ -202,8 +202,8 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
     if agent.endswith(".py"):
         raise ParameterError(f"agent {agent!r}: expected what in the file, such as {agent}:learn")
     if is_reference(agent) and not is_known(agent):
-        source = find(agent)
-        code = load(source)
+        source = find_source(agent)
+        code = load_source(source)
         if form_of(agent, code) != CLASS:
             return _function(code, source, setting)
         check_hyperparameters(code, setting)
@@ -216,7 +216,7 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
 
 
 def sha256(file: str | os.PathLike) -> str:
-    """SHA-256 of a file; empty where there is none."""
+    """SHA-256 of a file; empty if there is none."""
     return hashlib.sha256(Path(file).read_bytes()).hexdigest() if Path(file).is_file() else ""
 
 
@@ -252,7 +252,8 @@ class TrainedForm(Form):
             failures = f", {now.failed} failed" if now.failed else ""
             settings.tell(now.done / now.total, f"{now.finished} of {len(jobs)} runs{failures}")
 
-        tasks = TaskCache(trust=True)  # the user has named the code
+        stored = {config.id: job.task.stored_values for config, job in zip(configs, jobs, strict=True)}
+        tasks = TaskCache(lambda config: stored[config.id], trust=True)  # the user has named the code
         options: dict[str, Any] = {"progress": progress, "tasks": tasks, "workers": settings.workers}
         train_configs(configs, folders, checkpoints=settings.checkpoints, seconds=seconds, **options)
 
@@ -278,7 +279,7 @@ def _train_alone(label: str, entry: dict[str, Any], checkpoints: Path, jobs: Seq
     _seed(job.seed)
     config = RunConfig.from_dict(entry)
     try:
-        tasks = TaskCache(trust=True)  # the user has named the code
+        tasks = TaskCache(lambda _: job.task.stored_values, trust=True)  # the user has named the code
         (end,) = train_configs([config], [job.folder], checkpoints=checkpoints, tasks=tasks)
         send((job.folder, end.error if isinstance(end, FailedRun) else None))
     except Terminated:
@@ -441,7 +442,7 @@ def _send_end(send: Send, label: str, job: Job, *ended: Any) -> None:
 def _loaded(code: Source | bytes) -> Any:
     if isinstance(code, Source):
         sys.path.append(str(Path(code.file).parent))  # for imports within functions, and files of Numba's cache
-        return load(code)
+        return load_source(code)
     import cloudpickle
 
     return cloudpickle.loads(code)
@@ -450,7 +451,7 @@ def _loaded(code: Source | bytes) -> Any:
 def _seed(seed: int) -> None:
     """Seed the global random numbers of Python, NumPy and, if the agent has loaded it, PyTorch.
 
-    A process that was forked has those of the process that it was forked from.
+    A forked process starts with the random numbers of the process that it was forked from.
     """
     random.seed(seed)
     np.random.seed(seed % (1 << 32))  # noqa: TID251  (of the agent's own code, which is its own affair)
@@ -515,7 +516,7 @@ class Apart(Execution[Job]):
 
     Args:
         form: whose jobs they are; it keeps errors of runs that could not write their own.
-        groups: of jobs; those of a group that are finished run again if one is not.
+        groups: of jobs; finished jobs of a group run again if one of it is not finished.
         body: function(*arguments[folder of the first job], jobs, send), which writes the folders of all runs and sends
             for each (its folder, None, an error message, or the OSError of writing).
         fail: fail(job, reason) writes the folder of a run whose process could not.
@@ -597,6 +598,8 @@ class ExactForm(Form):
         return RunResult(np.full(protocol.evaluations, self.regrets[job.task.name]), True, 0)
 
     def _regret(self, task: Task) -> float:
-        if self.label == "oracle":
-            return 0.0
-        return float(regret(evaluate_agent(uniform_policy(task), task).value, task.reference, normalized_by="uniform"))
+        if self.label == "oracle" or task.values is not None:  # U of a large task is stored
+            return float(self.label != "oracle")
+        return float(
+            regret(evaluate_agent(uniform_policy(task.mdp), task).value, task.reference, normalized_by="uniform")
+        )

@@ -5,12 +5,13 @@ colour, the dash and the marker of its place, so that no line is told by its col
 """
 
 from collections.abc import Mapping, Sequence
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, tostring
 
 import numpy as np
 
 from pharos.benchmark.scores import ConfidenceInterval
 
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 WIDTH = 340
 MARKERS = ("M-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0z", "M-4 -4h8v8h-8z", "M0 -5l5 9h-10z", "M0 -5.5l5 5.5l-5 5.5l-5 -5.5z")
 CIVIDIS = ((0, 34, 78), (60, 78, 109), (124, 123, 120), (187, 174, 107), (254, 232, 56))  # Nunez et al. (2018)
@@ -81,6 +82,49 @@ def element(tag: str, *children: Child, **attributes: object) -> Element:
         else:
             node.text = (node.text or "") + child
     return node
+
+
+def document(title: str, lead: Sequence[Element], sections: Sequence[Element]) -> str:
+    """A page of HTML with its style, that loads and runs nothing."""
+    meta = (
+        {"charset": "utf-8"},
+        {"name": "viewport", "content": "width=device-width, initial-scale=1"},
+        {"http_equiv": "Content-Security-Policy", "content": POLICY},
+    )
+    head = element(
+        "head", *(element("meta", **each) for each in meta), element("title", title), element("style", STYLE)
+    )
+    body = element("body", element("header", element("h1", title), *lead), element("main", *sections))
+    return "<!doctype html>\n" + tostring(element("html", head, body, lang="en"), encoding="unicode", method="html")
+
+
+def section(title: str, text: str, *parts: Element) -> Element:
+    """A part of a page with a heading, and a soft text below it."""
+    soft = [element("p", text, class_="soft")] if text else []
+    return element("section", element("h2", title), *soft, *parts)
+
+
+def captioned(caption: str, *parts: Element, text: str = "", class_: str = "") -> Element:
+    """A figure with its caption."""
+    soft = [element("span", text, class_="soft")] if text else []
+    captions = [element("figcaption", caption, *soft)] if caption else []
+    return element("figure", *captions, *parts, class_=class_)
+
+
+def bullets(texts: Sequence[str]) -> Element:
+    """A list of texts."""
+    return element("ul", *(element("li", text) for text in texts))
+
+
+def html_table(heads: Sequence[str], rows: Sequence[Sequence[Child]], numeric: Sequence[int] = ()) -> Element:
+    """A table that scrolls if it is wide; numbers to the right in the columns `numeric`."""
+
+    def kind(k: int, cell: Child) -> str:
+        return "n" if k in numeric else "bar" if not isinstance(cell, str) and cell.tag == "svg" else ""
+
+    head = element("tr", *(element("th", name, class_=kind(k, rows[0][k])) for k, name in enumerate(heads)))
+    body = [element("tr", *(element("td", cell, class_=kind(k, cell)) for k, cell in enumerate(row))) for row in rows]
+    return element("div", element("table", element("thead", head), element("tbody", *body)), class_="scroll")
 
 
 def _text(value: object) -> str:
@@ -178,8 +222,8 @@ def ladder_panel(
 
     Args:
         levels: of the rungs, which stand equally far apart; between them the frontier is interpolated.
-        lines: for each agent its normalised regret on each rung, None where it did not run.
-        theory: of the idealised learner, None where it was not predicted.
+        lines: for each agent its normalised regret on each rung, None if it did not run.
+        theory: of the idealised learner, None if it was not predicted.
         frontier: of the first agent, in units of `levels`.
         unit: label of the horizontal axis.
     """
@@ -263,7 +307,9 @@ def regret_axis(left: float, right: float, top: float, bottom: float) -> list[El
     return shapes + [label(left - 5, y + 4, name, "end", "faint") for name, y in heights.items()]
 
 
-def plane(points: Sequence[tuple[str, float, float, float]], below: str, beside: Sequence[str], title: str) -> Element:
+def scatter(
+    points: Sequence[tuple[str, float, float, float]], below: str, beside: Sequence[str], title: str
+) -> Element:
     """Tasks as dots: (name, x, y, regret in [0, 1]), the darker the less regret, in a scale for all eyes.
 
     Args:
@@ -325,7 +371,7 @@ def shortened(text: str, letters: int) -> str:
 
 
 def ends(interval: ConfidenceInterval) -> tuple[float, float]:
-    """The ends of an interval, for drawing: both at the value where one seed leaves none."""
+    """The ends of an interval, for drawing: both at the value if one seed leaves none."""
     return (interval.value, interval.value) if np.isnan(interval.low) else (interval.low, interval.high)
 
 

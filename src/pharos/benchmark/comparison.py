@@ -1,7 +1,7 @@
 """Comparisons of two agents on a suite, and how many seeds a difference needs.
 
-All differences are of the first agent less the second. A p-value is that of Welch's t over seeds within tasks, which
-belongs to the interval: the interval excludes 0 where p < 0.05. Holm's correction covers the axes, and for themselves
+All differences are of the first agent less the second. A p-value belongs to Welch's t over seeds within tasks, as the
+interval does: the interval excludes 0 if p < 0.05. Holm's correction covers the axes, and for themselves
 the tasks; the core is one question and stands alone.
 
 Source: Newcombe (1998), Interval estimation for the difference between independent proportions, for differences of
@@ -55,13 +55,13 @@ class Difference:
 
     Attributes:
         ours, theirs: the scores, in [0, 1].
-        interval: first agent less second, with its 95 % interval; NaN ends where one of them has one seed.
+        interval: first agent less second, with its 95 % interval; NaN ends if one of them has one seed.
         improvement: how probable it is that a run of the first scores higher, ties half, mean over the tasks.
         p_value: two-sided; NaN with one seed.
         adjusted: the same after Holm's correction in its family.
-        verdict: "better" or "worse" where adjusted < 0.05 and the scores are 0.02 apart or more, "less than 0.02 apart"
-            where they are not; else "not shown to differ". Without a p-value "one seed", or "equal seeds" where those
-            of one agent are one run.
+        verdict: "better" or "worse" if adjusted < 0.05 and the scores are 0.02 apart or more; "less than 0.02 apart"
+            if they are not; otherwise "not shown to differ". Without a p-value "one seed", or "equal seeds" if the
+            seeds of one agent are one run.
     """
 
     ours: float
@@ -79,7 +79,7 @@ class AxisComparison:
 
     Attributes:
         frontiers: first agent's and second's.
-        frontier: their difference: NaN where both lie beyond the same end, a bound ("above", "below") where one does.
+        frontier: their difference: NaN if both lie beyond the same end, a bound ("above", "below") if one does.
     """
 
     axis: str
@@ -94,7 +94,7 @@ class Comparison:
     """One agent against another on the tasks that both have run.
 
     Attributes:
-        ours, theirs: labels. core: None where no core task is common to both.
+        ours, theirs: labels. core: None if no core task is common to both.
         axes: by axis; tasks: by name.
         left_out: tasks of the suite that one of them lacks, which nothing here contains.
     """
@@ -114,7 +114,7 @@ class Power:
     Attributes:
         standard_error: over the seeds that there are.
         least_differences: number of seeds -> least difference that is found with power 0.8.
-        seeds_needed: of each agent, for the difference that was asked for; None where none was, or beyond 100,000.
+        seeds_needed: of each agent, for the difference that was asked for; None if none was, or beyond 100,000.
     """
 
     standard_error: float
@@ -129,7 +129,7 @@ def compare(
 
     Args:
         ours, theirs: results, a folder or file of them, or the name of a shipped baseline.
-        suite: the one that `ours` was run on, where that is not shipped.
+        suite: the one that `ours` was run on, if that is not shipped.
     Raises:
         ParameterError: the suites' digests differ, or no task is common to both.
     Cost: milliseconds.

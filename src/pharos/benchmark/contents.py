@@ -26,13 +26,14 @@ from pharos.benchmark.results import FILE, AgentResults, baselines
 from pharos.benchmark.scores import BenchmarkScore, ConfidenceInterval, as_one_run, run_regrets, run_scores, score
 from pharos.benchmark.suite import BenchmarkTask, Suite
 from pharos.errors import ParameterError
-from pharos.plots import agent_name
+from pharos.plots import agent_label
 from pharos.system import storage
 from pharos.system.wording import pluralize
 
 BESIDE = ("dqn", "ppo", "q_learning")
 LEARNERS = ("dqn", "ppo")  # idealised, with networks
 RESIDUAL = 0.2
+NO_LADDERS = " The ladders were not run, so there are no frontiers."
 LATE = 0.2  # of an agent that learns late, by which the final score exceeds the mean one, with its whole interval
 ENDS_WORSE = 0.05  # the same of one that ends worse than it was, by which the final score is lower
 MOST = 5  # reasons of failures on the page
@@ -112,7 +113,7 @@ def contents_of(
     own = results_of(results)
     suite = suite_of_results(own, suite)
     if beside is None:
-        beside = [name for name in BESIDE if name in baselines(suite.name) and name != own.agent]
+        beside = [f"{suite.name}/{name}" for name in BESIDE if name in baselines(suite.name) and name != own.agent]
     if predictor not in (None, "none", *PREDICTORS):
         raise ParameterError(f"predictor {predictor}; expected one of {', '.join(PREDICTORS)}, none")
     others = [results_of(each) for each in beside]
@@ -122,10 +123,10 @@ def contents_of(
         name = next(name for name in _names(source, each.agent, not agents) if name.lower() not in names)
         agents.append(ScoredAgent(name, each, score(each, suite)))
     comparisons = [compare(own, each, suite=suite) for each in others]
-    return Contents(suite, agents[0], agents[1:], comparisons, predictor or kind_of(own))
+    return Contents(suite, agents[0], agents[1:], comparisons, predictor or learner_kind(own))
 
 
-def kind_of(results: AgentResults) -> str:
+def learner_kind(results: AgentResults) -> str:
     """The idealised learner that an agent is a kind of, by its name and source; "both" if these do not tell."""
     names = f"{results.agent} {results.record.get('source')}".lower()
     if "recurrent" in names:  # no idealised learner has a memory
@@ -137,9 +138,9 @@ def kind_of(results: AgentResults) -> str:
 def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:
     """Candidate names of an agent, best first: pharos' spelling, then with the folder of its results, with a number.
 
-    The agent that the report is about, and those of a file or a module, have the label that they ran with.
+    The agent that the report is about, and agents of a file or a module, have the label that they ran with.
     """
-    name = label if is_first or ":" in label else agent_name(label)
+    name = label if is_first or ":" in label else agent_label(label)
     yield name
     if not isinstance(source, AgentResults) and Path(source).exists():
         path = Path(source).resolve()
@@ -148,13 +149,13 @@ def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:
 
 
 def regret_of(agent: ScoredAgent, task: BenchmarkTask) -> ConfidenceInterval | None:
-    """Normalised regret of an agent on a task, clipped to [0, 1]; None where it did not run."""
+    """Normalised regret of an agent on a task, clipped to [0, 1]; None if it did not run."""
     own = agent.score.tasks.get(task.name)
     return None if own is None else ConfidenceInterval(1 - own.value, 1 - own.high, 1 - own.low)
 
 
 def sentence(contents: Contents) -> str:
-    """Sentence on what the agent can do, in units: a frontier for each axis, with those of the baselines."""
+    """Sentence on what the agent can do, in units: a frontier for each axis, with the baselines' frontiers."""
     clauses = []
     for axis, own in contents.agent.score.axes.items():
         if math.isnan(own.frontier.value):  # of one rung
@@ -187,7 +188,7 @@ def _core_sentence(contents: Contents) -> str:
     parts = [f"Core score {number(contents.agent.score.core)} on {pluralize(len(names), 'task')}"]
     parts += [f"{word} {listed(texts)}" for word, texts in groups.items() if texts]
     worst = f"worst on {listed(names[:3])}" if len(names) > 3 else ""
-    return "; ".join(filter(None, (", ".join(parts), worst))) + ". The ladders were not run, so there are no frontiers."
+    return "; ".join(filter(None, (", ".join(parts), worst))) + "." + NO_LADDERS * bool(contents.suite.ladders)
 
 
 def _split(text: str) -> tuple[str, str]:
@@ -201,7 +202,7 @@ def listed(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
-def residuals(contents: Contents) -> list[tuple[BenchmarkTask, ConfidenceInterval, float]]:
+def residual_tasks(contents: Contents) -> list[tuple[BenchmarkTask, ConfidenceInterval, float]]:
     """Tasks whose regret is more than 0.2 above the predicted one, the largest first: task, observed, predicted."""
     pairs = [(task, regret_of(contents.agent, task), contents.predicted(task)) for task in contents.suite.tasks]
     rows = [(task, own, expected) for task, own, expected in pairs if own is not None and expected is not None]
@@ -261,7 +262,7 @@ def learning_sentence(contents: Contents) -> str:
 
 
 def unclipped_regret(contents: Contents) -> str:
-    """The mean regret on the core without clipping, in words, where runs far below random play make it differ."""
+    """The mean regret on the core without clipping, in words, if runs far below random play make it differ."""
     own = contents.agent.score
     if not own.optimality_gap.value > 1 - own.core.value + 0.1:
         return ""

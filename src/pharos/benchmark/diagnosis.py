@@ -1,7 +1,7 @@
 """Words of the report, which follow from its numbers: verdicts of `compare`, falls of axes, what a mistake looks like.
 
-Nothing here tests anything anew: a verdict is that of the score in `compare`, after Holm's correction, so that page and
-command cannot contradict each other; a frontier is the unit in which it is told.
+Nothing here tests anything anew: a verdict is taken from the score in `compare`, after Holm's correction, so that page
+and command cannot contradict each other. A frontier is the unit in which it is reported.
 """
 
 import math
@@ -19,24 +19,35 @@ from pharos.benchmark.comparison import (
     Comparison,
     Difference,
 )
-from pharos.benchmark.contents import PREDICTORS, Contents, ScoredAgent, kind_of, listed, number, residuals, signed
+from pharos.benchmark.contents import (
+    PREDICTORS,
+    Contents,
+    ScoredAgent,
+    learner_kind,
+    listed,
+    number,
+    residual_tasks,
+    signed,
+)
+from pharos.benchmark.levels import twins
 from pharos.benchmark.properties import known_properties
 from pharos.benchmark.results import AgentResults, baselines
-from pharos.benchmark.scores import CROSSING, AxisScore, equal_seeds, run_scores
+from pharos.benchmark.scores import CROSSING, AxisScore, ConfidenceInterval, equal_seeds, run_scores
 from pharos.benchmark.suite import BenchmarkTask
 from pharos.system.wording import pluralize
 
 SHIPPED = {"dqn": ("dqn",), "ppo": ("ppo",), "table": ("q_learning",), "both": ("dqn", "ppo")}
-OWN = 0.1  # by which the regret of a residual is above that of the shipped agent of the kind
+OWN = 0.1  # by which the regret of a residual is above the regret of the shipped agent of the kind
 ONE_ACTION = 0.9  # share of states in which a policy prefers the same action, to be told so
 SHOWN = 5  # names of tasks in a sentence
 VERDICTS = (WORSE, BETTER, NEGLIGIBLE, UNDECIDED)
 
 
 def nearest(contents: Contents) -> tuple[int, float, bool] | None:
-    """Place of the baseline that the agent is held against, mean distance of their scores, whether of the same kind.
+    """Index of the baseline to compare the agent with, mean distance of their scores, whether of the same kind.
 
-    Of those of the agent's kind, else of all, the one whose scores on core tasks are nearest; None without any.
+    Among baselines of the agent's kind, else among all, the one with the nearest scores on core tasks; None without
+    any.
     """
     names = {task.name for task in contents.suite.core}
     distances = {}
@@ -46,8 +57,8 @@ def nearest(contents: Contents) -> tuple[int, float, bool] | None:
             distances[k] = sum(own) / len(own)
     if not distances:
         return None
-    kind = kind_of(contents.agent.results)
-    same = [k for k in distances if kind == kind_of(contents.beside[k].results) and kind not in ("both", "none")]
+    kind = learner_kind(contents.agent.results)
+    same = [k for k in distances if kind == learner_kind(contents.beside[k].results) and kind not in ("both", "none")]
     place = min(same or distances, key=distances.__getitem__)
     return place, distances[place], bool(same)
 
@@ -142,10 +153,30 @@ def falls(contents: Contents) -> list[list[str]]:
     return rows
 
 
+def gaps(contents: Contents) -> list[list[str]]:
+    """Rows on each pair of levels seen and held out that was run: both scores of the agent, and the gap of all agents.
+
+    The gap is regret on held-out levels less that on training levels, by seed.
+    """
+    rows = []
+    runs = [run_scores(each.results) for each in contents.agents]
+    for own_levels, held_out in twins(contents.suite):
+        texts = [
+            signed(ConfidenceInterval.of_mean([own[own_levels.name] - own[held_out.name]]))
+            if {own_levels.name, held_out.name} <= own.keys()
+            else "–"
+            for own in runs
+        ]
+        if texts[0] != "–":
+            scores = (number(contents.agent.score.tasks[each.name]) for each in (own_levels, held_out))
+            rows.append([held_out.axis, str(own_levels.parameters["train"]), *scores, *texts])
+    return rows
+
+
 def groups_of(contents: Contents) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
     """Names of core tasks by what is seen, and by property: reward sizes, length, ends, chance, number of actions.
 
-    Properties with one group say nothing, and are left out; so are those of tasks that `known_properties` lacks.
+    Properties with one group say nothing, and are left out; so are tasks that `known_properties` lacks.
     """
     by_observation: dict[str, list[str]] = {}
     kinds: list[dict[str, list[str]]] = []
@@ -177,7 +208,9 @@ def shipped_regret(contents: Contents, task: BenchmarkTask) -> float | None:
     regrets = []
     for name in SHIPPED.get(contents.predictor, ()):
         beside = [each.results for each in contents.beside if each.results.agent == name]
-        shipped = beside or ([AgentResults.read(name)] if name in baselines(contents.suite.name) else [])
+        shipped = beside or (
+            [AgentResults.read(f"{contents.suite.name}/{name}")] if name in baselines(contents.suite.name) else []
+        )
         regrets += [float(1.0 - run_scores(each)[task.name].mean()) for each in shipped if task.name in each.curves]
     return max(regrets, default=None)
 
@@ -191,14 +224,16 @@ def is_own(contents: Contents, task: BenchmarkTask, regret: float) -> bool:
 def predictor_sentence(contents: Contents) -> str:
     """Sentence on which idealised learner was taken, and the number of tasks that the others would list."""
     counts = {
-        name: len(residuals(replace(contents, predictor=name))) for name in PREDICTORS if name != contents.predictor
+        name: len(residual_tasks(replace(contents, predictor=name)))
+        for name in PREDICTORS
+        if name != contents.predictor
     }
     others = listed([f"{count} beside {PREDICTORS[name]}" for name, count in counts.items()])
     request = (
         "The agent's name does not say its kind, so the worse of two was taken, which lists the fewest; say it: "
         "--predictor dqn, ppo, table or none. "
     )
-    is_unsaid = contents.predictor == kind_of(contents.agent.results) == "both"
+    is_unsaid = contents.predictor == learner_kind(contents.agent.results) == "both"
     return f"{request if is_unsaid else ''}Others would list {others}."
 
 

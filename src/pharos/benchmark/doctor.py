@@ -1,9 +1,10 @@
 """Readings of an agent whose worlds are known exactly: whether its values obey the equation that they ought to obey.
 
-Values of actions of a healthy learner are near their own backup, Q(s, a) = r(s, a) + gamma E max Q(s', .), and those of
-states near that of their policy, whatever has been learnt so far. A fault is another equation: without the end of an
-episode, with clipped rewards, with another discount. `residuals` says how far the values are from each, in units of the
-deviation of the backup, and the discount that fits best is part of the answer. All is arithmetic on small arrays.
+Values of actions of a healthy learner are near their own backup, Q(s, a) = r(s, a) + gamma E max Q(s', .), and values
+of states near the value of their policy, whatever has been learnt so far. A fault is another equation: without the end
+of an episode, with clipped rewards, with another discount. `residuals` says how far the values are from each, in units
+of the deviation of the backup, and the discount that fits best is part of the answer. All is arithmetic on small
+arrays.
 
 Source: Sutton and Barto (2018), sections 3.6 and 11.4 (Bellman residuals); the equations of faults are ours.
 """
@@ -78,7 +79,7 @@ def targets(examination: Examination, gamma: float) -> dict[str, np.ndarray]:
 
 def earlier_rewards(examination: Examination) -> np.ndarray:
     """(S,) mean reward of the step before each state, over the steps of the run, if that is not forgotten at a reset:
-    where episodes begin that of the last step of another one counts.
+    at the start of an episode the last step of another one counts.
     """
     world, visits, cuts = examination.world, examination.visits, examination.cuts
     flow = (visits - cuts)[:, :, None] * world.transitions * ~world.terminal
@@ -139,8 +140,8 @@ def least_scale(world: WorldArrays) -> float:
 
 
 def contrast(examination: Examination, name: str, gamma: float, right_gamma: float) -> float:
-    """log10 of the distance from an equation, less that from the right one, where both differ: negative if the values
-    obey this one. Each with its own discount. NaN: they differ nowhere where it was.
+    """log10 of the distance from an equation, less the distance from the right one, where both differ: negative if the
+    values obey this one. Each with its own discount. NaN: they differ nowhere where it was.
     """
     other, right = targets(examination, gamma), targets(examination, right_gamma)[RIGHT]
     if name not in other:
@@ -163,10 +164,10 @@ def _scale(target: np.ndarray, weights: np.ndarray) -> float:
 
 
 def cut_shares(examination: Examination, gamma: float) -> tuple[float, float]:
-    """Shares of the way from the right equation, 0, to that where the time limit is an end, 1, that values are on: by
+    """Shares of the way from the right equation, 0, to the equation in which the time limit is an end, 1: by
     projection, and by regression beside the next values and a constant, which a slow target network does not move.
 
-    NaN where the time limit ends less than one in CUTS steps.
+    NaN if the time limit ends less than one in CUTS steps.
     """
     if examination.cuts.sum() * CUTS < examination.visits.sum():
         return float("nan"), float("nan")
@@ -201,18 +202,18 @@ def readings(examinations: Sequence[Examination]) -> dict[str, float]:
     """Numbers that describe an agent, by name; those that do not apply to it are left out.
 
     Of an agent with values: `gamma`, the discount that fits them best, as log10 of 1 / (1 - gamma); `consistency`,
-    log10 of the residual; of each other equation the residual less that of the right one, negative if it fits better;
-    `cut_share` and `cut_partial`, see `cut_shares`; `image` and `image_size`, the residual and `size` where it sees
-    images less those elsewhere;
+    log10 of the residual; of each other equation the residual less the right one's, negative if it fits better;
+    `cut_share` and `cut_partial`, see `cut_shares`; `image` and `image_size`, the residual and `size` if it sees
+    images less the same for others;
     `slope`, log10 of the factor with which rewards enter; `size`, log10 of the deviation of the values relative to
     exact ones; `truth`, their correlation with exact ones, and `truth_unvisited` elsewhere; `bias`, their mean error in
     deviations; `ends`, values of terminal states in deviations; `deaf`, the share of numbers of observations that
     change nothing, `deaf_last` of last ones; `wavering`, log10 of the change if asked again; `forgets`, the residual
-    where it was of late less that of all; `own`, whether they are nearer to values of the agent's own policy than to
-    optimal ones; `far`, the error far from the end less that near it.
+    in lately visited states less the residual of all; `own`, whether they are nearer to values of its policy than to
+    optimal ones; `far`, the error far from the end less the error near it.
     Of all: `overlap` of late behaviour with the policy, and `overlap_shifted` with its actions shifted, less that;
     `random`, entropy of late behaviour, 1 as uniform; `certain`, probability of the likeliest action; `coverage` of
-    states; `behind`, late regret of behaviour less that of the policy; `equal_seeds`, share of worlds where two seeds
+    states; `behind`, late regret of behaviour less the policy's; `equal_seeds`, share of worlds in which two seeds
     did the same; `regret` of each world.
     """
     numbers: dict[str, float] = {}
@@ -327,7 +328,7 @@ def greedy_share(q: np.ndarray, exact: np.ndarray, weights: np.ndarray) -> float
 def reward_slope(examination: Examination, gamma: float) -> float:
     """log10 of the factor with which rewards enter values: the slope of values less discounted next values on rewards.
 
-    NaN if rewards do not differ where it was, or the slope is not positive: -3.
+    NaN if rewards do not differ in states that it visited; -3 if the slope is not positive.
     """
     values, world = answers_of(examination), examination.world
     live = np.where(world.terminal, 0.0, values.max(axis=1) if values.ndim == 2 else values)

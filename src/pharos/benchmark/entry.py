@@ -97,7 +97,7 @@ class Entry:
         """Entry of the record and the arrays of a file; FileFormatError or ValueError if they are damaged."""
         check_values(record)
         fields = {name: value for name, value in record.items() if name not in ("format", "id", storage.DIGEST)}
-        entry = records.read(Entry, {**fields, _ARRAYS: arrays}, "its record")
+        entry = records.parse_record(Entry, {**fields, _ARRAYS: arrays}, "its record")
         if record["id"] != run_id(record["config"]):
             raise ValueError("its configuration is not that of its run")
         if entry.claim.error_bound < 0:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.agents import agent_called, agents, algorithm, extractor, make_model
+from pharos.agents import agent_called, agents, algorithm, extractor_class, make_model
 from pharos.benchmark.entry import POLICY, Entry
 from pharos.environments import BUILT_IN
 from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, UntrustedCode
@@ -170,7 +170,7 @@ def _check_arrays(entry: Entry, env: "VecEnv", hyperparameters: dict[str, Any]) 
 
     kwargs = hyperparameters.get("policy_kwargs", {})
     with torch.device("meta"):
-        features = extractor(env.observation_space)(
+        features = extractor_class(env.observation_space)(
             env.observation_space, **kwargs.get("features_extractor_kwargs", {})
         )
     expected = {tuple(each.shape) for each in features.state_dict().values()}
@@ -232,7 +232,7 @@ def _as_floats(value: object) -> object:
         return {name: _as_floats(item) for name, item in value.items()}
     if isinstance(value, list):
         return [_as_floats(item) for item in value]
-    return float(value) + 0.0 if isinstance(value, int | float) else value  # 0.0, where it is -0.0
+    return float(value) + 0.0 if isinstance(value, int | float) else value  # 0.0, if it is -0.0
 
 
 def _check_code(config: RunConfig, trust: bool) -> None:

@@ -1,8 +1,8 @@
 """An agent trained on twelve small worlds, with all that there is to see of it: the material of `pharos diagnose`.
 
-Each run ends in an `Examination`: the world as arrays, how often the agent took which action where while it learnt, and
-what its last policy answers about every state. A policy may offer `q_values(observations)`, (N, A), or
-`values(observations)`, (N,); those of Stable-Baselines3 are asked without being told how.
+Each run ends in an `Examination`: the world as arrays, how often the agent took which action in which state while it
+learnt, and what its last policy answers about every state. A policy may offer `q_values(observations)`, (N, A), or
+`values(observations)`, (N,); policies of Stable-Baselines3 are asked in their own way.
 """
 
 import contextlib
@@ -13,17 +13,20 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import CLASS, agents, algorithm, form_of, generator_of, is_known, make_model
+from pharos.agents import CLASS, QLearning, agents, algorithm, form_of, generator_of, is_known, make_model
 from pharos.benchmark.suite import BenchmarkTask, Protocol
-from pharos.errors import ParameterError, UnknownName
+from pharos.errors import ParameterError, TimeLimit, UnknownName
 from pharos.policies import PolicyLike, SB3Model
-from pharos.system.sources import find, load
+from pharos.system.interrupts import time_limit
+from pharos.system.sources import find_source, load_source
+from pharos.system.workers import Terminated
 from pharos.training import (
     BudgetSpent,
     CountedEnv,
     PolicyRecorder,
     StepBudget,
     Task,
+    end_process,
     errors_in_one_line,
     evaluate_agent,
     generate,
@@ -82,7 +85,7 @@ class Examination:
     Attributes:
         name: of the world. seed: of the run.
         world: as arrays.
-        visits: (S, A) steps by state and action; late, last: those of the last fifth and of the last fortieth.
+        visits: (S, A) steps by state and action; late, last: in the last fifth and in the last fortieth.
         cuts: (S, A) steps after which the time limit ended the episode.
         policy: (S, A) probabilities of the last policy.
         q: (S, A) and v: (S,), if it offers them.
@@ -90,6 +93,7 @@ class Examination:
             another state, relative to the deviation of answers between states.
         wavering: largest change of its answers if it is asked again, in another order.
         regret: of the last policy, 0 optimal and 1 as uniform play; late_regret: of the returns of the last fifth.
+        notes: sentences on what looks like a mistake of its loop, by kind.
     """
 
     name: str
@@ -106,6 +110,7 @@ class Examination:
     wavering: float
     regret: float
     late_regret: float
+    notes: Mapping[str, str] = field(default_factory=dict)
 
 
 @cache
@@ -211,7 +216,7 @@ class Witness(PolicyRecorder):
         if self.answers is None:
             raise ParameterError(
                 f"world {self.name}, seed {self.seed}: no policy came in the last {LATE:.0%} of {self.budget.limit:,} "
-                f"steps; expected one at the end: yield policy"
+                f"steps, of which it used {self.budget.steps:,}; expected one at the end: yield policy"
             )
         task, log, shape = self.task, self.log, self.world.rewards.shape
         table = np.asarray(self.in_force, np.float64)
@@ -240,13 +245,42 @@ class Witness(PolicyRecorder):
             wavering,
             float(regret(evaluate_agent(policy, task).value, reference, normalized_by="uniform")),
             float(late_regret),
+            {kind: text for kind, text in self.notes().items() if kind != "late policy"},
         )
 
 
-def value_functions(policy: Any) -> tuple[Callable[[Any], np.ndarray] | None, Callable[[Any], np.ndarray] | None]:
-    """Functions of observations to (N, A) values of actions and to (N,) values of states; None where it has none.
+def table_examination(name: str, seed: int, steps: int, setting: Mapping[str, Any]) -> Examination:
+    """The examination of pharos' own table, `QLearning`, by its counts of visits; it sees states, not numbers."""
+    task, world, _ = solved(name)
+    table = QLearning(task.mdp, total_steps=steps, seed=seed, time_limit=task.time_limit, **setting)
+    ends = [int(steps * (1 - LATE)), int(steps * (1 - LAST)), steps]
+    visits = []
+    for end in ends:
+        visits.append(table.learn(end - table.steps).visits.copy())
+    policy = np.eye(world.rewards.shape[1])[table.policy_table()]
+    return Examination(
+        name,
+        seed,
+        world,
+        visits[2],
+        visits[2] - visits[0],
+        visits[2] - visits[1],
+        np.zeros_like(visits[2]),
+        policy,
+        table.q.copy(),
+        None,
+        np.ones(world.vary.shape),
+        0.0,
+        float(regret(evaluate_agent(policy, task).value, task.reference, normalized_by="uniform")),
+        np.nan,
+    )
 
-    A method of an object that offers them, such as `policy` of a class with act and observe, has those of its object.
+
+def value_functions(policy: Any) -> tuple[Callable[[Any], np.ndarray] | None, Callable[[Any], np.ndarray] | None]:
+    """Functions of observations to (N, A) values of actions and to (N,) values of states; None if it has none.
+
+    A method of an object that offers them, such as `policy` of a class with act and observe, has the functions of its
+    object.
     """
     if not (hasattr(policy, "q_values") or hasattr(policy, "values")):
         policy = getattr(policy, "__self__", policy)
@@ -283,12 +317,12 @@ def learner_of(agent: str | Callable[..., Any], hyperparameters: Mapping[str, An
         agent: a generator, or a class with act, observe and policy, or `file.py:Name` of one; or the name or class of
             an algorithm of Stable-Baselines3, such as dqn.
     Raises:
-        ParameterError, UnknownName: there is no such agent, or it is one in JAX or a table.
+        ParameterError, UnknownName: there is no such agent, or it is one in JAX.
     """
     setting = dict(hyperparameters or {})
     code: Any = agent
     if isinstance(agent, str) and not is_known(agent):
-        code = load(find(agent))
+        code = load_source(find_source(agent))
     if not isinstance(code, str):
         form = form_of(str(agent), code)
         if form not in (CLASS, "generator"):
@@ -305,7 +339,7 @@ def learner_of(agent: str | Callable[..., Any], hyperparameters: Mapping[str, An
 def _file_of(agent: str | Callable[..., Any]) -> str | None:
     """The file with the code of an agent of the user's own."""
     if isinstance(agent, str):
-        return None if is_known(agent) else find(agent).file
+        return None if is_known(agent) else find_source(agent).file
     return getattr(getattr(agent, "__code__", None), "co_filename", None)
 
 
@@ -329,6 +363,7 @@ def examine(
     worlds: Sequence[str] = NAMES,
     seeds: Sequence[int] = (0, 1),
     steps: int = PROTOCOL.steps,
+    timeout: float | None = None,
     tell: Callable[[float, str], object] = lambda share, text: None,
 ) -> list[Examination]:
     """Train an agent on small worlds, in this process, and write down all that there is to see.
@@ -336,19 +371,36 @@ def examine(
     Args:
         agent, hyperparameters: as `learner_of` takes them.
         worlds: of NAMES. seeds: of the runs of each. steps: of each run.
+        timeout: seconds after which a run is ended; None: never. Counted in the main thread alone, not on Windows.
         tell: called with the share that is done, and a text.
     Raises:
         ParameterError: it is no agent, or it yields no policy.
-        PharosError: its code raises something, SystemExit included.
+        PharosError: its code raises something, SystemExit included. TimeLimit: a run took longer than was allowed.
     Cost: `len(worlds) * len(seeds)` runs, and values of some hundred states.
     """
-    learn, file = learner_of(agent, hyperparameters), _file_of(agent)
+    has_table = isinstance(agent, str) and agent in agents() and agents()[agent].has_table
+    learn, file = (None, None) if has_table else (learner_of(agent, hyperparameters), _file_of(agent))
+    setting = {**agents()[str(agent)].defaults, **(hyperparameters or {})} if has_table else {}
     examinations: list[Examination] = []
     for name in worlds:
         for seed in seeds:
             tell(len(examinations) / (len(worlds) * len(seeds)), f"{name}, seed {seed}")
+            if learn is None:
+                examinations.append(table_examination(name, seed, steps, setting))
+                continue
             witness = Witness(name, seed, steps)
-            with np.errstate(all="ignore"), errors_in_one_line(str(agent), file):  # of an agent that diverges
-                generate(learn, witness, seed)
+            witness.budget.give_up = partial(end_process, str(agent), steps)
+            try:
+                with time_limit(timeout, OutOfTime), np.errstate(all="ignore"), errors_in_one_line(str(agent), file):
+                    generate(learn, witness, seed)
+            except OutOfTime:
+                raise TimeLimit(
+                    f"agent {agent} on {name}, seed {seed}: took longer than {timeout:g} s; it was ended: raise the "
+                    f"timeout, or look for a loop without an end"
+                ) from None
             examinations.append(witness.examination())
     return examinations
+
+
+class OutOfTime(Terminated):
+    """The time of a run is over; `except Exception` of an agent does not catch it."""

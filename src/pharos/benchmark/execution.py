@@ -18,17 +18,17 @@ from typing import Any
 
 import numpy as np
 
+from pharos.agents import COMPILED
 from pharos.benchmark.agents import Form, Job, RunSettings, Tell, agent_form
 from pharos.benchmark.results import FILE, AgentResults
-from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, score
+from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, equal_seeds, score
 from pharos.benchmark.suite import CORE, EARLIER, BenchmarkTask, Suite, load_suite
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError, PharosError, UnknownName
 from pharos.system import storage
-from pharos.system.wording import in_one_line, pluralize
+from pharos.system.wording import in_one_line
 from pharos.system.workers import usable_workers
 from pharos.training import versions
 
-QUICK = 3  # seeds
 SUITE, AGENT, SCORE = "suite.json", "agent.json", "score.json"
 SHOWN = 200  # characters of what differs
 
@@ -74,7 +74,7 @@ def run(  # noqa: PLR0913
     suite: str | Path | Suite = "v1",
     *,
     out: str | os.PathLike,
-    seeds: Iterable[int] = range(10),
+    seeds: Iterable[int] | None = None,
     quick: bool = False,
     tasks: str | Iterable[str] | None = None,
     name: str | None = None,
@@ -85,8 +85,8 @@ def run(  # noqa: PLR0913
 ) -> Outcome:
     """Run an agent on the tasks of a suite, with one setting for all of them.
 
-    Finished runs in `out` are kept, so that the same call goes on where it was killed, and to the same bytes of
-    results; runs of the batched engine and of tables go on from their last checkpoint, others begin anew.
+    Finished runs in `out` are kept, so that the same call resumes after an interruption, and ends with the same bytes
+    of results. Runs of the batched engine and of tables resume from their last checkpoint, others begin anew.
 
     Args:
         agent: a name (q_learning, dqn, ppo, a2c; oracle, random), `module:Class` or `file.py:Class` with
@@ -94,11 +94,12 @@ def run(  # noqa: PLR0913
             yields policies. Code that is named here is imported.
         suite: name, file, or a suite that was loaded, by `load_suite(file, trust=True)` if it names code.
         out: folder of one agent with one setting, of one suite.
-        seeds: of the runs of each task.
-        quick: the first three seeds of the core alone; what is made of it is preliminary.
+        seeds: of the runs of each task; None: as many as the suite asks for, from 0 on.
+        quick: the tasks and the number of seeds that the suite has for a quick look, of v1 the core with three; what is
+            made of it is preliminary.
         tasks: "core", axes and names of tasks; None: all.
         name: label of the agent in tables; its own when not given.
-        hyperparameters: of all tasks; they go before those of the suite and the agent.
+        hyperparameters: of all tasks; they override those that the suite and the agent have.
         workers: processes; as many as processors when not given. Changes no result.
         timeout: seconds after which a run of the user's own code, or of Stable-Baselines3, is ended, and failed; None:
             never.
@@ -106,19 +107,26 @@ def run(  # noqa: PLR0913
     Raises:
         ParameterError: an option is wrong, a task is another one on this installation, or the folder holds another
             agent, setting or suite. AllRunsFailed: no run has finished. FolderLocked: another process is at it.
-    Cost: of v1, 30,000 steps a task and seed.
+    Cost: of v1, 30,000 steps a task and seed; of large, 600,000.
     """
-    folder = Path(out).absolute()  # an agent may change the directory where its file is loaded
+    folder = Path(out).absolute()  # an agent may change the directory when its file is loaded
     suite = suite if isinstance(suite, Suite) else load_suite(suite)
     form = agent_form(agent, suite, hyperparameters)
-    numbers = [int(seed) for seed in seeds][: QUICK if quick else None]
+    protocol = suite.protocol
+    default = range(suite.quick_seeds if quick else protocol.seeds)
+    numbers = [int(seed) for seed in (default if seeds is None else seeds)]
+    numbers = numbers[: suite.quick_seeds if quick else None]
     if not numbers or len(set(numbers)) < len(numbers) or min(numbers) < 0:
         raise ParameterError(f"seeds are {numbers}; expected whole numbers of at least 0, each once")
-    entries = selected(suite, CORE if quick and tasks is None else tasks)
-    protocol = suite.protocol
+    entries = selected(suite, suite.quick_tasks if quick and tasks is None else tasks)
     if protocol.steps % protocol.evaluations:
         raise ParameterError(
             f"suite {suite.name}: {protocol.steps} steps with {protocol.evaluations} evaluations; expected a multiple"
+        )
+    if form.kind == COMPILED and any(task.stored for task in entries):
+        raise ParameterError(
+            f"agent {form.label!r} learns from tables of observations, and tasks of suite {suite.name} have "
+            f"millions of states; expected an agent that steps an environment, such as file.py:learn"
         )
     for task in entries:
         task.check(protocol)
@@ -251,15 +259,3 @@ def mean_facts(facts: Sequence[Mapping[str, Any]], curves: np.ndarray) -> dict[s
         regrets = [np.mean(each.get("greedy_regret", curve)) for each, curve in zip(facts, curves, strict=True)]
         means["greedy_score"] = float(np.mean(1.0 - np.clip(regrets, 0.0, 1.0)))
     return means
-
-
-def equal_seeds(curves: Mapping[str, np.ndarray]) -> str:
-    """A sentence if all seeds have equal curves on more than a third of the tasks where any run learns, else ""."""
-    several = [curve for curve in curves.values() if len(curve) > 1 and (curve != curve[:1, :1]).any()]
-    equal = sum((curve == curve[0]).all() for curve in several)
-    if not several or equal <= len(several) / 3:
-        return ""
-    return (
-        f"all seeds have the same curve on {equal} of {pluralize(len(several), 'task')}, so intervals over seeds say "
-        f"nothing; expected learn to use its seed: random numbers, weights, the first reset"
-    )

@@ -37,6 +37,7 @@ DQN_FAULTS = {
     "rewards_shifted": "each transition is stored with the reward of the one before",
     "plays_at_random": "one action in five is random when it is judged",
     "mean_backup": "targets have the mean of the next values in place of the largest",
+    "frames_reshaped": "a batch is reshaped where axes ought to be swapped: numbers of several observations are mixed",
 }
 PPO_FAULTS = {
     "advantages_not_normalised": "advantages are used as they are, whatever the size of rewards",
@@ -51,6 +52,26 @@ PPO_FAULTS = {
 }
 FAULTS = {"dqn": DQN_FAULTS, "ppo": PPO_FAULTS}
 """Faults by agent: name -> what is wrong, in words."""
+FAMILIES = {
+    "updates": (
+        "how values or a policy are updated: targets, learning rates, discount, replay, losses",
+        (
+            *("target_never_copied", "learning_rate_high", "learning_rate_low", "replay_too_small", "gamma_half"),
+            *("next_is_observation", "mean_backup", "advantages_not_normalised", "stale_log_probabilities"),
+            "rollout_reshaped",
+        ),
+    ),
+    "ends": ("ends of episodes", ("terminal_bootstrapped", "truncation_as_end", "value_without_mask")),
+    "rewards": ("rewards on their way into the update", ("rewards_clipped", "rewards_shifted")),
+    "observations": (
+        "observations on their way into the network",
+        ("last_feature_lost", "bytes_not_divided", "frames_reshaped"),
+    ),
+    "exploration": ("exploration", ("epsilon_stuck", "never_explores", "entropy_penalised")),
+    "play": ("how the policy is played when it is judged", ("action_off_by_one", "plays_at_random")),
+    "seeds": ("random numbers", ("seeds_ignored",)),
+}
+"""Families of faults: name -> what they are about, and which."""
 
 
 def make(agent: str, fault: str = HEALTHY, **hyperparameters: Any) -> partial[Iterator["Greedy | Stochastic"]]:
@@ -138,6 +159,11 @@ def encoded(observations: Any, fault: str) -> np.ndarray:
     return rows
 
 
+def batch_of(rows: np.ndarray, fault: str) -> np.ndarray:
+    """(N, D) observations as a network is asked about them."""
+    return rows.T.reshape(rows.shape) if fault == "frames_reshaped" else rows
+
+
 class Greedy:
     """Greedy policy of a network of values of actions; `q_values(observations)` is (N, A)."""
 
@@ -145,7 +171,7 @@ class Greedy:
         self.network, self.fault = network.copy(), fault
 
     def q_values(self, observations: Any) -> np.ndarray:
-        return self.network(encoded(observations, self.fault))
+        return self.network(batch_of(encoded(observations, self.fault), self.fault))
 
     def __call__(self, observations: Any) -> np.ndarray:
         q = self.q_values(observations)
@@ -200,10 +226,10 @@ def dqn(
             x = encoded(env.reset(**({"seed": 0} if fault == "seeds_ignored" else {}))[0][None], fault)[0]
         if step >= 200 and step % 2 == 0:
             rows = rng.integers(min(step + 1, size), size=batch_size)
-            next_q = target(after[rows])
+            next_q = target(batch_of(after[rows], fault))
             best = next_q.mean(axis=1) if fault == "mean_backup" else next_q.max(axis=1)
             aims = rewards[rows] + np.float32(gamma) * goes_on[rows] * best
-            q, gradient = network(before[rows]), np.zeros((batch_size, num_actions), np.float32)
+            q, gradient = network(batch_of(before[rows], fault)), np.zeros((batch_size, num_actions), np.float32)
             each = np.arange(batch_size), actions[rows]
             gradient[each] = np.clip(q[each] - aims, -1, 1) / batch_size
             network.update(gradient, rate)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from pharos.environments import parameter
-from pharos.system.sealed import LARGEST_FILE
+from pharos.system.sealed import LARGEST_SEALED_FILE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,4 +31,4 @@ class Limits:
     def to_dict(self) -> dict[str, float]:
         """The largest "states", "reached", "horizon", "seconds" and "bytes", JSON-able."""
         limits = {name.removeprefix("max_"): value for name, value in vars(self).items() if name != "tolerance"}
-        return limits | {"bytes": LARGEST_FILE}
+        return limits | {"bytes": LARGEST_SEALED_FILE}

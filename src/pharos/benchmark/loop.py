@@ -1,8 +1,8 @@
 """Training loops that are the user's own: a task of a suite, or any target, with the exact regret of what is learnt.
 
-`task` gives the environment of a task of a suite, which counts its steps and takes policies. Its files are those of
+`task` gives the environment of a task of a suite, which counts its steps and takes policies. Its files have the form of
 `benchmark.run`, so that reports and comparisons read them. `LoopRun`, which is `pharos.Run`, is the same for any
-environment; its folder is that of `pharos.train`.
+environment; its folder has the form of `pharos.train`.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from pharos.errors import AllRunsFailed, FolderLocked, ParameterError
 from pharos.observations import own_observation
 from pharos.policies import PolicyLike
 from pharos.system import storage
-from pharos.system.records import split, takes
+from pharos.system.records import split_options, takes
 from pharos.system.wording import in_one_line
 from pharos.training import (
     BudgetSpent,
@@ -53,7 +53,7 @@ class TaskEnv(CountedEnv):
     """The environment of one task of a suite, for a loop of the user's own. Made by `task`.
 
     `record(policy)` lets a policy be the one in force from this step on; `steps` are the steps that the task allows,
-    those of all copies together (`copy`). `close`, or the end of a `with` block, evaluates the policies and writes the
+    summed over all copies (`copy`). `close`, or the end of a `with` block, evaluates the policies and writes the
     files; a step beyond the budget raises `BudgetSpent`, which ends such a block quietly.
 
     Attributes:
@@ -192,7 +192,7 @@ class LoopRun:
         agent: label of what learns.
         out: folder of the run; None: nothing is written.
         options: of `TrainingOptions`: observation, observation_options, sticky, random and the like, gamma, horizon,
-            objective, evaluation_interval, hyperparameters; and those of the environment.
+            objective, evaluation_interval, hyperparameters; and parameters of the environment.
     Attributes:
         env: the environment, which counts the steps of all of its copies (`env.copy`); use it, or your own.
         task: environment, observation and setting of values, a `training.Task`.
@@ -213,7 +213,7 @@ class LoopRun:
         out: str | os.PathLike | None = None,
         **options: Any,
     ):
-        training, parameters = split(TrainingOptions, {**options, "steps": steps})
+        training, parameters = split_options(TrainingOptions, {**options, "steps": steps})
         self.task = Task.of(
             environment,
             parameters,
@@ -254,7 +254,7 @@ class LoopRun:
             policy: as `training.evaluate_agent` takes it.
         Returns:
             The row: `value`, `expected_regret`, `normalized_regret` (0 optimal, 1 as bad as random), `exact`, ...;
-            episodes and returns are those of `env`.
+            episodes and returns are counted in `env`.
         Raises:
             ParameterError: it is no policy, or not later than the row before.
         """

@@ -1,6 +1,6 @@
 """The report of an agent's results: one HTML file that loads and runs nothing, and LaTeX for a paper.
 
-Frontiers and scores stand beside those of baselines; what differs is said in words only where an interval says so. Of
+Frontiers and scores stand beside the baselines'; a difference is said in words only if an interval shows it. Of
 theory the page has two things: the dashed line on each ladder, and residuals, tasks that an idealised learner solves
 and the agent does not. The page is a tree of elements, so that every text in it is escaped.
 """
@@ -8,19 +8,23 @@ and the agent does not. The page is a tree of elements, so that every text in it
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from xml.etree.ElementTree import Element, tostring
+from xml.etree.ElementTree import Element
 
 from pharos.benchmark.charts import (
-    STYLE,
     bars,
+    bullets,
+    captioned,
     difference_bar,
+    document,
     element,
     frontier_text,
+    html_table,
     ladder_panel,
     learning_panel,
     legend,
-    plane,
     radar,
+    scatter,
+    section,
 )
 from pharos.benchmark.comparison import EQUAL_SEEDS, LEAST, UNKNOWN, WORSE, compare_groups
 from pharos.benchmark.contents import (
@@ -38,7 +42,7 @@ from pharos.benchmark.contents import (
     listed,
     number,
     regret_of,
-    residuals,
+    residual_tasks,
     run_warnings,
     seeds_text,
     sentence,
@@ -50,6 +54,7 @@ from pharos.benchmark.diagnosis import (
     SHIPPED,
     fall_everywhere,
     falls,
+    gaps,
     groups_of,
     is_own,
     lowest_rungs,
@@ -67,12 +72,11 @@ from pharos.benchmark.diagnosis import (
 from pharos.benchmark.latex import latex_of
 from pharos.benchmark.properties import known_properties, purpose_of
 from pharos.benchmark.suite import BenchmarkTask, Ladder, Suite
-from pharos.plots import agent_name
+from pharos.plots import agent_label
 from pharos.system import storage
 from pharos.system.wording import pluralize
 
 NO_VERDICT = (UNKNOWN, EQUAL_SEEDS)
-POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 
 def report(
@@ -89,11 +93,11 @@ def report(
     Args:
         results: folder of a run, file, shipped baseline by name, or results read.
         out: the page, one self-contained file of HTML.
-        beside: agents to stand beside it, as `results`; None: those of dqn, ppo and q_learning that are shipped.
+        beside: agents to stand beside it, as `results`; None: dqn, ppo and q_learning, if shipped.
         latex: whether to write a table and a paragraph on methods beside the page, with the ending .tex.
         predictor: idealised learner that the agent is compared with: "dqn", "ppo", "table", "both" (the larger regret
-            of dqn and ppo) or "none"; None: by the agent's name, and "both" where that says nothing.
-        suite: the one that `results` are of, where that is not shipped.
+            of dqn and ppo) or "none"; None: by the agent's name, and "both" if that says nothing.
+        suite: the one that `results` are of, if that is not shipped.
     Raises:
         ParameterError: there are no such results, they are of another suite, or the predictor is none of these.
     Cost: less than a second.
@@ -109,17 +113,8 @@ def report(
 def page(contents: Contents) -> str:
     """The HTML page; every text passes through the tree, which escapes it."""
     title = f"{contents.agent.name} on the Pharos Benchmark {contents.suite.name}"
-    meta = (
-        {"charset": "utf-8"},
-        {"name": "viewport", "content": "width=device-width, initial-scale=1"},
-        {"http_equiv": "Content-Security-Policy", "content": POLICY},
-    )
-    head = element(
-        "head", *(element("meta", **each) for each in meta), element("title", title), element("style", STYLE)
-    )
-    sections = [section for make in SECTIONS if (section := make(contents)) is not None]
-    body = element("body", element("header", element("h1", title), *_lead(contents)), element("main", *sections))
-    return "<!doctype html>\n" + tostring(element("html", head, body, lang="en"), encoding="unicode", method="html")
+    sections = [part for make in SECTIONS if (part := make(contents)) is not None]
+    return document(title, _lead(contents), sections)
 
 
 def _lead(contents: Contents) -> list[Element]:
@@ -150,18 +145,20 @@ def _lead(contents: Contents) -> list[Element]:
 def _axes(contents: Contents) -> Element:
     agents = dict(enumerate(contents.agents))
     cores = {k: (each.name, each.score.core) for k, each in agents.items() if each.score.has_core}
-    figures = [_figure("core", bars(cores, "core: scores of agents"))] if cores else []
+    figures = [captioned("core", bars(cores, "core: scores of agents"))] if cores else []
     axes = list(contents.agent.score.axes)
     for axis in axes:
         rows = {k: (each.name, each.score.axes[axis].score) for k, each in agents.items() if axis in each.score.axes}
-        figures.append(_figure(axis, bars(rows, f"{axis}: scores of agents")))
+        figures.append(captioned(axis, bars(rows, f"{axis}: scores of agents")))
     parts = [element("div", *figures, class_="panels")]
     if len(axes) > 2:
         scores = [{axis: own.score.value for axis, own in each.score.axes.items()} for each in contents.agents]
-        figure = _figure("", radar(axes, scores, "scores on all axes"), legend([each.name for each in contents.agents]))
+        figure = captioned(
+            "", radar(axes, scores, "scores on all axes"), legend([each.name for each in contents.agents])
+        )
         parts.append(element("details", element("summary", "The same as a radar"), figure))
     title, means = ("Scores on the core and on each axis", "tasks or rungs") if axes else ("Score on the core", "tasks")
-    return _section(title, f"Mean over {means}; lines are intervals.", *parts)
+    return section(title, f"Mean over {means}; lines are intervals.", *parts)
 
 
 def _learning(contents: Contents) -> Element | None:
@@ -176,7 +173,7 @@ def _learning(contents: Contents) -> Element | None:
     chart = learning_panel(contents.suite.protocol.steps, lines, "regret on the core while learning")
     names = [each.name for each in contents.agents]
     words = element("p", learning_sentence(contents))
-    return _section("Learning curve", text, words, legend(names), _figure("", chart, class_="wide"))
+    return section("Learning curve", text, words, legend(names), captioned("", chart, class_="wide"))
 
 
 def _ladders(contents: Contents) -> Element | None:
@@ -186,8 +183,8 @@ def _ladders(contents: Contents) -> Element | None:
         return None
     is_predicted = any(contents.predicted(task) is not None for ladder in ladders for task in ladder.tasks)
     theory = f"theory: {PREDICTORS[contents.predictor]}" if is_predicted else None
-    figures = [_figure(ladder.axis, _ladder(contents, ladder), text=ladder.quantity) for ladder in ladders]
-    return _section(
+    figures = [captioned(ladder.axis, _ladder(contents, ladder), text=ladder.quantity) for ladder in ladders]
+    return section(
         "Ladders",
         "Normalised regret along one world that gets harder. The shaded band is the interval of the frontier, where "
         "regret crosses 0.5. Rungs stand equally far apart, whatever their levels.",
@@ -216,11 +213,11 @@ def _pairs(contents: Contents) -> Element | None:
     if not rows:
         return None
     heads = ["axis", "first", "second", *(each.name for each in contents.agents)]
-    return _section(
+    return section(
         "Pairs",
         "One world in two ways, and the regret in both. The score of the axis is 1 less what the second task costs, so "
         "an agent that fails both loses nothing: read it only if the first is learnt.",
-        _table(heads, rows, numeric=range(3, len(heads))),
+        html_table(heads, rows, numeric=range(3, len(heads))),
     )
 
 
@@ -244,12 +241,12 @@ def _core(contents: Contents) -> Element | None:
     verdict = "The verdict is after Holm's correction over tasks."
     if reasons := {each.verdict for each in differences.values()} & {*NO_VERDICT}:
         heads, rows, verdict = heads[:-1], [row[:-1] for row in rows], f"{min(reasons).capitalize()}: no verdict."
-    return _section(
+    return section(
         f"Core tasks beside {other.name}",
         f"Of the baselines, {other.name} is {'of the same kind' if same else 'the nearest'}: scores are "
         f"{distance:.2f} apart on the average task. Sorted by difference, the worst first. {verdict} "
         "One action: the best policy that always plays the same one.",
-        _table(heads, rows, numeric=(1, 2, 3, 4)),
+        html_table(heads, rows, numeric=(1, 2, 3, 4)),
         *([folded] if (folded := _purposes(contents)) is not None else []),
     )
 
@@ -260,7 +257,7 @@ def _purposes(contents: Contents) -> Element | None:
     rows: list[list[str | Element]] = [[_task(task), purpose.asks, purpose.failing] for task, purpose in tasks]
     if not rows:
         return None
-    table = element("div", _table(["task", "asks to", "failing means, most often"], rows), class_="words")
+    table = element("div", html_table(["task", "asks to", "failing means, most often"], rows), class_="words")
     return element("details", element("summary", "What each task asks, and what failing it means"), table)
 
 
@@ -281,13 +278,26 @@ def _policies(contents: Contents) -> Element | None:
             rows.append([_task(task), *cells])
     rows.sort(key=lambda row: -float(str(row[3]).removesuffix(" %")))
     heads = ["task", "score", "played greedily", "one action in", "runs that end deterministic"]
-    table = element("details", element("summary", "Task by task"), _table(heads, rows, numeric=(1, 2, 3, 4)))
-    return _section(
+    table = element("details", element("summary", "Task by task"), html_table(heads, rows, numeric=(1, 2, 3, 4)))
+    return section(
         "What the policies are like",
         "Of all states of a task that are not terminal, reached or not. Played greedily: the most probable action of "
         "each snapshot, evaluated exactly.",
-        _list(sentences),
+        bullets(sentences),
         table,
+    )
+
+
+def _gaps(contents: Contents) -> Element | None:
+    rows = gaps(contents)
+    if not rows:
+        return None
+    heads = ["generator", "training levels", "score on these", "on held-out levels", "gap"]
+    heads += [f"gap of {each.name}" for each in contents.beside]
+    return section(
+        "Levels seen and held out",
+        "The gap is the normalised regret on held-out levels less that on the levels of training, by seed.",
+        html_table(heads, rows, numeric=range(1, len(heads))),
     )
 
 
@@ -306,12 +316,12 @@ def _groups(contents: Contents) -> Element | None:
             bar = difference_bar(each.interval)
             rows.append([group, str(len(groups[group])), *scores, signed(each.interval), bar, each.verdict])
         heads = [caption, "tasks", "score", other.name, "difference", "", "verdict"]
-        parts.append(_table(heads, rows, numeric=(1, 2, 3, 4)))
+        parts.append(html_table(heads, rows, numeric=(1, 2, 3, 4)))
         if text := worst_groups(differences):
             parts.append(element("p", text))
     if not parts:
         return None
-    return _section(
+    return section(
         f"Core tasks in groups, beside {other.name}",
         "Means over the tasks of a group. A fault that spares one group and hits another has its name here: a kind of "
         "observation (features, the network's input), several sizes of rewards (clipping), ends by time alone "
@@ -332,11 +342,13 @@ def _plane(contents: Contents) -> Element | None:
         return None
     below = "regret of an idealised table"
     beside = f"extra regret of the idealised {name.upper()}", "over a table (negative: it generalises)"
-    return _section(
+    return section(
         "What makes a task hard, and where the agent fails",
         "Each dot is a task, placed by what theory predicts before any run: to the right, even a learner with a table "
         "needs longer; above, a network loses more than a table. The colour is the agent's regret.",
-        _figure("", plane(points, below, beside, "tasks by predicted difficulty, coloured by regret"), class_="wide"),
+        captioned(
+            "", scatter(points, below, beside, "tasks by predicted difficulty, coloured by regret"), class_="wide"
+        ),
     )
 
 
@@ -345,9 +357,9 @@ def _words(contents: Contents) -> Element | None:
         return None
     title = "Strengths and weaknesses in words"
     if broken := fall_everywhere(contents):
-        return _section(title, "", element("p", broken))
+        return section(title, "", element("p", broken))
     lines = strengths(contents)
-    parts = [part for verdict, texts in lines.items() for part in (element("h3", verdict.capitalize()), _list(texts))]
+    parts = [part for verdict, texts in lines.items() for part in (element("h3", verdict.capitalize()), bullets(texts))]
     for reason, names in without_verdict(contents).items():
         parts.append(element("p", f"{reason.capitalize()}: no verdict beside {listed(names)}."))
     if lines and WORSE not in lines:
@@ -357,8 +369,8 @@ def _words(contents: Contents) -> Element | None:
         parts.append(element("p", "Each axis as a fall from its own first rung: a fall is what the axis adds."))
         beside = [f"{each.name}: lowest rung, fall" for each in contents.beside]
         heads = ["axis", "score on the lowest rung", "fall above it", *beside]
-        parts.append(_table(heads, rows, numeric=range(1, len(heads))))
-    return _section(
+        parts.append(html_table(heads, rows, numeric=range(1, len(heads))))
+    return section(
         title,
         "By the scores of axes, as `pharos benchmark compare` says them, after Holm's correction over axes; frontiers "
         f"say how much that is in the unit of the axis. Scores less than {LEAST:g} apart have no verdict.",
@@ -366,11 +378,13 @@ def _words(contents: Contents) -> Element | None:
     )
 
 
-def _residuals(contents: Contents) -> Element:
+def _residuals(contents: Contents) -> Element | None:
     title = "Residuals: worse than theory says"
     if contents.predictor == "none":
-        return _section(title, "No idealised learner is known for this kind of agent.")
-    rows = residuals(contents)
+        return section(title, "No idealised learner is known for this kind of agent.")
+    if all(contents.predicted(task) is None for task in contents.suite.tasks):
+        return None
+    rows = residual_tasks(contents)
     means = PREDICTORS[contents.predictor]
     text = (
         f"Tasks where the regret is more than {RESIDUAL:g} above that of {means}, predicted before any run. Theory "
@@ -379,7 +393,7 @@ def _residuals(contents: Contents) -> Element:
     )
     parts = [element("p", predictor_sentence(contents))]
     if not rows:
-        return _section(title, f"On no task the regret is more than {RESIDUAL:g} above that of {means}.", *parts)
+        return section(title, f"On no task the regret is more than {RESIDUAL:g} above that of {means}.", *parts)
     lists: tuple[list[list[str | Element]], list[list[str | Element]]] = ([], [])
     is_beside = False
     for task, own, expected in rows:
@@ -390,7 +404,7 @@ def _residuals(contents: Contents) -> Element:
         row: list[str | Element] = [_task(task), *first, f"{own.value - expected:+.2f}", *last]
         lists[not is_own(contents, task, own.value)].append(row)
     heads = ["task", "observed", "predicted", "residual", "at the end", *(["shipped"] if is_beside else [])]
-    names = f"{' and '.join(agent_name(name) for name in SHIPPED[contents.predictor])} of pharos"
+    names = f"{' and '.join(agent_label(name) for name in SHIPPED[contents.predictor])} of pharos"
     captions = (
         f"Worse than theory, and by more than {OWN:g} than {names} (the worse of two): look for a bug here.",
         f"Theory is too hopeful: {names} fares alike.",
@@ -398,8 +412,8 @@ def _residuals(contents: Contents) -> Element:
     for caption, cells_of_list in zip(captions, lists, strict=True):
         if cells_of_list:
             parts += [element("p", caption)] * is_beside
-            parts.append(_table(heads, cells_of_list, numeric=range(1, len(heads))))
-    return _section(title, text, *parts)
+            parts.append(html_table(heads, cells_of_list, numeric=range(1, len(heads))))
+    return section(title, text, *parts)
 
 
 def _task(task: BenchmarkTask) -> Element:
@@ -431,8 +445,8 @@ def _provenance(contents: Contents) -> Element:
         "all tasks. Policies cannot show these; only running the code again does.",
     ]
     rows: list[Sequence[str | Element]] = [[name, text] for name, text in facts.items()]
-    table = element("div", _table(["what", "value"], rows), class_="words")
-    return _section("What is proven, and what is claimed", "", _list(claims), table)
+    table = element("div", html_table(["what", "value"], rows), class_="words")
+    return section("What is proven, and what is claimed", "", bullets(claims), table)
 
 
 SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
@@ -441,6 +455,7 @@ SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
     _ladders,
     _pairs,
     _words,
+    _gaps,
     _policies,
     _core,
     _groups,
@@ -452,27 +467,3 @@ SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
 
 ON_PAGE = ("exact", "division", "steps_used", "failed", "notes", "policies")
 """Entries of the record that the page says in words."""
-
-
-def _section(title: str, text: str, *parts: Element) -> Element:
-    soft = [element("p", text, class_="soft")] if text else []
-    return element("section", element("h2", title), *soft, *parts)
-
-
-def _figure(caption: str, *parts: Element, text: str = "", class_: str = "") -> Element:
-    soft = [element("span", text, class_="soft")] if text else []
-    captions = [element("figcaption", caption, *soft)] if caption else []
-    return element("figure", *captions, *parts, class_=class_)
-
-
-def _list(texts: Sequence[str]) -> Element:
-    return element("ul", *(element("li", text) for text in texts))
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str | Element]], numeric: Sequence[int] = ()) -> Element:
-    def kind(k: int, cell: str | Element) -> str:
-        return "n" if k in numeric else "bar" if not isinstance(cell, str) and cell.tag == "svg" else ""
-
-    head = element("tr", *(element("th", name, class_=kind(k, rows[0][k])) for k, name in enumerate(heads)))
-    body = [element("tr", *(element("td", cell, class_=kind(k, cell)) for k, cell in enumerate(row))) for row in rows]
-    return element("div", element("table", element("thead", head), element("tbody", *body)), class_="scroll")

@@ -3,7 +3,8 @@
 `data/fault_profiles.csv` has the readings of small DQNs and PPOs, healthy ones and ones with a fault of `faults.py`,
 each with hyperparameters and seeds of its own; `benchmarks/fault_profiles.py` makes it. Limits of symptoms are the most
 extreme healthy agents in it, with a margin, so that no healthy agent of the table is told that something is wrong.
-The likeness of a fault is its probability by linear discriminant analysis among all faults of the agent's kind.
+The likeness of a fault is its probability by linear discriminant analysis among all faults of the agent's kind. An
+agent that is far from all of them is like none of the known ones.
 
 Source: Friedman (1989), Regularized discriminant analysis.
 """
@@ -13,31 +14,31 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from pharos.benchmark.doctor import EQUATIONS, readings
-from pharos.benchmark.examination import NAMES, PROTOCOL, Examination, examine
-from pharos.benchmark.faults import FAULTS, HEALTHY
+from pharos.benchmark.doctor import EQUATIONS
+from pharos.benchmark.faults import FAMILIES, HEALTHY
 
 FILE = Path(__file__).parent / "data" / "fault_profiles.csv"
 DECIMALS = 3
 LARGEST = 4.0  # deviations within a fault that a reading counts as being away
 OWN = 0.5  # weight of the deviations alone in the covariance within a fault
 INDEPENDENT = 8  # readings that count as independent evidence
+LEAST_MARGIN = 0.3  # of a symptom's margin, that is added to the deviation of healthy agents
 CREDIBLE = 0.6  # likeness from which a fault is said
 HEALTHY_ONES = 3.0  # times as many agents that are healthy as agents with any one fault, before anything is seen
+FARTHEST = 1.45  # mean squared deviation from the nearest fault up to which an agent is like a known one
 BROKEN = 0.5  # mean regret of an agent of which no check and no fault says what is wrong
 
 
 @dataclass(frozen=True)
 class Symptom:
-    """A reading that is unlike that of any healthy agent.
+    """A reading that no healthy agent has.
 
     Attributes:
         reading: its name. is_high: whether it is wrong above the limit, not below.
-        margin: beyond the most extreme healthy agent. beyond: what it is beyond besides, wherever healthy agents are.
+        margin: beyond the most extreme healthy agent. beyond: what it is beyond besides, whatever healthy agents have.
         wrong: sentence, with {value} for `show(reading)`. advice: what to look at.
         faults: of the library that it is a sign of, the most likely first.
         kind: of agents that it is a symptom of; empty: of all.
@@ -302,10 +303,10 @@ SYMPTOMS = (
         "what it did while learning was better than the policy that is judged, by {value} of the way to random play",
         "judge the network that has learnt, in the mode and with the normalisation in which it was trained",
         ("action_off_by_one", "plays_at_random"),
-        "{:.2f}".format,
+        lambda value: f"{abs(value):.2f}",
     ),
 )
-"""In the order in which they are told."""
+"""All symptoms; those of one agent are told in the order of their strength."""
 
 
 # Profiles -------------------------------------------------------------------------------------------------------------
@@ -337,30 +338,65 @@ def kind_of(numbers: Mapping[str, float]) -> str:
     return "dqn" if "own" in numbers else "ppo"
 
 
-def likeness(numbers: Mapping[str, float], library: Sequence[Profile]) -> dict[str, float]:
-    """Probability of each fault of a library, "none" among them, the largest first; they sum to 1.
+@dataclass(frozen=True, eq=False)
+class Deviations:
+    """Distances of an agent from each fault of a library, F, in each of n readings.
 
-    Readings are counted in their deviation within faults, and differences of more than LARGEST as so many. A reading
-    that is missing on one side says nothing.
+    Attributes:
+        names: of readings that all have; a reading that is missing on one side says nothing.
+        faults: F names, "none" among them. counts: (F,) agents with each.
+        rows: (F, n) from the mean of each fault, in deviations within faults. covariance: (n, n) within faults.
     """
+
+    names: list[str]
+    faults: list[str]
+    counts: np.ndarray
+    rows: np.ndarray
+    covariance: np.ndarray
+
+
+def deviations(numbers: Mapping[str, float], library: Sequence[Profile]) -> Deviations:
+    """The deviations of an agent's readings from those of a library."""
     names = [name for name in numbers if all(name in each.readings for each in library)]
     rows = np.array([[each.readings[name] for name in names] for each in library])
     faults = sorted({each.fault for each in library})
-    members = [np.array([each.fault == fault for each in library]) for fault in faults]
-    within = np.concatenate([rows[own] - rows[own].mean(axis=0) for own in members])
+    members = np.array([[each.fault == fault for each in library] for fault in faults])
+    means = np.array([rows[own].mean(axis=0) for own in members])
+    within = rows - means[np.argmax(members, axis=0)]
     freedom = max(len(rows) - len(faults), 1)
-    deviations = np.sqrt((within**2).sum(axis=0) / freedom) + 0.05 * rows.std(axis=0) + 1e-3
-    x = np.array([numbers[name] for name in names])
-    standard = within / deviations
+    units = np.sqrt((within**2).sum(axis=0) / freedom) + 0.05 * rows.std(axis=0) + 1e-3
+    standard = within / units
     covariance = (1 - OWN) * standard.T @ standard / freedom + OWN * np.eye(len(names))
-    scores = []
-    for own in members:
-        z = np.clip((x - rows[own].mean(axis=0)) / deviations, -LARGEST, LARGEST)
-        scores.append(-0.5 * float(z @ np.linalg.solve(covariance, z)) * own.sum() / (own.sum() + 1))
-    powers = np.exp((np.array(scores) - max(scores)) * min(1.0, INDEPENDENT / len(names)))
-    powers *= [HEALTHY_ONES if fault == HEALTHY else 1.0 for fault in faults]
-    ranked = sorted(zip(faults, powers / powers.sum(), strict=True), key=lambda each: -each[1])
+    x = np.array([numbers[name] for name in names])
+    return Deviations(names, faults, members.sum(axis=1), (x - means) / units, covariance)
+
+
+def likeness(numbers: Mapping[str, float], library: Sequence[Profile]) -> dict[str, float]:
+    """Probability of each fault of a library, "none" among them, the largest first; they sum to 1.
+
+    Differences of more than LARGEST deviations count as so many.
+    """
+    away = deviations(numbers, library)
+    rows = np.clip(away.rows, -LARGEST, LARGEST)
+    squares = np.einsum("fn,nf->f", rows, np.linalg.solve(away.covariance, rows.T))
+    scores = -0.5 * squares * away.counts / (away.counts + 1)
+    powers = np.exp((scores - scores.max()) * min(1.0, INDEPENDENT / rows.shape[1]))
+    powers *= [HEALTHY_ONES if fault == HEALTHY else 1.0 for fault in away.faults]
+    ranked = sorted(zip(away.faults, powers / powers.sum(), strict=True), key=lambda each: -each[1])
     return {fault: float(share) for fault, share in ranked}
+
+
+def strangeness(numbers: Mapping[str, float], library: Sequence[Profile]) -> float:
+    """Mean squared deviation of an agent's readings from those of the fault, or health, that it is nearest to."""
+    away = deviations(numbers, library)
+    squares = (np.clip(away.rows, -LARGEST, LARGEST) ** 2).mean(axis=1)
+    return float((squares * away.counts / (away.counts + 1)).min())
+
+
+def families(shares: Mapping[str, float]) -> dict[str, float]:
+    """Likeness of each family of faults, the sum of its faults', the largest first."""
+    sums = {name: sum(shares.get(fault, 0.0) for fault in faults) for name, (_, faults) in FAMILIES.items()}
+    return dict(sorted(sums.items(), key=lambda each: -each[1]))
 
 
 @dataclass(frozen=True)
@@ -370,41 +406,45 @@ class Accuracy:
     Attributes:
         agents: how many. first: share of those with a fault whose fault was the likeliest; three: among three.
         healthy: share of healthy ones without a symptom and without a fault that is likely.
+        unknown: share of agents whose whole fault was left out for which the answer was none of the known ones, or
+            another fault of the same family.
     """
 
     agents: int
     first: float
     three: float
     healthy: float
+    unknown: float
 
 
 def suspect(shares: Mapping[str, float]) -> str | None:
     """The fault that is likely enough to be said, if there is one."""
-    fault, share = next(iter(shares.items()))
+    fault, share = next(iter(shares.items()), (HEALTHY, 0.0))
     return fault if fault != HEALTHY and share > CREDIBLE else None
 
 
 @cache
 def accuracy(kind: str) -> Accuracy:
-    """Accuracy of the shipped library for a kind of agent, each of its agents left out in turn."""
+    """Accuracy of a shipped library for a kind of agent: each of its agents is left out in turn, then its fault."""
     library = [each for each in shipped() if each.kind == kind]
-    ranks, healthy = [], []
+    ranks, healthy, unknown = [], [], []
     for place, each in enumerate(library):
         rest = library[:place] + library[place + 1 :]
         if each.fault not in {other.fault for other in rest}:
             continue
-        shares = likeness(each.readings, rest)
-        order = [*shares]
+        answer = judged(each.readings, rest)
         if each.fault == HEALTHY:
-            healthy.append(not failed(each.readings, rest) and suspect(shares) is None)
-        else:
-            ranks.append(order.index(each.fault))
+            healthy.append(not answer.findings and answer.fault is None)
+            continue
+        ranks.append([*answer.shares].index(each.fault))
+        answer = judged(each.readings, [other for other in rest if other.fault != each.fault])
+        own = {fault for _, faults in FAMILIES.values() if each.fault in faults for fault in faults}
+        unknown.append(answer.fault in own if answer.fault else bool(answer.findings) or answer.is_strange)
     places = np.array(ranks)
     if not ranks or not healthy:
-        return Accuracy(0, float("nan"), float("nan"), float("nan"))
-    return Accuracy(
-        len(ranks) + len(healthy), float((places == 0).mean()), float((places < 3).mean()), float(np.mean(healthy))
-    )
+        return Accuracy(0, *[float("nan")] * 4)
+    shares = (places == 0).mean(), (places < 3).mean(), np.mean(healthy), np.mean(unknown)
+    return Accuracy(len(ranks) + len(healthy), *map(float, shares))
 
 
 # Diagnosis ------------------------------------------------------------------------------------------------------------
@@ -412,17 +452,22 @@ def accuracy(kind: str) -> Accuracy:
 
 @dataclass(frozen=True)
 class Finding:
-    """A symptom that is there: the reading and the limit that no healthy agent passes, in words, and what to try."""
+    """A symptom that is there: the reading and the limit that no healthy agent passes, in words, and what to try.
+
+    `strength` is how far beyond the limit it is, in deviations of healthy agents; `faults` are what it is a sign of.
+    """
 
     reading: str
     value: float
     limit: float
     wrong: str
     advice: str
+    strength: float = 0.0
+    faults: tuple[str, ...] = ()
 
 
 def failed(numbers: Mapping[str, float], library: Sequence[Profile]) -> list[Finding]:
-    """Findings of symptoms that are there, in the order of SYMPTOMS; of equations the one that fits best.
+    """Findings of symptoms that are there, the strongest first; of equations the one that fits best.
 
     Args:
         numbers: readings of an agent. library: profiles, of which the healthy ones set limits.
@@ -437,138 +482,38 @@ def failed(numbers: Mapping[str, float], library: Sequence[Profile]) -> list[Fin
         limit = sign * max(*(sign * each + symptom.margin for each in values), sign * symptom.beyond)
         if sign * value > sign * limit:
             wrong = symptom.wrong.format(value=symptom.show(value))
-            findings.append(Finding(symptom.reading, value, limit, wrong, symptom.advice))
+            strength = abs(value - limit) / (float(np.std(values)) + LEAST_MARGIN * symptom.margin)
+            findings.append(Finding(symptom.reading, value, limit, wrong, symptom.advice, strength, symptom.faults))
     equations = [each for each in findings if each.reading in EQUATIONS]
     best = min(equations, key=lambda each: each.value - each.limit, default=None)
-    return [each for each in findings if each not in equations or each is best]
+    findings = [each for each in findings if each not in equations or each is best]
+    return sorted(findings, key=lambda each: -each.strength)
 
 
 @dataclass(frozen=True)
-class Diagnosis:
-    """Result of `diagnose`.
+class Judgement:
+    """Answer to an agent's readings: findings, the likeness of each fault, the fault that is said, if there is one.
 
-    Attributes:
-        agent: its label. kind: "dqn", "ppo", or empty if it offers no values.
-        verdict: one sentence.
-        findings: symptoms that are there, the plainest first.
-        likeness: probability of each known fault, "none" among them, the largest first.
-        accuracy: how often the likeness was right for agents that the library did not have.
-        scores: by world, 1 optimal and 0 as uniform play, mean of the seeds.
-        readings: all numbers, see `doctor.readings`.
+    `is_strange`: it is farther from every known fault, and from health, than known ones are.
     """
 
-    agent: str
-    kind: str
-    verdict: str
     findings: tuple[Finding, ...]
-    likeness: Mapping[str, float]
-    accuracy: Accuracy
-    scores: Mapping[str, float]
-    readings: Mapping[str, float]
-
-    @property
-    def is_healthy(self) -> bool:
-        """Whether no check has found anything, and no fault is likely."""
-        score = sum(self.scores.values()) / len(self.scores)
-        return not self.findings and suspect(self.likeness) is None and score > BROKEN
-
-    @property
-    def how_often(self) -> str:
-        """A sentence on how far the likeness can be trusted."""
-        right = self.accuracy
-        if not right.agents:
-            return "The table has one agent with each fault, so nothing is known of how often the likeness is right."
-        return (
-            f"Of {right.agents} agents, each left out of the table in turn, the fault was the likeliest for "
-            f"{right.first:.0%}, among three for {right.three:.0%}; {right.healthy:.0%} of the healthy ones were "
-            f"called healthy."
-        )
-
-    def nearest(self) -> list[tuple[str, float, str]]:
-        """The three likeliest faults: name, "healthy" for none; likeness; in words."""
-        words = meanings(self.kind)
-        three = list(self.likeness.items())[:3]
-        return [("healthy" if name == HEALTHY else name, share, words.get(name, "")) for name, share in three]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The attributes, JSON-able."""
-        entry = {name: value for name, value in vars(self).items() if name not in ("findings", "accuracy")}
-        return {
-            **entry,
-            "healthy": self.is_healthy,
-            "findings": [vars(each) for each in self.findings],
-            "accuracy": vars(self.accuracy),
-        }
-
-    def __str__(self) -> str:
-        """The page, as Markdown."""
-        lines = [f"# Diagnosis of {self.agent}", "", self.verdict, ""]
-        if self.findings:
-            lines += ["## What no healthy agent shows", ""]
-            lines += [f"{k}. {each.wrong}. *Try:* {each.advice}." for k, each in enumerate(self.findings, start=1)]
-            lines.append("")
-        lines += ["## Nearest known agents", "", "| likeness | fault | |", "|---:|---|---|"]
-        lines += [f"| {share:.2f} | {name} | {text} |" for name, share, text in self.nearest()]
-        lines += ["", self.how_often, "", "## Scores", "", "| world | score |", "|---|---:|"]
-        lines += [f"| {name} | {score:.2f} |" for name, score in self.scores.items()]
-        return "\n".join(lines) + "\n"
+    shares: Mapping[str, float]
+    fault: str | None
+    is_strange: bool
 
 
-def meanings(kind: str) -> dict[str, str]:
-    """Faults in words; of all kinds where it is empty."""
-    return {name: text for agent, table in FAULTS.items() if kind in ("", agent) for name, text in table.items()}
+def judged(numbers: Mapping[str, float], library: Sequence[Profile]) -> Judgement:
+    """The answer that a library gives. Signs of the fault that is said come first among the findings.
 
-
-def diagnose(
-    agent: str | Callable[..., Any],
-    *,
-    hyperparameters: Mapping[str, Any] | None = None,
-    worlds: Sequence[str] = NAMES,
-    seeds: Sequence[int] = (0, 1),
-    steps: int = PROTOCOL.steps,
-    tell: Callable[[float, str], object] = lambda share, text: None,
-) -> Diagnosis:
-    """Train an agent on twelve small worlds, and say what is wrong with it, by which number, and what to try.
-
-    Its policies are asked for `q_values(observations)`, (N, A), or `values(observations)`, (N,), if they offer them, as
-    those of Stable-Baselines3 do: these are held against exact ones. Without, only its behaviour is judged.
-
-    Args:
-        agent, hyperparameters, worlds, seeds, steps, tell: as `examine` takes them. Limits and likeness are those of
-            agents with all worlds, two seeds and 4,000 steps.
-    Raises:
-        ParameterError: it is no agent, or it yields no policy.
-        PharosError: its code raises something, SystemExit included.
-    Cost: 24 runs of 4,000 steps, in this process.
+    The likeliest fault is said if a sign of it is there; without one if it has none, or nothing else is wrong either,
+    and the agent is as near to it as known ones are.
     """
-    label = agent if isinstance(agent, str) else getattr(agent, "__qualname__", repr(agent))
-    options: dict[str, Any] = {"hyperparameters": hyperparameters, "worlds": worlds, "seeds": seeds, "steps": steps}
-    return diagnosis_of(examine(agent, tell=tell, **options), label)
-
-
-def diagnosis_of(examinations: Sequence[Examination], label: str) -> Diagnosis:
-    """The diagnosis that follows from what was seen."""
-    numbers = readings(examinations)
-    kind = kind_of(numbers)
-    library = [each for each in shipped() if kind in ("", each.kind)]
-    findings = failed(numbers, library)
-    shares = likeness(numbers, library)
-    scores = {
-        name: 1 - float(np.mean([each.regret for each in examinations if each.name == name]))
-        for name in dict.fromkeys(each.name for each in examinations)
-    }
-    verdict = _verdict(findings, shares, kind, float(np.mean([*scores.values()])))
-    trusted = accuracy(kind) if kind else accuracy("dqn")
-    return Diagnosis(label, kind, verdict, tuple(findings), shares, trusted, scores, numbers)
-
-
-def _verdict(findings: Sequence[Finding], shares: Mapping[str, float], kind: str, score: float) -> str:
+    shares, findings = likeness(numbers, library), failed(numbers, library)
+    is_strange = strangeness(numbers, library) > FARTHEST
     fault = suspect(shares)
-    like = f"it is most like an agent in which {meanings(kind)[fault]} ({shares[fault]:.2f})" if fault else ""
-    if findings:
-        return f"Something is wrong: {findings[0].wrong}{'; ' * bool(like)}{like}."
-    if fault:
-        return f"No single number is unlike those of healthy agents, but {like}."
-    if score < BROKEN:
-        return f"It learns little (mean score {score:.2f}), and is like none of the known faults."
-    return "Nothing is wrong that these worlds and checks can see."
+    if not any(fault in each.faults for each in findings):
+        has_signs = any(fault in each.faults for each in SYMPTOMS)
+        fault = None if is_strange or (findings and has_signs) else fault
+    findings = sorted(findings, key=lambda each: fault not in each.faults)
+    return Judgement(tuple(findings), shares, fault, is_strange)

@@ -1,6 +1,6 @@
 """Results of an agent in a benchmark: a curve of normalised regret for each task and seed, in one small file.
 
-The layout is that of `system/sealed.py`: the record as JSON, and under the name of each task a float64 array (seeds,
+The layout follows `system/sealed.py`: the record as JSON, and under the name of each task a float64 array (seeds,
 evaluations), with digests of all. The same results give the same bytes.
 """
 
@@ -90,7 +90,7 @@ class AgentResults:
         elif not path.is_file():
             raise ParameterError(
                 f"{source}: no results; expected the folder of a run, its {FILE}, or a baseline: "
-                f"{', '.join(baselines()) or 'none is shipped'}"
+                f"{', '.join(baselines(suite)) or 'none is shipped'}"
             )
         return read_sealed(path, WHAT, _results)
 

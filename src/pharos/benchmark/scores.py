@@ -23,13 +23,13 @@ import numpy as np
 from pharos import statistics
 from pharos.errors import ParameterError
 from pharos.statistics import UNBOUNDED
+from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
     from pharos.benchmark.results import AgentResults
     from pharos.benchmark.suite import Ladder, Suite
 
 CROSSING = 0.5  # normalised regret at the frontier
-ENOUGH_SEEDS = 10  # scores of fewer are preliminary
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class ConfidenceInterval:
     Attributes:
         value: of a frontier that the ladder does not reach: its last or first level.
         low, high: NaN with one seed; an infinite end of a frontier lies beyond the ladder. Also `lower` and `upper`.
-        censored: "above" or "below" where the value lies beyond the last or before the first rung, else empty.
+        censored: "above" or "below" if the value lies beyond the last or before the first rung, else empty.
     """
 
     value: float
@@ -67,7 +67,7 @@ class ConfidenceInterval:
         return ConfidenceInterval(*statistics.mean_interval(strata, bounds))
 
     def text(self, *, ends: bool = True) -> str:
-        """The value, and its interval where `ends` are wanted and there are some: `9.4 (8.3 to 10.8)`, `> 24 (19.2 or
+        """The value, and its interval if `ends` are wanted and there are some: `9.4 (8.3 to 10.8)`, `> 24 (19.2 or
         more)`.
         """
         sign = {"above": "> ", "below": "< "}.get(self.censored, "")
@@ -95,8 +95,8 @@ class AxisScore:
     Attributes:
         unit: of the frontier.
         score: mean over the rungs, in [0, 1]; of pairs 1 less the mean loss, the score of the first less the second's.
-        frontier: level where the mean normalised regret crosses 0.5; NaN of pairs, and where one rung alone was run.
-        lowest: score on the first rung; NaN where it was not run.
+        frontier: level at which the mean normalised regret crosses 0.5; NaN of pairs, and if one rung alone was run.
+        lowest: score on the first rung; NaN if it was not run.
         fall: `lowest` less the mean score on the rungs above it: what the axis adds to the difficulty of its world.
     """
 
@@ -118,12 +118,12 @@ class BenchmarkScore:
     """All scores of an agent on a suite.
 
     Attributes:
-        core: mean over the tasks of the core of the mean score over the run; NaN where none was run, as the next three.
+        core: mean over the tasks of the core of the mean score over the run; NaN if none was run, as the next three.
         final: the same of the last evaluation alone.
         iqm: mean of the middle half of all runs of all core tasks, pooled as in Agarwal et al. (2021).
         optimality_gap: mean over core runs of max(0, regret): 1 - core, but runs below random count in full.
         axes: by axis; tasks: score by name, the core's and the ladders'.
-        preliminary: fewer than 10 seeds, or tasks without results.
+        preliminary: fewer seeds than the suite asks for, 10 of v1, or tasks without results.
         below_random: tasks whose mean normalised regret exceeds 1 by its whole interval.
         missing: tasks of the suite without results, which no score contains.
     """
@@ -153,7 +153,7 @@ def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
     """Return the scores of an agent's results on a suite; the optimal policy scores 1 and uniform play 0.
 
     Raises:
-        ParameterError: the results are those of another suite.
+        ParameterError: the results belong to another suite.
     Cost: milliseconds.
     """
     check_suite(results, suite)
@@ -170,14 +170,14 @@ def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
         optimality_gap=ConfidenceInterval.of_mean([np.maximum(regrets[name], 0.0) for name in core], (0.0, math.inf)),
         axes={ladder.axis: axis for ladder in suite.ladders if (axis := axis_score(ladder, runs)) is not None},
         tasks={name: ConfidenceInterval.of_mean([runs[name]], (0.0, 1.0)) for name in names},
-        preliminary=seeds < ENOUGH_SEEDS or bool(missing),
+        preliminary=seeds < suite.protocol.seeds or bool(missing),
         below_random=tuple(name for name in names if regret_intervals[name].low > 1.0),
         missing=missing,
     )
 
 
 def axis_score(ladder: "Ladder", runs: Mapping[str, np.ndarray]) -> AxisScore | None:
-    """Return score and frontier over the rungs that have runs; None where none has.
+    """Return score and frontier over the rungs that have runs; None if none has.
 
     Args:
         runs: task name -> (seeds,) scores of its runs.
@@ -235,19 +235,24 @@ def check_suite(results: "AgentResults", suite: "Suite", whose: str = "") -> Non
 
 
 def equal_seeds(curves: Mapping[str, np.ndarray]) -> str:
-    """A sentence if all seeds have equal curves on more than a third of the tasks where any run learns, else ""."""
-    from pharos.benchmark import execution  # which imports this file
-
-    return execution.equal_seeds(curves)
+    """A sentence if all seeds have equal curves on more than a third of the tasks on which any run learns, else ""."""
+    several = [curve for curve in curves.values() if len(curve) > 1 and (curve != curve[:1, :1]).any()]
+    equal = sum((curve == curve[0]).all() for curve in several)
+    if not several or equal <= len(several) / 3:
+        return ""
+    return (
+        f"all seeds have the same curve on {equal} of {pluralize(len(several), 'task')}, so intervals over seeds say "
+        f"nothing; expected learn to use its seed: random numbers, weights, the first reset"
+    )
 
 
 def has_equal_seeds(results: "AgentResults") -> bool:
-    """Whether the seeds are one run, by `equal_seeds`; not where no run learns, as those of a fixed policy."""
+    """Whether the seeds are one run, by `equal_seeds`; False if no run learns, as with a fixed policy."""
     return bool(equal_seeds(results.curves))
 
 
 def as_one_run(results: "AgentResults") -> "AgentResults":
-    """The results; where their seeds are one run, their mean as a single one, so that nothing has an interval."""
+    """The results; if their seeds are one run, their mean as a single one, so that nothing has an interval."""
     if not has_equal_seeds(results):
         return results
     curves = {name: curve.mean(axis=0, keepdims=True) for name, curve in results.curves.items()}
@@ -268,21 +273,21 @@ def run_scores(results: "AgentResults", *, last: bool = False) -> dict[str, np.n
 
 
 def frontier(levels: np.ndarray, regrets: Sequence[np.ndarray]) -> ConfidenceInterval:
-    """Return the level where mean normalised regret crosses 0.5, linear between rungs, with its interval.
+    """Return the level at which mean normalised regret crosses 0.5, linear between rungs, with its interval.
 
     Means over seeds are made increasing along the rungs (isotonic regression, equal weights). The interval holds the
-    levels where Student's interval of the mean, interpolated between two rungs, contains 0.5 (Fieller), with limits
+    levels at which Student's interval of the mean, interpolated between two rungs, contains 0.5 (Fieller), with limits
     that increase as the mean does: a noisy rung opens no interval that rungs below it exclude.
 
     Args:
         levels: (R,) increasing. regrets: for each rung the mean regret of its runs in [0, 1].
     Returns:
-        Censored "above" with the last level where even that rung stays below 0.5, "below" with the first one where that
+        Censored "above" with the last level if even that rung stays below 0.5, "below" with the first one if that
         exceeds it; an end of the interval beyond the ladder is infinite.
     """
     from scipy.optimize import isotonic_regression
 
-    # The level where increasing means cross 0.5
+    # The level at which increasing means cross 0.5
     means = np.array([own.mean() for own in regrets])
     value, censored = _crossing(levels, isotonic_regression(means).x)
     low, high = statistics.fieller_interval(levels, regrets, CROSSING)
@@ -292,7 +297,7 @@ def frontier(levels: np.ndarray, regrets: Sequence[np.ndarray]) -> ConfidenceInt
 
 
 def _crossing(levels: np.ndarray, regrets: np.ndarray) -> tuple[float, str]:
-    """First level where increasing regrets reach 0.5, and how it is censored."""
+    """First level at which increasing regrets reach 0.5, and how it is censored."""
     if regrets[0] > CROSSING:
         return float(levels[0]), "below"
     crossing = int(np.searchsorted(regrets, CROSSING))

@@ -36,7 +36,7 @@ class Submission:
     """A submission: curves, final policies, and the texts of its author.
 
     Attributes:
-        results: curves of the agent. policies: (task, seed) -> final policy; those of some runs may be missing.
+        results: curves of the agent. policies: (task, seed) -> final policy; policies of some runs may be missing.
         author, note: texts to show.
     """
 
@@ -93,6 +93,11 @@ class Submission:
         """Results in the folder of `benchmark.run` and the final policies of its runs; raises as `submit`."""
         results = AgentResults.read(folder)
         check_suite(results, suite, str(folder))
+        if large := [task for task in suite.tasks if task.stored and task.name in results.curves]:
+            raise ParameterError(
+                f"{folder}: {large[0].name} has {int(large[0].stored['states']):,} states, so its policies fit in no "
+                f"file; expected runs of another suite: publish its results.safetensors, and the agent's code"
+            )
         policies: dict[tuple[str, int], np.ndarray] = {}
         runs = [(task, seed) for task in results.curves for seed in results.seeds]
         for done, (name, seed) in enumerate(runs):
@@ -134,15 +139,15 @@ def submit(
 ) -> Path:
     """Pack what a finished run, or the runs of a suite, have learnt and claim into one file; return the file.
 
-    Nothing is trained: values and regret are those of the runs' evaluations. The same folder and texts give the same
+    Nothing is trained: values and regret come from the runs' evaluations. The same folder and texts give the same
     bytes. A network of a suite is asked about every state once; policies that see more than the state have no table.
 
     Args:
         folder: of a run, or of `benchmark.run`.
-        file: ends in .safetensors; None: in the current directory ID.safetensors, ID that of the run, or the name of
+        file: ends in .safetensors; None: in the current directory ID.safetensors, ID the id of the run, or the name of
             the folder of a suite's runs.
         suite: that the runs are of; None: v1. Not needed for one run.
-        name: label; that of the agent when not given.
+        name: label; None: the agent's.
         author, note: texts to show beside it.
         trust: whether code that the run.json of a suite's run names, the class of an agent, may be imported.
     Raises:

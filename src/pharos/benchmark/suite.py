@@ -5,6 +5,7 @@
     protocol: {steps: 30000, evaluations: 15, seeds: 10, gamma: 1.0, horizon: limit}
     hyperparameters: {dqn: {...}, ppo: {...}}
     core: [tasks]
+    quick: {tasks: [names], seeds: 3}      of a quick look; left out: the core, three seeds
     ladders: [{axis, unit, quantity, measure, tasks: [tasks, the easiest first]}]
 
 A task is an entry with the fields of `BenchmarkTask`, but its axis; empty ones are left out. Names say little about a
@@ -22,13 +23,14 @@ from typing import Any
 
 import numpy as np
 
+from pharos.benchmark import levels
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
 from pharos.mdp import ChanceSetting, TabularMDP
 from pharos.system import storage
-from pharos.system.records import read
+from pharos.system.records import parse_record
 from pharos.system.sources import is_reference, untrusted_code
 from pharos.system.storage import check_name
-from pharos.training import Task
+from pharos.training import ReferenceValues, Task, TaskValues
 
 FOLDER = Path(__file__).parent / "suites"
 V1 = "50d45f848f991081acf6b8ce6a5c532614ebc2139ea50d148094ea50894b1086"
@@ -39,6 +41,10 @@ PAIRS = "pairs"
 """Measure of an axis of pairs: one world in two ways, and how much worse an agent is at the second."""
 BITS = 40
 """Of a mantissa that enter a digest, 12 digits: what compilers and processors may round differently is beyond."""
+SAMPLED = 4096
+"""States of a large task whose rewards and observations enter its digest."""
+STORED = ("states", "worst", "lowest", "highest", "error_bound")
+QUICK = 3  # seeds
 TOLERANCE = 1e-6
 """Of values, relative to V* less that of uniform play: solvers may sum in another order."""
 
@@ -71,17 +77,21 @@ class BenchmarkTask:
 
     Attributes:
         name: unique in its suite, and fit for a file name (`check_name`), since runs are written below it.
-        environment, parameters: as `pharos.make` takes them. observation, observation_options: as `pharos.observe`.
+        environment, parameters: as `pharos.make` takes them; or "levels", with those of `levels_of`.
+        observation, observation_options: as `pharos.observe`.
         chance: the kinds of `ChanceSetting` that are not 0.
-        axis: "core", or that of its ladder.
+        axis: "core", or the axis of its ladder.
         level: on a ladder: the measured quantity, in the ladder's unit; None in the core.
         predicted: by `pharos.predict`, normalised regret, 0 optimal and 1 uniform play: "dqn", "ppo", and "table",
-            that of the DQN with a table; some may be missing.
+            for the DQN with a table; some may be missing.
         value_optimal, value_uniform: at the start, of the optimal policy and of uniform play.
         digest: SHA-256 of the task as it was frozen; see `digest_of_task`.
         seconds: processor time of one run of a baseline that was measured, by its name; a guide.
+        stored: of a large task, which is not solved before each run: its number of `states`, value of the `worst`
+            policy, `lowest` and `highest` return of an episode, and `error_bound` of all its values. Empty: it is
+            solved.
     Raises:
-        ParameterError: the name is not fit for a file name.
+        ParameterError: the name is not fit for a file name, or entries of `stored` are missing.
     """
 
     name: str
@@ -97,9 +107,20 @@ class BenchmarkTask:
     value_uniform: float = float("nan")
     digest: str = ""
     seconds: Mapping[str, float] = field(default_factory=dict)
+    stored: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_name(self.name, "the name of a task")
+        if self.stored and {*self.stored} != {*STORED}:
+            raise ParameterError(f"task {self.name}: stored has {', '.join(self.stored)}; expected {', '.join(STORED)}")
+
+    @property
+    def stored_values(self) -> TaskValues | None:
+        """Values at the start of a large task, as they were frozen; None: they are to be solved for."""
+        if not (own := self.stored):
+            return None
+        reference = ReferenceValues(self.value_optimal, self.value_uniform, own["worst"], own["error_bound"])
+        return TaskValues(reference, (own["lowest"], own["highest"]))
 
     def training_task(self, protocol: Protocol) -> Task:
         """The task as agents are trained on it; nothing is built before it is needed."""
@@ -108,23 +129,28 @@ class BenchmarkTask:
                 f"task {self.name}: gamma is 1 without a horizon, so regret may be infinite, and no score a mean of "
                 f"it; give a horizon, or gamma < 1"
             )
+        if self.environment == levels.LEVELS:
+            world: tuple[Any, ...] = (levels.levels_of(**self.parameters),)
+        else:
+            world = self.environment, self.parameters
         return Task.of(
-            self.environment,
-            self.parameters,
+            *world,
             observation=self.observation,
             observation_options=dict(self.observation_options),
             chance=ChanceSetting.from_dict(self.chance),
             gamma=protocol.gamma,
             horizon=protocol.horizon,
+            values=self.stored_values,
         )
 
     def check(self, protocol: Protocol) -> Task:
         """The task as agents are trained on it; ParameterError if it is another task on this installation.
 
-        Cost: its states are built and solved.
+        Cost: its states are built, and solved unless it is large.
         """
         task = self.training_task(protocol)
-        if (digest := digest_of_task(task)) != self.digest:
+        digest = digest_of_large_task(task) if self.stored else digest_of_task(task)
+        if digest != self.digest:
             raise ParameterError(
                 f"task {self.name}: its digest is {digest[:16]}... on this installation; expected "
                 f"{self.digest[:16]}...: rules, rewards, chance or observations differ; install the version of pharos "
@@ -184,6 +210,7 @@ class Suite:
         core: tasks that a score is the mean of. ladders: one for each axis.
         digest: SHA-256 of all the rest; see `digest_of_suite`.
         hyperparameters: of baselines by name, one setting for all tasks.
+        quick: of a quick look, the names of its `tasks` and how many `seeds`; empty: the core, three seeds.
     """
 
     name: str
@@ -192,6 +219,17 @@ class Suite:
     ladders: tuple[Ladder, ...]
     digest: str = ""
     hyperparameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    quick: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def quick_tasks(self) -> tuple[str, ...]:
+        """Names of tasks and axes of a quick look."""
+        return tuple(self.quick.get("tasks", (CORE,)))
+
+    @property
+    def quick_seeds(self) -> int:
+        """Number of seeds of a quick look."""
+        return int(self.quick.get("seeds", QUICK))
 
     @property
     def tasks(self) -> tuple[BenchmarkTask, ...]:
@@ -203,7 +241,7 @@ class Suite:
         return {task.name: task for task in self.tasks}
 
     def task(self, name: str) -> BenchmarkTask:
-        """The task of this name; UnknownName where there is none."""
+        """The task of this name; UnknownName if there is none."""
         if name not in self._by_name:
             raise UnknownName(f"task of suite {self.name}", name, self._by_name)
         return self._by_name[name]
@@ -247,25 +285,29 @@ def suite_of(entry: object, whose: str) -> Suite:
         FileFormatError: an entry is missing, unknown, of another type or damaged; `whose` says of which file.
     """
     keys = [each.name for each in fields(Suite)]
-    if not isinstance(entry, dict) or {*entry} != {*keys}:
+    if not isinstance(entry, dict) or {*entry, "quick"} != {*keys}:
         raise FileFormatError(f"{whose}: is no suite; expected the entries {', '.join(keys)}")
     ladders: list[Ladder] = []
     for each in _list(entry["ladders"], f"{whose}: ladders"):
         of = f"{whose}: ladder {each.get('axis')}"
         tasks = _tasks(each.get("tasks"), str(each.get("axis")), of)
-        ladders.append(replace(read(Ladder, {**each, "tasks": ()}, of, ("measure",)), tasks=tasks))
+        ladders.append(replace(parse_record(Ladder, {**each, "tasks": ()}, of, ("measure",)), tasks=tasks))
         if ladders[-1].measure == PAIRS and len(tasks) % 2:
             raise FileFormatError(f"{of}: has {len(tasks)} tasks; expected pairs")
     settings = entry["hyperparameters"]
     if not isinstance(settings, dict) or not all(isinstance(each, dict) for each in settings.values()):
         raise FileFormatError(f"{whose}: hyperparameters are {str(settings)[:60]}; expected some of each baseline")
+    quick = entry.get("quick", {})
+    if not isinstance(quick, dict) or not ({*quick} <= {"tasks", "seeds"} and isinstance(quick.get("seeds", 1), int)):
+        raise FileFormatError(f"{whose}: quick is {str(quick)[:60]}; expected tasks and seeds")
     suite = Suite(
         str(entry["name"]),
-        read(Protocol, entry["protocol"], f"{whose}: protocol"),
+        parse_record(Protocol, entry["protocol"], f"{whose}: protocol"),
         _tasks(entry["core"], CORE, f"{whose}: core"),
         tuple(ladders),
         str(entry["digest"]),
         settings,
+        quick,
     )
     if len(suite._by_name) < len(suite.tasks):
         raise FileFormatError(f"{whose}: two tasks have the same name; expected a name of its own for each")
@@ -291,7 +333,7 @@ def _tasks(entries: object, axis: str, whose: str) -> tuple[BenchmarkTask, ...]:
     optional = [each.name for each in fields(BenchmarkTask) if each.name not in ("name", "environment", "digest")]
     try:
         return tuple(
-            read(BenchmarkTask, {**each, "axis": axis}, f"{whose}: task {str(each.get('name'))[:60]}", optional)
+            parse_record(BenchmarkTask, {**each, "axis": axis}, f"{whose}: task {str(each.get('name'))[:60]}", optional)
             for each in _list(entries, whose)
         )
     except ParameterError as error:  # of a name
@@ -302,16 +344,28 @@ def digest_of_suite(suite: Suite) -> str:
     """SHA-256 of all that a suite says but its digest, as canonical JSON.
 
     So of name and protocol, of hyperparameters of baselines, of each ladder with its unit, quantity and measure, and of
-    each task with its parameters, predictions, values, seconds and digest.
+    each task with its parameters, predictions, values, seconds and digest. Optional parts count where they are there.
     """
-    entry = storage.plain(asdict(suite))
+    entry = _entries(suite)
     del entry["digest"]
     return hashlib.sha256(_canonical(entry)).hexdigest()
 
 
+def _entries(suite: Suite) -> dict[str, Any]:
+    """Entries of the file of a suite, JSON-able; empty `quick` and `stored` are left out, as v1 has neither."""
+    entry = storage.plain(asdict(suite))
+    tasks = [*entry["core"], *(task for ladder in entry["ladders"] for task in ladder["tasks"])]
+    for each, name in [(entry, "quick"), *((task, "stored") for task in tasks)]:
+        if not each[name]:
+            del each[name]
+    return entry
+
+
 def frozen(task: BenchmarkTask, protocol: Protocol) -> BenchmarkTask:
-    """A copy of the task with its digest and values. Cost: as solving it."""
+    """A copy of the task with its digest and values. Cost: as solving it; a large task has its values already."""
     solved = task.training_task(protocol)
+    if task.stored:
+        return replace(task, digest=digest_of_large_task(solved))
     optimal, uniform = solved.reference.optimal, solved.reference.uniform
     return replace(task, value_optimal=optimal, value_uniform=uniform, digest=digest_of_task(solved))
 
@@ -326,7 +380,7 @@ def write_suite(suite: Suite, file: str | os.PathLike) -> None:
         import yaml
     except ImportError as error:
         raise MissingExtra("writing a suite", "pyyaml", "study") from error
-    entry = storage.plain(asdict(replace(suite, digest=digest_of_suite(suite))))
+    entry = _entries(replace(suite, digest=digest_of_suite(suite)))
     for each in (*entry["core"], *(task for ladder in entry["ladders"] for task in ladder["tasks"])):
         del each["axis"]
     storage.replace_file(file, yaml.safe_dump(entry, sort_keys=False, allow_unicode=True).encode())
@@ -343,7 +397,29 @@ def digest_of_task(task: Task) -> str:
     bits.
     """
     space, mdp = task.space, task.space.mdp(gamma=task.gamma)
-    env, observe = task.env, task.observer.observe.observation
+    return _digest(task, [*_arrays(mdp), task.observer.observe.observation(space.states())])
+
+
+def digest_of_large_task(task: Task) -> str:
+    """SHA-256 of a task with too many states for their observations in memory, as it is frozen.
+
+    Of its components by name, as `digest_of_task` has them; of the checksums of all states and transitions in the files
+    of its state space, which are the same everywhere; and of rewards and observations of SAMPLED states, equally far
+    apart in the order in which they are found, the first and the last among them.
+
+    Cost: as building the states.
+    """
+    space = task.space
+    states = np.unique(np.linspace(0, space.num_states - 1, SAMPLED).astype(np.int64))
+    rewards = np.asarray(space.mdp(gamma=task.gamma).reward_table.rows(states), np.float64)
+    files = {name: entry["checksums"] for name, entry in sorted(space.manifest["arrays"].items())}
+    world = {"states": space.num_states, "initial": space.manifest["initial"], "files": files}
+    return _digest(task, [rewards, task.observer.observe.observation(space.states(states))], world)
+
+
+def _digest(task: Task, arrays: Iterable[np.ndarray], world: object = None) -> str:
+    """SHA-256 of the components of a task by name, what else is said of its world, and arrays."""
+    env = task.env
     description = {
         "environment": env.name,
         "parameters": {} if env.name == "imported" else env.parameters,  # whose folder may lie anywhere
@@ -352,9 +428,10 @@ def digest_of_task(task: Task) -> str:
         "observation_options": dict(task.observation_options),
         "chance": {name: float(value) for name, value in task.chance.to_dict().items()},
         **task.conventions,
+        **({} if world is None else {"world": world}),
     }
     digest = hashlib.sha256(_canonical(description))
-    for array in (*_arrays(mdp), observe(space.states())):
+    for array in arrays:
         kind = "<f8" if array.dtype.kind == "f" else "<i8"
         values = (rounded(array) if kind == "<f8" else array).astype(kind)
         digest.update(_canonical([kind, list(array.shape)]))

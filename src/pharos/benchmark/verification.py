@@ -8,8 +8,6 @@ import contextlib
 import errno
 import math
 import os
-import signal
-import threading
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +24,7 @@ from pharos.benchmark.submission import ProgressCallback, Submission, read
 from pharos.benchmark.suite import BenchmarkTask, Suite, load_suite
 from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, TimeLimit, UntrustedCode
 from pharos.policies import Evaluation
+from pharos.system.interrupts import time_limit
 from pharos.system.memory import available_memory
 from pharos.system.records import takes
 from pharos.system.sealed import LONGEST_TEXT
@@ -154,7 +153,7 @@ def verify(
 
     Args:
         suite: of runs of a suite, or several that it may be; v1 when not given. Its tasks are the ones on this
-            installation, not those of the file.
+            installation, not the tasks in the file.
         trust: whether code that an entry names may be imported: an environment, observation or agent that is no part
             of pharos or Stable-Baselines3. It comes from this machine; no file holds any.
         values: filled with the values of each task of an entry, for the entries that follow.
@@ -193,7 +192,7 @@ def _verify_entry(
             raise FileFormatError(f"{path}: its {name} is {steps:,} steps; expected at most {limits.max_horizon:,}")
     # Value of the policy and reference values, computed again within limits of time and memory
     try:
-        with _time_limit(limits.max_seconds), _memory_limit():
+        with time_limit(limits.max_seconds, TimeLimit), _memory_limit():
             task = task_of(entry, trust, limits.max_states, values)
             policy = policy_of(entry, task, trust=trust)
             evaluation = evaluate_agent(policy, task, max_states=limits.max_reached, seed=SEED)
@@ -270,7 +269,7 @@ def _verify_submission(
             refused[name] = f"its normalised regret is {curve.min():.6g}, better than the optimal policy"
         entry = suite.task(name)
         try:
-            with _time_limit(limits.max_seconds), _memory_limit():
+            with time_limit(limits.max_seconds, TimeLimit), _memory_limit():
                 task = entry.check(suite.protocol)
                 for seed, claimed in zip(results.seeds, curve[:, -1], strict=True):
                     run, policy = f"{name}/{seed}", submission.policies.get((name, seed))
@@ -304,34 +303,7 @@ def _regret(policy: np.ndarray, task: Task, entry: BenchmarkTask) -> float:
     return (entry.value_optimal - value) / (entry.value_optimal - entry.value_uniform)
 
 
-# Limits of time and memory --------------------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def _time_limit(seconds: float) -> Iterator[None]:
-    """Raise TimeLimit in the block after that many seconds of wall-clock time, and every second until the block ends.
-
-    A compiled kernel is not interrupted; it raises when it returns. Only the main thread can be stopped, by SIGALRM:
-    elsewhere, and on Windows, there is no limit.
-    """
-    able = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
-    if not able or not seconds < math.inf:
-        yield
-        return
-
-    def stop(*_: object) -> None:
-        raise TimeLimit(f"takes more than {seconds:g} s")
-
-    before = signal.signal(signal.SIGALRM, stop)
-    try:
-        signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-6), 1.0)
-        try:
-            yield
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-    finally:  # once more: the alarm may have come before the block began, or while it was turned off
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+# Limits of memory -----------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager

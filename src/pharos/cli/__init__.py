@@ -1,7 +1,13 @@
 """The command line: one verb per step of the data flow, one file per verb. docs/cli.md describes it.
 
-Every command takes `--json` (exactly one JSON object on standard output) and exits 0; 2 where the command or its
-parameters are wrong; 1 where it failed; 130 where it was interrupted; with one line on standard error.
+Every command takes `--json` (exactly one JSON object on standard output) and exits with
+
+- 0 if it succeeds,
+- 1 if it fails,
+- 2 if the command or its parameters are wrong,
+- 130 if it is interrupted.
+
+All but the first write one line on standard error.
 """
 
 from pharos.cli.app import app, main

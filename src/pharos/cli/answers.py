@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from pharos.environments import Environment
 
-NOTABLE_SECONDS = 0.2  # of compiling, beside those of work
+NOTABLE_SECONDS = 0.2  # of compiling, beside lines on work
 SPECIAL = re.compile(r"[^\w@%+=:,./\[\]-]")  # what a shell would read as more than a character of a word
 
 
@@ -45,7 +45,7 @@ class Answer(NamedTuple):
     failed: bool = False
 
     def say(self, json: bool) -> None:
-        """Print it; typer.Exit where it says that something failed."""
+        """Print it; typer.Exit if it says that something failed."""
         if json:
             print_json(self.json)
         elif isinstance(self.text, tuple):
@@ -95,13 +95,13 @@ class _Trimmed:
         return self.stream.write(re.sub(r" +(?=\n)", "", text))
 
 
-TOLD_AFTER, TOLD_AT_LEAST_EVERY = 10.0, 60.0  # seconds of work after which a line says what is going on, and again
+SLOW_AFTER, TOLD_AT_LEAST_EVERY = 10.0, 60.0  # seconds of work after which a line says what is going on, and again
 
 
 class SlowWork:
-    """Lines on standard error on work that takes long, where no terminal shows its progress.
+    """Lines on standard error on work that takes long, if no terminal shows its progress.
 
-    The first comes after `TOLD_AFTER` seconds, the next ones when it has taken twice as long, and every
+    The first comes after `SLOW_AFTER` seconds, the next ones when it has taken twice as long, and every
     `TOLD_AT_LEAST_EVERY` seconds in the end.
 
     Attributes:
@@ -110,7 +110,7 @@ class SlowWork:
 
     def __init__(self, what: str, clock: Callable[[], float] = time.monotonic):
         self.what, self.text = what, ""
-        self._clock, self._began, self._due = clock, clock(), TOLD_AFTER
+        self._clock, self._began, self._due = clock, clock(), SLOW_AFTER
 
     def tell_if_due(self) -> None:
         """Write a line if the time for one has come."""
@@ -139,7 +139,8 @@ class SlowWork:
 
 @contextlib.contextmanager
 def told_if_slow(what: str) -> Iterator[None]:
-    """Say on standard error, where that is no terminal, that a block is slow whose own progress is for terminals."""
+    """Say on standard error, if that is no terminal, that a block is slow. Its progress is otherwise for terminals
+    only."""
     with contextlib.nullcontext() if sys.stderr.isatty() else SlowWork(what).watched():
         yield
 
@@ -168,17 +169,17 @@ def progress_line(what: str, *, logged: bool = False) -> Iterator[ProgressLine]:
     """Report progress in a line on standard error: on a terminal always, and removed at the end; else if it is slow.
 
     Args:
-        logged: whether each text is a line of its own where there is no terminal, as in a log.
+        logged: whether each text is a separate line if there is no terminal, as in a log.
     """
     if not sys.stderr.isatty():
         with SlowWork(what).watched() as work:
 
-            def tell(text: str) -> None:
+            def report(text: str) -> None:
                 work.text = text
                 if logged:
                     print(f"pharos: {text}", file=sys.stderr, flush=True)
 
-            yield ProgressLine(tell)
+            yield ProgressLine(report)
         return
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
@@ -190,7 +191,7 @@ def progress_line(what: str, *, logged: bool = False) -> Iterator[ProgressLine]:
 
 @contextlib.contextmanager
 def progress_bar(what: str, total: int, before: str = "") -> Iterator[Callable[..., None]]:
-    """A bar on standard error, on a terminal: call it with how much is done, a text, and the total where that changes.
+    """A bar on standard error, on a terminal: call it with how much is done, a text, and the total if that changes.
 
     Nothing is shown elsewhere.
 
@@ -348,7 +349,7 @@ def termination() -> Iterator[None]:
     """Turn SIGTERM into SystemExit in the block, so that running work ends first; prints that the command resumes."""
 
     def leave(number: int, frame: FrameType | None) -> None:
-        if is_importing(frame):  # where SystemExit may be lost
+        if is_importing(frame):  # if SystemExit may be lost
             send_again(number)
             return
         complain(INTERRUPTED)

@@ -131,7 +131,7 @@ def _exit_code(error: Exception) -> int | None:
         return EXIT_FAILED
     if type(error).__name__ == "Abort":
         return EXIT_INTERRUPTED
-    if hasattr(error, "format_message"):  # of typer, wherever its exceptions live in this version
+    if hasattr(error, "format_message"):  # of typer, in whichever module this version has its exceptions
         text = error.format_message()
         name = getattr(error, "option_name", None) or "".join(text.split("'")[1:2])  # No such command 'NAME'.
         complain(f"{REMOVED.get(f'{_command_of(error)} {name}') or text} (see `{_command_of(error)} --help`)")

@@ -41,9 +41,7 @@ if TYPE_CHECKING:
 app = Commands(no_args_is_help=True, help="Run agents on a frozen suite of solved tasks, and compare them.")
 
 SuiteName = Annotated[str, typer.Argument(metavar="[SUITE]", help="Name of a suite, or FILE.yaml.")]
-SuiteFile = Annotated[
-    str | None, typer.Option("--suite", metavar="NAME|FILE", help="That the runs are of; v1 when not given.")
-]
+SuiteFile = Annotated[str | None, typer.Option("--suite", metavar="NAME|FILE", help="Suite of the runs. Default: v1.")]
 CLAIMED = [
     "curves while learning",
     "core scores and intervals",
@@ -58,6 +56,7 @@ COMPUTED = (
     *("states", "episodes"),
 )
 """Numbers of one task."""
+LONG_MINUTES = 600  # minutes
 
 
 @app.command("show")
@@ -87,7 +86,7 @@ def run(
     out: Path,
     suite: Annotated[str, "NAME|FILE"] = "v1",
     hyperparameters: Mapping[str, Any] | None = None,
-    seeds: Annotated[str, "N|A:B|S,..."] = "10",
+    seeds: Annotated[str | None, "N|A:B|S,..."] = None,
     quick: bool = False,
     tasks: Annotated[list[str] | None, "core|AXIS|NAME"] = None,
     name: str | None = None,
@@ -99,19 +98,19 @@ def run(
 
     Args:
         agent: A name (dqn, ppo, q_learning, a2c, oracle, random), module:Class or file.py:Class, or file.py:learn.
-        out: Folder for the runs and their results, of one agent with one setting.
-        suite: Which tasks.
-        hyperparameters: A hyperparameter, of all tasks.
-        seeds: How many, from 0 on; or which, such as 1000:1003.
-        quick: The first three seeds of the core alone; results are preliminary.
-        tasks: The core, an axis or a task, and no other; several times for more.
-        name: Label in tables; the agent's own when not given.
-        workers: Processes; as many as processors when not given.
-        timeout: Seconds after which a run of code of your own, or of Stable-Baselines3, is ended, and failed.
+        out: Write the runs and results of one agent with one setting into this folder.
+        suite: Run the tasks of this suite.
+        hyperparameters: Set a hyperparameter, for all tasks.
+        seeds: Number of seeds, from 0 on; or a range, such as 1000:1003. Default: as many as the suite asks for.
+        quick: Run a first look, of v1 the first three seeds of the core alone; results are preliminary.
+        tasks: Run only the core, an axis or a task. Repeatable.
+        name: Label in tables. Default: the agent's name.
+        workers: Number of processes. Default: as many as processors.
+        timeout: End a run of your own code, or of Stable-Baselines3, after this many seconds; it has failed then.
     """
     from pharos import benchmark
 
-    numbers = list(range(int(seeds))) if seeds.isdigit() else parse_seeds(seeds)
+    numbers = None if seeds is None else range(int(seeds)) if seeds.isdigit() else parse_seeds(seeds)
     loaded = benchmark.load_suite(suite, trust=trust)
     with progress_bar("runs", 1000, "checking tasks, loading, compiling") as show, termination():
         try:
@@ -172,13 +171,13 @@ def check(
     workers: Count | None = None,
     timeout: float = 120.0,
 ) -> Answer:
-    """Try an agent on two tiny tasks, and say in one line each what is wrong; exit code 1 if something is.
+    """Try an agent on two tiny tasks, and report each fault in one line; exit code 1 if there is one.
 
     Args:
         agent: As for `benchmark run`, such as file.py:learn.
-        hyperparameters: A hyperparameter, of both tasks.
-        workers: Processes; as many as processors when not given.
-        timeout: Seconds after which a run is ended, and failed.
+        hyperparameters: Set a hyperparameter, for both tasks.
+        workers: Number of processes. Default: as many as processors.
+        timeout: End a run after this many seconds; it has failed then.
     """
     from pharos import benchmark
 
@@ -199,10 +198,10 @@ def report(
 
     Args:
         results: Folder of a run, file, or name of a shipped baseline.
-        out: FILE.html, which loads nothing.
-        beside: Names of baselines or other results, with commas; dqn,ppo,q_learning when not given, as far as shipped.
-        latex: A table and a paragraph on methods, too, in FILE.tex.
-        predictor: Idealised learner to compare with: dqn, ppo, table, both or none; by the agent's name when not given.
+        out: Write the page to FILE.html, which loads nothing.
+        beside: Baselines or other results to compare with, with commas. Default: dqn,ppo,q_learning, if shipped.
+        latex: Also write a table and a paragraph on methods to FILE.tex.
+        predictor: Idealised learner to compare with: dqn, ppo, table, both or none. Default: by the agent's name.
     """
     from pharos import benchmark
 
@@ -225,17 +224,17 @@ def submit(
     """Pack what a run, or the runs of a suite, have learnt and claim into one file; anybody can compute it again.
 
     Args:
-        folder: Of one finished run, or of `benchmark run`.
-        out: FILE.safetensors; ID.safetensors of a run, DIR.safetensors of a suite, when not given.
-        name: Label; the agent's own when not given.
-        author: Who submits it.
-        note: Shown beside it.
+        folder: Folder of one finished run, or of `benchmark run`.
+        out: Write FILE.safetensors. Default: ID.safetensors for a run, DIR.safetensors for a suite.
+        name: Label in tables. Default: the agent's name.
+        author: Name of whoever submits it.
+        note: Text to show beside it.
     """
     from pharos import benchmark
 
     texts = {"name": name, "author": author, "note": note}
-    with counted_bar("policies") as tell:
-        file = benchmark.submit(folder, out, _loaded(suite, trust), **texts, trust=trust, progress=tell)
+    with counted_bar("policies") as report:
+        file = benchmark.submit(folder, out, _loaded(suite, trust), **texts, trust=trust, progress=report)
     content, size = benchmark.read(file), file.stat().st_size
     if isinstance(content, benchmark.Entry):
         claim, more = content.claim, {"id": content.id, "claim": content.claim}
@@ -266,7 +265,7 @@ def verify(
     """Solve the tasks of submissions and evaluate their policies again; exit code 1 if one is not as claimed.
 
     Args:
-        files: That `benchmark submit` wrote.
+        files: Files from `benchmark submit`.
     """
     from pharos import benchmark
 
@@ -274,8 +273,8 @@ def verify(
     for file in files:
         began = time.perf_counter()
         try:
-            with counted_bar(f"verifying {file}") as tell:
-                verdict = benchmark.verify(file, loaded, trust=trust, progress=tell, **vars(limits))
+            with counted_bar(f"verifying {file}") as report:
+                verdict = benchmark.verify(file, loaded, trust=trust, progress=report, **vars(limits))
         except Exception as error:
             if len(files) == 1:
                 raise
@@ -366,16 +365,16 @@ def board(
     """Verify submissions, and write a page that ranks them by what was computed; all else on it is claimed.
 
     Args:
-        files: Submissions, and folders with some in them and below.
-        out: FILE.html.
-        suite: That they may be of; several times for more; v1 when not given.
-        title: Of the page.
+        files: Submissions, and folders with submissions in them or below.
+        out: Write the page to FILE.html.
+        suite: Accept submissions of this suite. Repeatable. Default: v1.
+        title: Title of the page.
     """
     from pharos import benchmark
 
     suites = [benchmark.load_suite(each, trust=trust) for each in suite or ()]
-    with counted_bar("verifying") as tell:
-        page = benchmark.board(files, out, suites, title=title, trust=trust, progress=tell, **vars(limits))
+    with counted_bar("verifying") as report:
+        page = benchmark.board(files, out, suites, title=title, trust=trust, progress=report, **vars(limits))
     verified = len(page.verified)
     facts = [("verified", f"{verified:,}"), ("refused", f"{len(page.refused):,}"), *page.refused.items()]
     answer = {"file": out, "verified": verified, "refused": page.refused, "final_scores": page.final_scores}
@@ -407,14 +406,18 @@ def _print(suite: "Suite") -> None:
     for ladder in [None, *suite.ladders]:
         for task in suite.core if ladder is None else ladder.tasks:
             level = "" if task.level is None or ladder is None else f"{task.level:.3g} {ladder.unit}"
+            level = f"{task.stored['states']:,} states" if task.stored else level
             numbers = (task.predicted.get(name) for name in ("dqn", "ppo", "table"))
             cells = ("" if value is None else f"{value:.2f}" for value in numbers)
             rows.append(("" if task.axis == axis else task.axis, task.name, level, *cells))
             axis = task.axis
-    text = "Regret as predicted before any run: 0 is optimal, 1 is uniform play."
+    notes = []
+    if any(task.predicted for task in suite.tasks):
+        notes.append("Regret as predicted before any run: 0 is optimal, 1 is uniform play.")
     if minutes := _minutes(suite):
-        times = ", ".join(f"{agent.upper()} {value:.0f}" for agent, value in minutes.items())
-        text += f" Minutes of one processor, all seeds, as shipped: {times}"
+        unit, size = ("Hours", 60) if max(minutes.values()) > LONG_MINUTES else ("Minutes", 1)
+        times = ", ".join(f"{agent.upper()} {value / size:.0f}" for agent, value in minutes.items())
+        notes.append(f"{unit} of one processor, all seeds, as shipped: {times}")
     protocol = suite.protocol
     setting = (
         f"{protocol.steps:,} steps a task, {pluralize(protocol.evaluations, 'evaluation')}, "
@@ -422,10 +425,12 @@ def _print(suite: "Suite") -> None:
     )
     title = f"{suite.name}, {pluralize(len(suite.tasks), 'task')}: {suite.digest}"
     columns = ("axis", "task", "level", ">DQN", ">PPO", ">table")
-    print_table(title, columns, rows, before=[setting, ""], notes=[text])
+    print_table(title, columns, rows, before=[setting, ""], notes=[" ".join(notes)])
 
 
-SuiteOption = Annotated[str | None, typer.Option(metavar="NAME|FILE.yaml", help="The results' own when not given.")]
+SuiteOption = Annotated[
+    str | None, typer.Option(metavar="NAME|FILE.yaml", help="Suite of the results. Default: theirs.")
+]
 
 
 @app.command("compare")
@@ -489,11 +494,11 @@ def power(
     suite: SuiteOption = None,
     difference: float | None = None,
 ) -> Answer:
-    """Show how precise scores are, and which difference from an agent that varies as much would be found.
+    """Show the standard error of scores, and the smallest difference that is detected with 80 % power.
 
     Args:
         results: Folder of a run, file of results, or a baseline by name.
-        difference: Of scores: how many seeds find it with power 0.8.
+        difference: Also show how many seeds detect this difference of scores with 80 % power.
     """
     from pharos import benchmark
 

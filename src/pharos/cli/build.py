@@ -28,7 +28,7 @@ def build(building: SharedBuilding, target: Target, *, out: Path | None = None) 
     """Enumerate every state that can be reached, and its transitions, onto disk. The same command resumes.
 
     Args:
-        out: Folder to write; the cache when not given.
+        out: Write to this folder. Default: the cache.
     """
     from pharos import state_space
     from pharos.state_space import cached_folder
@@ -89,7 +89,7 @@ def _is_there(folder: Path) -> bool:
 # Count ----------------------------------------------------------------------------------------------------------------
 
 
-SMALL = 10_000  # states, so that solving takes no time
+MOST_QUICK_STATES = 10_000  # states, so that solving takes no time
 
 
 def count(target: Target, *, building: Building) -> Answer:
@@ -120,7 +120,7 @@ def _table_of(goal: Target) -> "TabularMDP":
 
 
 def _counts_of_space(goal: Target, building: Building) -> dict[str, int]:
-    """Counts of a folder, or of the cache where the space is there; else it is built beside the cache and removed."""
+    """Counts of a folder, or of the cache if the space is there; else it is built beside the cache and removed."""
     from pharos.state_space import cached_folder, load, read_manifest
     from pharos.system import storage
 
@@ -130,9 +130,9 @@ def _counts_of_space(goal: Target, building: Building) -> dict[str, int]:
     manifest = read_manifest(cached_folder(goal.environment))
     if manifest is not None and manifest["complete"]:
         return counts_of(goal.space(building))
-    place = storage.cache_directory()
-    place.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix="count-", dir=place))
+    cache = storage.cache_directory()
+    cache.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix="count-", dir=cache))
     try:
         return counts_of(goal.space(building, temporary))
     finally:
@@ -149,7 +149,7 @@ def counts_of(space: "StateSpace") -> dict[str, int]:
         "num_actions": space.num_actions,
         "num_transitions": rows - space.num_terminal_states * space.num_actions,
         "depth": space.depth,
-        "has_regret": space.num_states > SMALL or _has_regret(space.mdp(gamma=0.99)),
+        "has_regret": space.num_states > MOST_QUICK_STATES or _has_regret(space.mdp(gamma=0.99)),
     }
 
 
@@ -199,7 +199,7 @@ def check(target: Target, *, max_states: Count = 1000) -> Answer:
     """Check an environment against the contract, state by state, and whether any policy beats uniform play.
 
     Args:
-        max_states: States that are looked at; more for a larger sample.
+        max_states: Check at most this many states; more for a larger sample.
     """
     env = target.found_environment()
     from pharos import check_environment

@@ -131,8 +131,8 @@ USUAL: tuple[tuple[str, dict[str, int]], ...] = (
     ("freeway", {"num_cars": 2, "lane_length": 3}),
     ("breakout", {"height": 8, "columns": 5}),
 )
-STEPS = 50
-LARGEST = 5_000_000
+WARM_STEPS = 50
+LARGEST_WARMED = 5_000_000
 
 
 def warm(
@@ -146,7 +146,7 @@ def warm(
     """Compile what building, solving, measuring, playing and Q-learning need, and keep it for later processes.
 
     Args:
-        targets: Environments or named instances; small ones of the paper's four classes when not given.
+        targets: Environments or named instances. Default: small ones of the paper's four classes.
     """
     environments = [Target(name).found_environment() for name in targets or ()]
     if not targets:
@@ -155,10 +155,10 @@ def warm(
         environments = [make(name, **parameters) for name, parameters in USUAL]
     seconds: dict[str, float] = {}
     watch = Stopwatch()
-    compiling.SMALL = 0  # as if all of it were large
-    with progress_line("compiling") as tell:
+    compiling.SMALL_STATES = 0  # as if all of it were large
+    with progress_line("compiling") as report:
         for env in environments:
-            tell(str(env))
+            report(str(env))
             before = watch.compiling
             _use(env, chance)
             seconds[str(env)] = watch.compiling - before
@@ -183,7 +183,7 @@ def _use(env: "Environment", chance: ChanceSetting) -> None:
         two.step([0, 0])
     with tempfile.TemporaryDirectory() as folder:
         try:
-            space = state_space.build(env, f"{folder}/space", max_states=LARGEST, progress=False)
+            space = state_space.build(env, f"{folder}/space", max_states=LARGEST_WARMED, progress=False)
         except StateSpaceTooLarge:
             return
         mdp = chance.of(space.mdp(gamma=0.99))
@@ -197,4 +197,12 @@ def _use(env: "Environment", chance: ChanceSetting) -> None:
         finally:
             outcomes.UNROLLED_FROM = few
         hardness.report(mdp, budget=10.0, keep=False)
-    train("q_learning", env, steps=STEPS, gamma=0.99, horizon=None, evaluation_interval=STEPS, chance=chance)
+    train(
+        "q_learning",
+        env,
+        steps=WARM_STEPS,
+        gamma=0.99,
+        horizon=None,
+        evaluation_interval=WARM_STEPS,
+        chance=chance,
+    )

@@ -5,7 +5,7 @@
         '''Find the optimal values.
 
         Args:
-            threads: Of a sweep.
+            threads: Use this many threads for a sweep.
         '''
 
 A parameter is an argument, one after `*` is an option; `Annotated[Path, "DIR"]` says what stands for its value in help.
@@ -28,7 +28,7 @@ from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
 from pharos.cli.answers import Answer
 from pharos.cli.options import parse_parameters
 from pharos.environments import declared_parameters
-from pharos.system.records import first_sentence, meanings
+from pharos.system.records import docstring_entries, first_sentence
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -57,7 +57,7 @@ def command(function: Callable[..., Any]) -> Callable[..., None]:
     """Return the callback of a function for Typer: a parameter for each argument and option, `--json` the last."""
     parameters: list[inspect.Parameter] = []
     objects: dict[str, tuple[inspect.Parameter, Any, list[str]]] = {}
-    texts, signature = meanings(function), inspect.signature(function)
+    texts, signature = docstring_entries(function), inspect.signature(function)
     for each in signature.parameters.values():
         cls, *names = get_args(each.annotation) if get_origin(each.annotation) is Annotated else (each.annotation,)
         if isinstance(cls, type) and dataclasses.is_dataclass(cls):
@@ -97,9 +97,9 @@ def _of_fields(cls: "type[DataclassInstance]", values: object, docs: Mapping[str
     """Yield a parameter for each field of a dataclass, and for the fields of nested dataclasses.
 
     Args:
-        values: the defaults. docs: help texts that go before those of the class.
+        values: the defaults. docs: help texts that override the texts of the class.
     """
-    texts, declared = meanings(cls), declared_parameters(cls)
+    texts, declared = docstring_entries(cls), declared_parameters(cls)
     for field in dataclasses.fields(cls):
         default = getattr(values, field.name) if values is not None else field.default
         if isinstance(field.type, type) and dataclasses.is_dataclass(field.type):

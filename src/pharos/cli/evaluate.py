@@ -1,6 +1,6 @@
-"""pharos solve: optimal values, beside those of the uniformly random policy.
+"""pharos solve: optimal values, beside the values of the uniformly random policy.
 
-pharos evaluate: the exact value of a policy, between those of the best and the worst.
+pharos evaluate: the exact value of a policy, between the best and the worst value.
 """
 
 import math
@@ -57,13 +57,13 @@ def solve(
     """Find the optimal values and policy, with a proven error bound. With --processes the same command resumes.
 
     Args:
-        reach: Instead of values, probabilities and costs of reaching terminal, a label, an expression such as
-            'x=3 & !done', or states such as 5,7.
-        out: FILE.npz for the arrays v and policy, FILE.npy for the policy alone.
-        values: Folder for the values, in place of memory where that has no room; a solve that was ended goes on.
-        print_policy: Print the action of each state that the policy gets to; with --reach of the least cost, or where
-            the target may be missed, of the largest probability.
-        policy_rows: States of the policy that are printed, at most.
+        reach: Compute probabilities and costs of reaching terminal, a label, an expression such as 'x=3 & !done', or
+            states such as 5,7, instead of values.
+        out: Write the arrays v and policy to FILE.npz, or the policy alone to FILE.npy.
+        values: Keep the values in this folder if memory has no room for them; an interrupted solve resumes.
+        print_policy: Print the action of each state that the policy reaches; with --reach for the least cost, or for
+            the largest probability if the target may be missed.
+        policy_rows: Print at most this many states of the policy.
     """
     ranks, processes = building.ranks, building.processes
     with termination():
@@ -94,7 +94,7 @@ def solve(
         report("value of the uniform policy")
         try:
             uniform = solution_by(uniform_value, "uniform", "uniform policy, ")
-        except DivergenceError:  # it may go on for ever where the optimal policy ends
+        except DivergenceError:  # it may go on for ever although the optimal policy ends
             uniform = None
     if solution is None:  # a rank of MPI that is not the first
         return None
@@ -109,7 +109,7 @@ def solve(
         "compiling_seconds": compiling.seconds(),
         "gamma": solution.gamma,
         "horizon": solution.horizon,
-        **{name: getattr(chance, name) for name in ACTING},
+        **{name: getattr(chance, name) for name in CHANCE_OPTIONS},
         "tolerance": solving.tolerance,
         "dtype": solving.dtype,
         "processes": int(processes) if processes.isdigit() and processes != "1" else ranks,
@@ -203,7 +203,7 @@ def _how_it_was_answered(
     return {
         "seconds": time.perf_counter() - began,
         "compiling_seconds": compiling.seconds(),
-        **{each: getattr(chance, each) for each in ACTING},
+        **{each: getattr(chance, each) for each in CHANCE_OPTIONS},
         "tolerance": tolerance,
         "num_states": mdp.num_states,
         "num_actions": mdp.num_actions,
@@ -279,8 +279,8 @@ def save(path: Path, solution: "Solution") -> None:
 # Evaluate -------------------------------------------------------------------------------------------------------------
 
 
-POLICIES = ("optimal", "uniform", "worst")
-ACTING = ("sticky", "random", "lazy")
+NAMED_POLICIES = ("optimal", "uniform", "worst")
+CHANCE_OPTIONS = ("sticky", "random", "lazy")
 
 
 @dataclass(frozen=True)
@@ -309,7 +309,7 @@ def evaluate(
     building: Building,
     trust: Trust = False,
 ) -> Answer:
-    """Evaluate a policy exactly, and say where it stands: regret 0 is optimal, 1 is as bad as playing at random.
+    """Evaluate a policy exactly, and report its regret: 0 is optimal, 1 is as bad as playing at random.
 
     What a run has learnt is evaluated in the run's own setting (discount, horizon, chance) but for what options say.
     Only a policy that sees several frames and reaches more than 100,000 histories is estimated, from 2,000 episodes.
@@ -319,14 +319,14 @@ def evaluate(
     """
     from pharos.regret import ReferenceValues, regret
 
-    decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
+    decisions = None if policy in NAMED_POLICIES else read_policy(policy, trust=trust)
     source, of_command = "given", (gamma, horizon)
     if decisions is not None and decisions.task is not None:
-        own, names = decisions.task, ("gamma", "horizon", *ACTING)
+        own, names = decisions.task, ("gamma", "horizon", *CHANCE_OPTIONS)
         overridden = {name for name in names if context.get_parameter_source(name).name == "COMMANDLINE"}  # type: ignore[union-attr]
         gamma = gamma if "gamma" in overridden else own.gamma
         horizon = horizon if "horizon" in overridden else own.horizon_steps
-        chance = replace(chance, **{name: getattr(own.chance, name) for name in {*ACTING} - overridden})
+        chance = replace(chance, **{name: getattr(own.chance, name) for name in {*CHANCE_OPTIONS} - overridden})
         source = "the run's own" if not overridden else f"the run's own, but for {', '.join(sorted(overridden))}"
     goal = target
     if goal.is_imported and Path(policy).expanduser().is_dir():  # what was learnt on the environment of the table
@@ -337,7 +337,7 @@ def evaluate(
     if objective == "average":
         return averaged(goal, mdp, policy, decisions, tolerance, chance, source)
     with progress_line("evaluating"):
-        values = {name: _worth_of_named(mdp, name, tolerance) for name in POLICIES}
+        values = {name: _worth_of_named(mdp, name, tolerance) for name in NAMED_POLICIES}
         if decisions is None:
             worth = values[policy]
         elif _sees_frames(goal, decisions):
@@ -346,9 +346,9 @@ def evaluate(
             worth = _worth_of_given(goal, mdp, decisions, chance, tolerance)
     is_network = decisions is not None and "observation" in decisions.observer_options
     rounding = ", for the probabilities that its network computes in 32 bits" if is_network else ""
-    best, uniform, worst = (values[name].value for name in POLICIES)
+    best, uniform, worst = (values[name].value for name in NAMED_POLICIES)
     every = [*values.values(), worth]
-    reference = ReferenceValues(best, uniform, worst, max(values[name].error_bound for name in POLICIES))
+    reference = ReferenceValues(best, uniform, worst, max(values[name].error_bound for name in NAMED_POLICIES))
     lost, relative, against_worst = (
         regret(worth.value, reference, normalized_by=name) for name in (None, "uniform", "worst")
     )
@@ -367,7 +367,7 @@ def evaluate(
         "seconds": sum(each.seconds for each in every),
         "gamma": mdp.gamma,
         "horizon": mdp.horizon,
-        **{name: getattr(chance, name) for name in ACTING},
+        **{name: getattr(chance, name) for name in CHANCE_OPTIONS},
         "setting": source,
         "policy_dtype": "float32" if is_network else None,
     }
@@ -416,7 +416,7 @@ def averaged(
         "uniform_gain_at_start": uniform.gain._asdict(),
         "worst_gain_at_start": worst.gain._asdict(),
         "seconds": time.perf_counter() - began,
-        **{name: getattr(chance, name) for name in ACTING},
+        **{name: getattr(chance, name) for name in CHANCE_OPTIONS},
         "setting": source,
     }
     facts = [
@@ -445,7 +445,7 @@ def _worth(solution: "Solution") -> Worth:
 
 
 def _worth_of_named(mdp: "TabularMDP", name: str, tolerance: float) -> Worth:
-    """Worth of one of POLICIES; all but the best may go on for ever, where the total reward has no limit."""
+    """Worth of one of POLICIES; all but the best may go on for ever, if the total reward has no limit."""
     from pharos.policies import endless_value
 
     began = time.perf_counter()
@@ -491,7 +491,7 @@ def _sees_frames(goal: Target, decisions: Given) -> bool:
 
 
 def _worth_over_histories(goal: Target, mdp: "TabularMDP", decisions: Given, chance: "ChanceSetting") -> Worth:
-    """Value of a policy that sees several frames: exact where it reaches few histories, else estimated."""
+    """Value of a policy that sees several frames: exact if it reaches few histories, else estimated."""
     from pharos.training import Task, evaluate_agent
 
     began = time.perf_counter()
@@ -532,7 +532,7 @@ def read_policy(name: str, *, trust: bool = False) -> Given:
             return Given(agent, {}, task)
         return Given(agent, {"observation": task.observation, "observation_options": task.observation_options}, task)
     if path.suffix.lower() not in (".npy", ".npz"):
-        raise UnknownName("policy", name, [*POLICIES, "FILE.npy", "RUN_DIR"])
+        raise UnknownName("policy", name, [*NAMED_POLICIES, "FILE.npy", "RUN_DIR"])
     if not path.is_file():
         raise ParameterError(f"--policy {name}: no such file")
     try:

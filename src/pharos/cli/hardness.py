@@ -63,22 +63,23 @@ def hardness(
     """Measure how hard an instance is: visitation, estimation and planning complexity.
 
     Args:
-        measures: Names of measures, or all; those that are quick when not given.
-        gamma: Discount of values and gaps; 0.99 when not given, or what an imported file says.
+        measures: Names of measures, or all. Default: the quick ones.
+        gamma: Discount of values and gaps. Default: 0.99, or the discount of an imported file.
         horizon: Steps of an episode, for measures of episodes.
         tolerance: Largest error of the optimal values, in units of return.
-        restart: Whether terminal states lead back to the start.
+        restart: Let terminal states lead back to the start.
         budget: Seconds a measure may take before it gives a proven interval, or says that it is not available.
-        observation: What the agent sees, as of train: adds measures of what its network makes of it.
+        observation: Observation, as in `pharos train`. Adds measures of how its network represents states.
         option: Option of the observation, such as hide=row.
-        network: mlp128, mlp128x2, cnn16, nature; that of the agents when not given. Or file.py:function, your own.
-        initialisation: Of the network: pytorch (as DQN has; when not given), or sb3 (as PPO and A2C).
-        optimizer: Of the idealised learner: gradient (when not given), or adam, which rescales gradients.
-        landmarks: Approximate the kernel by so many; 0: never; beyond 4,096 when not given.
+        network: mlp128, mlp128x2, cnn16, nature, or your own file.py:function. Default: the agents' network.
+        initialisation: Initialisation of the network: pytorch (the default, as in DQN) or sb3 (as in PPO and A2C).
+        optimizer: Optimizer of the idealised learner: gradient (the default), or adam, which rescales gradients.
+        landmarks: Landmarks of the kernel approximation; 0 turns it off. Default: only above 4,096 observations.
         definitions: Show definitions and sources.
         latex: Print a LaTeX table.
-        values: Folder for values and bounds while they are computed, in place of memory; what was killed goes on.
-        fresh: Compute anew what is kept beside the state space.
+        values: Keep values and bounds in this folder while they are computed, in place of memory; an interrupted
+            computation resumes.
+        fresh: Compute measures anew, even if they are stored beside the state space.
     """
     from pharos.hardness import selected_measures
 
@@ -114,11 +115,11 @@ def hardness(
         shown = [name for name in names if measures is not None or steps is not None or name != "covering"]
         is_named = measures is not None
         table = _Table(target.title, _setting(mdp, steps, chance), shown, definitions, is_named)
-    with progress_line("measuring") as tell:
+    with progress_line("measuring") as progress:
 
         def show(result: "Result") -> None:
             if table is not None:
-                with tell.away():
+                with progress.away():
                     table.add(result)
 
         report = measure(
@@ -129,7 +130,7 @@ def hardness(
             restart=restart,
             budget=budget,
             keep=not fresh,
-            progress=lambda what, line: tell(f"{what}  {line}".rstrip()),
+            progress=lambda what, line: progress(f"{what}  {line}".rstrip()),
             on_result=show,
             representation=representation,
             schedule=None if representation is None else Schedule(optimizer=optimizer or "gradient"),
@@ -260,23 +261,23 @@ def predict(
     """Predict the regret of an agent behind each observation, before anything is trained.
 
     Args:
-        observation: What the agent sees, as of train, such as hash,bits=64; again for another; vector when not given.
-        network: mlp64, mlp256x3, cnn16, ..., or file.py:function, your own; again for another one. That of the agent
-            when not given.
+        observation: Observation, as in `pharos train`: hash,bits=64. Repeatable. Default: vector.
+        network: mlp64, mlp256x3, cnn16, ..., or your own file.py:function. Repeatable. Default: the agent's network.
         agent: dqn or ppo.
-        steps: Steps that it would learn from.
-        pilot: Train one seed for this share of the steps, too: 0.1, 0.25 or 0.5. Values are of both together.
-        preset: Those of the published cells, for which the interval is calibrated; --set goes before them.
-        horizon: Steps of an episode; the environment's time limit when not given.
-        landmarks: Approximate the kernel by so many; 0: never; beyond 2,048 if not given.
-        plot: Draw the bars into a PNG, PDF or SVG.
+        steps: Training steps to predict for.
+        pilot: Also train one seed for this share of the steps: 0.1, 0.25 or 0.5. Predictions then use both.
+        preset: Use the hyperparameters of the published cells, for which the interval is calibrated; --set overrides
+            them.
+        horizon: Steps of an episode. Default: the environment's time limit.
+        landmarks: Landmarks of the kernel approximation; 0 turns it off. Default: only above 2,048 observations.
+        plot: Draw the bars into a PNG, PDF or SVG file.
     """
     env = target.found_environment()
     from pharos.prediction import predict as foretell
 
     if preset not in (None, "common"):
         raise UnknownName("set of hyperparameters", str(preset), ("common",))
-    with progress_line("predicting") as tell:
+    with progress_line("predicting") as report:
         prediction = foretell(
             env,
             [_observation(text) for text in observation or ["vector"]],
@@ -284,7 +285,7 @@ def predict(
             landmarks=landmarks,
             common=preset is not None,
             pilot=pilot,
-            progress=tell,
+            progress=report,
             **{name: getattr(training, name) for name in ("agent", "steps", "hyperparameters", "chance")},
             horizon=horizon or "limit",
         )

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 app = Commands(help="Bring an MDP from elsewhere into a folder.", no_args_is_help=True)
 
 Out = Annotated[Path, typer.Option(help="Folder for the MDP.")]
-Episode = Annotated[int | None, typer.Option(min=1, help="Steps of an episode; without end when not given.")]
+Episode = Annotated[int | None, typer.Option(min=1, help="Steps of an episode. Default: no limit.")]
 
 
 @app.command("bridge")
@@ -38,7 +38,7 @@ def bridge(file: Path, *, out: Out, horizon: Annotated[int | None, typer.Option(
 
     Args:
         file: npz of the BRIDGE dataset.
-        horizon: Steps of an episode; what the name says when not given.
+        horizon: Steps of an episode. Default: as in the name of the file.
     """
     from pharos import importers
 
@@ -53,10 +53,10 @@ def minigrid(name: str, *, out: Out, seed: int = 0, horizon: Count = 100, rememb
     """Enumerate an environment of MiniGrid, by playing it from every state.
 
     Args:
-        name: Such as MiniGrid-KeyCorridorS3R1-v0.
-        seed: Of the layout.
+        name: Name of the environment, such as MiniGrid-KeyCorridorS3R1-v0.
+        seed: Seed of the layout.
         horizon: Steps of an episode.
-        remember_carried: Objects know whether they were ever carried, as in BRIDGE.
+        remember_carried: Let objects know whether they were ever carried, as in BRIDGE.
     """
     from pharos import importers
 
@@ -82,10 +82,10 @@ def gymnasium(
     """Import the table P of an environment of Gymnasium; training takes its time limit.
 
     Args:
-        name: Such as Taxi-v4: an environment with a table P.
-        option: Of the environment, such as is_slippery=false.
+        name: Name of an environment with a table P, such as Taxi-v4.
+        option: Option of the environment, such as is_slippery=false.
         gamma: Discount of the MDP.
-        initial: The start, or several that are equally likely; what the environment says when not given.
+        initial: The start, or several that are equally likely. Default: the environment's starts.
         check: Compare sampled steps with the table.
     """
     import gymnasium as package
@@ -136,15 +136,15 @@ def env(
 
     Args:
         target: gymnasium:ID, gymnax:ID, pgx:ID, module:factory, file.py:factory, or jax:file.py:factory.
-        option: Of the environment or the factory, such as is_slippery=false.
-        seed: Of one reset; else all starts are imported.
+        option: Option of the environment or the factory, such as is_slippery=false.
+        seed: Import the start of the reset with this seed. Default: all starts.
         key: module:function or file.py:function (environment) -> equal for equal states; pairs are checked.
-        ignore: FIELD,FIELD: no part of the state, such as counters of steps.
+        ignore: Leave these fields out of the state, such as counters of steps: FIELD,FIELD.
         reward: module:function or file.py:function (reward) -> number.
-        weights: 1,0.5 of a vector of rewards.
-        max_states: More are an error.
-        max_outcomes: Of the draws of one step.
-        workers: Processes that share the work.
+        weights: Weights of a vector of rewards, such as 1,0.5.
+        max_states: Fail beyond this many states.
+        max_outcomes: Fail if the draws of one step have more outcomes than these.
+        workers: Number of processes that share the work.
         check: Play the environment and compare.
     """
     from pharos import importers
@@ -200,16 +200,16 @@ def atari(
         horizon: Steps of an episode.
         frame_skip: Frames of a step, during which the action is held.
         noops: Frames without an action before the first step.
-        all_actions: All 18 actions, in place of those that the game uses.
-        life_loss_ends: The loss of a life ends the episode.
-        settle: Steps without an action after the last one, whose rewards count; 200 in skiing, else 0.
-        raw: Keep states that cannot be told apart.
+        all_actions: Take all 18 actions, in place of the actions that the game uses.
+        life_loss_ends: End the episode when a life is lost.
+        settle: Steps without an action after the last one, whose rewards count. Default: 200 in skiing, else 0.
+        raw: Keep states that cannot be distinguished.
         max_states: Refuse more states than these.
         workers: Processes that share the work; the result is the same.
     """
     from pharos import importers
 
-    with progress_line("importing") as tell, termination():
+    with progress_line("importing") as report, termination():
         mdp, recording = importers.atari(
             game,
             horizon=horizon,
@@ -222,7 +222,7 @@ def atari(
             max_states=max_states,
             workers=workers,
             folder=importers.building_folder(out),
-            progress=tell,
+            progress=report,
         )
         return _recorded_answer(game, mdp, recording, out)
 
@@ -245,20 +245,20 @@ def procgen(
     """Enumerate a level of a Procgen game over its first steps. The same command resumes an interrupted import.
 
     Args:
-        game: Such as maze.
+        game: Name of the game, such as maze.
         level: Seed of the level.
         mode: easy, hard, extreme, memory or exploration.
         horizon: Steps of an episode.
-        frame_skip: Steps of Procgen in a step, during which the action is held; BRIDGE's when not given.
+        frame_skip: Steps of Procgen in a step, during which the action is held. Default: as in BRIDGE.
         noops: Steps of Procgen without an action before the first step.
-        all_actions: All 15 actions, in place of those that BRIDGE takes.
-        raw: Keep states that cannot be told apart.
+        all_actions: Take all 15 actions, in place of the actions that BRIDGE takes.
+        raw: Keep states that cannot be distinguished.
         max_states: Refuse more states than these.
         workers: Processes that share the work; the result is the same.
     """
     from pharos import importers
 
-    with progress_line("importing") as tell, termination():
+    with progress_line("importing") as report, termination():
         mdp, recording = importers.procgen(
             game,
             level=level,
@@ -271,7 +271,7 @@ def procgen(
             max_states=max_states,
             workers=workers,
             folder=importers.building_folder(out),
-            progress=tell,
+            progress=report,
         )
         return _recorded_answer(f"{game}, level {level}", mdp, recording, out)
 
@@ -293,10 +293,11 @@ def prism(
 
     Args:
         file: A model: .prism, .nm, .pm, .jani or .drn; built by Storm.
-        constants: Undefined ones, such as N=3,K=2.
-        reward: Reward structure; the only one when not given, without --target.
-        target: Label or expression that ends the episode; pays 1 where there is no --reward.
-        property: Such as 'Pmax=? [F "goal" & !x=3]' or 'Rmin{"steps"}=? [F "goal"]', or its name in a JANI file.
+        constants: Values of undefined constants, such as N=3,K=2.
+        reward: Reward structure. Default: the only one, if there is no --target.
+        target: Label or expression that ends the episode; pays 1 if there is no --reward.
+        property: Property to compute, such as 'Pmax=? [F "goal" & !x=3]' or 'Rmin{"steps"}=? [F "goal"]', or its name
+            in a JANI file.
         gamma: Discount of the MDP.
         tolerance: Largest error of the answer to a property.
     """
@@ -405,7 +406,7 @@ def export(
 
     Args:
         format: bridge (npz), drn (Storm) or gym (P table as JSON).
-        out: FILE.npz, FILE.drn or FILE.json.
+        out: Write to FILE.npz, FILE.drn or FILE.json.
     """
     if format not in ENDINGS:
         raise UnknownName("format", format, ENDINGS)

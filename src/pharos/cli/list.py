@@ -10,9 +10,9 @@ import typer
 
 from pharos.cli.answers import Answer, console, print_table
 from pharos.cli.options import complete_target
-from pharos.environments import class_called, classes, declared_parameters, imported, named_instances
+from pharos.environments import class_called, classes, declared_parameters, import_class, named_instances
 from pharos.errors import UnknownName
-from pharos.system.records import meanings
+from pharos.system.records import docstring_entries
 
 if TYPE_CHECKING:
     from pharos.environments import Environment
@@ -23,10 +23,10 @@ def list_(
         str | None, typer.Argument(metavar="[ENVIRONMENT]", show_default=False, autocompletion=complete_target)
     ] = None,
 ) -> Answer:
-    """Show the environments with their parameters and instances; of one of them its rules and parameters in full.
+    """Show the environments with their parameters and instances, or the rules and parameters of one in full.
 
     Args:
-        name: One class, or file.py:Class: its rules and parameters.
+        name: Show the rules and parameters of this class, or of file.py:Class.
     """
     if name is None:
         described = [_overview(name, cls) for name, cls in classes().items()]
@@ -44,7 +44,7 @@ def _class_called(name: str) -> type["Environment"]:
     if name in named_instances():
         return classes()[named_instances()[name][0]]
     if ":" in name:
-        return imported(name)
+        return import_class(name)
     raise UnknownName("environment", name, classes())
 
 
@@ -60,7 +60,7 @@ def _overview(name: str, cls: type["Environment"]) -> dict[str, Any]:
 
 def _parameters(cls: type["Environment"]) -> dict[str, dict[str, Any]]:
     """Name -> default, range and meaning of a parameter: the line under *Attributes* in the docstring of the class."""
-    declared, texts = declared_parameters(cls), meanings(cls)
+    declared, texts = declared_parameters(cls), docstring_entries(cls)
     return {
         field.name: {
             "default": _default(field),

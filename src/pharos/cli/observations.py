@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 MOST_SOLVED = 5_000_000
 
 # What is counted when nothing is asked for
-COUNTED: tuple[tuple[str, dict[str, Any]], ...] = (
+COUNTED_OBSERVATIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("vector", {}),
     ("one_hot", {}),
     ("index", {}),
@@ -45,13 +45,13 @@ def observations(
     """Count the states that share their observation with another state, and bound what that costs.
 
     Args:
-        observation: This one alone, or your own; may be given several times.
-        option: Option of the observations that were named.
+        observation: Count only for this observation, or for your own. Repeatable.
+        option: Option of the observations that you name.
         budget: Seconds to bound what one observation costs; 0: do not.
     """
     if option and not observation:
         raise ParameterError("--option goes with --observation NAME")
-    choices = tuple((name, dict(option)) for name in observation) if observation else COUNTED
+    choices = tuple((name, dict(option)) for name in observation) if observation else COUNTED_OBSERVATIONS
     space = target.space(building)
     env = space.environment
     if env is None:

@@ -56,7 +56,7 @@ Count = Annotated[int, typer.Option(min=1)]
 Seed = Annotated[int, typer.Option(min=0)]
 Seconds = Annotated[float, typer.Option(min=0)]
 Discount = Annotated[float, typer.Option(min=0, max=1)]
-Gamma = Annotated[float | None, typer.Option(min=0, max=1, help="Discount; 0.99 when not given, or 1 with a horizon.")]
+Gamma = Annotated[float | None, typer.Option(min=0, max=1, help="Discount. Default: 0.99, or 1 with a horizon.")]
 Objective = Annotated[
     Literal["discounted", "total", "average"] | None,
     typer.Option(
@@ -64,9 +64,7 @@ Objective = Annotated[
         "run. By --gamma if not given."
     ),
 ]
-Horizon = Annotated[
-    int | None, typer.Option(min=1, help="Steps after which an episode ends; without end when not given.")
-]
+Horizon = Annotated[int | None, typer.Option(min=1, help="Steps after which an episode ends. Default: no limit.")]
 Tolerance = Annotated[float, typer.Option(help="Largest error of a value, in units of return.")]
 Chance = Annotated[ChanceSetting, "sticky random lazy"]
 Trust = Annotated[bool, typer.Option(help="Execute code that received files name: classes, observations and agents.")]
@@ -117,7 +115,7 @@ _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "
 
 
 def parse_size(text: str | None, option: str = "--memory") -> int | None:
-    """`2GiB` -> 2147483648, `500MB` -> 500000000, `4096` -> 4096; ParameterError where it is no size."""
+    """`2GiB` -> 2147483648, `500MB` -> 500000000, `4096` -> 4096; ParameterError if it is no size."""
     if text is None:
         return None
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([KMGT]I?)?B?\s*", text.upper())
@@ -146,7 +144,8 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def total_of(mdp: "TabularMDP", gamma: float | None, horizon: int | None, objective: str | None) -> "TabularMDP":
-    """The MDP, with gamma 1 and no horizon if the objective is the total reward, or that of a step in the long run."""
+    """The MDP; with gamma 1 and no horizon if the objective is the total reward, or the reward of a step in the long
+    run."""
     if objective not in ("total", "average"):
         return mdp
     if objective == "average" and (gamma is not None or horizon is not None):
@@ -159,7 +158,7 @@ def total_of(mdp: "TabularMDP", gamma: float | None, horizon: int | None, object
 
 
 def discount(gamma: float | None, horizon: int | None) -> float:
-    """The discount that `--gamma` names: when not given 0.99, or 1 with a horizon."""
+    """The discount that `--gamma` names; 0.99 by default, or 1 with a horizon."""
     if gamma is not None:
         return gamma
     return 0.99 if horizon is None else 1.0
@@ -203,7 +202,7 @@ class Building:
 
     Attributes:
         memory: memory to use at most, such as 2GiB or 500MB.
-        workers: threads; all processors when not given.
+        workers: threads (default: as many as processors).
         max_states: stop with an error beyond this many states.
         ranks: processes, as `build` takes them.
     """
@@ -235,7 +234,7 @@ class SharedBuilding(Building):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Keywords of `build`; the memory is that of one process."""
+        """Keywords of `build`; the memory is meant for one process."""
         size = parse_size(self.memory)
         if size is not None and self.processes.isdigit():
             size //= int(self.processes)
@@ -336,7 +335,7 @@ class Target:
         return space
 
     def found_environment(self) -> "Environment":
-        """The environment, also of a folder: the one it was built from, or that of the imported MDP.
+        """The environment, also of a folder: the one it was built from, or of the imported MDP.
 
         Raises:
             ParameterError: a file, or the folder of a class that pharos does not know.

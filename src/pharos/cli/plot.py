@@ -12,7 +12,7 @@ import typer
 
 from pharos.cli.answers import Answer, complain, print_json, progress_line
 from pharos.cli.command import Commands
-from pharos.cli.evaluate import POLICIES, read_policy, solution_of
+from pharos.cli.evaluate import NAMED_POLICIES, read_policy, solution_of
 from pharos.cli.options import (
     Building,
     Chance,
@@ -67,7 +67,7 @@ def value(
 
     Args:
         policy: optimal, uniform, worst, FILE.npy, or the folder of a finished run.
-        fix: Draw the slice in which this variable has this value; start: all others as where episodes start.
+        fix: Draw the slice in which this variable has this value; start: all others as at the start of episodes.
         over: Two variables to draw over: down, and to the right.
     """
     down, comma, right = over.partition(",")
@@ -75,12 +75,12 @@ def value(
         raise ParameterError(f"--over is {over!r}; expected two variables, such as row,column")
     rest: Literal["start"] | None = "start" if "start" in (fix or ()) else None
     fixed = parse_parameters([text for text in fix or () if text != "start"])
-    decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
+    decisions = None if policy in NAMED_POLICIES else read_policy(policy, trust=trust)
     mdp = target.mdp(gamma=gamma, horizon=horizon, chance=chance)
     from pharos import plots
 
     solution = solution_of(mdp, policy, decisions, 1e-6)
-    title = f"{target.title}, {policy if policy in POLICIES else Path(policy).name}"
+    title = f"{target.title}, {policy if policy in NAMED_POLICIES else Path(policy).name}"
     if chance:
         title += f", {chance.in_words()}"
     facts = {"policy": policy, "value_at_start": solution.value_at_start, "gamma": mdp.gamma, "horizon": mdp.horizon}
@@ -113,7 +113,7 @@ def plane(
     """Draw instances by visitation and estimation complexity; a diameter known as an interval is a bar.
 
     Args:
-        visitation, estimation: A measure.
+        visitation, estimation: Name of a measure.
         budget: Seconds for each measure.
     """
     from pharos import hardness, plots
@@ -137,13 +137,13 @@ def policies(
     gamma: Discount = 0.99,
     trust: Trust = False,
 ) -> Answer:
-    """Draw an episode of what runs have learnt on one task, beside the best policy and a random one, as a GIF.
+    """Draw an episode of what runs have learnt on one task, beside the optimal policy and a random one, as a GIF.
 
     Args:
-        out: FILE.gif.
-        steps: At most.
-        seed: Of chance and of random actions.
-        gamma: Discount of the best policy.
+        out: Write to FILE.gif.
+        steps: Draw at most this many steps.
+        seed: Seed of chance and of random actions.
+        gamma: Discount of the optimal policy.
     """
     import numpy as np
 
@@ -195,13 +195,13 @@ def explore(
     trust: Trust = False,
     json: bool = False,
 ) -> None:
-    """Show states, values, gaps, paths and maps on a page in the browser; TARGET may be the folder of a run, too.
+    """Show states, values, gaps, paths and maps on a page in the browser. TARGET may also be the folder of a run.
 
     Args:
         policy: FILE.npy, or the folder of a finished run: shown beside optimal and uniform.
-        gamma: Discount; 0.99 when not given. Values have no horizon.
-        out: FILE.html: one page with all its data, for up to 10,000 states.
-        port: Of the local server; 0: any free one.
+        gamma: Discount. Default: 0.99. Values have no horizon.
+        out: Write one page with all its data to FILE.html, for up to 10,000 states.
+        port: Port of the local server; 0: any free one.
         browser: Open the page in the browser.
     """
     from pharos.explorer import Explorer, write

@@ -52,11 +52,11 @@ def _state(row: dict[str, Any]) -> str:
 
 
 def readable_policy(mdp: "TabularMDP", policy: "np.ndarray", most: int, title: str = "policy") -> PolicyRows:
-    """The actions of a policy where it may get to from the start, terminal states left out; at most so many rows.
+    """The actions of a policy in states that it may reach, without terminal states; at most so many rows.
 
     Args:
-        policy: (S,) actions, or (S, A + 1) by the previous action. With a horizon, it is that of the first step, and
-            states are those that any actions may get to.
+        policy: (S,) actions, or (S, A + 1) by the previous action. With a horizon, it is the policy of the first step,
+            and rows are states that any actions may reach.
     """
     import numpy as np
 
@@ -96,20 +96,20 @@ def _visited(mdp: "TabularMDP", policy: "np.ndarray") -> "np.ndarray":
     terminal = np.append(np.asarray(mdp.terminal), True)
     is_new = np.ones((mdp.num_states + 1) * (width if mdp.is_sticky else 1), np.bool_)
 
-    def place(states: "np.ndarray", previous: "np.ndarray") -> "np.ndarray":
+    def index_of(states: "np.ndarray", previous: "np.ndarray") -> "np.ndarray":
         return states * width + previous if mdp.is_sticky else states
 
     frontier = np.stack([mdp.starts, np.full(len(mdp.starts), none)], axis=1)
     levels = []
     while True:
         frontier = frontier[~terminal[frontier[:, 0]]]
-        places = place(frontier[:, 0], frontier[:, 1])
-        _, first = np.unique(places, return_index=True)
-        first = np.sort(first[is_new[places[first]]])
+        indices = index_of(frontier[:, 0], frontier[:, 1])
+        _, first = np.unique(indices, return_index=True)
+        first = np.sort(first[is_new[indices[first]]])
         frontier = frontier[first]
         if not len(frontier):
             break
-        is_new[places[first]] = False
+        is_new[indices[first]] = False
         levels.append(frontier)
         states, previous = frontier.T
         actions = policy[states] if policy.ndim == 1 else policy[states, previous]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pharos.environments import Environment, State
 
 
-POLICIES = ("auto", "optimal", "uniform")
+PLAYED_POLICIES = ("auto", "optimal", "uniform")
 AUTOMATIC_STATES = 20_000_000  # "auto" solves what is not larger
 
 
@@ -48,13 +48,13 @@ def render(
     Args:
         observation: How to draw: human, text, simple_image, complex_image, or your own.
         option: Option of the observation, such as size=natural.
-        out: FILE.png, FILE.gif or FILE.txt; the terminal when not given.
-        state: Number of a state, or its values 2,3,1; the start when not given.
+        out: Write to FILE.png, FILE.gif or FILE.txt. Default: draw in the terminal.
+        state: Number of a state, or its values 2,3,1. Default: the start.
         steps: Play this many steps from the state.
-        policy: optimal, uniform, or auto: optimal where that is quick to find.
+        policy: optimal, uniform, or auto: optimal if that is quick to find.
         gamma: Discount of the optimal policy.
-        seed: Of the uniform policy, and of chance in the rules.
-        fps: Frames a second of a GIF.
+        seed: Seed of the uniform policy, and of chance in the rules.
+        fps: Frames per second of a GIF.
     """
     from pharos import drawing, observations
     from pharos.system import storage
@@ -62,8 +62,8 @@ def render(
     suffix = out.suffix.lower() if out else ""
     if observation != "text" and observation not in (renderers := observations.renderers()):
         raise UnknownName("observation to render", observation, [*renderers, "text"])
-    if policy not in POLICIES:
-        raise UnknownName("policy", policy, POLICIES)
+    if policy not in PLAYED_POLICIES:
+        raise UnknownName("policy", policy, PLAYED_POLICIES)
     env = target.found_environment()
     start = find_state(target, env, state)
     if steps is None:
@@ -116,7 +116,7 @@ def _captions(env: "Environment", played: Sequence[tuple]) -> list[str]:
 
 
 def find_state(target: Target, env: "Environment", text: str | None) -> "State":
-    """The state that `--state` names: its number in the state space, or its values; the start state when not given."""
+    """The state that `--state` names: its number in the state space, or its values; by default the start state."""
     from pharos.drawing import check_state
 
     if text is None:
@@ -134,7 +134,7 @@ def find_state(target: Target, env: "Environment", text: str | None) -> "State":
 def find_policy(
     target: Target, env: "Environment", name: str, gamma: float, seed: int
 ) -> tuple[str, Callable[["State"], int]]:
-    """The name and the function of a policy; "auto" is optimal where the state space is small, else uniform."""
+    """The name and the function of a policy; "auto" is optimal if the state space is small, else uniform."""
     if name == "auto":
         try:
             return "optimal", _optimal(target, gamma, AUTOMATIC_STATES)
@@ -162,15 +162,15 @@ def _optimal(target: Target, gamma: float, max_states: int | None) -> Callable[[
 
 ESCAPES = {"[A": "up", "[B": "down", "[C": "right", "[D": "left", "OA": "up", "OB": "down", "OC": "right", "OD": "left"}
 SIGNS = {"up": "↑", "left": "←", "down": "↓", "right": "→", "space": "space"}
-QUIT, AGAIN, BACK = "q", "r", "u"
+QUIT, NEW_GAME, UNDO = "q", "r", "u"
 
 
 def play(target: Target, *, state: str | None = None, seed: Seed | None = None) -> Answer:
     """Play with the keyboard, in the terminal; one key is one step.
 
     Args:
-        state: Number of a state, or its values 2,3,1; the start when not given.
-        seed: Of chance in the rules; another game each time without it.
+        state: Number of a state, or its values 2,3,1. Default: the start.
+        seed: Seed of chance in the rules. Default: another game each time.
     """
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise PharosError("play needs a terminal for the keyboard and the picture; it cannot run in a pipe")
@@ -216,9 +216,9 @@ class Game:
 
     def press(self, key: str) -> None:
         """Execute the command of a key: an action, AGAIN (restart), BACK (undo one step); other keys do nothing."""
-        if key == AGAIN:
+        if key == NEW_GAME:
             self.state, self.history = self.start, []
-        elif key == BACK and self.history:
+        elif key == UNDO and self.history:
             self.state = self.history.pop()[0]
         elif key in self.keys and not self.over:
             action = self.keys[key]
@@ -247,7 +247,7 @@ def _picture(game: Game) -> "RenderableType":
     for key, action in game.keys.items():
         names.setdefault(action, []).append(SIGNS.get(key, key))
     does = [f"{'/'.join(sorted(shown, key=len))} {game.env.actions[action]}" for action, shown in names.items()]
-    help_line = Text("   ".join([*does, f"{BACK} undo", f"{AGAIN} restart", f"{QUIT} quit"]), style="dim")
+    help_line = Text("   ".join([*does, f"{UNDO} undo", f"{NEW_GAME} restart", f"{QUIT} quit"]), style="dim")
     return Group(line, Text(), colored_text(game.env, game.state), Text(), help_line)
 
 

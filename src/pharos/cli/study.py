@@ -34,8 +34,8 @@ class Study:
 
     Attributes:
         spec: A YAML file, a study's folder, or a preset: quick, small, classes, paper, hardness-dev, hardness-sealed.
-        out: where results are; studies/NAME when not given.
-        environments: YAML: a list of environments, for studies that have none of their own.
+        out: folder of the results (default: studies/NAME).
+        environments: YAML file with a list of environments, for studies that have none.
     """
 
     spec: Annotated[str, typer.Argument(metavar="SPEC")]
@@ -110,11 +110,11 @@ def run(
     """Execute the runs that are missing. Interrupt it at any time: the same command goes on from there.
 
     Args:
-        on: Where the runs are executed.
-        shards: With --on slurm: jobs of the array; 8 when not given.
+        on: Execute the runs here, on slurm or on ray.
+        shards: With --on slurm: jobs of the array. Default: 8.
         slurm: With --on slurm: timeout_min=600, slurm_partition=cpu, ...
-        address: With --on ray: of the cluster; one is started when not given.
-        log: Write curves there as runs finish; see `study log`.
+        address: With --on ray: address of the cluster. Default: start one.
+        log: Write curves as runs finish; see `study log`.
     """
     from pharos import study
 
@@ -122,22 +122,22 @@ def run(
         raise UnknownName("place to run on", on, ("local", "slurm", "ray"))
     if log is not None and on == "slurm":
         raise ParameterError("--log goes with --on local or ray; write those of a cluster by `pharos study log`")
-    opened, place = source.opened()
+    opened, directory = source.opened()
     options = vars(execution)
     if on == "slurm":
-        jobs = study.submit(opened, place, shards=shards or 8, parameters=slurm, **options)
+        jobs = study.submit(opened, directory, shards=shards or 8, parameters=slurm, **options)
         names = [str(job.job_id) for job in jobs]
         submitted = f"submitted {len(jobs)} jobs: {', '.join(names)}; `pharos study status` says how far they are"
         return Answer(
             {"jobs": names}, submitted if jobs else "nothing is missing; `pharos study report` shows the results"
         )
-    logs = None if log is None else study.RunLog(opened, place, log)
-    with _progress(logs) as tell, termination():
+    logs = None if log is None else study.RunLog(opened, directory, log)
+    with _progress(logs) as report, termination():
         if on == "ray":
-            end = study.run_on_ray(opened, place, address=address, progress=tell, **options)
+            end = study.run_on_ray(opened, directory, address=address, progress=report, **options)
         else:
             try:
-                end = study.run(opened, place, foretold=_say, progress=tell, **options)
+                end = study.run(opened, directory, foretold=_say, progress=report, **options)
             except AllRunsFailed as error:  # the answer says of each why
                 end = error.outcome
     if logs is not None:
@@ -168,15 +168,15 @@ def report(
     """Make the figures and tables of the finished runs: one HTML file, PNG, PDF, CSV and LaTeX.
 
     Args:
-        to: Where to write; DIR/report of the study when not given.
-        predictions: Of `pharos study predict`: what came true of them; again for a study predicted in parts.
+        to: Write to this folder. Default: DIR/report of the study.
+        predictions: Compare with this file of `pharos study predict`. Repeatable, for a study predicted in parts.
     """
     from pharos import study
 
-    foretold = [study.read_predictions(each) for each in predictions or ()]
-    with progress_line("report") as tell:
-        opened, place = source.opened()
-        written = study.report(opened, place, out=to, progress=tell, predictions=foretold)
+    predicted = [study.read_predictions(each) for each in predictions or ()]
+    with progress_line("report") as report:
+        opened, directory = source.opened()
+        written = study.report(opened, directory, out=to, progress=report, predictions=predicted)
 
     def text() -> None:
         for note in written.notes:
@@ -198,21 +198,25 @@ def log(
     """Write the curves of finished runs, exact values and regret, for TensorBoard or Weights & Biases.
 
     Args:
-        to: Where the curves are looked at.
-        project: Of Weights & Biases; the name of the study when not given.
-        offline: Weights & Biases writes files for `wandb sync`, and sends nothing.
+        to: Program that shows the curves.
+        project: Project of Weights & Biases. Default: the name of the study.
+        offline: Write files for `wandb sync`, and send nothing to Weights & Biases.
     """
     from pharos import study
 
     if to == "tensorboard" and (project is not None or offline):
         raise ParameterError("--project and --offline are of Weights & Biases; expected them with --to wandb")
-    with progress_line("log") as tell:
-        opened, place = source.opened()
-        number = study.RunLog(opened, place, to, project=project, offline=offline).update(tell)
-    how = f"tensorboard --logdir {place / to}" if to == "tensorboard" else f"wandb sync {place / to}/offline-run-*"
+    with progress_line("log") as report:
+        opened, directory = source.opened()
+        number = study.RunLog(opened, directory, to, project=project, offline=offline).update(report)
+    how = (
+        f"tensorboard --logdir {directory / to}"
+        if to == "tensorboard"
+        else f"wandb sync {directory / to}/offline-run-*"
+    )
     remedy = f"; `{how}` {'shows' if to == 'tensorboard' else 'sends'} them" if to == "tensorboard" or offline else ""
-    answer = {"to": to, "folder": str(place / to), "added": number}
-    return Answer(answer, f"{place / to}: {pluralize(number, 'run')} added{remedy}")
+    answer = {"to": to, "folder": str(directory / to), "added": number}
+    return Answer(answer, f"{directory / to}: {pluralize(number, 'run')} added{remedy}")
 
 
 @app.command("predict")
@@ -228,25 +232,25 @@ def predict(
     """Predict the regret of each cell from what its network makes of its states, before any run; hashed and dated.
 
     Args:
-        out: The Parquet file to write.
-        block: Of these blocks alone, from 1; again for another one.
-        agent: Of this agent alone; again for another.
-        observation: Of this observation alone; again for another one.
-        primary: Only the predictor that stands for each agent, in a small part of the time.
+        out: Write to this Parquet file.
+        block: Predict only this block, counted from 1. Repeatable.
+        agent: Predict only this agent. Repeatable.
+        observation: Predict only this observation. Repeatable.
+        primary: Compute only the predictor that stands for each agent, in a small part of the time.
     """
     from pharos import study
     from pharos.agents import primary_predictors
 
-    opened, place = source.opened()
-    with progress_line("predicting", logged=True) as tell:
+    opened, directory = source.opened()
+    with progress_line("predicting", logged=True) as report:
         predictions = study.predict(
             opened,
-            place,
+            directory,
             blocks=block or None,
             agents=agent or None,
             observations=observation or None,
             primary=primary,
-            progress=tell,
+            progress=report,
         )
     record = study.write_predictions(opened, predictions, out)
     columns = predictions.columns.intersection(["kernel_regret", *primary_predictors().values()])
@@ -267,7 +271,7 @@ def pack(source: Results, *, to: Annotated[Path, "FILE"]) -> Answer:
     """Put the finished runs into one Parquet file, to keep, publish or carry; without what the agents learnt.
 
     Args:
-        to: The Parquet file to write.
+        to: Write to this Parquet file.
     """
     from pharos import study
 
@@ -286,9 +290,9 @@ def unpack(
     """Put packed runs into a study's folder; `pharos study run FOLDER` goes on with those that are missing.
 
     Args:
-        file: Written by `pharos study pack`.
-        into: Another study, which gets those of the runs that it has as well.
-        out: Where results are; studies/NAME when not given.
+        file: File from `pharos study pack`.
+        into: Put the runs that another study has as well into that study.
+        out: Folder of the results. Default: studies/NAME.
     """
     from pharos import study
 
@@ -320,7 +324,7 @@ def _progress(logs: "RunLog | None") -> "Iterator[Callable[[Status], None]]":
     with progress_bar("runs", 1) as show:
         latest = time.monotonic()
 
-        def tell(status: "Status") -> None:
+        def report(status: "Status") -> None:
             nonlocal latest
             show(status.finished + status.failed, str(status), status.total)
             if time.monotonic() - latest > LINE_SECONDS:
@@ -330,7 +334,7 @@ def _progress(logs: "RunLog | None") -> "Iterator[Callable[[Status], None]]":
                     logs.update()
                 latest = time.monotonic()
 
-        yield tell
+        yield report
 
 
 def _steps(study: "Specification") -> int:

@@ -49,16 +49,16 @@ def train(
     """Train an agent and measure the exact regret of its policy on the way.
 
     Args:
-        seed: Decides everything random.
-        seeds: A run for each, such as 0:64; --out has a folder for each.
-        device: Of the batched engine: cpu or cuda.
-        out: Folder for results; an unfinished run there is resumed.
-        table: YAML of hyperparameters, such as `pharos tune` writes.
-        workers: Processes for many seeds; as many as processors when not given.
-        gamma: Discount of values and returns; 1 when not given, with a horizon.
-        horizon: Steps of an episode; the environment's time limit when not given.
-        endless: Discounted values without a horizon, at --gamma (0.99).
-        objective: total: gamma 1 and no horizon; average: measure the reward of a step in the long run, too.
+        seed: Seed of everything random.
+        seeds: Train a run for each of these seeds, such as 0:64; --out has a folder for each.
+        device: Device of the batched engine: cpu or cuda.
+        out: Write results to this folder; an unfinished run in it resumes.
+        table: YAML file of hyperparameters, such as `pharos tune` writes.
+        workers: Number of processes for many seeds. Default: as many as processors.
+        gamma: Discount of values and returns. Default: 1, with a horizon.
+        horizon: Steps of an episode. Default: the environment's time limit.
+        endless: Use discounted values without a horizon, at --gamma (0.99).
+        objective: total: gamma 1 and no horizon; average: also measure the reward of a step in the long run.
         tensorboard: Write TensorBoard logs into --out.
     """
     env = target.found_environment()
@@ -146,7 +146,7 @@ def _is_uniform_optimal(result: Mapping[str, Any]) -> bool:
 
 
 def _quartiles(values: list[float | None]) -> list[float] | None:
-    """Lower quartile, median, upper quartile; None where there is no number."""
+    """Lower quartile, median, upper quartile; None if there is no number."""
     import numpy as np
 
     numbers = [value for value in values if value is not None and math.isfinite(value)]
@@ -181,7 +181,7 @@ def _telling_of_many(show: Callable[[int, str], None]) -> "Callable[[TrainingPro
     """Return the callback of `train_many`, which shows the mean regret of the policies, and the pace."""
     began: list[tuple[float, int]] = []
 
-    def tell(now: "TrainingProgress") -> None:
+    def report(now: "TrainingProgress") -> None:
         if not began:
             began.append((time.perf_counter(), now.done))
         elapsed, before = time.perf_counter() - began[0][0], began[0][1]
@@ -190,7 +190,7 @@ def _telling_of_many(show: Callable[[int, str], None]) -> "Callable[[TrainingPro
         text = f"mean regret {sum(regrets) / len(regrets):.4g}" if regrets else "finished before"
         show(now.done, f"{text}{pace}{f', {now.failed} failed' if now.failed else ''}")
 
-    return tell
+    return report
 
 
 def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, object]]:
@@ -233,7 +233,7 @@ def _facts_of_averages(result: Mapping[str, Any]) -> list[tuple[str, object]]:
 
 
 def _plot(out: Path | None) -> Path | None:
-    """The regret curve beside the results, where matplotlib is installed."""
+    """The regret curve beside the results, if matplotlib is installed."""
     if out is None:
         return None
     try:
@@ -247,11 +247,11 @@ def _plot(out: Path | None) -> Path | None:
 def _telling(show: Callable[[int, str], None]) -> Callable[[int, int, Any], None]:
     """Return the callback of `train`, which shows the value of the policy, beside the bar."""
 
-    def tell(done: int, _steps: int, row: Mapping[str, Any]) -> None:
+    def report(done: int, _steps: int, row: Mapping[str, Any]) -> None:
         episodes = pluralize(row["episodes"], "episode")
         show(done, f"value {row['value']:.4g}, regret {row['expected_regret']:.4g}, {episodes}")
 
-    return tell
+    return report
 
 
 # Tune -----------------------------------------------------------------------------------------------------------------
@@ -276,17 +276,18 @@ def tune(
 
     Args:
         targets: Instances of one class, such as frozen_lake/4x4 frozen_lake/8x8.
-        trials: Trials in all, earlier ones in --out included.
-        steps: Steps of every run.
-        seeds: Of the runs of a trial; not those of your experiment.
-        search: Search this instead of the agent's own space: learning_rate=log,0.0001,0.01, gamma=linear,0.9,1,
-            batch_size=32,64. Can be given several times.
-        search_seed: Of the search.
+        trials: Number of trials, with earlier ones in --out.
+        steps: Training steps of every run.
+        seeds: Seeds of the runs of a trial; do not use the seeds of your experiment.
+        search: Search this instead of the agent's space: learning_rate=log,0.0001,0.01, gamma=linear,0.9,1,
+            batch_size=32,64. Repeatable.
+        search_seed: Seed of the search.
         engine: sb3; or batched: all runs of a trial that fit together as one program.
-        out: Folder for the YAML and the record; a search there goes on.
-        chance: A kind of chance, for every instance: --chance plain --chance random=0.1 --chance sticky=0.25.
-        shortlist_by_prediction: Proposals for each trial, of which the one with the least predicted regret is run; for
-            dqn and ppo.
+        out: Write the YAML file and the record to this folder; a search in it resumes.
+        chance: Train under this kind of chance, on every instance: --chance plain --chance random=0.1 --chance
+            sticky=0.25.
+        shortlist_by_prediction: Proposals for each trial; only the one with the least predicted regret is run. For dqn
+            and ppo.
     """
     instances = [Target(target).found_environment() for target in targets]
     from pharos.training import tune as find
@@ -334,7 +335,7 @@ def tune(
 
 
 def _chances(words: list[str] | None) -> list[dict[str, float]] | None:
-    """`["plain", "random=0.1"]` -> `[{}, {"random": 0.1}]`; None where nothing is said."""
+    """`["plain", "random=0.1"]` -> `[{}, {"random": 0.1}]`; None if nothing is said."""
     if not words:
         return None
     try:
@@ -349,7 +350,7 @@ def _chances(words: list[str] | None) -> list[dict[str, float]] | None:
 
 
 def _space(words: list[str] | None) -> dict[str, tuple[Any, ...]] | None:
-    """`["batch_size=32,64"]` -> `{"batch_size": ("one of", 32, 64)}`; None where nothing is said."""
+    """`["batch_size=32,64"]` -> `{"batch_size": ("one of", 32, 64)}`; None if nothing is said."""
     if not words:
         return None
     space = {}

@@ -22,14 +22,14 @@ if TYPE_CHECKING:
         ground_of,
         human,
         image,
-        inside,
         planes_of,
         save_gif,
         save_png,
         scenery_of,
         text_drawing,
+        without_margin,
     )
-    from pharos.drawing.shapes import SHAPES, color_of, glyph_of, shade, shape_of, sprite_of, sprite_pixels, tile
+    from pharos.drawing.shapes import SHAPES, color_of, glyph_of, letter_color, shape_of, sprite_of, sprite_pixels, tile
 
 __all__ = [
     "GROUNDS",

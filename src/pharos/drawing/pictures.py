@@ -1,6 +1,6 @@
 """Pictures of states for people: as text, as pixels, written to files, in a window.
 
-Everything is made from what an environment declares: `draw` says what is where (one plane of cells for each layer),
+Everything is made from what an environment declares: `draw` marks the things in one plane of cells for each layer,
 `layers` and `look` say how it looks. As text: one glyph a cell, later layers cover earlier ones. Grounds, by name, lie
 below all things. The look of "asphalt" and "walls" follows the Atari 2600 games (colours of its palette, wide pixels).
 """
@@ -66,7 +66,7 @@ def colored_text(env: Environment, state: Sequence[int]) -> "Text":
 
 
 def planes_of(env: Environment, state: Sequence[int]) -> np.ndarray:
-    """(L, rows, columns) uint8: for each layer, 0 where nothing is, 1, 2, ... where its things are.
+    """(L, rows, columns) uint8: for each layer, 0 in empty cells, 1, 2, ... in cells with its things.
 
     Raises:
         ParameterError: the class declares no `grid` or `draw`, or `state` is none of its states.
@@ -94,8 +94,11 @@ def check_state(env: Environment, state: Sequence[int]) -> None:
 # Pictures -------------------------------------------------------------------------------------------------------------
 
 
-HEIGHT, WIDTH = 720, 960  # pixels that a picture takes at most, where its cells are not smaller than CELLS[0] for it
-CELLS = (8, 16, 24, 32, 40, 48, 64)  # pixels of a cell; multiples of 8, so that sprites of 8 x 8 stay sharp
+PICTURE_HEIGHT, PICTURE_WIDTH = (
+    720,
+    960,
+)  # most pixels of a picture, unless its cells would be below CELL_SIZES[0]
+CELL_SIZES = (8, 16, 24, 32, 40, 48, 64)  # pixels of a cell; multiples of 8, so that sprites of 8 x 8 stay sharp
 LEAST_PICTURE = 400  # pixels of the longer side of a picture that a class has of its own
 NIGHT, INK = (16, 18, 24), (226, 228, 232)
 
@@ -112,14 +115,14 @@ def human(env: Environment, state: Sequence[int], *, cell: int | None = None) ->
     planes = planes_of(env, state)
     if (own := env.picture(state)) is not None:
         return enlarged(own, LEAST_PICTURE)
-    cell = cell or fitting_cell(planes.shape[1], planes.shape[2], HEIGHT, WIDTH)
+    cell = cell or fitting_cell(planes.shape[1], planes.shape[2], PICTURE_HEIGHT, PICTURE_WIDTH)
     canvas = empty_grid(env, cell)
-    court = inside(canvas, (cell // 2,) * 4)
+    court = without_margin(canvas, (cell // 2,) * 4)
     for plane, (name, layer) in zip(planes, env.layers.items(), strict=True):
         for row, column in np.argwhere(plane):
             thing = tile(name, layer, int(plane[row, column]), cell)
-            place = court[row * cell : (row + 1) * cell, column * cell : (column + 1) * cell]
-            place += (thing[..., :3] - place) * thing[..., 3:]
+            area = court[row * cell : (row + 1) * cell, column * cell : (column + 1) * cell]
+            area += (thing[..., :3] - area) * thing[..., 3:]
     return np.rint(canvas).astype(np.uint8)
 
 
@@ -193,9 +196,9 @@ def enlarged(picture: np.ndarray, at_least: int) -> np.ndarray:
 
 
 def fitting_cell(rows: int, columns: int, height: int, width: int) -> int:
-    """Pixels of a cell, the most with which a grid and its margins fit; CELLS[0] where none does."""
-    fits = [cell for cell in CELLS if (rows + 1) * cell <= height and (columns + 1) * cell <= width]
-    return fits[-1] if fits else CELLS[0]
+    """Pixels of a cell, the most with which a grid and its margins fit; CELL_SIZES[0] if none does."""
+    fits = [cell for cell in CELL_SIZES if (rows + 1) * cell <= height and (columns + 1) * cell <= width]
+    return fits[-1] if fits else CELL_SIZES[0]
 
 
 # Episodes -------------------------------------------------------------------------------------------------------------
@@ -231,7 +234,7 @@ def episode(
 
 
 def ground_of(ground: str | Ground) -> Ground:
-    """The function that paints a ground; UnknownName where GROUNDS has none of this name."""
+    """The function that paints a ground; UnknownName if GROUNDS has none of this name."""
     if not isinstance(ground, str):
         return ground
     if ground not in GROUNDS:
@@ -240,11 +243,11 @@ def ground_of(ground: str | Ground) -> Ground:
 
 
 def scenery_of(env: Environment) -> Scenery:
-    """The scenery of complex images: that of the class, or square cells on the ground of pictures for people."""
+    """The scenery of complex images: the scenery of the class, or square cells on the ground of pictures for people."""
     return env.look.scenery or Scenery(cell=(16, 16), margin=(0, 0, 0, 0), ground=env.look.ground)
 
 
-def inside(picture: np.ndarray, margin: Margin) -> np.ndarray:
+def without_margin(picture: np.ndarray, margin: Margin) -> np.ndarray:
     """The part of a picture that its cells fill; a view."""
     top, right, bottom, left = margin
     return picture[top : len(picture) - bottom, left : picture.shape[1] - right]
@@ -255,14 +258,14 @@ def inside(picture: np.ndarray, margin: Margin) -> np.ndarray:
 
 def _plain(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     """Dark cells with thin lines between them."""
-    court = inside(picture, margin)
+    court = without_margin(picture, margin)
     court[:] = (30, 33, 41)
     court[:: cell[0]] = court[:, :: cell[1]] = (40, 44, 54)
 
 
 def _road(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     """Asphalt, with dashes between the lanes; the first and the last row are pavements."""
-    court, side = inside(picture, margin), cell[0]
+    court, side = without_margin(picture, margin), cell[0]
     court[:] = (52, 54, 60)
     thickness = max(1, side // 16)
     lanes = len(court) // side - 2
@@ -277,12 +280,12 @@ def _court(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     top, _, bottom, _ = margin
     picture[: len(picture) - bottom] = (142, 142, 146)
     picture[: max(1, top // 6)] = (176, 176, 180)
-    inside(picture, margin)[:] = (12, 13, 18)
+    without_margin(picture, margin)[:] = (12, 13, 18)
 
 
 def _tiles(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     """Pale tiles, like a chessboard."""
-    court = inside(picture, margin)
+    court = without_margin(picture, margin)
     rows, columns = (np.arange(n) // side for n, side in zip(court.shape, cell, strict=False))
     odd = ((rows[:, None] + columns) % 2)[..., None]
     court[:] = np.where(odd, (216, 211, 200), (226, 221, 210))
@@ -290,7 +293,7 @@ def _tiles(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
 
 def _ice(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     """Pale blue ice with faint seams and scratches."""
-    court, side = inside(picture, margin), cell[0]
+    court, side = without_margin(picture, margin), cell[0]
     court[:] = (176, 210, 232)
     court[::side] = court[:, ::side] = (150, 190, 218)
     y, x = np.mgrid[: court.shape[0], : court.shape[1]]
@@ -301,7 +304,7 @@ def _ice(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
 # Of complex images ----------------------------------------------------------------------------------------------------
 
 ASPHALT, PAVEMENT, KERB, WHITE, YELLOW = (142, 142, 142), (170, 170, 170), (96, 96, 96), (214, 214, 214), (210, 210, 64)
-WALL = (142, 142, 142)
+WALL_COLOR = (142, 142, 142)
 
 
 def _asphalt(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
@@ -324,7 +327,7 @@ def _asphalt(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None
 def _walls(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     """A black court inside grey walls, open at the bottom."""
     top, right, _, left = margin
-    picture[:] = WALL
+    picture[:] = WALL_COLOR
     picture[top:, left : picture.shape[1] - right] = 0
 
 

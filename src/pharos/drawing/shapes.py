@@ -63,7 +63,7 @@ def sprite_pixels(rows: Sequence[str], color: Color) -> np.ndarray:
     for y, row in enumerate(rows):
         for x, letter in enumerate(row):
             if letter not in ". ":
-                pixels[y, x] = (*shade(color, letter), 1.0)
+                pixels[y, x] = (*letter_color(color, letter), 1.0)
     return pixels
 
 
@@ -74,7 +74,7 @@ def sprite_tile(rows: Sequence[str], color: Color, cell: int) -> np.ndarray:
     return pixels[ys[:, None], xs]
 
 
-def shade(color: Color, letter: str) -> Color:
+def letter_color(color: Color, letter: str) -> Color:
     """The colour of a letter of a sprite: '#' is `color`, '1' nearly white, '5' `color`, '9' nearly black."""
     if not letter.isdigit() or letter == "0":
         return color
@@ -158,7 +158,7 @@ def _bar(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
 
 
 def _car(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
-    """A car from above, with its lights on; it goes left where its glyph is "<"."""
+    """A car from above, with its lights on; it goes left if its glyph is "<"."""
     fine = 4
     y, x = _grid(fine * cell)
     if glyph == "<":
@@ -191,7 +191,7 @@ def _lettered(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
 
 
 def _power(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
-    """A block with a power of two, whose exponent in base 36 is the glyph; with the glyph where the cell is small."""
+    """A block with a power of two, whose exponent in base 36 is the glyph; with the glyph if the cell is small."""
     number = str(2 ** int(glyph, 36))
     return _written(color, cell, number if 4 * len(number) < cell else glyph)
 

@@ -1,7 +1,7 @@
 """Environments: the contract of a class (`Environment`, `Layer`), the built-in classes, the catalogue of names.
 
-`import pharos` needs the names of the built-in classes alone; a file is loaded when something in it is first used. The
-classes themselves, such as `environments.Breakout`, are those of BUILT_IN.
+`import pharos` needs the names of the built-in classes alone; a file is loaded when something in it is first used.
+BUILT_IN lists the classes, such as `environments.Breakout`.
 """
 
 import importlib
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from pharos.environments.catalog import (
         class_called,
         class_of,
+        class_source,
         classes,
-        imported,
+        import_class,
         instance_name,
         list_environments,
         make,
         named_instances,
         register,
-        source_of,
     )
 
 __all__ = [

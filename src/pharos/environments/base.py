@@ -1,11 +1,11 @@
 """Environment: the interface of a class of environments. Small deterministic rules on integer states, nothing else.
 
-A state is a vector of D integers. Chance of the world's own is said by outcomes: which ones there are, how likely each
-is, and where each leads. Chance of acting (sticky and random actions), time limits, observations and pixels are added
-outside, so that the same state space serves every one of them.
+A state is a vector of D integers. A stochastic action has outcomes, each with a probability and a next state. Sticky
+and random actions, time limits, observations and pixels are added outside, so that the same state space serves every
+one of them.
 
-How a class looks is declared too: `Layer`, `Scenery`, `Look`. `pharos.drawing` paints from these; wherever a name of a
-ground or a shape is expected, a function of one's own may stand.
+How a class looks is declared too: `Layer`, `Scenery`, `Look`. `pharos.drawing` paints from these. A function may
+replace any name of a ground or a shape.
 """
 
 import dataclasses
@@ -66,8 +66,8 @@ class Parameter:
         kind: int, float, bool, or a Kind.
         low, high: of numbers; constants, or functions of the environment.
         optional: whether None is a value too.
-        added: whether it came after instances had been kept by their parameters: where it has its default, it is not
-            among `Environment.parameters`, so that these stay what they were.
+        added: whether the class got it when instances were already stored by their parameters. If it has its default,
+            it is not among `Environment.parameters`, so that these stay as they were.
     """
 
     kind: type | Kind
@@ -116,10 +116,10 @@ def parameter(
 
     Args:
         default: the value when none is given; None as a default is a value that is not checked.
-        low, high: bounds of a number; functions of the environment where they depend on other parameters.
+        low, high: bounds of a number; functions of the environment if they depend on other parameters.
         kind: int, float, bool, or a Kind; None: the type of the default.
-        added: True for a parameter that a class gets when there are results of it already: what is kept by the
-            parameters of an instance, such as built state spaces, is found again where the new one has its default.
+        added: True for a parameter that a class gets when there are results of it already. If it has its default,
+            what was stored before, such as built state spaces, is found again.
     """
     declared = Parameter(kind or type(default), low, high, default is None, added)
     return dataclasses.field(default=default, metadata={_DECLARED: declared})
@@ -214,9 +214,9 @@ def _valued_cells(env: Grid, name: str, value: object) -> tuple[tuple[Cell, floa
     try:
         if isinstance(value, str):
             texts = [part.split(":") for part in value.split(";") if part.strip()]
-            pairs = [(place, float(number)) for place, number in texts]
+            pairs = [(cell, float(number)) for cell, number in texts]
         else:
-            pairs = [(place, number) for place, number in _items(value)]
+            pairs = [(cell, number) for cell, number in _items(value)]
     except (TypeError, ValueError):
         pairs = [(None, None)]
     if not all(is_real(number) for _, number in pairs):
@@ -224,15 +224,15 @@ def _valued_cells(env: Grid, name: str, value: object) -> tuple[tuple[Cell, floa
             f"{type(env).__name__}: {name}={value!r}; expected ((row, column), value) pairs, "
             f"or text such as '2,2:0.1; 0,3:0.5'"
         )
-    return tuple((_cell(env, name, place), float(number)) for place, number in pairs)
+    return tuple((_cell(env, name, cell), float(number)) for cell, number in pairs)
 
 
 def _cells(env: Grid, name: str, value: object) -> tuple[Cell, ...]:
     """Cells, from pairs (row, column) or text such as "0,1; 2,3"."""
-    places = [part for part in value.split(";") if part.strip()] if isinstance(value, str) else value
-    if not isinstance(places, Iterable):
+    parts = [part for part in value.split(";") if part.strip()] if isinstance(value, str) else value
+    if not isinstance(parts, Iterable):
         raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected cells, such as '0,1; 2,3'")
-    return tuple(_cell(env, name, place) for place in places)
+    return tuple(_cell(env, name, part) for part in parts)
 
 
 def _items(value: object) -> Iterable[Any]:
@@ -282,7 +282,7 @@ def _truth(env: object, name: str, value: object) -> bool:
 
 
 def as_tuples(value: object) -> Any:
-    """Convert nested lists to tuples: parameters as JSON or YAML writes them become those of a class."""
+    """Convert nested lists to tuples, as JSON or YAML writes the parameters of a class."""
     return tuple(as_tuples(item) for item in value) if isinstance(value, list | tuple) else value
 
 
@@ -312,7 +312,7 @@ class Layer:
     Attributes:
         glyph: one character for text drawings; several, one for each value 1, 2, ... on the plane.
         color: (red, green, blue), 0 to 255; or several, one for each value on the plane.
-        sprite: rows of text, '#' where the sprite has the colour and '.' where the ground shows through; digits 1-9
+        sprite: rows of text: '#' is the colour, '.' lets the ground show through; digits 1-9
             pick shades from light to dark; several sprites, one for each value on the plane. None draws a full cell.
         shape: how pictures for people draw it, in place of the sprite: a name in `pharos.drawing.SHAPES`, or a function
             (see `Shape`). None: the sprite, or else the shape that is called like the layer ("ball", "agent", "holes",
@@ -403,9 +403,9 @@ class Environment:
     Class attributes that may be left out
         look: Look                  the ground below the layers, the screen of complex images, the colour in plots
         instances: dict             name -> parameters: `make("breakout/12x8x1")` and "pharos/Breakout-12x8x1-v0"
-        paper_instances: tuple      those of them that stand in the tables of the pharos paper, in their order
-        hyperparameters: dict       agent -> observation, or "default" for all -> values that suit the class; they go
-                                    before those of agents/hyperparameters.py
+        paper_instances: tuple      names of instances in the tables of the pharos paper, in their order
+        hyperparameters: dict       agent -> observation, or "default" for all -> values that suit the class; they
+                                    override agents/hyperparameters.py
         foreign_parameters: dict    name that other libraries have -> what to do here instead; for the error message
         numbered_by: tuple          variables by which the source numbers its states, the last one fastest, as Gymnasium
                                     does; for the observation `number`
@@ -418,7 +418,7 @@ class Environment:
     Parameters are the fields of the dataclass. `parameter(12, low=4)` as a default declares what they may be.
 
     Methods that describe an instance (ordinary Python)
-        validate(self)              raises ParameterError where parameters do not go together
+        validate(self)              raises ParameterError if parameters do not go together
         variables(self)             name -> range, or a nested sequence of ranges for an array of variables
         initial_state(self)         the start state, a sequence of D integers;
                                     or `initial_states`: several of them with their probabilities
@@ -434,12 +434,12 @@ class Environment:
         probability(self, state, action, outcome)   of outcome 0 .. K-1, a float; 0: it is impossible here. They sum to
                                                     1 over the outcomes, up to 1e-9
         transition(self, state, action, outcome, out)    where this outcome leads; asked for possible ones only
-        reward(self, state, action, next_state, outcome)    where outcomes that lead to the same state pay different
-                                    rewards; the shorter form stays for all others. Outcome -1: the action has no effect
+        reward(self, state, action, next_state, outcome)    if outcomes that lead to the same state pay different
+                                    rewards; otherwise use the shorter form. Outcome -1: the action has no effect
                                     (`lazy`), and next_state is the state
 
     Rules that may be left out
-        draw_motion(self, state, planes)    what one picture of `draw` does not tell, such as where a ball comes from:
+        draw_motion(self, state, planes)    what one picture of `draw` does not show, such as where a ball comes from:
                                     planes (M, rows, columns) uint8, zero, for the M motion_layers. Images have it with
                                     `motion=True`; with it no two states should look alike
         age(self, state) -> int     a number that every transition out of a state that is not terminal increases, such
@@ -496,7 +496,7 @@ class Environment:
     # What an instance is ----------------------------------------------------------------------------------------------
 
     def validate(self) -> None:
-        """Raise ParameterError where parameters do not go together; each has been checked against its declaration."""
+        """Raise ParameterError if parameters do not go together. Each has been checked against its declaration."""
 
     def variables(self) -> Mapping[str, Ranges]:
         """Name -> range of values, or a nested sequence of ranges for an array of variables (flattened in C order)."""
@@ -748,7 +748,7 @@ def num_arguments(rule: Callable[..., object]) -> int:
 
 
 def start_distribution(env: Environment) -> tuple[list[State], np.ndarray]:
-    """The start states, each once, and their probabilities; ParameterError where they are not a distribution."""
+    """The start states, each once, and their probabilities; ParameterError if they are not a distribution."""
     merged: dict[State, float] = {}
     components = env.components
     for state, probability in env.initial_states():

@@ -86,15 +86,15 @@ BUILT_IN = (  # in the order in which they are listed
     BuiltIn("game_2048", "Game2048", "2x2 2x3 3x3 2x2-to-32 3x3-to-64 3x3-to-256 3x3-to-512 3x3-to-1024"),
 )
 
-_LISTENERS: list[Callable[[type["Environment"]], None]] = []
+_CALLBACKS: list[Callable[[type["Environment"]], None]] = []
 
 
-def on_registration(hear: Callable[[type["Environment"]], None]) -> None:
+def on_registration(callback: Callable[[type["Environment"]], None]) -> None:
     """Call `hear` with every user class that is registered from now on."""
-    _LISTENERS.append(hear)
+    _CALLBACKS.append(callback)
 
 
-def announce(cls: type["Environment"]) -> None:
+def notify(cls: type["Environment"]) -> None:
     """Call the functions of `on_registration` with a class that has just been registered."""
-    for hear in _LISTENERS:
-        hear(cls)
+    for callback in _CALLBACKS:
+        callback(cls)

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from pharos.environments.base import Environment, as_tuples
-from pharos.environments.built_in import BUILT_IN, announce
+from pharos.environments.built_in import BUILT_IN, notify
 from pharos.errors import ParameterError, UnknownName
 from pharos.system import mdp_files, sources
 from pharos.system.sources import Source
 
 _CLASS_NAMES = {entry.name: entry.class_name for entry in BUILT_IN}
-_MODULES = {entry.name: entry.file for entry in BUILT_IN}
+_FILES_BY_NAME = {entry.name: entry.file for entry in BUILT_IN}
 _IMPORTED = {"imported": "ImportedWorld"}  # named by its folder, so it stands in no list
 _OWN = _CLASS_NAMES | _IMPORTED
 _REGISTERED: dict[str, type[Environment]] = {}
@@ -33,7 +33,7 @@ def make(name: str, **parameters: object) -> Environment:
         name: a class (`"breakout"`), a named instance (`"breakout/12x10x1"`, see `list_environments`), a folder with an
             imported MDP, or where your own class is (`"my_module:MyClass"`, `"folder/my_file.py:MyClass"`), which
             registers it.
-        parameters: of the class; those of a named instance may be overridden.
+        parameters: of the class; they override the parameters of a named instance.
     Raises:
         UnknownName: no such environment or parameter; the nearest name is suggested.
         ParameterError: a parameter is out of range, there is no such module or class, or `name` is no text.
@@ -53,7 +53,7 @@ def make(name: str, **parameters: object) -> Environment:
                 raise UnknownName("environment", name, (), f"{reason}; expected what `pharos import` writes")
             shown = f"known: {', '.join(sorted(classes()))}; `pharos list` shows their parameters and named instances"
             raise UnknownName("environment", name, list_environments(), shown)
-        cls, slash = imported(name), ""
+        cls, slash = import_class(name), ""
         class_name = cls.name
     defaults: Mapping[str, Any] = cls.instances[instance] if slash else {}
     if not dataclasses.is_dataclass(cls):
@@ -75,7 +75,7 @@ def list_environments() -> list[str]:
 
 
 def class_called(name: str) -> type[Environment] | None:
-    """The class with this name; None where there is none."""
+    """The class with this name; None if there is none."""
     return _built_in(name) if name in _OWN else _REGISTERED.get(name)
 
 
@@ -85,7 +85,7 @@ def classes() -> dict[str, type[Environment]]:
 
 
 def _built_in(name: str) -> type[Environment]:
-    return getattr(importlib.import_module(f"pharos.environments.{_MODULES.get(name, name)}"), _OWN[name])
+    return getattr(importlib.import_module(f"pharos.environments.{_FILES_BY_NAME.get(name, name)}"), _OWN[name])
 
 
 def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:
@@ -112,7 +112,7 @@ def instance_name(environment: str, parameters: Mapping[str, object]) -> str:
     return " ".join([environment, *(f"{name}={value}" for name, value in setting.items() if value != usual.get(name))])
 
 
-def imported(path: str, folder: str | os.PathLike | None = None) -> type[Environment]:
+def import_class(path: str, folder: str | os.PathLike | None = None) -> type[Environment]:
     """Import a user's class from "module:Class" or "file.py:Class", register it and return it.
 
     Args:
@@ -120,8 +120,8 @@ def imported(path: str, folder: str | os.PathLike | None = None) -> type[Environ
     Raises:
         ParameterError: no such module, file or class; or one that `register` refuses.
     """
-    source = sources.find(path, None if folder is None else Path(folder))
-    return _known_class(source, sources.load(source))
+    source = sources.find_source(path, None if folder is None else Path(folder))
+    return _known_class(source, sources.load_source(source))
 
 
 def class_of(source: Source, *, trust: bool = False, strict: bool = False) -> type[Environment]:
@@ -135,7 +135,7 @@ def class_of(source: Source, *, trust: bool = False, strict: bool = False) -> ty
     return _known_class(source, sources.resolve(source, trust=trust, strict=strict))
 
 
-def source_of(cls: type[Environment]) -> Source | None:
+def class_source(cls: type[Environment]) -> Source | None:
     """Module or file of a user's class; None for built-in classes, and for those that no other process can import."""
     return None if _is_built_in(cls) else sources.source_of(cls)
 
@@ -174,7 +174,7 @@ def register(cls: type[Environment]) -> type[Environment]:
     if name in _OWN:
         raise ParameterError(f"register: {name!r} is the name of a built-in class; choose another name")
     _REGISTERED[name] = cls
-    announce(cls)
+    notify(cls)
     return cls
 
 

@@ -17,8 +17,8 @@ from pharos.system.arrays import OutcomeRows, rounding_of_sums
 from pharos.system.distinct_rows import DistinctRows
 
 TIME_LIMIT = 1000  # of an MDP that has no horizon, and whose source has no limit
-MOST_ENTRIES = 1 << 28  # of a table of outcomes, written out
-DIGITS = (
+MOST_TABLE_ENTRIES = 1 << 28  # of a table of outcomes, written out
+DIGIT_SPRITES = (
     ("###", "#.#", "#.#", "#.#", "###"),
     (".#.", "##.", ".#.", ".#.", "###"),
     ("###", "..#", "###", "#..", "###"),
@@ -36,11 +36,11 @@ DIGITS = (
 class ImportedWorld(Environment):
     """The MDP of a folder that `pharos import` or `importers.save` wrote.
 
-    State    its number in the folder; where transitions end an episode without a next state, S is the end.
-    Actions  those of the source by their names, where the import recorded them, else by their numbers.
-    Reward   of the outcome, where the folder knows it; else of the state and action, on average.
-    Ends     in terminal states, and where the source ends.
-    Chance   that of the table.
+    State    its number in the folder; S is the end, if transitions end an episode without a next state.
+    Actions  as in the source; by name if the import recorded the names, otherwise by number.
+    Reward   of the outcome, if the folder has it; otherwise the mean for the state and action.
+    Ends     in terminal states, and on transitions without a next state.
+    Chance   as in the table.
     """
 
     folder: str = ""
@@ -50,7 +50,7 @@ class ImportedWorld(Environment):
     version = 1
     numbered_by = ("state",)
     is_filled = True
-    layers = {"digit": Layer(tuple("0123456789"), (226, 228, 232), sprite=DIGITS)}
+    layers = {"digit": Layer(tuple("0123456789"), (226, 228, 232), sprite=DIGIT_SPRITES)}
 
     def validate(self) -> None:
         if not isinstance(self.folder, str) or not self.folder:
@@ -66,17 +66,17 @@ class ImportedWorld(Environment):
         for entry, is_optional in (("num_states", 0), ("num_actions", 0), ("horizon", 1), ("time_limit", 1)):
             value = self.manifest.get(entry)
             if not (is_optional and value is None) and (type(value) is not int or value < 1):
-                raise FileFormatError(f"{self.folder}: {entry} is {value!r}; expected an integer; {mdp_files.AGAIN}")
+                raise FileFormatError(f"{self.folder}: {entry} is {value!r}; expected an integer; {mdp_files.REIMPORT}")
         names = self.manifest.get("actions")
         if names is not None and not (
             isinstance(names, list) and len(names) == self.manifest["num_actions"] and all(map(is_name, names))
         ):
-            raise FileFormatError(f"{self.folder}: actions are {names!r}; expected their names; {mdp_files.AGAIN}")
+            raise FileFormatError(f"{self.folder}: actions are {names!r}; expected their names; {mdp_files.REIMPORT}")
 
     @cached_property
     def manifest(self) -> Mapping[str, Any]:
         """Manifest of the folder."""
-        return mdp_files.read_manifest(self.folder)
+        return mdp_files.read_mdp_manifest(self.folder)
 
     @property
     def actions(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -99,7 +99,7 @@ class ImportedWorld(Environment):
             knows_outcomes = set(mdp_files.PAID) <= set(self.manifest["arrays"])
             return probabilities, rewards + (0.0 if knows_outcomes else mdp_files.rounding_of(self.manifest))
         except ValueError as error:
-            raise FileFormatError(f"{self.folder}: {error}; {mdp_files.AGAIN}") from None
+            raise FileFormatError(f"{self.folder}: {error}; {mdp_files.REIMPORT}") from None
 
     @property
     def outcomes(self) -> int:  # type: ignore[override]
@@ -146,7 +146,7 @@ class ImportedWorld(Environment):
 
         Codes of a grid are shown as colours.
         """
-        kind, shown = self.manifest.get(mdp_files.OBSERVATIONS), self.recorded
+        kind, shown = self.manifest.get(mdp_files.SHOWN_NAME), self.recorded
         if kind not in ("image", "grid") or shown is None or shown.ndim != 4 or shown.shape[-1] != 3:
             return None
         if kind == "image":
@@ -163,7 +163,7 @@ class ImportedWorld(Environment):
 
     @property
     def successors(self) -> np.ndarray:
-        """(S, A, K) int64, where outcomes lead; with a row for the end, where there is one."""
+        """(S, A, K) int64, next states; with a row for the end, if there is one."""
         return self._table[0]
 
     @property
@@ -187,14 +187,14 @@ class ImportedWorld(Environment):
 
     @cached_property
     def available(self) -> np.ndarray:
-        """(S, A) bool, the actions that exist in each state; (1, A), all True, where all do everywhere."""
+        """(S, A) bool, the actions that exist in each state; (1, A), all True, if every action exists everywhere."""
         if not self.has_sets:
             return np.ones((len(self.successors), self.manifest["num_actions"]), np.bool_)
         return self._with_end(np.asarray(self._arrays[mdp_files.AVAILABLE], np.bool_), True)
 
     @property
     def paid(self) -> np.ndarray:
-        """(S, A, K) float64, the reward of each outcome; (S, A, 1) where the folder knows the means alone."""
+        """(S, A, K) float64, the reward of each outcome; (S, A, 1) if the folder has only the means."""
         paid = self._table[2]
         return self.rewards[:, :, None] if paid is None else paid
 
@@ -204,7 +204,7 @@ class ImportedWorld(Environment):
 
         Rows of a large recording are read when they are looked at.
         """
-        shown = mdp_files.read_rows(self.folder, self.manifest)
+        shown = mdp_files.read_observations(self.folder, self.manifest)
         if shown is None:
             return None
         if len(shown) != self.manifest["num_states"]:
@@ -226,15 +226,19 @@ class ImportedWorld(Environment):
         try:
             return mdp_files.read_arrays(self.folder, self.manifest)
         except (KeyError, ValueError) as error:
-            raise FileFormatError(f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.AGAIN}") from None
+            raise FileFormatError(
+                f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.REIMPORT}"
+            ) from None
 
     @cached_property
     def _table(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         states, actions = self.manifest["num_states"], self.manifest["num_actions"]
         try:
-            table = written_out(*outcomes_of(self._arrays, states, actions), states, actions, self._paid)
+            table = written_out(*table_outcomes(self._arrays, states, actions), states, actions, self._paid)
         except (ValueError, IndexError, TypeError, OverflowError) as error:
-            raise FileFormatError(f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.AGAIN}") from None
+            raise FileFormatError(
+                f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.REIMPORT}"
+            ) from None
         return table
 
     @property
@@ -247,12 +251,12 @@ def is_name(value: object) -> bool:
     return isinstance(value, str) and value != ""
 
 
-def outcomes_of(
+def table_outcomes(
     arrays: Mapping[str, np.ndarray], states: int, actions: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(rows (N,), successors (N,), probabilities (N,)): the outcomes of row s A + a, in any of the forms of a folder.
 
-    The end of an episode is the successor -1. Raises ValueError where they are no table of an MDP.
+    The end of an episode is the successor -1. Raises ValueError if they are no table of an MDP.
     """
     number = states * actions
     if mdp_files.PAID[0] in arrays:
@@ -261,7 +265,7 @@ def outcomes_of(
     if mdp_files.TABLE[0] in arrays:
         successors = arrays[mdp_files.TABLE[0]].reshape(number)
         return np.arange(number), successors, np.ones(number)
-    if mdp_files.OUTCOMES[0] in arrays:
+    if mdp_files.OUTCOME_ARRAYS[0] in arrays:
         stored = OutcomeRows(**{name: array for name, array in arrays.items() if name in OutcomeRows.NAMES})
         return stored.possible(np.arange(number))
     data, indices, indptr = (arrays[name] for name in mdp_files.MATRIX)
@@ -282,7 +286,7 @@ def written_out(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """(S, A, K) successors, probabilities that sum to 1, and rewards; impossible outcomes are left out.
 
-    S is the end, where there is one. p (N,): probabilities; outcome_rewards (N,): the reward of each outcome, if known.
+    S is the end, if there is one. p (N,): probabilities; outcome_rewards (N,): the reward of each outcome, if known.
 
     Raises:
         ParameterError: they are more than MOST_ENTRIES numbers. ValueError: they are no table of an MDP.
@@ -299,22 +303,22 @@ def written_out(
     counts = np.bincount(rows, minlength=states * actions)
     has_end = bool((successors == -1).any())
     most, count = int(counts.max()), states + has_end
-    if count * actions * most > MOST_ENTRIES:
+    if count * actions * most > MOST_TABLE_ENTRIES:
         raise ParameterError(
             f"the table has {count:,} states, {actions} actions and up to {most:,} outcomes of each; expected at most "
-            f"{MOST_ENTRIES:,} numbers in all: it can be solved and measured, but not stepped"
+            f"{MOST_TABLE_ENTRIES:,} numbers in all: it can be solved and measured, but not stepped"
         )
     # Tables with K columns, filled up with probability 0
-    place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    index = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     table = np.zeros((count * actions, most), np.int64)
     chances = np.zeros((count * actions, most))
-    table[rows, place] = np.where(successors == -1, states, successors)
-    chances[rows, place] = p / np.bincount(rows, p, minlength=states * actions)[rows]
+    table[rows, index] = np.where(successors == -1, states, successors)
+    chances[rows, index] = p / np.bincount(rows, p, minlength=states * actions)[rows]
     if has_end:
         table[states * actions :], chances[states * actions :, 0] = states, 1.0
     shape = (count, actions, most)
     if outcome_rewards is None:
         return table.reshape(shape), chances.reshape(shape), None
     rewards = np.zeros((count * actions, most))
-    rewards[rows, place] = payments
+    rewards[rows, index] = payments
     return table.reshape(shape), chances.reshape(shape), rewards.reshape(shape)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from pharos.explorer.exploration import Exploration
     from pharos.explorer.keys import ARROWS, keys_of
     from pharos.explorer.launch import Explorer, exploration_of, explore, open_browser
-    from pharos.explorer.pages import contents, page, write
+    from pharos.explorer.pages import contents, explorer_page, write
     from pharos.explorer.states import Learnt
 
 __all__ = [

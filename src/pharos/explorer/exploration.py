@@ -74,7 +74,7 @@ class DiscountedVisits:
         return state_losses(world.solutions[OPTIMAL], pairs, first), pairs.sum(axis=1), pairs.argmax(axis=1)
 
     def _table(self, policy: str) -> np.ndarray | None:
-        """The policy as solvers take it; None for the uniform one. Uniform in states where it was not asked."""
+        """The policy as solvers take it; None for the uniform one. Uniform in states in which it was not asked."""
         if policy == UNIFORM:
             return None
         table = np.asarray(self.exploration.solutions[policy].policy)
@@ -84,9 +84,9 @@ class DiscountedVisits:
 
 
 LONGEST_PATH = 2_000  # steps that are shown
-MOST_STARTS = 100  # start states that are listed
+MOST_LISTED_STARTS = 100  # start states that are listed
 LISTED = 48  # states of a layer that are listed at a time
-WORST = 24  # states that are listed where a policy goes wrong
+MOST_WORST_STATES = 24  # states that are listed where a policy goes wrong
 ERRORS_PER_TIE = 2.5  # the gap of a tie is at most this times the bound on errors of values, see hardness.gaps
 
 
@@ -95,8 +95,8 @@ class Exploration:
 
     Args:
         mdp: with its chance. A horizon is left out: values are discounted.
-        env: draws the states and names the actions, where it is known.
-        space: gives the values of their variables, where there is one.
+        env: draws the states and names the actions, if it is known.
+        space: gives the values of their variables, if there is one.
         learnt: a policy to set beside the optimal and the uniform one.
         title: for people.
         progress: called with what is done next.
@@ -145,7 +145,7 @@ class Exploration:
         return StateLayers(self.mdp, is_numbered=self.space is not None)
 
     def values(self, name: str, states: np.ndarray) -> np.ndarray:
-        """(N,) values of a policy in states, where there is no action before."""
+        """(N,) values of a policy in states without a previous action."""
         solution = self.solutions[name]
         if not self.mdp.is_sticky:
             return np.asarray(solution.x[states, 0])
@@ -193,7 +193,7 @@ class Exploration:
             previous: the action executed before, under sticky actions; None: there was none.
         Returns:
             state, previous, values (of its variables), labels, terminal, layer, start (probability that an episode
-            starts there), v (policy -> value), the drawing as `Pictures.of` has it, and for each action: `name`, where
+            starts there), v (policy -> value), the drawing as `Pictures.of` has it, and for each action: `name`, if
             actions have other names in other states, else None; `q` and `gap`, of choosing it; `available`, whether it
             is; `best`, whether the gap is a tie; of each policy, `policies` (how often it chooses it) and `q_of` (the
             value of choosing it, and following the policy afterwards); `reward`, expected; `outcomes`: a list of state
@@ -222,7 +222,9 @@ class Exploration:
         q = {name: self.chosen_values(name, here, previous) for name in self.solutions}
         chances = {name: self.chances(name, here, q[OPTIMAL], previous)[0] for name in self.solutions}
         best = float(q[OPTIMAL].max())
-        answer["v"] = {name: best if name == OPTIMAL else number(chances[name] @ q[name][0]) for name in self.solutions}
+        answer["v"] = {
+            name: best if name == OPTIMAL else float_or_none(chances[name] @ q[name][0]) for name in self.solutions
+        }
         sets = self.available(here)[0]
         for action, executed in enumerate(self._executed(state, previous)):
             gap = best - float(q[OPTIMAL][0, action])
@@ -234,8 +236,8 @@ class Exploration:
                     "name": self.names.action(state, action) if self.names.choices is not None else None,
                     "available": bool(sets[action]),
                     "best": gap <= self.tie_tolerance and bool(sets[action]),
-                    "policies": {name: number(chances[name][action]) for name in self.solutions},
-                    "q_of": {name: number(q[name][0, action]) for name in self.solutions},
+                    "policies": {name: float_or_none(chances[name][action]) for name in self.solutions},
+                    "q_of": {name: float_or_none(q[name][0, action]) for name in self.solutions},
                     "reward": sum(probability * reward for _, _, probability, reward in outcomes),
                     "outcomes": outcomes,
                 }
@@ -252,15 +254,15 @@ class Exploration:
         merged: dict[tuple[int | None, int | None, float], float] = {}
         for action in np.flatnonzero(executed).tolist():
             for after, probability, reward in self._of_executing(state, action):
-                place = (after, action if self.mdp.is_sticky else None, reward)
-                merged[place] = merged.get(place, 0.0) + float(executed[action]) * probability
+                key = (after, action if self.mdp.is_sticky else None, reward)
+                merged[key] = merged.get(key, 0.0) + float(executed[action]) * probability
         listed = [[after, previous, probability, reward] for (after, previous, reward), probability in merged.items()]
         return sorted(listed, key=lambda each: (-each[2], -1 if each[0] is None else each[0]))
 
     def _of_executing(self, state: int, action: int) -> list[tuple[int | None, float, float]]:
         """(state, probability, reward) of possible outcomes of executing an action.
 
-        Outcomes have rewards of their own where the rules are known; else, and with lazy actions, each has the mean.
+        Each outcome has its reward if the rules are known. Otherwise, and with lazy actions, it has the mean.
         """
         env, mdp = self.env, self.mdp
         if env is not None and env.has_chance and not mdp.laziness:
@@ -319,9 +321,9 @@ class Exploration:
         the way, until the end, or until nothing new is left.
 
         Returns:
-            `steps`, a list of state, previous, action, probability (of the outcome), reward, gap (of the action); where
-            it `stops`: state and previous; `why`: "end", "circle", "limit", or "unknown", where the policy was not
-            asked.
+            `steps`, a list of state, previous, action, probability (of the outcome), reward, gap (of the action);
+            `stops`: the last state and previous; `why`: "end", "circle", "limit", or "unknown" (the policy was not
+            asked there).
         Raises:
             ParameterError: there is no such policy or position.
         """
@@ -394,11 +396,11 @@ class Exploration:
         steps = self.path(policy, start)["steps"]
         number_of = next((i for i, step in enumerate(steps) if step[-1] > self.tie_tolerance), None)
         lost, visits, actions = self.visits.losses(policy)
-        worst = np.argsort(-lost, kind="stable")[:WORST]
+        worst = np.argsort(-lost, kind="stable")[:MOST_WORST_STATES]
         worst = worst[lost[worst] > self.tie_tolerance * 1e-3]
         best, value = (self.solutions[name].value_at_start for name in (OPTIMAL, policy))
         return {
-            "regret": number(best - value),
+            "regret": float_or_none(best - value),
             "lost": float(lost.sum()),
             "first": None if number_of is None else {"number": number_of, "step": steps[number_of]},
             "worst": [[int(s), float(lost[s]), float(visits[s]), int(actions[s])] for s in worst],
@@ -410,7 +412,7 @@ class Exploration:
         """Page metadata: title, sizes, policies, map axes."""
         from pharos.explorer.pages import about_maps
 
-        mdp, starts = self.mdp, np.argsort(-self.mdp.start_probabilities, kind="stable")[:MOST_STARTS]
+        mdp, starts = self.mdp, np.argsort(-self.mdp.start_probabilities, kind="stable")[:MOST_LISTED_STARTS]
         return {
             "title": self.title,
             "num_states": mdp.num_states,
@@ -423,7 +425,7 @@ class Exploration:
             "is_sticky": mdp.is_sticky,
             "starts": [[int(mdp.start_states[i]), float(mdp.start_probabilities[i])] for i in starts],
             "policies": self.policies,
-            "value_at_start": {name: number(each.value_at_start) for name, each in self.solutions.items()},
+            "value_at_start": {name: float_or_none(each.value_at_start) for name, each in self.solutions.items()},
             "error_bound": max(float(each.error_bound) for each in self.solutions.values()),
             "tie_tolerance": self.tie_tolerance,
             "learnt": None if self.learnt is None else {"name": self.learnt.name, "facts": dict(self.learnt.facts)},
@@ -439,15 +441,15 @@ class Exploration:
         }
 
 
-def number(value: float | np.floating) -> float | None:
-    """A float; None where it is not a number."""
+def float_or_none(value: float | np.floating) -> float | None:
+    """A float; None if it is not a number."""
     return float(value) if np.isfinite(value) else None
 
 
 # Picture --------------------------------------------------------------------------------------------------------------
 
 
-LONGEST = 720  # pixels of the longer side of a drawing, where cells are not the smallest for it
+LONGEST_SIDE = 720  # pixels of the longer side of a drawing, if cells are not the smallest for it
 
 
 def _states_of(mdp: TabularMDP, space: StateSpace | None) -> States:
@@ -459,11 +461,11 @@ def _states_of(mdp: TabularMDP, space: StateSpace | None) -> States:
 
 
 class Pictures:
-    """Draws the states of an environment; where that is not possible, `fault` says why, in one line.
+    """Draws the states of an environment. If that is not possible, `fault` is the reason, in one line.
 
     Attributes:
-        kit: what all drawings are composed of, for the page; None where the states cannot be drawn.
-        fault: why they cannot; "" where they can.
+        kit: what all drawings are composed of, for the page; None if the states cannot be drawn.
+        fault: why they cannot; "" if they can.
     """
 
     def __init__(self, env: Environment | None, start: State | None):
@@ -503,7 +505,7 @@ def kit_of(env: Environment) -> dict[str, Any]:
         `layers`, their names.
     """
     rows, columns = env.grid()
-    cell = fitting_cell(rows, columns, LONGEST, LONGEST)
+    cell = fitting_cell(rows, columns, LONGEST_SIDE, LONGEST_SIDE)
     tiles = [
         [url_of(tile(name, layer, value + 1, cell) * (1, 1, 1, 255)) for value in range(num_values(layer))]
         for name, layer in env.layers.items()

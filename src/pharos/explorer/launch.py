@@ -1,9 +1,9 @@
 """Opening the explorer: from an environment, a state space, an MDP or the folder of a run to a page in the browser.
 
 `Explorer` is a small local server of the page: one address, one token, GET alone, no files. It listens on the loopback
-interface. A request is answered where its Host header names this server (a page from elsewhere whose name was led here
-by DNS does not) and its path begins with the token, compared in constant time. Answers come from a table of questions;
-no part of a request ever names a file.
+interface. A request is answered if its Host header names this server (a page from elsewhere whose name was led here
+by DNS does not) and if its path begins with the token, compared in constant time. Answers come from a table of
+questions; no part of a request ever names a file.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from urllib.parse import parse_qs, urlsplit
 from pharos.environments import Environment, class_called, make
 from pharos.errors import ParameterError, PharosError
 from pharos.explorer.exploration import Exploration
-from pharos.explorer.pages import POLICY_OF_SERVER, check_size, heat_map, page, write
+from pharos.explorer.pages import POLICY_OF_SERVER, check_page_size, explorer_page, heat_map, write
 from pharos.explorer.states import Learnt
 from pharos.mdp import TabularMDP
 from pharos.policies import PolicyLike
@@ -33,9 +33,9 @@ from pharos.state_space import StateSpace, build, load
 from pharos.training import ChanceSetting, Task, load_agent, read_record
 
 HOST = "127.0.0.1"
-NAMES = (HOST, "localhost")  # that a Host header may have
+HOST_NAMES = (HOST, "localhost")  # that a Host header may have
 LONGEST_QUERY = 8192  # characters
-SECONDS = 30  # of waiting for the next bytes of a request
+REQUEST_SECONDS = 30  # of waiting for the next bytes of a request
 FREE_SECONDS = 5  # of waiting for the place of a connection that was ended
 MOST_CONNECTIONS = 64  # at once; a thread each
 
@@ -66,8 +66,8 @@ class Explorer:
         self._http.owner = self
         self.port = int(self._http.server_address[1])
         self.url = f"http://{HOST}:{self.port}/{self.token}/"
-        self.hosts = frozenset(f"{name}:{self.port}" for name in NAMES)
-        self._page = page(exploration).encode()
+        self.hosts = frozenset(f"{name}:{self.port}" for name in HOST_NAMES)
+        self._page = explorer_page(exploration).encode()
         self._thread = threading.Thread(
             target=self._http.serve_forever, args=(0.2,), name="pharos explorer", daemon=True
         )
@@ -163,16 +163,16 @@ class _Http(ThreadingHTTPServer):
     owner: Explorer
 
     def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]):
-        self.places = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        self.connections = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self.incomplete: dict[socket.socket, None] = {}  # whose requests have not arrived, the oldest first
         super().__init__(address, handler)
 
     def process_request(self, request: Request, client_address: Address) -> None:
         """Give the connection a thread; if there is none left, the one that has waited longest for a request ends."""
-        if not self.places.acquire(blocking=False):
+        if not self.connections.acquire(blocking=False):
             with contextlib.suppress(StopIteration, OSError):  # of those that send a byte now and then
                 next(iter(list(self.incomplete))).shutdown(socket.SHUT_RDWR)
-            if not self.places.acquire(timeout=FREE_SECONDS):
+            if not self.connections.acquire(timeout=FREE_SECONDS):
                 self.shutdown_request(request)
                 return
         super().process_request(request, client_address)
@@ -181,14 +181,14 @@ class _Http(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self.places.release()
+            self.connections.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
         """A browser that went away in the middle of an answer is no error."""
 
 
 class _Handler(BaseHTTPRequestHandler):
-    timeout = SECONDS
+    timeout = REQUEST_SECONDS
     server: _Http
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "pharos", ""
@@ -262,7 +262,7 @@ class _Handler(BaseHTTPRequestHandler):
 # Launch ---------------------------------------------------------------------------------------------------------------
 
 
-RECORD = "run.json"
+RUN_RECORD = "run.json"
 GAMMA = 0.99
 """The discount, where none is given: values of states need one, as they belong to no number of steps to go."""
 
@@ -287,11 +287,11 @@ def explore(  # noqa: PLR0913
         target: an environment or its name; a state space, or the folder of one; a tabular MDP; or the folder of a
             finished run, whose chance and policy are taken.
         policy: one to set beside the optimal and the uniform policy, as `pharos.evaluate_policy` takes it.
-        gamma: discount; None: that of the MDP where it is below 1, else 0.99. A horizon is left out.
+        gamma: discount; None: the discount of the MDP if it is below 1, else 0.99. A horizon is left out.
         sticky, random, lazy: chance that is added, see `pharos.sticky_actions`.
-        observation: what `policy` sees, where it is no table.
+        observation: what `policy` sees, if it is no table.
         trust: whether code that a run names may be imported.
-        out: write the page with all its data into this file instead, where the space is small enough (10,000 states).
+        out: write the page with all its data into this file instead, if the space is small enough (10,000 states).
         port: of the server; 0: any that is free.
         browser: whether to open the page in the browser.
     Returns:
@@ -329,7 +329,7 @@ def exploration_of(
         in_one_page: whether it is for a page of its own; what is too large for that is refused before it is solved.
     """
     chance = chance or ChanceSetting()
-    if isinstance(target, str | os.PathLike) and (Path(target) / RECORD).is_file():
+    if isinstance(target, str | os.PathLike) and (Path(target) / RUN_RECORD).is_file():
         return _of_run(Path(target), learnt, gamma, chance, trust, title, progress)
     title = title or (target if isinstance(target, str) else "")
     if isinstance(target, str) and (class_called(target.partition("/")[0]) or not Path(target).exists()):
@@ -352,7 +352,7 @@ def exploration_of(
     title = title or (_title(env) if env is not None else "")
     mdp_with_chance = chance.of(mdp.with_gamma(GAMMA if gamma is None else gamma))
     if in_one_page:
-        check_size(mdp_with_chance, title or str(mdp), env)
+        check_page_size(mdp_with_chance, title or str(mdp), env)
     return Exploration(
         mdp_with_chance,
         env=env,
@@ -419,7 +419,7 @@ def _short(value: object) -> str:
 
 
 def open_browser(url: str) -> bool:
-    """Open a page in the user's browser; False where there is none, or no screen to show it on."""
+    """Open a page in the user's browser; False if there is none, or no screen to show it on."""
     has_screen = bool({"DISPLAY", "WAYLAND_DISPLAY", "BROWSER"} & set(os.environ))
     if sys.platform.startswith("linux") and not has_screen:  # else a browser of the terminal would take it over
         return False

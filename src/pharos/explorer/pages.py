@@ -22,15 +22,15 @@ import numpy as np
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, PharosError, UnknownName
-from pharos.explorer.exploration import Exploration, number
+from pharos.explorer.exploration import Exploration, float_or_none
 from pharos.explorer.states import OPTIMAL, Axis, axes_of
 from pharos.mdp import TabularMDP
 from pharos.state_space import build
 from pharos.system import storage
 
-BLOCK = 1 << 18  # states that are looked at in one go
-MEAN, LEAST, MOST, SUM = "mean", "least", "most", "sum"
-HOW = (MEAN, LEAST, MOST, SUM)
+STATES_AT_ONCE = 1 << 18  # states that are looked at in one go
+MEAN, LEAST_VALUE, MOST_VALUE, SUM = "mean", "least", "most", "sum"
+HOW = (MEAN, LEAST_VALUE, MOST_VALUE, SUM)
 GROUPS = {"column", "x"}, {"row", "y"}  # words in the names of variables that are drawn first, across and down
 
 
@@ -49,7 +49,7 @@ def quantities(world: Exploration) -> dict[str, str]:
 
 
 def quantity(world: Exploration, name: str, states: np.ndarray) -> np.ndarray:
-    """(N,) a quantity of states, one of `quantities`; NaN where it has none, as most have in terminal states."""
+    """(N,) a quantity of states, one of `quantities`; NaN if it has none, as most have in terminal states."""
     kind, _, policy = name.partition("_")
     if name == "layer":
         layers = world.layers.of(states).astype(np.float64)
@@ -82,11 +82,11 @@ def heat_map(
         x, y: names of axes, across and down.
         what: a quantity, see `quantities`.
         fixed: variable -> value, of the states that count; other variables may have any value.
-        how: what a cell of several states shows: "mean", "least", "most" or "sum". Of actions: the action where all
+        how: what a cell of several states shows: "mean", "least", "most" or "sum". Of actions: the action if all
             states have the same, else -1.
     Returns:
-        `x`, `y`: the axes; `cells`: rows of values, None where there are none; `count`: rows of numbers of states;
-        `state`: rows of the first state of each cell, -1 where there is none; `terminal`: rows of how many are
+        `x`, `y`: the axes; `cells`: rows of values, None if there are none; `count`: rows of numbers of states;
+        `state`: rows of the first state of each cell, -1 if there is none; `terminal`: rows of how many are
         terminal; `low`, `high`: of all cells; `states`: how many count.
     Raises:
         UnknownName: an axis, a variable or a quantity does not exist. ParameterError: `how` is none of these, or the
@@ -103,15 +103,15 @@ def heat_map(
     across, down = axes[x], axes[y]
     slices = {names.index(name): value for name, value in fixed.items()}
     cells = _Cells(down.count, across.count)
-    for start in range(0, world.mdp.num_states, BLOCK):
-        block = slice(start, min(start + BLOCK, world.mdp.num_states))
+    for start in range(0, world.mdp.num_states, STATES_AT_ONCE):
+        block = slice(start, min(start + STATES_AT_ONCE, world.mdp.num_states))
         states = np.flatnonzero(world.states.matching(slices, block))
         if not states.size:
             continue
-        places = [axis.places(world.states.column(axis.variable, block)[states]) for axis in (down, across)]
+        indices = [axis.indices(world.states.column(axis.variable, block)[states]) for axis in (down, across)]
         here = start + states
         terminal = world.mdp.terminal[here]
-        cells.add(places[0] * across.count + places[1], here, quantity(world, what, here), terminal)
+        cells.add(indices[0] * across.count + indices[1], here, quantity(world, what, here), terminal)
     return {"x": asdict(across), "y": asdict(down), "what": what, "how": how} | cells.answer(what, how)
 
 
@@ -124,17 +124,17 @@ class _Cells:
         self.sum, self.least, self.most = np.zeros(size), np.full(size, np.inf), np.full(size, -np.inf)
         self.first = np.full(size, np.iinfo(np.int64).max)
 
-    def add(self, places: np.ndarray, states: np.ndarray, values: np.ndarray, terminal: np.ndarray) -> None:
+    def add(self, indices: np.ndarray, states: np.ndarray, values: np.ndarray, terminal: np.ndarray) -> None:
         size = len(self.count)
-        self.count += np.bincount(places, minlength=size)
-        self.terminal += np.bincount(places[terminal], minlength=size)
-        np.minimum.at(self.first, places, states)
+        self.count += np.bincount(indices, minlength=size)
+        self.terminal += np.bincount(indices[terminal], minlength=size)
+        np.minimum.at(self.first, indices, states)
         is_known = ~np.isnan(values)
-        places, values = places[is_known], values[is_known]
-        self.known += np.bincount(places, minlength=size)
-        self.sum += np.bincount(places, values, minlength=size)
-        np.minimum.at(self.least, places, values)
-        np.maximum.at(self.most, places, values)
+        indices, values = indices[is_known], values[is_known]
+        self.known += np.bincount(indices, minlength=size)
+        self.sum += np.bincount(indices, values, minlength=size)
+        np.minimum.at(self.least, indices, values)
+        np.maximum.at(self.most, indices, values)
 
     def answer(self, what: str, how: str) -> dict[str, Any]:
         is_known = self.known > 0
@@ -142,16 +142,16 @@ class _Cells:
             shown = np.where(self.least == self.most, self.least, -1.0)
         else:
             means = self.sum / np.maximum(self.known, 1)
-            shown = {MEAN: means, LEAST: self.least, MOST: self.most, SUM: self.sum}[how]
-        listed = [number(value) if there else None for value, there in zip(shown, is_known, strict=True)]
+            shown = {MEAN: means, LEAST_VALUE: self.least, MOST_VALUE: self.most, SUM: self.sum}[how]
+        listed = [float_or_none(value) if there else None for value, there in zip(shown, is_known, strict=True)]
         numbers = shown[is_known]
         return {
             "cells": self._rows(listed),
             "count": self._rows(self.count.tolist()),
             "terminal": self._rows(self.terminal.tolist()),
             "state": self._rows(np.where(self.count > 0, self.first, -1).tolist()),
-            "low": number(numbers.min()) if numbers.size else None,
-            "high": number(numbers.max()) if numbers.size else None,
+            "low": float_or_none(numbers.min()) if numbers.size else None,
+            "high": float_or_none(numbers.max()) if numbers.size else None,
             "states": int(self.count.sum()),
         }
 
@@ -184,9 +184,9 @@ def _first_axes(axes: Mapping[str, Axis]) -> list[str]:
 
 MOST_POSITIONS = 10_000  # states, under sticky actions times previous ones, that a page of its own holds
 MOST_BYTES = 64 << 20  # of such a page
-TRIES = 6  # named instances that are built to find one that fits
+MOST_INSTANCES = 6  # named instances that are built to find one that fits
 SCRIPTS = ("source.js", "drawing.js", "maps.js", "panels.js", "main.js")
-DIGITS = 12  # significant ones of a number in a page of its own
+SIGNIFICANT_DIGITS = 12  # significant ones of a number in a page of its own
 
 
 @cache
@@ -217,7 +217,7 @@ def _policy(connect: str) -> str:
 POLICY_OF_SERVER = _policy("'self'") + "; frame-ancestors 'none'"
 
 
-def page(world: Exploration, data: dict[str, Any] | None = None) -> str:
+def explorer_page(world: Exploration, data: dict[str, Any] | None = None) -> str:
     """The page as HTML. `data`: what it holds of its own; None: it asks the server that it came from."""
     parts = {
         "TITLE": html.escape(world.title),
@@ -238,20 +238,20 @@ def contents(world: Exploration) -> dict[str, Any]:
         ParameterError: there are more than MOST_POSITIONS.
     """
     mdp = world.mdp
-    check_size(mdp, world.title, world.env)
+    check_page_size(mdp, world.title, world.env)
     states = np.arange(mdp.num_states)
     before: list[int | None] = [None, *range(mdp.policy_width - 1)]
     positions = {
-        _place(state, previous): world.position(state, previous)
+        _state_key(state, previous): world.position(state, previous)
         for state in range(mdp.num_states)
         for previous in before
     }
-    fields = {name: [number(value) for value in quantity(world, name, states)] for name in quantities(world)}
+    fields = {name: [float_or_none(value) for value in quantity(world, name, states)] for name in quantities(world)}
     wrong = {name: world.wrong(name) for name in world.policies}
     return _shortened({"about": world.about(), "positions": positions, "fields": fields, "wrong": wrong})
 
 
-def check_size(mdp: TabularMDP, title: str, env: Environment | None = None) -> None:
+def check_page_size(mdp: TabularMDP, title: str, env: Environment | None = None) -> None:
     """ParameterError if a page of its own does not hold all positions of an MDP; it names a smaller one of `env`."""
     width = mdp.policy_width
     if mdp.num_states * width > MOST_POSITIONS:
@@ -267,10 +267,10 @@ def check_size(mdp: TabularMDP, title: str, env: Environment | None = None) -> N
 def smaller_instance(env: Environment, most: int) -> str:
     """Instance of the same class with at most `most` states, in words: `frozen_lake/8x8 has 64`; empty without one.
 
-    The largest of the first TRIES named instances; else the same environment with one whole-number parameter as much
-    smaller as needed, by bisection. Cost: builds of at most `most` states.
+    The largest of the first MOST_INSTANCES named instances; else the same environment with one whole-number parameter
+    as much smaller as needed, by bisection. Cost: builds of at most `most` states.
     """
-    named = [f"{env.name}/{name}" for name in type(env).instances][:TRIES]
+    named = [f"{env.name}/{name}" for name in type(env).instances][:MOST_INSTANCES]
     sizes = {name: size for name in named if (size := _num_states(partial(make, name), most))}
     if sizes:
         name = max(sizes, key=sizes.__getitem__)
@@ -301,7 +301,7 @@ def write(world: Exploration, path: str | os.PathLike) -> Path:
     Raises:
         ParameterError: the space is too large for that.
     """
-    text = page(world, contents(world))
+    text = explorer_page(world, contents(world))
     if len(text) > MOST_BYTES:
         raise ParameterError(
             f"{world.title}: its page would have {len(text) >> 20} MiB; expected at most {MOST_BYTES >> 20}: choose a "
@@ -312,7 +312,7 @@ def write(world: Exploration, path: str | os.PathLike) -> Path:
     return path
 
 
-def _place(state: int, previous: int | None) -> str:
+def _state_key(state: int, previous: int | None) -> str:
     return f"{state}" if previous is None else f"{state},{previous}"
 
 
@@ -322,4 +322,4 @@ def _shortened(data: object) -> Any:
         return {name: _shortened(value) for name, value in data.items()}
     if isinstance(data, list | tuple):
         return [_shortened(value) for value in data]
-    return float(f"{data:.{DIGITS}g}") if isinstance(data, float) else data
+    return float(f"{data:.{SIGNIFICANT_DIGITS}g}") if isinstance(data, float) else data

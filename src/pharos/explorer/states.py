@@ -1,6 +1,6 @@
 """States of an MDP as the page shows them: variables, layers, and actions of a learned policy.
 
-`States`: the variables of a state space, or where there are none the number itself. `StateLayers`, breadth-first: the
+`States`: the variables of a state space, or the number itself if there are none. `StateLayers`, breadth-first: the
 states whose shortest way from a start state has 0, 1, 2, ... steps. `Learnt`: the policy of a run, its table, its
 value, and its losses.
 """
@@ -18,8 +18,8 @@ from pharos.policies import Observer, PolicyAnswers, PolicyLike, TabularAgent, e
 from pharos.solvers import Solution
 from pharos.state_space import StateSpace
 
-MOST = 128  # intervals of an axis
-ROW = 24  # values of an only variable that make one row
+MOST_AXIS_CELLS = 128  # intervals of an axis
+ROW_CELLS = 24  # values of an only variable that make one row
 
 
 class States(Protocol):
@@ -47,7 +47,7 @@ class States(Protocol):
         """(N,) bool: which states of a block have these values, of the variables that are named by their number."""
 
     def number(self, values: Sequence[int]) -> int:
-        """The number of the state that has these values; ParameterError where it is not reachable."""
+        """The number of the state that has these values; ParameterError if it is not reachable."""
 
 
 class SpaceStates:
@@ -110,7 +110,7 @@ class NumberedStates:
 
 
 class NamedStates:
-    """States with the variables that an MDP names, such as those of an imported model."""
+    """States with the variables that an MDP names, such as the variables of an imported model."""
 
     def __init__(self, variables: Mapping[str, np.ndarray]):
         self.names = tuple(variables)
@@ -141,7 +141,7 @@ class NamedStates:
 class Axis:
     """An axis of a heat map: a variable, or a part of the only one, in intervals of equal width.
 
-        interval = ((value - origin) // divisor % modulus) // width, without `% modulus` where that is 0
+        interval = ((value - origin) // divisor % modulus) // width, without `% modulus` if that is 0
 
     Attributes:
         name: as the page asks for it.
@@ -159,14 +159,14 @@ class Axis:
     divisor: int = 1
     modulus: int = 0
 
-    def places(self, values: np.ndarray) -> np.ndarray:
+    def indices(self, values: np.ndarray) -> np.ndarray:
         """(N,) the intervals of values of the variable."""
         part = (values - self.origin) // self.divisor
         return (part % self.modulus if self.modulus else part) // self.width
 
 
 def axes_of(states: States) -> dict[str, Axis]:
-    """Name -> axis. A variable each; where there is but one, its values fill a row, or rows if there are many."""
+    """Name -> axis. A variable each; if there is but one, its values fill a row, or rows if there are many."""
     if len(states.names) == 1:
         return {axis.name: axis for axis in _folded(states.names[0], int(states.low[0]), int(states.size[0]))}
     listed = enumerate(zip(states.names, states.low.tolist(), states.size.tolist(), strict=True))
@@ -175,23 +175,23 @@ def axes_of(states: States) -> dict[str, Axis]:
 
 def _folded(name: str, low: int, size: int) -> tuple[Axis, Axis]:
     """The axes across and down of the only variable."""
-    if size <= ROW:
+    if size <= ROW_CELLS:
         return Axis(name, 0, low, low, size), Axis("all", 0, low, 0, 1, 1, size)
-    side = min(MOST, math.ceil(math.sqrt(size)))
+    side = min(MOST_AXIS_CELLS, math.ceil(math.sqrt(size)))
     rows = Axis(f"{name} div {side}", 0, low, 0, *_intervals(-(-size // side)), side)
     return Axis(f"{name} mod {side}", 0, low, 0, side, 1, 1, side), rows
 
 
 def _intervals(size: int) -> tuple[int, int]:
     """(number of intervals, values in each)."""
-    width = -(-size // MOST)
+    width = -(-size // MOST_AXIS_CELLS)
     return -(-size // width), width
 
 
 # Layers ---------------------------------------------------------------------------------------------------------------
 
 
-BLOCK = 1 << 16  # states whose successors are looked at in one go
+STATES_PER_BLOCK = 1 << 16  # states whose successors are looked at in one go
 BARS = 200  # of the drawing of all layers
 
 
@@ -199,7 +199,7 @@ class StateLayers:
     """The layers of an MDP.
 
     Args:
-        is_numbered: whether states are numbered layer by layer, as those of a state space are: then a layer is a range
+        is_numbered: whether states are numbered layer by layer, as in a state space: then a layer is a range
             of numbers, and nothing is kept of each state.
     Attributes:
         counts: (L,) states of each layer.
@@ -207,7 +207,7 @@ class StateLayers:
     """
 
     def __init__(self, mdp: TabularMDP, *, is_numbered: bool):
-        self._order: np.ndarray | None = None  # states, layer by layer, where their numbers are not in this order
+        self._order: np.ndarray | None = None  # states, layer by layer, if their numbers are not in this order
         self._of_states: np.ndarray | None = None
         if is_numbered:
             ends = _ends(mdp.dynamics, len(mdp.starts))
@@ -238,7 +238,8 @@ class StateLayers:
 
 
 def _ends(dynamics: Dynamics, num_starts: int) -> np.ndarray:
-    """(L,) the number after the last state of each layer; a layer ends where the one before leads to at most."""
+    """(L,) the number after the last state of each layer; a layer ends with the last state that the layer before leads
+    to."""
     farthest = np.maximum.accumulate(_largest_successors(dynamics))
     ends = [num_starts]
     while ends[-1] < dynamics.num_states:
@@ -252,8 +253,8 @@ def _ends(dynamics: Dynamics, num_starts: int) -> np.ndarray:
 def _largest_successors(dynamics: Dynamics) -> np.ndarray:
     result = np.empty(dynamics.num_states, np.int64)
     table = dynamics.deterministic_table()
-    for start in range(0, dynamics.num_states, BLOCK):
-        states = np.arange(start, min(start + BLOCK, dynamics.num_states))
+    for start in range(0, dynamics.num_states, STATES_PER_BLOCK):
+        states = np.arange(start, min(start + STATES_PER_BLOCK, dynamics.num_states))
         if table is not None:
             result[states] = table[start : states[-1] + 1].max(axis=1)
             continue
@@ -267,7 +268,7 @@ def _largest_successors(dynamics: Dynamics) -> np.ndarray:
 
 
 def _distances(mdp: TabularMDP) -> np.ndarray:
-    """(S,) steps from a start state, -1 where there is no way."""
+    """(S,) steps from a start state, -1 if there is no way."""
     result = np.full(mdp.num_states + 1, -1, np.int32)
     frontier, layer = mdp.starts, 0
     result[frontier] = 0
@@ -284,7 +285,7 @@ def _distances(mdp: TabularMDP) -> np.ndarray:
 
 
 OPTIMAL, UNIFORM, LEARNT = "optimal", "uniform", "learnt"  # the policies, by name
-ASKED_EVERYWHERE = 200_000  # states and, where it matters, previous actions; above, a policy is asked where it gets to
+ASKED_EVERYWHERE = 200_000  # states and, if it matters, previous actions; above, only in states that it reaches
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +295,7 @@ class Learnt:
     Attributes:
         policy: a table, or what sees observations.
         name: for people.
-        observation, observation_options, previous_action: what it sees, where it is no table.
+        observation, observation_options, previous_action: what it sees, if it is no table.
         facts: what is known of it, such as the regret of its run: name -> text.
     """
 

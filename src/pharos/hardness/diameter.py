@@ -1,18 +1,18 @@
 """Diameter: the largest number of steps of the best way between two states. Source: Jaksch, Ortner and Auer (2010).
 
 Deterministic MDPs: directed ExactSumSweep (Borassi et al. 2015) from the start state, searches from many nodes at once
-where it does not close (Then et al. 2014), and an argument of ours for spaces that contain a clock. Chance:
+if it does not close (Then et al. 2014), and an argument of ours for spaces that contain a clock. Chance:
 `stochastic_diameter`.
 
 The diameter as Colosseum defines it for episodes of a fixed length. Source: Conserva and Rauber (2022).
 
-Where searches do not fit in memory (`LeanSweep`): two bytes a node and bound, and the table read in order. The
-algorithm is that of sum_sweep.py, without the parts that need more memory. Distances come from sweeps over the table
+If searches do not fit in memory (`LeanSweep`): two bytes a node and bound, and the table read in order. The
+algorithm is the one of sum_sweep.py, without the parts that need more memory. Distances come from sweeps over the table
 (kernels/graph.py) in place of searches with a queue and a reversed graph, which takes 8 bytes an edge. Arrays that
 memory has no room for are mapped files; bounds may be in files that outlive the process, of which the search in
 progress is all that is lost.
 
-`KeptBounds`: bounds on all eccentricities in a folder, so that a diameter whose searches take minutes goes on where it
+`KeptBounds`: bounds on all eccentricities in a folder, so that a diameter whose searches take minutes goes on after it
 was killed. Searches only ever raise lower bounds and lower upper ones, so that a file that was left in the middle of an
 update holds bounds all the same. What counts is that they are of the same graph, of which a digest is kept beside them.
 """
@@ -64,8 +64,8 @@ def diameter(
         tolerance: relative width of the interval from which on it counts as exact. Counted steps are exact anyway.
         budget: seconds (300 by default), or a `Budget`; a value out of reach comes as the interval proven by then.
         progress: called with a `MeasureProgress` now and then.
-        bounds: a folder for the bounds on all states, 8 bytes each, where memory has no room for searches of a
-            deterministic MDP: the same call goes on from them where one was killed, or its budget spent. They are
+        bounds: a folder for the bounds on all states, 8 bytes each, if memory has no room for searches of a
+            deterministic MDP: the same call goes on from them after one was killed, or its budget spent. They are
             removed once the diameter is known.
     Returns:
         An `Interval`, in steps. The implicit end of an episode (-1 in a row of `next_states`) counts as one more state,
@@ -75,7 +75,7 @@ def diameter(
         ParameterError: an option is out of range. FileFormatError: `bounds` are of another MDP. FolderLocked: in use.
     Cost:
         deterministic: usually 3 to 100 breadth-first searches, each one pass over the table in the order of discovery;
-        memory 8 bytes an edge and 32 a state. Where there is less, some ten sweeps over the table in place of each
+        memory 8 bytes an edge and 32 a state. If there is less, some ten sweeps over the table in place of each
         search, and 12 bytes a state, which may be mapped files. Chance: see `stochastic_diameter`.
     Source: Jaksch, Ortner and Auer (2010), definition 1; Borassi et al. (2015), "Fast diameter and radius BFS-based
         computation in (weakly connected) real-world graphs", section 4.
@@ -107,12 +107,12 @@ def start_eccentricity(
         tolerance: relative accuracy under chance, and with several start states; else it is counted.
         budget: seconds (300 by default), or a `Budget`, under chance and with several start states.
     Returns:
-        Steps; infinite where some state cannot be reached from some start state. An expectation comes as its upper
+        Steps; infinite if some state cannot be reached from some start state. An expectation comes as its upper
         bound, proven to lie within `tolerance`.
     Raises:
         UndefinedMeasure: out of reach of the budget or of 64-bit floats; it names the interval that is proven.
         `start_eccentricity_interval` returns it.
-    Cost: one search for each start state; under chance, and where terminal states lead back to several start states,
+    Cost: one search for each start state; under chance, and if terminal states lead back to several start states,
         one stochastic shortest path problem for each target that bounds do not rule out.
     Source: the pharos paper, equation 1.
     """
@@ -203,9 +203,9 @@ def colosseum_diameter(mdp: TabularMDP, *, horizon: int | None = None) -> float:
     1 + E[ET_e(0, s0)], and no state has more. Terminal states last until the episode starts again.
 
     Args:
-        horizon: H, steps; that of the MDP by default.
+        horizon: H, steps; the MDP's by default.
     Returns:
-        Steps; infinite where some state cannot be reached within an episode with positive probability.
+        Steps; infinite if some state cannot be reached within an episode with positive probability.
     Raises:
         ParameterError: there is no horizon, or it is below 1.
     Cost: a few backward passes of H steps for each state; O(H S^2 A) time for each pass with sparse rows.
@@ -250,7 +250,7 @@ class _Episodes:
         return self.rho @ steps, self.rho @ misses
 
     def times_from_start(self) -> np.ndarray:
-        """(targets,), E[ET(0, s0)]; infinite where every episode from the start misses the target."""
+        """(targets,), E[ET(0, s0)]; infinite if every episode from the start misses the target."""
         c, q = self._pass(np.ones(self.goal.shape[1]), 0.0)
         lost = q >= 1 - 1e-12
         x = np.where(lost, 0.0, c / np.where(lost, 1.0, 1 - q))
@@ -266,10 +266,10 @@ class _Episodes:
 # Beyond memory --------------------------------------------------------------------------------------------------------
 
 
-_FILE, _RECORD = "bounds.npy", "bounds.json"
-_FORMAT = 1
+_FILE, _BOUNDS_RECORD = "bounds.npy", "bounds.json"
+_BOUNDS_FORMAT = 1
 # Rows of a table that a digest reads in one go.
-_BLOCK = 1 << 20
+_DIGEST_ROWS = 1 << 20
 
 
 class KeptBounds:
@@ -284,26 +284,26 @@ class KeptBounds:
         Raises:
             FileFormatError: the folder holds the bounds of another graph.
         """
-        self._folder, self._graph = folder, digest_of(graph)
+        self._folder, self._graph = folder, graph_digest(graph)
         self._size = graph.num_nodes
         self.dtype: np.dtype | None = None
-        path = folder / _RECORD
+        path = folder / _BOUNDS_RECORD
         if not path.exists():
             return
         record = storage.read_json(path)
-        if not isinstance(record, dict) or record.get("format") != _FORMAT or record.get("graph") != self._graph:
+        if not isinstance(record, dict) or record.get("format") != _BOUNDS_FORMAT or record.get("graph") != self._graph:
             raise FileFormatError(
                 f"{path}: is of another graph, or of another pharos; choose another folder, or delete {_FILE} and "
-                f"{_RECORD} there"
+                f"{_BOUNDS_RECORD} there"
             )
         self.dtype = np.dtype(np.int16 if record.get("bytes") == 2 else np.int32)
 
     def arrays(self, dtype: np.dtype) -> np.ndarray:
-        """(4, N): lower bounds on out(v) and in(v), then upper ones; those of the file, or 0 and the largest number.
+        """(4, N): lower bounds on out(v) and in(v), then upper ones; from the file, or 0 and the largest number.
 
         The record is written once these are on the disk: after a power failure a file may hold what it held before.
         """
-        path, record = storage.inside(self._folder, _FILE), self._folder / _RECORD
+        path, record = storage.inside(self._folder, _FILE), self._folder / _BOUNDS_RECORD
         try:
             if self.dtype != dtype:
                 record.unlink(missing_ok=True)
@@ -313,7 +313,7 @@ class KeptBounds:
                 bounds[:2] = 0
                 bounds[2:] = np.iinfo(dtype).max
                 storage.sync(path)
-                storage.replace_json(record, {"format": _FORMAT, "graph": self._graph, "bytes": dtype.itemsize})
+                storage.replace_json(record, {"format": _BOUNDS_FORMAT, "graph": self._graph, "bytes": dtype.itemsize})
                 self.dtype = dtype
         except OSError as error:
             raise ParameterError(f"{path}: cannot be used for bounds: {error.strerror}; choose another one") from error
@@ -321,16 +321,16 @@ class KeptBounds:
 
     def remove(self) -> None:
         """Delete the files, once the diameter is known."""
-        for name in (_RECORD, _FILE):
+        for name in (_BOUNDS_RECORD, _FILE):
             (self._folder / name).unlink(missing_ok=True)
 
 
-def digest_of(graph: Graph) -> str:
+def graph_digest(graph: Graph) -> str:
     """Digest of all that distances depend on: the table, the states that end, and the state to which these lead."""
     digest = xxhash.xxh3_128(f"{graph.next_states.shape} {graph.start} {graph.has_end}".encode())
     for rows in (graph.next_states, graph.ends):
-        for start in range(0, len(rows), _BLOCK):
-            digest.update(np.ascontiguousarray(rows[start : start + _BLOCK]).data)
+        for start in range(0, len(rows), _DIGEST_ROWS):
+            digest.update(np.ascontiguousarray(rows[start : start + _DIGEST_ROWS]).data)
     return digest.hexdigest()
 
 
@@ -349,7 +349,7 @@ def needs_more_than_memory(graph: Graph) -> bool:
 def lean_diameter(graph: Graph, spending: BudgetClock, folder: str | os.PathLike | None = None) -> Interval:
     """The diameter, or the interval proven within the budget.
 
-    folder: where bounds are kept, and from which tightening goes on; None: in memory.
+    folder: in which bounds are kept, and from which tightening goes on; None: in memory.
     """
     store = None if folder is None else KeptBounds(Path(folder), graph)
 
@@ -375,7 +375,7 @@ def lean_eccentricity(graph: Graph, source: int, spending: BudgetClock) -> Inter
 
 
 def _in_two_bytes_or_four(result: Callable[[Integers], Result]) -> Result:
-    """result(dtype) with distances of two bytes; of four where one does not fit into two."""
+    """result(dtype) with distances of two bytes; of four if one does not fit into two."""
     try:
         return result(np.int16)
     except OverflowError:
@@ -398,7 +398,7 @@ class LeanGraph:
     def search_forward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
         """Set distance[v] to d(source, v), or `far`; return (nodes found, largest distance, sum of distances).
 
-        OverflowError where a distance does not fit.
+        OverflowError if a distance does not fit.
         """
         return self._swept(kernels.lower_forward, source, distance, False)
 
@@ -454,7 +454,7 @@ class LeanSweep(SumSweep):
         self.method = "directed ExactSumSweep, by sweeps over the table"
 
     def interval(self) -> Interval:
-        """The diameter, or the interval proven within the budget. OverflowError where bounds do not fit."""
+        """The diameter, or the interval proven within the budget. OverflowError if bounds do not fit."""
         graph = self.graph
         if not self._is_bounded() and not self._pivot(graph.pivot):
             note = "some states cannot be reached from others; how many pairs was not counted, for want of memory"

@@ -26,12 +26,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from pharos.errors import PrecisionError, UndefinedMeasure
-from pharos.hardness.gaps import optimal_solution, solved
+from pharos.hardness.gaps import optimal_solution, solution_within
 from pharos.hardness.gorp import gorp_bound
 from pharos.hardness.interval import fields_of
-from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
+from pharos.hardness.steps import OPTIMAL_TIE, FiniteHorizonValues, check_returns, steps_of
 from pharos.mdp import (
-    STEPS,
+    STEPS_EXPECTED,
     ExpandedMDP,
     TabularMDP,
     mdp_within,
@@ -53,7 +53,7 @@ class LookAhead:
         k_min: smallest k for which acting greedily in Q^k is optimal, Q^1 being the value of uniform play.
         effective_planning_window: the same from Q^1 = r: the number of rewards ahead that planning needs.
         ks, ms, gaps, vars: for each k that was tried and does not fail: k, the samples m_k, and gap and variance bound
-            where m_k is attained.
+            of the node at which m_k is attained.
     """
 
     value: float
@@ -72,7 +72,7 @@ class LookAhead:
         return f"{self.value:.6g} (k_min {self.k_min}, window {self.effective_planning_window})"
 
 
-COMPILED = 2**26  # bytes of the table of all steps from which on it is not written out
+LARGEST_WRITTEN_TABLE = 2**26  # bytes of the table of all steps from which on it is not written out
 GREEDY_RETURNS = 5
 WRITTEN_OUT = 2**18  # action values, of nodes that each lead to one; of more a compiled kernel is worth loading
 
@@ -84,7 +84,7 @@ class EffectiveHorizon(LookAhead):
     Attributes:
         value, k_min, effective_planning_window, ks, ms, gaps, vars: see LookAhead; `value` is the effective horizon by
             the simple bound.
-        tight: a tighter bound by GORP's failure probability, where it was asked for; else None.
+        tight: a tighter bound by GORP's failure probability, if it was asked for; else None.
         greedy_returns: J_k for k = 1, ..., 5: return of the policy greedy in Q^k, ties broken adversarially.
         optimal_return, random_return, worst_return: from the start.
         num_states: number of states that can be met at some step; under sticky actions, as BRIDGE counts, of pairs
@@ -117,42 +117,45 @@ def effective_horizon(
         m_k = max over states met of max(1, ceil(16 max_a var^k / gap_k^2 ln(2 T A^k))),  H = min_k k + log_A m_k
 
     gap_k is the difference between the largest Q^k and the largest Q^k of an action that is not optimal; states met are
-    those that actions better than all of the latter lead to. k fails where that difference is exactly 0. Where some
-    actions are not available, the uniform policy takes those that are, and A is the largest number of them in a state.
+    the states that actions better than all of the latter lead to. k fails if that difference is exactly 0. If
+    some actions are not available, the uniform policy takes the available ones, and A is the largest number of them in
+    a state.
 
     Args:
-        horizon: T; None: that of the MDP.
+        horizon: T; None: the MDP's.
         tight: the largest k for which the tight bound of `gorp_bound` is computed as well; 0: none.
         progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: there is no horizon, or the table of all steps does not fit into memory: 8 GiB under chance,
-            else 60 % of that of the machine. PrecisionError: returns may pass 1e150.
-    Cost: a pass over T x nodes x A for every k that is tried, of those that can be met within T steps. Memory 40 bytes
-        for each of them under chance; 17 bytes for each of T x S without.
+            else 60 % of the machine's memory. PrecisionError: returns may pass 1e150.
+    Cost: a pass over T x nodes x A for every k that is tried, of the nodes that can be met within T steps. Memory 40
+        bytes for each of them under chance; 17 bytes for each of T x S without.
     Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", theorem
         5.4 and appendix C; sticky actions: Laidlaw et al. (2024).
     """
     steps = steps_of("effective_horizon", mdp, horizon)
     check_returns("effective_horizon", mdp, steps)
     mdp = mdp_within(mdp, steps)
-    compiled = applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > COMPILED
-    tell = progress or str
-    parts = parts_of(LargeHorizon(mdp, steps, TIE, tell) if compiled else NodeHorizon.of_steps(mdp, steps, tell))
+    compiled = applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > LARGEST_WRITTEN_TABLE
+    report = progress or str
+    parts = horizon_fields(
+        LargeHorizon(mdp, steps, OPTIMAL_TIE, report) if compiled else NodeHorizon.of_steps(mdp, steps, report)
+    )
     bound = gorp_bound(mdp, horizon=steps, max_k=tight, progress=progress).value if tight else None
     conventions = {
         "horizon": steps,
         "gamma": 1.0,
         "exploration": "uniform",
-        "tie_tolerance": TIE,
+        "tie_tolerance": OPTIMAL_TIE,
         "states": mdp.nodes,
     }
     return EffectiveHorizon(**parts, tight=bound, conventions=conventions)
 
 
-def parts_of(values: "NodeHorizon | LargeHorizon") -> dict[str, Any]:
+def horizon_fields(values: "NodeHorizon | LargeHorizon") -> dict[str, Any]:
     """Fields of an `EffectiveHorizon`, but for `tight` and `conventions`."""
     assert values.steps is not None
-    ahead, greedy = look_ahead(values, values.steps, values.most_actions, values.greedy_return, values.tell)
+    ahead, greedy = look_ahead(values, values.steps, values.most_actions, values.greedy_return, values.report)
     returns = dict(zip(("optimal_return", "random_return", "worst_return"), values.returns, strict=True))
     return {**vars(ahead), **returns, "greedy_returns": greedy, "num_states": values.num_visitable}
 
@@ -161,7 +164,7 @@ class LookaheadValues(Protocol):
     """Q^k for one k after the other, k = 1 at first, with the questions of both effective horizons."""
 
     def samples(self, log: float) -> tuple[int, float, float] | None:
-        """(m_k, gap, variance where it is attained), log = ln(2 T A^k); None where k fails."""
+        """(m_k, gap, variance of the node that attains it), log = ln(2 T A^k); None if k fails."""
 
     def is_greedy_optimal(self) -> bool:
         """Whether all actions greedy in Q^k, from the start on, are optimal."""
@@ -178,9 +181,9 @@ def look_ahead(
     steps: int,
     num_actions: int,
     greedy_return: Callable[[], float] | None = None,
-    tell: Callable[[str], object] = str,
+    report: Callable[[str], object] = str,
 ) -> tuple[LookAhead, list[float]]:
-    """(LookAhead of episodes of `steps` steps, `greedy_return` for k = 1, ..., 5, where it is given)."""
+    """(LookAhead of episodes of `steps` steps, `greedy_return` for k = 1, ..., 5, if it is given)."""
     best, log_actions = float(steps), math.log(num_actions)
     rows: list[tuple[int, int, float, float]] = []
     greedy: list[float] = []
@@ -188,7 +191,7 @@ def look_ahead(
     k_min, k = 0, 1
     # Q^1 of uniform play, Q^2, ...: the smallest k + log_A m_k, and the smallest k that acts optimally.
     while k < best or k <= last or not k_min:
-        tell(f"k = {k}, bound {best:.4g}")
+        report(f"k = {k}, bound {best:.4g}")
         if k < best and (needed := values.samples(math.log(2 * steps) + k * log_actions)) is not None:
             rows.append((k, *needed))
             best = min(best, k + (math.log(needed[0]) / log_actions if num_actions > 1 else 0.0))
@@ -202,7 +205,7 @@ def look_ahead(
     values.restart_from_rewards()
     window = 1
     while window < steps and not values.is_greedy_optimal():
-        tell(f"window {window}")
+        report(f"window {window}")
         values.advance(spread=False)
         window += 1
     ks, ms, gaps, variances = (list(each) for each in zip(*rows, strict=True)) if rows else ([], [], [], [])
@@ -228,18 +231,18 @@ class NodeHorizon:
         self.choices, self.rewards, self.gamma, self.steps = choices, rewards, gamma, steps
         self.num_nodes, self.starts = len(rewards), np.array(sorted(node for node, _ in choices.starts))
         self.is_large = choices.table is not None and choices.table.size > WRITTEN_OUT
-        self.tell: Callable[[str], object] = str
+        self.report: Callable[[str], object] = str
 
     @staticmethod
-    def of_steps(mdp: TabularMDP, steps: int, tell: Callable[[str], object] = str) -> "NodeHorizon":
+    def of_steps(mdp: TabularMDP, steps: int, report: Callable[[str], object] = str) -> "NodeHorizon":
         """Values of T steps, all of which are written out."""
-        tree = FiniteHorizonValues(mdp, steps, tell)
+        tree = FiniteHorizonValues(mdp, steps, report)
         nodes = NodeHorizon(tree.choices, tree.rewards, steps=steps)
-        nodes.tell, nodes.most_actions, nodes.num_visitable = tell, tree.most_actions, tree.num_visitable
+        nodes.report, nodes.most_actions, nodes.num_visitable = report, tree.most_actions, tree.num_visitable
         values = (tree.best.max(axis=2)[0], tree.explored_value[0], tree.worst.min(axis=2)[0])
         nodes.returns = tuple(map(tree.at_start, values))
         nodes.values = [_ActionValues(nodes, value) for value in nodes._after(tree.explored_value)]
-        nodes.compare(zip(tree.best, tree.worst, tree.explored, strict=True), TIE)
+        nodes.compare(zip(tree.best, tree.worst, tree.explored, strict=True), OPTIMAL_TIE)
         return nodes
 
     def compare(self, values: Iterable[Sequence[np.ndarray]], tie: float, slack: float = 0.0) -> None:
@@ -253,7 +256,7 @@ class NodeHorizon:
             self.spread.append(((e - w) * (b - w)).max(axis=1))
 
     def _after(self, rows: Iterable[np.ndarray]) -> list[np.ndarray]:
-        """Rows (N,) that come after each step, of those of each step: zeros after the last of T steps."""
+        """Rows (N,) that come after each step, from the rows of each step: zeros after the last of T steps."""
         return list(rows) if self.steps is None else [*rows, np.zeros(self.num_nodes)][1:]
 
     def samples(self, log: float) -> tuple[int, float, float] | None:
@@ -280,7 +283,7 @@ class NodeHorizon:
         return self.met(greedy) is not None
 
     def met(self, actions: Callable[[int, np.ndarray], np.ndarray | None]) -> list[np.ndarray] | None:
-        """The nodes that are met at each of T steps by some actions, or at any step; None where `actions` is None.
+        """The nodes that are met at each of T steps by some actions, or at any step; None if `actions` is None.
 
         actions: from a step and nodes (n,) to (n, A) bool, the actions that are chosen there.
         """
@@ -302,7 +305,7 @@ class NodeHorizon:
     def advance(self, spread: bool = True) -> None:
         best = []
         for t, values in enumerate(self.values):
-            self.tell(f"lookahead of step {t} of {self.steps}")
+            self.report(f"lookahead of step {t} of {self.steps}")
             best.append(values.best)
         self.values = [_ActionValues(self, value) for value in self._after(best)]
         if spread:
@@ -316,7 +319,7 @@ class NodeHorizon:
         from pharos.kernels import horizon
 
         result = np.empty(self.num_nodes)
-        horizon.largest(self.choices.table, values, result)
+        horizon.largest_after(self.choices.table, values, result)
         return result
 
     def restart_from_rewards(self) -> None:
@@ -333,7 +336,7 @@ class NodeHorizon:
 
 
 class _ActionValues:
-    """Action values r + gamma E value(next) of nodes; on demand where there are many and each leads to one node."""
+    """Action values r + gamma E value(next) of nodes; on demand if there are many and each leads to one node."""
 
     def __init__(self, nodes: NodeHorizon, value: np.ndarray):
         self.nodes, self.value = nodes, value
@@ -374,7 +377,7 @@ def most_samples(gap: np.ndarray, variance: np.ndarray, log: float) -> tuple[int
 # Large horizon --------------------------------------------------------------------------------------------------------
 
 
-_PARTS = 0.6  # of the memory that is free
+_MEMORY_SHARE = 0.6  # of the memory that is free
 
 
 def applies(mdp: TabularMDP) -> bool:
@@ -388,23 +391,23 @@ class LargeHorizon:
     Attributes:
         ahead: (T + 1, S) W^{k-1}, for the present k; row T is 0.
         spread: (T, S) max over a of var^k.
-        optimal: (T, S) bit a is set where a is optimal.
+        optimal: (T, S) bit a is set if a is optimal.
     """
 
-    def __init__(self, mdp: TabularMDP, steps: int, tie: float, tell: Callable[[str], object] = str):
+    def __init__(self, mdp: TabularMDP, steps: int, tie: float, report: Callable[[str], object] = str):
         from pharos.kernels import horizon as kernels
 
-        self.kernels, self.steps, self.most_actions, self.tell = kernels, steps, mdp.num_actions, tell
+        self.kernels, self.steps, self.most_actions, self.report = kernels, steps, mdp.num_actions, report
         states = mdp.num_states
         bits = next(
             kind for kind in (np.uint8, np.uint16, np.uint32, np.uint64) if mdp.num_actions <= 8 * kind(0).itemsize
         )
         needed = (16 + bits(0).itemsize) * steps * states
-        if needed > (room := _PARTS * memory.available_memory()):
+        if needed > (room := _MEMORY_SHARE * memory.available_memory()):
             raise UndefinedMeasure(
                 f"effective_horizon: {steps} steps of the {states} states that they can meet need "
                 f"{needed / 2**30:.1f} GiB, more than {room / 2**30:.1f}, "
-                f"{_PARTS:.0%} of the free memory; a smaller horizon or instance would define it"
+                f"{_MEMORY_SHARE:.0%} of the free memory; a smaller horizon or instance would define it"
             )
         table = mdp.dynamics.deterministic_table()
         assert table is not None
@@ -419,8 +422,8 @@ class LargeHorizon:
         best, worst = np.zeros((2, states)), np.zeros((2, states))
         for t in range(steps - 1, -1, -1):
             now, after = t % 2, 1 - t % 2
-            tell(f"values of step {t} of {steps}")
-            kernels.values(
+            report(f"values of step {t} of {steps}")
+            kernels.step_values(
                 *(self.next_states, self.rewards, tie, best[after], worst[after], self.ahead[t + 1]),
                 *(best[now], worst[now], self.ahead[t], self.optimal[t], self.spread[t]),
             )
@@ -455,7 +458,7 @@ class LargeHorizon:
         n, most = self._begin(), np.zeros(3)
         now, after = self.nodes
         for t in range(self.steps):
-            self.tell(f"states met at step {t} of {self.steps}")
+            self.report(f"states met at step {t} of {self.steps}")
             n = self.kernels.step_along(
                 *(self.next_states, self.rewards, self.ahead[t + 1], self.optimal[t], self.spread[t], log, near),
                 *(now, n, after, self.is_visited, most),
@@ -471,11 +474,11 @@ class LargeHorizon:
     def advance(self, spread: bool = True) -> None:
         nothing = np.zeros(len(self.next_states))
         for t in range(self.steps):
-            self.tell(f"lookahead of step {t} of {self.steps}")
+            self.report(f"lookahead of step {t} of {self.steps}")
             self.kernels.lookahead(self.next_states, self.rewards, 1.0, self.ahead[t + 1], self.ahead[t])
             if spread:
                 after = self.spread[t + 1] if t + 1 < self.steps else nothing
-                self.kernels.largest(self.next_states, after, self.spread[t])
+                self.kernels.largest_after(self.next_states, after, self.spread[t])
 
     def restart_from_rewards(self) -> None:
         self.ahead[:] = 0.0
@@ -497,7 +500,7 @@ class StationaryHorizon(LookAhead):
     """Effective horizon of a discounted MDP, of values that do not depend on the step.
 
     Attributes:
-        value, k_min, effective_planning_window, ks, ms, gaps, vars: see LookAhead; k_min is `steps` where no k will do.
+        value, k_min, effective_planning_window, ks, ms, gaps, vars: see LookAhead; k_min is `steps` if no k will do.
         conventions: gamma, steps, tie tolerance, slack of comparisons.
     """
 
@@ -525,7 +528,7 @@ def stationary_effective_horizon(
         m_k = max over states met of max(1, ceil(16 max_a var^k / gap_k^2 ln(2 T A^k))),  H = min_k k + log_A m_k
 
     As `effective_horizon`, but for values that do not depend on the step: in place of T steps there are states, and T,
-    the time limit, only counts the decisions. Where an MDP ends by itself within T steps, each state at one depth, both
+    the time limit, only counts the decisions. If an MDP ends by itself within T steps, each state at one depth, both
     are the same for gamma = 1.
 
     Args:
@@ -533,7 +536,7 @@ def stationary_effective_horizon(
         steps: T; None: the MDP's horizon, else ceil(1 / (1 - gamma)).
         tie_tolerance: an action is optimal if its value is within it of the best; None: 2.5 times the largest error of
             the values, at least 1e-9.
-        tolerance: largest error of the values; a larger one is used where floats cannot reach it.
+        tolerance: largest error of the values; a larger one is used if floats cannot reach it.
         progress: called with a line on the progress.
     Raises:
         UndefinedMeasure: gamma is 1.
@@ -549,10 +552,12 @@ def stationary_effective_horizon(
         raise UndefinedMeasure(
             "stationary_effective_horizon is defined for gamma < 1; see effective_horizon for episodes"
         )
-    limit = mdp.horizon or math.ceil(1 / (1 - mdp.gamma)) if steps is None else whole_number(steps, "steps", STEPS)
+    limit = (
+        mdp.horizon or math.ceil(1 / (1 - mdp.gamma)) if steps is None else whole_number(steps, "steps", STEPS_EXPECTED)
+    )
     endless = mdp if mdp.horizon is None else mdp.with_horizon(None)
-    tell = progress or str
-    nodes, values, error = _nodes_of(endless, solution, tolerance, tell)
+    report = progress or str
+    nodes, values, error = _nodes_of(endless, solution, tolerance, report)
     floor = 2 * error
     tie = max(1e-9, 1.25 * floor) if tie_tolerance is None else float(tie_tolerance)
     if not tie > floor:
@@ -562,7 +567,7 @@ def stationary_effective_horizon(
         )
     slack = max(1e-12, 2 * floor)
     nodes.compare([values], tie, slack)
-    ahead, _ = look_ahead(nodes, limit, most_actions(mdp), tell=tell)
+    ahead, _ = look_ahead(nodes, limit, most_actions(mdp), report=report)
     conventions = {
         "gamma": mdp.gamma,
         "steps": limit,
@@ -575,16 +580,16 @@ def stationary_effective_horizon(
 
 
 def _nodes_of(
-    mdp: TabularMDP, solution: Solution | None, tolerance: float, tell: Callable[[str], object]
+    mdp: TabularMDP, solution: Solution | None, tolerance: float, report: Callable[[str], object]
 ) -> tuple[NodeHorizon, list[np.ndarray], float]:
     """(Lookahead values without time, action values (N, A) of the best, worst and uniform play, their error)."""
     choices = _states_and_the_end(mdp) if mdp.is_deterministic else ExpandedMDP.of(mdp, restart=False).reachable()
     nodes = NodeHorizon(choices, choices.rewards(mdp), mdp.gamma)
 
-    def solution_of(solve: Callable[..., Solution], whose: str) -> Solution:
-        tell(f"values of {whose} play")
-        return solved(
-            solve, mdp, tolerance, progress=lambda sweeps, _: tell(f"sweep {sweeps} of the values of {whose} play")
+    def solution_of(solve: Callable[..., Solution], play: str) -> Solution:
+        report(f"values of {play} play")
+        return solution_within(
+            solve, mdp, tolerance, progress=lambda sweeps, _: report(f"sweep {sweeps} of the values of {play} play")
         )
 
     best = solution_of(value_iteration, "optimal") if solution is None else optimal_solution(mdp, solution)

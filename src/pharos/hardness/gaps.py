@@ -1,15 +1,15 @@
 """Suboptimality gaps: how much worse an action is than the best one. Source: Simchowitz and Jamieson (2019).
 
 What is proven. Each value is within the solution's error bound of the true one, so a gap is known to twice that. A gap
-above the tie tolerance is a gap. Below it, a tie is proven where the best action and this one pay the same and lead to
-the same states, or where equal values come from equal rewards for ever; else it may be a gap of any size, and its
+above the tie tolerance is a gap. Below it, a tie is proven if the best action and this one pay the same and lead to
+the same states, or if equal values come from equal rewards for ever; else it may be a gap of any size, and its
 reciprocal anything. Proofs that actions of equal computed value are tied:
 
 1. Two actions that pay the same and have the same outcomes are tied, whatever the MDP.
 
 2. Deterministic dynamics, with or without sticky actions. Let x be the computed values, and let every action that is
 not among the best computed ones be surely worse (its gap exceeds the error). Call two pairs (state, previous action)
-alike where x is the same to the last bit. If all pairs that are alike, and each of the best actions there, pay the same
+alike if x is the same to the last bit. If all pairs that are alike, and each of the best actions there, pay the same
 and lead to pairs that are alike, then what the best actions collect is the same sequence of rewards for ever, so their
 values are the same number: any choice among them solves the same equations, one for each class of pairs. Under sticky
 actions the action that is repeated must lead on alike as well. A map from values to rewards and next values
@@ -39,17 +39,17 @@ from pharos.solvers import Solution, value_iteration
 from pharos.system.memory import large_zeros
 
 # States at once; fixed, so that sums do not depend on the machine, and so few that a block stays in the cache.
-_BLOCK = 1 << 14
+_GAP_BLOCK = 1 << 14
 # Bytes for the values of every step, with a horizon.
 _MEMORY = 8 * 2**30
 
 
 class Step(NamedTuple):
-    """Values of a time step, or of all where there is no horizon, and how often each state counts."""
+    """Values of a time step, or of all if there is no horizon, and how often each state counts."""
 
     own: np.ndarray  # (S + 1, W) x of this step
     next_x: np.ndarray  # (S + 1, W) x of the next step
-    later: np.ndarray  # (S,) see `steps_of`
+    later: np.ndarray  # (S,) see `value_steps`
     first: np.ndarray
 
 
@@ -80,15 +80,15 @@ class GapBlock(NamedTuple):
 
 def weighted_gaps(mdp: TabularMDP, solution: Solution) -> Iterator[GapBlock]:
     """The gaps of all states, in blocks."""
-    for number, step in enumerate(steps_of(mdp, solution)):
+    for number, step in enumerate(value_steps(mdp, solution)):
         yield from _gaps_of_step(mdp, step, number, solution.horizon is None and not mdp.is_sticky)
 
 
 def _gaps_of_step(mdp: TabularMDP, step: Step, number: int, everywhere: bool) -> Iterator[GapBlock]:
     """The gaps of one step, in blocks; `everywhere`: states that cannot be reached have a weight, too."""
     chance = mdp.chance
-    for first in range(0, mdp.num_states, _BLOCK):
-        block = slice(first, min(first + _BLOCK, mdp.num_states))
+    for first in range(0, mdp.num_states, _GAP_BLOCK):
+        block = slice(first, min(first + _GAP_BLOCK, mdp.num_states))
         states = np.arange(block.start, block.stop)
         rewards = mdp.reward_table.rows(block)
         next_values = mdp.acting(mdp.dynamics.expected(step.next_x, block), block)
@@ -113,7 +113,7 @@ def _of_sets(gap: np.ndarray, sets: np.ndarray | None) -> np.ndarray:
     return gap if sets is None else np.where(sets, gap, np.inf)
 
 
-def steps_of(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
+def value_steps(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
     """Yield the values of each step t = 1, ..., T, or once, and how many times each state counts.
 
     later (S,): 1 for a reachable state, under sticky actions the number of actions by which it can be
@@ -208,7 +208,7 @@ class TieProof:
 
 
 def _empty_map(size: int, width: int) -> np.ndarray:
-    return np.full((size, 3 if width == 1 else 5), kernels.FREE, np.int64)
+    return np.full((size, 3 if width == 1 else 5), kernels.FREE_KEY, np.int64)
 
 
 def same_outcomes(
@@ -233,7 +233,7 @@ class UnresolvedTies:
     """Count of the ties that are not proven to be ties.
 
     Attributes:
-        small: gaps that are computed as larger than 0, and no larger than the tolerance; where the tolerance is part of
+        small: gaps that are computed as larger than 0, and no larger than the tolerance; if the tolerance is part of
             the definition, gaps that are within their error of it.
         equal: gaps that are computed as 0, beyond the first of a state.
     """
@@ -292,7 +292,7 @@ class UnresolvedTies:
 # Of Colosseum.
 REGULARIZER = 0.1
 # Relative width up to which an interval counts as the value.
-NARROW = 1e-6
+VALUE_WIDTH = 1e-6
 # The default tie tolerance is this times the error bound of the values; more than 2, as a gap is known to twice the
 # bound.
 ERRORS_PER_TIE = 2.5
@@ -312,10 +312,10 @@ class Gaps:
         sum_of_reciprocals: sum of 1 / gap over the states that can be reached and are not terminal, and the actions
             with gap > tie_tolerance. Unit: 1 / return.
         lower, upper: the true sum lies between them: each gap is known up to twice the error bound of the solution.
-            `upper` is infinite where ties are unresolved.
+            `upper` is infinite if ties are unresolved.
         regularized: sum of 1 / (gap + 0.1) over all states and actions, optimal ones and terminal states included, as
             Colosseum prints it.
-        minimal: the smallest gap > tie_tolerance; infinite where there is none.
+        minimal: the smallest gap > tie_tolerance; infinite if there is none.
         count, ties: how many gaps exceed tie_tolerance, and how many do not, the best actions among them.
         unresolved: how many ties are not proven, so that they may be gaps smaller than the tolerance; with a
             `tie_tolerance` of the caller's own, how many gaps are within their error of it.
@@ -344,7 +344,7 @@ class Gaps:
     @property
     def is_resolved(self) -> bool:
         """Whether ties are ties, and the sum is known to a relative 1e-6."""
-        return not self.unresolved and self.upper - self.lower <= NARROW * self.upper
+        return not self.unresolved and self.upper - self.lower <= VALUE_WIDTH * self.upper
 
     @property
     def certified_sum(self) -> Certified:
@@ -353,7 +353,7 @@ class Gaps:
 
     @property
     def certified_minimal(self) -> Certified:
-        """The smallest gap, with its interval: from 0 on where ties are unresolved."""
+        """The smallest gap, with its interval: from 0 on if ties are unresolved."""
         low, high = self.minimal * (1 - _ROUNDING) - self.error, self.minimal * (1 + _ROUNDING) + self.error
         return self._certified(self.minimal, 0.0 if self.unresolved else max(low, 0.0), high)
 
@@ -363,10 +363,10 @@ class Gaps:
         share = self.error / REGULARIZER
         high = self.regularized / (1 - share) * (1 + _ROUNDING) if share < 1 else math.inf
         low = self.regularized / (1 + share) * (1 - _ROUNDING)
-        return Certified(self.regularized, low, high, high - low <= NARROW * high)
+        return Certified(self.regularized, low, high, high - low <= VALUE_WIDTH * high)
 
     def _certified(self, value: float, lower: float, upper: float) -> Certified:
-        exact = not self.unresolved and (lower == upper or upper - lower <= NARROW * upper)
+        exact = not self.unresolved and (lower == upper or upper - lower <= VALUE_WIDTH * upper)
         note = ""
         if self.unresolved:
             note = (
@@ -405,7 +405,7 @@ def gaps(
     steps: the sum runs over t = 1, ..., T and the states that can be reached at step t, as in Simchowitz and Jamieson.
 
     Args:
-        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, and where that leaves ties
+        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, and if that leaves ties
             unresolved to what 64-bit floats can reach.
         tie_tolerance: gaps up to it count as ties. None: 2.5 times the error bound of the solution.
     Raises:
@@ -424,7 +424,7 @@ def gaps(
 def resolved_gaps(
     mdp: TabularMDP, solution: Solution, in_place: bool = False, go_on: Callable[[], bool] = lambda: True
 ) -> Gaps:
-    """The gaps of a solution; of a more accurate one where ties are unresolved, or the sum is wide.
+    """The gaps of a solution; of a more accurate one if ties are unresolved, or the sum is wide.
 
     in_place: whether the values of the solution may become the more accurate ones; its bound holds for these, too.
     go_on: whether there may be another sweep; asked before each.
@@ -444,7 +444,7 @@ def resolved_gaps(
 def _settled(mdp: TabularMDP, solution: Solution, in_place: bool, go_on: Callable[[], bool]) -> Solution:
     """The solution after more sweeps, until values do not change, or by no more than rounding.
 
-    The bound is that of `pharos.solvers`: (rho change + rounding) / (1 - rho). Values that do not change at all make
+    The bound comes from `pharos.solvers`: (rho change + rounding) / (1 - rho). Values that do not change at all make
     proofs of ties possible, as equal states then have equal floats. A sweep keeps every bound D of that form: new
     entries are within rho D + rounding <= D of the fixed point.
     """
@@ -496,7 +496,7 @@ def minimal_gap(
     *,
     tie_tolerance: float | None = None,
 ) -> float:
-    """Return the smallest gap(s, a) that is no tie; infinite where there is none. As `gaps` says."""
+    """Return the smallest gap(s, a) that is no tie; infinite if there is none. As `gaps` says."""
     return gaps(mdp, solution, tie_tolerance=tie_tolerance).minimal
 
 
@@ -507,7 +507,7 @@ def gaps_of_states(
     solution = optimal_solution(mdp, solution)
     tolerance = _tolerance(tie_tolerance, _error(mdp, solution))
     blocks = ((part.gap, part.counted) for part in weighted_gaps(mdp, solution))
-    return blocks, tolerance, _conventions(mdp, solution, tolerance)
+    return blocks, tolerance, _gap_conventions(mdp, solution, tolerance)
 
 
 def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
@@ -517,7 +517,7 @@ def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
         ParameterError: it is of another kind or MDP.
     """
     if solution is None:
-        return solved(value_iteration, mdp, 1e-9)
+        return solution_within(value_iteration, mdp, 1e-9)
     shape = (mdp.num_states, mdp.num_actions)
     solution_shape = (solution.mdp.num_states, solution.mdp.num_actions)
     chance, other = ((each.chance, each.laziness) for each in (mdp, solution.mdp))
@@ -533,8 +533,8 @@ def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
     return solution
 
 
-def solved(solve: Callable[..., Solution], mdp: TabularMDP, tolerance: float, **options: Any) -> Solution:
-    """A solution to a tolerance, in return; where floats do not reach it, to the least multiple by a power of ten that
+def solution_within(solve: Callable[..., Solution], mdp: TabularMDP, tolerance: float, **options: Any) -> Solution:
+    """A solution to a tolerance, in return; if floats do not reach it, to the least multiple by a power of ten that
     they reach, which `error_bound` says.
 
     Raises:
@@ -552,10 +552,10 @@ def solved(solve: Callable[..., Solution], mdp: TabularMDP, tolerance: float, **
 
 
 def _error(mdp: TabularMDP, solution: Solution) -> float:
-    """Bound on the error of a gap: twice that of values, of which all steps are within the bound of the solution.
+    """Bound on the error of a gap: twice the bound of values, of which all steps are within the bound of the solution.
 
-    With a horizon the bound is that of the first step. Where gamma is below 1, that of a later one may be larger: it is
-    a sum of discounted rounding errors, in proportion to the largest reward and value of its own steps.
+    With a horizon the bound belongs to the first step. If gamma is below 1, the bound of a later one may be larger: it
+    is a sum of discounted rounding errors, in proportion to the largest reward and value of its own steps.
     """
     error = 2 * solution.error_bound
     if solution.horizon is None or mdp.gamma == 1.0 or solution.error_bound == 0.0:
@@ -575,7 +575,7 @@ def _tolerance(tie_tolerance: float | None, error: float) -> float:
     return float(tolerance)
 
 
-def _conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[str, Any]:
+def _gap_conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[str, Any]:
     return {
         **solution.conventions(),
         "tie_tolerance": tolerance,
@@ -608,12 +608,12 @@ def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) ->
         edges=10.0 ** ((np.arange(first, last + 2) - kernels.BIN_OF_ONE) / 4),
         tie_tolerance=tolerance,
         error=error,
-        conventions=_conventions(mdp, solution, tolerance),
+        conventions=_gap_conventions(mdp, solution, tolerance),
     )
 
 
 class _Sums:
-    """Sums over the gaps of states, a block at a time; the arrays are those of `kernels.gaps`.
+    """Sums over the gaps of states, a block at a time; the arrays are described in `kernels.gaps`.
 
     Attributes:
         minimal: the smallest gap above the tolerance. num_pairs: how many gaps count.

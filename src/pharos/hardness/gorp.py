@@ -16,14 +16,14 @@ import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.interval import fields_of
-from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
+from pharos.hardness.steps import OPTIMAL_TIE, FiniteHorizonValues, check_returns, steps_of
 from pharos.mdp import TabularMDP, drawn_actions, require_mdp, whole_number
 from pharos.system.wording import pluralize
 
 METHODS = ("binomial", "bernstein", "exact")
 MOST_SAMPLES, MOST_BINOMIAL = 10**100, 10**6
 MOST_SEQUENCES = 100  # of which `bernstein` compares each with each
-PARTS = 100  # of equal probability, into which BRIDGE cuts distributions
+DISTRIBUTION_PARTS = 100  # of equal probability, into which BRIDGE cuts distributions
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class GorpBound:
     """Bound on the samples that GORP needs, for each k.
 
     Attributes:
-        value: the effective horizon by this bound, the smallest H_k; infinite where no number of samples is proven to
+        value: the effective horizon by this bound, the smallest H_k; infinite if no number of samples is proven to
             do.
-        ks, ms, values: k, the samples m for each sequence, and H_k = k + log_A m; m is None where H_k is infinite.
+        ks, ms, values: k, the samples m for each sequence, and H_k = k + log_A m; m is None if H_k is infinite.
         failure_probabilities: the bound on the probability of failure at m, at most 1/2.
-        proven: whether every method is proven. `binomial` is not, where all returns of a node may be 0 at once.
+        proven: whether every method is proven. `binomial` is not, if all returns of a node may be 0 at once.
         conventions: horizon, methods, precision of m, tie tolerance.
     """
 
@@ -67,15 +67,15 @@ def gorp_bound(
     """Return a bound on the samples that GORP needs to act optimally through an episode with probability 1/2.
 
         F_t(s) = max over p of sum_sequences p(sequence) f(first action),  low <= p <= high,  sum p = 1
-        f(a) = 1 where a is not optimal in (t, s), else F_{t+1}(next state),  F_T of an optimal action 0
+        f(a) = 1 if a is not optimal in (t, s), else F_{t+1}(next state),  F_T of an optimal action 0
 
     [low, high] encloses the probability that a sequence has the best mean of m samples. Of all methods the smallest F
     counts, node by node. The maximum is a fractional knapsack: the largest f first. m is found by bisection, to 1 %.
-    Where some actions are not available, the sequences are those that can be executed, random play takes what is
+    If some actions are not available, sequences contain available actions only, random play takes what is
     available, and A is the largest number of available actions in a state.
 
     Args:
-        horizon: T; None: that of the MDP.
+        horizon: T; None: the MDP's.
         max_k: k = 1, ..., max_k are tried.
         methods: of `binomial` (as BRIDGE has it: k = 1, returns 0 or R, m up to 10^6; 100 cells by quantiles, without
             the outcome that all samples are 0, which is given to every sequence only in so far as the bounds do not add
@@ -112,7 +112,7 @@ def gorp_bound(
         values,
         failures,
         proven="binomial" not in names or not search.two_valued,
-        conventions={"horizon": steps, "methods": list(names), "precision": 0.01, "tie_tolerance": TIE},
+        conventions={"horizon": steps, "methods": list(names), "precision": 0.01, "tie_tolerance": OPTIMAL_TIE},
     )
 
 
@@ -135,7 +135,7 @@ class GorpRuns:
     @property
     def success_rate(self) -> float:
         """The fraction of runs that found an optimal sequence."""
-        return float((self.returns >= self.optimal_return - TIE).mean())
+        return float((self.returns >= self.optimal_return - OPTIMAL_TIE).mean())
 
     def to_dict(self) -> dict[str, Any]:
         """A summary, JSON-able."""
@@ -165,7 +165,7 @@ def run_gorp(
     Args:
         k: actions that are tried before play becomes random.
         m: samples of each of the A^k sequences.
-        horizon: T; None: that of the MDP.
+        horizon: T; None: the MDP's.
         runs: repetitions, each with random numbers of its own.
         seed: of the random numbers.
     Raises:
@@ -240,8 +240,8 @@ def _needs_one_outcome(name: str, mdp: TabularMDP) -> None:
 class GorpSearch:
     """The smallest m, to 1 %, that is proven to make GORP fail with probability 1/2 at most."""
 
-    def __init__(self, mdp: TabularMDP, steps: int, methods: tuple[str, ...], tell: Callable[[str], object] = str):
-        self.tree, self.methods, self.tell = FiniteHorizonValues(mdp, steps, tell), methods, tell
+    def __init__(self, mdp: TabularMDP, steps: int, methods: tuple[str, ...], report: Callable[[str], object] = str):
+        self.tree, self.methods, self.report = FiniteHorizonValues(mdp, steps, report), methods, report
         assert self.tree.table is not None
         self.nodes_at = [self.tree.first]
         for t in range(steps - 1):
@@ -278,7 +278,7 @@ class GorpSearch:
             open_ = np.flatnonzero(f.max(axis=1) > f.min(axis=1))
             for block in np.array_split(open_, max(1, len(open_) * tree.num_actions ** (2 * k) // 10**6)):
                 if len(block):
-                    self.tell(f"k = {k}, m = {m:.4g}, step {t} of {tree.steps}")
+                    self.report(f"k = {k}, m = {m:.4g}, step {t} of {tree.steps}")
                     now[nodes[block]] = self._worst_case(nodes[block], t, f[block], m, k)
             after = now
         return tree.at_start(after)
@@ -370,16 +370,16 @@ def _by_rows(
     bounds: Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]], m: int, p: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bounds from the probabilities p (n, A^k) that one sample is R and not 0, once for rows that are the same."""
-    rows, place = np.unique(p, axis=0, return_inverse=True)
+    rows, index = np.unique(p, axis=0, return_inverse=True)
     lower, upper = (np.array(each) for each in zip(*(bounds(m, row) for row in rows), strict=True))
-    return lower[place.ravel()], upper[place.ravel()]
+    return lower[index.ravel()], upper[index.ravel()]
 
 
 def _binomial(m: int, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cells between quantiles, as BRIDGE cuts them: by the normal distribution from m = 30, without outcome 0."""
     from scipy.special import bdtr, ndtri
 
-    levels = np.arange(PARTS + 1) / PARTS
+    levels = np.arange(DISTRIBUTION_PARTS + 1) / DISTRIBUTION_PARTS
     lower, upper = np.empty_like(p), np.empty_like(p)
     for own in np.unique(p):
         if m < 30:
@@ -387,7 +387,7 @@ def _binomial(m: int, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         else:
             deviation = math.sqrt(m * own * (1 - own))
             edges = np.floor((m * own + deviation * ndtri(levels) if deviation > 0 else np.full(1, m * own)).clip(0, m))
-        distribution = bdtr(np.unique(edges)[:, None], m, p)  # (cells, A^k): each ends where it is counted
+        distribution = bdtr(np.unique(edges)[:, None], m, p)  # (cells, A^k): each ends at its count
         same = p == own
         mass = np.diff(distribution[:, same.argmax()])
         distribution[:, same.argmax()] = 1.0

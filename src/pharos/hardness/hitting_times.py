@@ -9,13 +9,13 @@ Certificate. For any J >= 0 with T J - J <= above < 1 and J - T J <= below every
 
 With c = 1 / (1 - above), T(c J) = 1 + c (T J - 1) <= 1 + c (J + above - 1) = c J: the policy that is greedy in c J
 loses at least one expected step a step, so it needs at most c J. With c = 1 / (1 + below), T(c J) >= c J in the same
-way, and iterating T from c J rises to J*. It does not matter where J comes from, and the second half holds for J of any
+way, and iterating T from c J rises to J*. The origin of J does not matter, and the second half holds for J of any
 sign.
 
-The slow mode. Where an attempt mostly fails and begins again, sweeps bring J nearer by one failure each. What is
+The slow mode. If an attempt mostly fails and begins again, sweeps bring J nearer by one failure each. What is
 missing then has one shape: W(n), how likely the target is missed for long from n. It is swept along,
-W(n) = sum_m p(m | n, a) W(m) under the best actions, beginning with 1. A sweep adds f to J and takes g from W; where f
-is nearly c g, J + c W is the solution, but for what sweeps mend. Where J is so low that the best actions never arrive,
+W(n) = sum_m p(m | n, a) W(m) under the best actions, beginning with 1. A sweep adds f to J and takes g from W; if f
+is nearly c g, J + c W is the solution, but for what sweeps mend. If J is so low that the best actions never arrive,
 as each failure costs less than is missing, J is raised by itself along W first: from above, attempts are worth their
 while.
 
@@ -27,7 +27,7 @@ moved up and down by W with
 
     W(n) - sum_m p(m | n, policy) W(m) = 2 (|residual(n)| + its error): what the residuals cost over all visits.
 
-J + W then falls short of no step, J - W exceeds none: both certificates hold with 0. W is about 1e-12 of J. Where the
+J + W then falls short of no step, J - W exceeds none: both certificates hold with 0. W is about 1e-12 of J. If the
 linear solver itself has no correct digit (J beyond 1e15), the bounds of plain floats stand, wide as they are.
 
 The file also has the linear equations of the hitting times of one policy, with all restart nodes as one unknown, and
@@ -40,7 +40,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy  # whose `sparse` is loaded where it is used
+import scipy  # whose `sparse` is loaded on first use
 
 from pharos.hardness.interval import BudgetClock
 from pharos.kernels import hitting
@@ -77,7 +77,7 @@ class HittingBounds:
         return self.at_most(self.largest) * PRODUCT
 
     def at_most(self, j: float) -> float:
-        """Upper bound of a hitting time that is j in J, but for rounding: infinite where none is known, also where j is
+        """Upper bound of a hitting time that is j in J, but for rounding: infinite if none is known, also if j is
         at most 0."""
         return j * self.high if math.isfinite(self.high) else math.inf
 
@@ -112,35 +112,35 @@ def added(high: np.ndarray, low: np.ndarray, more: np.ndarray) -> tuple[np.ndarr
 
 
 # Sweeps before a policy is evaluated by a linear solve: as many as cost about as much as one.
-SWEEPS = 40
+SWEEPS_BEFORE_SOLVING = 40
 # Nodes at the same distance from the target up to which they are tried: so many are about the size of a full matrix in
 # the factors. A grid of a million nodes has a thousand, a random graph of ten thousand five thousand.
-WIDEST = 8_000
+MOST_WIDTH = 8_000
 # Sweeps that a linear solve takes as long as: FILL_IN times the cube of that number of nodes, by the outcomes.
 FILL_IN = 1 / 30
 # Seconds of a multiplication of a linear solve on a slow core: one that would outlast the budget is not begun.
 SECONDS_EACH = 2e-9
-# Times half of `SWEEPS` that are made in any case.
-LEAST = 6
+# Times half of `SWEEPS_BEFORE_SOLVING` that are made in any case.
+LEAST_ROUNDS = 6
 # They end closer than the tolerance asks for, nearly as close as a linear solve does.
 CLOSER = 1e-3
 # Nodes up to which linear solves are tried: beyond, their fill-in takes more memory than the MDP.
 SOLVABLE = 60_000
 # Sweeps before the slow mode is looked at, sweeps between two looks, and sweeps between two that raise J by itself.
-PLAIN_SWEEPS, LOOK, RAISE = 8, 4, 12
+PLAIN_SWEEPS, TIME_CHECKS, RAISE = 8, 4, 12
 # Cosine, squared, of the angle between what J gains and what the mode loses, from which on they are one direction.
-ALIGNED = 0.95
+SAME_DIRECTION = 0.95
 # Beyond, no J proves anything in 64-bit floats, and raising it ends.
 HIGHEST = 1e15
 # Stands for infinity in the hitting times of nodes that do not surely reach the target: products with it stay finite.
 TOP = 1e300
-# The residual of a float J is some units in its last place: where that is more than the tolerance, one float is too
+# The residual of a float J is some units in its last place: if that is more than the tolerance, one float is too
 # short.
 RESIDUAL_UNITS = 16
 # Linear solves that do not halve the distance of the bounds, after which one float is too short as well.
 STALLS = 3
 # Newton steps and policies that are tried with two floats a node; each step gains two digits or more, or is the last.
-REFINEMENTS = 12
+MOST_NEWTON_STEPS = 12
 # Linear solves without a proper policy as result, one after the other, after which the bounds stand as they are.
 FAILURES = 3
 
@@ -212,13 +212,13 @@ class HittingTimes:
     def bounds(self, j: np.ndarray, count: int) -> HittingBounds:
         """Bounds by the residuals of J; the greedy policy stands in `policy` then. `least` is the best lower one."""
         arrays = (*self.arrays, self.goal, self.order, count, j, None, self.policy, None, None)
-        above, below, largest = hitting.residuals(*arrays)
+        above, below, largest = hitting.residual_bounds(*arrays)
         bounds = certified(above, below, largest)
         self.least = max(self.least, bounds.lower)
         return bounds
 
     def sweep(self, j: np.ndarray, count: int, sweeps: int, enough: float, spending: BudgetClock) -> HittingBounds:
-        """Bounds after sweeps in place, fewer where the upper bound is at most `enough`, the budget ends, or J does not
+        """Bounds after sweeps in place, fewer if the upper bound is at most `enough`, the budget ends, or J does not
         move."""
         for number in range(sweeps):
             if self.swept < PLAIN_SWEEPS:
@@ -241,10 +241,10 @@ class HittingTimes:
             self.mode[self.order[:count]] = ~self.goal[self.order[:count]]
         arrays = (*self.arrays, self.goal, self.order, count, j, self.mode)
         change, ff, fg, gg = hitting.sweep_in_place(*arrays)
-        if self.swept % LOOK != LOOK - 1 or not (gg > 0 and math.isfinite(ff) and change > 0):
+        if self.swept % TIME_CHECKS != TIME_CHECKS - 1 or not (gg > 0 and math.isfinite(ff) and change > 0):
             return float(change)
         nodes = self.order[:count]
-        if fg * fg > ALIGNED * ff * gg:
+        if fg * fg > SAME_DIRECTION * ff * gg:
             j[nodes] += fg / gg * self.mode[nodes]
         elif fg > 0 and self.swept - self.raised >= RAISE and math.isinf(self.bounds(j, count).high):
             largest = float(j[nodes].max())
@@ -261,7 +261,7 @@ class HittingTimes:
             if count > SOLVABLE or self._outlasts(count, spending):
                 if bounds.limited:
                     return bounds
-                bounds = self.sweep(j, count, 8 * SWEEPS, enough, spending)
+                bounds = self.sweep(j, count, 8 * SWEEPS_BEFORE_SOLVING, enough, spending)
                 continue
             improved = self._evaluate(count)
             if improved is None:  # the greedy policy may stay away for ever: begin with one that does not
@@ -290,15 +290,16 @@ class HittingTimes:
     ) -> HittingBounds:
         """Bounds after sweeps, as long as at their rate these meet sooner than a linear solve takes, or nearly so.
 
-        The rate is that of three times `SWEEPS` / 2 sweeps: moves along the slow mode set single ones back.
+        The rate is taken over three times `SWEEPS_BEFORE_SOLVING` / 2 sweeps: moves along the slow mode set single ones
+        back.
         """
-        bounds = self.sweep(j, count, SWEEPS // 2, enough, spending)
+        bounds = self.sweep(j, count, SWEEPS_BEFORE_SOLVING // 2, enough, spending)
         as_long = FILL_IN * int(self._layers(count).max(initial=0)) ** 3 / max(self.support[1].size, 1)
-        left = max(LEAST, int(as_long / (SWEEPS // 2)) - 1)
-        unbounded = max(LEAST // 2, left // 4)  # of these: while nothing is proven, no rate is known
+        left = max(LEAST_ROUNDS, int(as_long / (SWEEPS_BEFORE_SOLVING // 2)) - 1)
+        unbounded = max(LEAST_ROUNDS // 2, left // 4)  # of these: while nothing is proven, no rate is known
         apart, goal = [bounds.apart], CLOSER * tolerance
         while left > 0 and not (bounds.upper <= enough or bounds.limited or bounds.apart <= goal or spending.is_over):
-            bounds = self.sweep(j, count, SWEEPS // 2, enough, spending)
+            bounds = self.sweep(j, count, SWEEPS_BEFORE_SOLVING // 2, enough, spending)
             left -= 1
             apart.append(bounds.apart)
             if math.isinf(bounds.apart):
@@ -315,14 +316,14 @@ class HittingTimes:
     def _outlasts(self, count: int, spending: BudgetClock) -> bool:
         """Whether a linear solve takes more than memory and the time that is left."""
         layers = self._layers(count)
-        return layers.max(initial=0) > WIDEST or multiplications(layers) * SECONDS_EACH > spending.seconds_left
+        return layers.max(initial=0) > MOST_WIDTH or multiplications(layers) * SECONDS_EACH > spending.seconds_left
 
     def _layers(self, count: int) -> np.ndarray:
         """Numbers of nodes at each distance from the target."""
         return np.bincount(self.distance[self.order[:count]])
 
     def _factored(self, count: int) -> "tuple[np.ndarray, Factors] | None":
-        """(inner nodes, factors of 1 - P of the greedy policy); None where no policy is proper. Rows are made to sum to
+        """(inner nodes, factors of 1 - P of the greedy policy); None if no policy is proper. Rows are made to sum to
         1."""
         nodes = self.order[:count]
         inner = nodes[~self.goal[nodes]]
@@ -330,7 +331,7 @@ class HittingTimes:
         return None if factors is None else (inner, factors)
 
     def _evaluate(self, count: int) -> np.ndarray | None:
-        """The hitting times of the greedy policy; None where it is not proper."""
+        """The hitting times of the greedy policy; None if it is not proper."""
         factored = self._factored(count)
         if factored is None:
             return None
@@ -347,11 +348,11 @@ class HittingTimes:
     def _refined(
         self, j: np.ndarray, count: int, tolerance: float, plain: HittingBounds, spending: BudgetClock
     ) -> HittingBounds:
-        """Bounds of a J that is the sum of two floats; `plain`, those of one, where they are no better. j becomes J +
-        W."""
+        """Bounds of a J that is the sum of two floats; `plain`, the bounds of one, if these are no better. j
+        becomes J + W."""
         high, low = j.copy(), np.zeros_like(j)
         best, policy = plain.but_limited(), None
-        for _ in range(REFINEMENTS):
+        for _ in range(MOST_NEWTON_STEPS):
             residual, _, _ = self._residuals(high, low, count)
             if policy is None or (policy != self.policy).any():
                 policy, factored = self.policy.copy(), self._factored(count)
@@ -382,8 +383,8 @@ class HittingTimes:
         factored: tuple[np.ndarray, "Factors"],
         spending: BudgetClock,
     ) -> tuple[HittingBounds, np.ndarray]:
-        """(bounds of J* relative to J + W, J + W rounded up); a policy that is greedy in J - W in place of that in J
-        where ties need it."""
+        """(bounds of J* relative to J + W, J + W rounded up); a policy that is greedy in J - W in place of one in J
+        if ties need it."""
         inner, factors = factored
         residual, error, _ = self._residuals(high, low, count)
         cost = 2 * (np.abs(residual[inner]) + error[inner])
@@ -393,7 +394,7 @@ class HittingTimes:
         upper = certified(above, 0.0, 1.0).high
         ceiling = np.nextafter(high + margin, math.inf) * PRODUCT
         ceiling[self.goal] = 0.0
-        for _ in range(REFINEMENTS):
+        for _ in range(MOST_NEWTON_STEPS):
             below_high, below_low = added(high, low, -margin)
             residual, error, (_, below) = self._residuals(below_high, below_low, count)
             if below <= 1e-9 or spending.is_over:
@@ -416,7 +417,7 @@ class HittingTimes:
         in `policy`."""
         residual, error = np.zeros_like(high), np.zeros_like(high)
         arrays = (high, low, self.policy, residual, error)
-        return residual, error, hitting.residuals(*self.arrays, self.goal, self.order, count, *arrays)[:2]
+        return residual, error, hitting.residual_bounds(*self.arrays, self.goal, self.order, count, *arrays)[:2]
 
 
 # Hitting equations ----------------------------------------------------------------------------------------------------
@@ -449,13 +450,13 @@ def multiplications(layers: np.ndarray) -> float:
 
 
 def factors_of(choices: ExpandedMDP, policy: np.ndarray, inner: np.ndarray) -> Factors | None:
-    """The factors of 1 - P of a policy on the `inner` nodes; None where it is not proper. Rows are made to sum to 1."""
+    """The factors of 1 - P of a policy on the `inner` nodes; None if it is not proper. Rows are made to sum to 1."""
     first, unknown = _numbered_once(choices.is_restart[inner])
-    place = np.full(len(policy), first.size)  # what leads elsewhere is left out of the equations
-    place[inner] = unknown
+    index = np.full(len(policy), first.size)  # what leads elsewhere is left out of the equations
+    index[inner] = unknown
     solved = inner[first]
     rows = scipy.sparse.csr_matrix(choices.matrix[solved * choices.num_actions + policy[solved]])
-    row, column = np.repeat(np.arange(first.size), np.diff(rows.indptr)), place[rows.indices]
+    row, column = np.repeat(np.arange(first.size), np.diff(rows.indptr)), index[rows.indices]
     data = np.where(row == column, 0.0, rows.data)
     leaving = np.bincount(row, data, first.size)
     if not _all_leave(row[data > 0], column[data > 0], first.size):
@@ -500,13 +501,13 @@ def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[tuple[np.nda
     """
     nodes = matrix.shape[0] // num_actions
     row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-    pairs, place, times = np.unique(
+    pairs, index, times = np.unique(
         (row // num_actions) * np.int64(nodes) + matrix.indices, return_inverse=True, return_counts=True
     )
     least = np.full(len(pairs), np.inf)
-    np.minimum.at(least, place, matrix.data)
+    np.minimum.at(least, index, matrix.data)
     least[times < num_actions] = 0.0
-    rest = matrix.data - least[place]
+    rest = matrix.data - least[index]
     distinct = rest > 8 * hitting.UNIT * matrix.data  # the kernels count as much as rounding of `least`
     if distinct.sum() + np.count_nonzero(least) >= matrix.nnz:  # nothing gained
         least[:] = 0.0

@@ -34,11 +34,11 @@ class Interval:
     """A value between two proven bounds.
 
     Attributes:
-        lower, upper: the value lies in [lower, upper]; both are infinite where the value is.
+        lower, upper: the value lies in [lower, upper]; both are infinite if the value is.
         exact: whether the interval is the value: lower == upper for counted steps, a relative width of at most
             `tolerance` for expected ones.
         unreachable_pairs: ordered pairs (s, s') such that no policy leads from s to s' with probability 1.
-        finite_part: the largest value among the other pairs; equal to `upper` where the value is finite and exact.
+        finite_part: the largest value among the other pairs; equal to `upper` if the value is finite and exact.
         counted: whether `unreachable_pairs` and `finite_part` are exact; else both are lower bounds.
         tolerance: relative width up to which the interval counts as exact.
         searches: searches of the graph, or targets solved, that it took.
@@ -141,7 +141,7 @@ class Certificate:
 
 
 def certificate_of(outcome: object) -> Certificate:
-    """Certificate of a measure's result, from its `exact`, `lower`, `upper` and `note`, where it has them."""
+    """Certificate of a measure's result, from its `exact`, `lower`, `upper` and `note`, if it has them."""
     if not hasattr(outcome, "exact"):
         return Certificate("float64", note=getattr(outcome, "note", ""))
     kind = "exact" if outcome.exact else "interval"
@@ -169,7 +169,7 @@ class Budget:
     """Limits of a measure: at the first one reached it returns the interval proven by then, not the exact value.
 
     Attributes:
-        seconds: of wall clock, those of compiling apart, looked at between searches.
+        seconds: of wall clock without compiling, looked at between searches.
         searches: searches of the graph, or targets solved; unlike seconds, the same on every machine.
     """
 
@@ -190,7 +190,7 @@ class Budget:
 
     @staticmethod
     def of(budget: "Budget | float | None") -> "Budget":
-        """`budget`, where a number stands for seconds and None for the default of 300 seconds."""
+        """`budget`, in which a number stands for seconds and None for the default of 300 seconds."""
         if budget is None:
             return Budget()
         return budget if isinstance(budget, Budget) else Budget(seconds=budget)
@@ -238,7 +238,7 @@ class BudgetClock:
 
     @property
     def seconds(self) -> float:
-        """Seconds since the start, without those of compiling."""
+        """Seconds since the start, without compiling."""
         return self._watch.seconds
 
     @property
@@ -262,7 +262,7 @@ class BudgetClock:
         return replace(interval, conventions=self.conventions, searches=self.searches, seconds=self.seconds)
 
     def report(self, lower: float, upper: float, candidates: int, *, now: bool = False) -> None:
-        """Call `progress`, where there is one and the last call is long enough ago."""
+        """Call `progress`, if there is one and the last call is long enough ago."""
         if self.progress is not None and (now or self.seconds - self._reported >= 0.1):
             self._reported = self.seconds
             self.progress(MeasureProgress(lower, upper, self.searches, candidates, self.seconds))

@@ -1,4 +1,4 @@
-"""Registry of the measures of a report: name, function, definition and source of each; those of pharos, in order."""
+"""Registry of the measures of a report, with name, function, definition and source; and the measures of pharos."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from pharos.errors import MeasureUnfinished, ParameterError, UndefinedMeasure, UnknownName
 from pharos.hardness.diameter import diameter, start_eccentricity_interval
 from pharos.hardness.effective_horizon import effective_horizon, stationary_effective_horizon
-from pharos.hardness.gaps import Gaps, resolved_gaps, solved
+from pharos.hardness.gaps import Gaps, resolved_gaps, solution_within
 from pharos.hardness.gorp import gorp_bound
 from pharos.hardness.interval import Budget, BudgetClock, Certified, MeasureProgress
 from pharos.hardness.representation.kernel_regret import (
@@ -34,17 +34,17 @@ class Problem:
     """An MDP that is being measured, with what several measures need, computed once.
 
     Attributes:
-        mdp: the MDP. Its gamma, and its horizon where it has one, are those of values and gaps.
-        horizon: number of steps T for measures of episodes; that of the MDP where it has one; or None.
-        tolerance: largest error of a value, in units of return; a larger one is used where floats cannot reach it.
+        mdp: the MDP. Values and gaps have its gamma, and its horizon if it has one.
+        horizon: number of steps T for measures of episodes; the MDP's if it has one; or None.
+        tolerance: largest error of a value, in units of return; a larger one is used if floats cannot reach it.
         restart: convention of the diameter: terminal states lead back to the start.
         budget: of each measure, after which it returns a proven interval.
         progress: called with the name of the running measure and a line on its progress.
         representation: of the states by the agent's network, for measures that need one; or None.
         schedule: of the idealised learner.
-        rollouts: of the idealised actor-critic; None: those of `Rollouts`.
-        sampling: of the learner that draws; None: that of `Sampling`.
-        folder: where optimal values and bounds of searches are kept while they are computed; None: in memory.
+        rollouts: of the idealised actor-critic; None: the defaults of `Rollouts`.
+        sampling: of the learner that draws; None: the default of `Sampling`.
+        folder: in which optimal values and bounds of searches are kept while they are computed; None: in memory.
         is_strict: whether the budget also ends measures without bounds to show for it, which are then not available.
         clock: of the running measure.
     """
@@ -77,7 +77,7 @@ class Problem:
     @cached_property
     def _solved(self) -> Solution | MeasureUnfinished:  # what a budget has ended is not tried by the next measure again
         try:
-            return solved(
+            return solution_within(
                 value_iteration,
                 self.mdp,
                 self.tolerance,
@@ -103,13 +103,13 @@ class Problem:
         return not self.is_strict or self.clock.seconds_left > 0
 
     def episode(self, measure: str) -> int:
-        """The horizon; UndefinedMeasure where there is none."""
+        """The horizon; UndefinedMeasure if there is none."""
         if self.horizon is None:
             raise UndefinedMeasure(f"{measure} is defined for episodes of T steps: give a horizon")
         return self.horizon
 
     def seen(self, measure: str) -> Representation:
-        """The representation; UndefinedMeasure where there is none."""
+        """The representation; UndefinedMeasure if there is none."""
         if self.representation is None:
             raise UndefinedMeasure(f"{measure} is of what an agent sees: give an observation and a network")
         return self.representation
@@ -155,7 +155,7 @@ class Measure:
 
     Attributes:
         name: key of the result.
-        function: Problem -> a number, or an object with `to_dict()`; UndefinedMeasure where it does not exist. The
+        function: Problem -> a number, or an object with `to_dict()`; UndefinedMeasure if it does not exist. The
             result's attributes `exact`, `lower`, `upper`, `note`, as of `Certified`, state its proven interval; a plain
             number has none, and is reported as "float64".
         definition: formula, in a line.
@@ -164,8 +164,8 @@ class Measure:
         version: goes up when the function's results change, so that kept ones are not used; None: never keep results.
         depends: on what results depend, beside the transitions, chance and start: "structure" (nothing else), "values"
             (rewards, gamma), "episodes" (rewards, horizon), "all" (these), "representation" (what the agent sees, too).
-        on_request: only part of a report where it is named, or where all are asked for; if it depends on the
-            representation, also where one is given.
+        on_request: only part of a report if it is named, or if all are asked for; if it depends on the
+            representation, also if one is given.
     """
 
     name: str
@@ -278,7 +278,7 @@ def _minimal_gap(problem: Problem) -> Certified:
 
 
 # Settings that several measures share
-_VALUES: dict[str, Any] = {"complexity": "estimation", "version": 2, "depends": "values"}
+_VALUE_SETTINGS: dict[str, Any] = {"complexity": "estimation", "version": 2, "depends": "values"}
 _REPRESENTATION: dict[str, Any] = {
     "complexity": "representation",
     "version": 1,
@@ -315,21 +315,21 @@ register(
     lambda problem: problem.gaps.certified_sum,
     definition="sum of 1 / (V*(s) - Q*(s, a)) over reachable s and actions that are not optimal",
     source="Simchowitz and Jamieson (2019); the pharos paper, equation 2",
-    **_VALUES,
+    **_VALUE_SETTINGS,
 )
 register(
     "sum_of_reciprocal_gaps_regularized",
     lambda problem: problem.gaps.certified_regularized,
     definition="sum of 1 / (V*(s) - Q*(s, a) + 0.1) over all s and a",
     source="Conserva and Rauber (2022), as in Colosseum",
-    **_VALUES,
+    **_VALUE_SETTINGS,
 )
 register(
     "minimal_gap",
     _minimal_gap,
     definition="the smallest V*(s) - Q*(s, a) > 0 over reachable s",
     source="Simchowitz and Jamieson (2019)",
-    **_VALUES,
+    **_VALUE_SETTINGS,
 )
 register(
     "environmental_value_norm",
@@ -338,7 +338,7 @@ register(
     ),
     definition="max over s, a of the standard deviation of V*(s') under p(. | s, a)",
     source="Maillard, Mann and Mannor (2014), definition 1",
-    **_VALUES,
+    **_VALUE_SETTINGS,
 )
 register(
     "effective_horizon",
@@ -363,7 +363,7 @@ register(
     lambda problem: action_gap_regularity(problem.mdp, problem.solution),
     definition="smallest c with P(0 < V*(s) - best Q*(s, a) that is not optimal <= t) <= c t for all t, s uniform",
     source="Farahmand (2011), assumption A1",
-    **_VALUES,
+    **_VALUE_SETTINGS,
     on_request=True,
 )
 register(

@@ -33,9 +33,9 @@ class Result:
 
     Attributes:
         name, definition, source, complexity: of the measure.
-        value: a number, or the measure's result as a dictionary; None where it is undefined.
+        value: a number, or the measure's result as a dictionary; None if it is undefined.
         text: the value for people.
-        undefined: why there is no value, and what would define it; empty where there is one.
+        undefined: why there is no value, and what would define it; empty if there is one.
         is_out_of_budget: whether there is no value because the budget ended.
         seconds: time that it took, when it was computed.
         kept: whether it stood beside the state space, and was not computed now.
@@ -140,13 +140,13 @@ def report(  # noqa: PLR0913
     Args:
         measures: names, as a sequence or with commas; None: all that are registered but for those that are slow and
             come on request; "all": these as well.
-        horizon: number of steps T for measures of episodes; None: that of the MDP, if any. Values and gaps have the
+        horizon: number of steps T for measures of episodes; None: the MDP's, if any. Values and gaps have the
             gamma and the horizon of the MDP itself.
         tolerance: largest error of the optimal values, in units of return.
         restart: convention of the diameter: terminal states lead back to the start.
         budget: what each measure may spend, in seconds, or a `Budget`: one that it ends has a proven interval, or no
             value yet (`Result.is_out_of_budget`). None: 300 s for measures that have intervals, no limit for others.
-        keep: use results kept beside the state space, and keep new ones there. Nothing is kept where there is no
+        keep: use results kept beside the state space, and keep new ones there. Nothing is kept if there is no
             folder.
         progress: called with the name of the running measure and a line on how far it is.
         on_result: called with each `Result` as soon as it is there.
@@ -155,8 +155,8 @@ def report(  # noqa: PLR0913
         schedule: of the idealised learner that these have; rollouts: of the actor-critic; sampling: of the
             one that draws.
         folder: for optimal values (`optimal.npy`, which `value_iteration(..., values=)` knows as well) and for the
-            bounds of a diameter while they are computed, in place of memory: the same call goes on from them where one
-            was killed, or a budget spent. None: memory, or where that has little room files without a name.
+            bounds of a diameter while they are computed, in place of memory: the same call goes on from them after one
+            was killed, or a budget spent. None: memory, or, if that has little room, files without a name.
     Returns:
         A Report. A measure that does not exist for this MDP says why; the others are there.
     Raises:
@@ -171,7 +171,7 @@ def report(  # noqa: PLR0913
     options = (representation, schedule, rollouts, sampling, None if folder is None else Path(folder))
     is_strict = budget is not None
     problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress, *options, is_strict)
-    conventions = _conventions(problem)
+    conventions = _problem_conventions(problem)
     file = ResultsFile(mdp, conventions) if keep else None
     results = {}
     for measure in wanted:
@@ -200,7 +200,9 @@ def _measured(measure: Measure, problem: Problem, file: "ResultsFile | None") ->
         is_over = isinstance(error, MeasureUnfinished)
         return replace(empty, undefined=str(error), is_out_of_budget=is_over, seconds=watch.seconds)
     certificate, seconds = certificate_of(outcome), watch.seconds
-    result = replace(empty, value=_plain(outcome), text=_text(outcome), certificate=certificate, seconds=seconds)
+    result = replace(
+        empty, value=_plain(outcome), text=_text_of_value(outcome), certificate=certificate, seconds=seconds
+    )
     if file is not None:
         file.put(measure, result, problem.budget, problem.error_bound)
     return result
@@ -216,7 +218,7 @@ def _plain(value: object) -> object:
     return value
 
 
-def _text(value: object) -> str:
+def _text_of_value(value: object) -> str:
     if isinstance(value, float | np.floating):
         return f"{value:.10g}"
     return str(value)
@@ -228,7 +230,7 @@ def _infinite(value: object) -> bool:
     return isinstance(value, float) and math.isinf(value)
 
 
-def _conventions(problem: Problem) -> dict[str, Any]:
+def _problem_conventions(problem: Problem) -> dict[str, Any]:
     mdp = problem.mdp
     starts = [[int(s), float(p)] for s, p in zip(mdp.start_states[:100], mdp.start_probabilities, strict=False)]
     representation = problem.representation
@@ -259,10 +261,10 @@ def _conventions(problem: Problem) -> dict[str, Any]:
 # hardness.json --------------------------------------------------------------------------------------------------------
 
 
-FILE = "hardness.json"
-FORMAT = 2
+REPORT_FILE = "hardness.json"
+REPORT_FORMAT = 2
 
-# Conventions that the results of a measure depend on, by its `depends`; else all, but for these where it is "all".
+# Conventions that the results of a measure depend on, by its `depends`; else all, but for these if it is "all".
 _OF_REPRESENTATIONS = ("representation", "schedule", "rollouts")
 _DEPENDS = {
     "structure": ("chance", "restart"),
@@ -280,13 +282,13 @@ class ResultsFile:
     """
 
     def __init__(self, mdp: TabularMDP, conventions: Mapping[str, Any]):
-        self.path = None if mdp.folder is None else Path(mdp.folder) / FILE
+        self.path = None if mdp.folder is None else Path(mdp.folder) / REPORT_FILE
         self.mdp, self.conventions = mdp, dict(conventions)
         self.error_bound: float | None = None  # the largest of the values behind the results that were read
         self._has_warned = False
 
     def get(self, measure: Measure, budget: Budget) -> dict[str, Any] | None:
-        """Value, text, seconds and certificate; None where there is no result, or one that a larger budget could
+        """Value, text, seconds and certificate; None if there is no result, or one that a larger budget could
         improve on."""
         if self.path is None or measure.version is None:
             return None
@@ -303,7 +305,7 @@ class ResultsFile:
             certificate = Certificate(**content["certificate"])
             if not certificate.is_exact and budget.exceeds(Budget(**content["budget"])):
                 return None
-            _check(content["value"])
+            _check_value(content["value"])
             text, seconds = str(content["text"]), float(content["seconds"])
             bound = None if content["error_bound"] is None else float(content["error_bound"])
         except (KeyError, TypeError, ValueError):
@@ -316,7 +318,7 @@ class ResultsFile:
     def put(self, measure: Measure, result: Result, budget: Budget, error_bound: float | None) -> None:
         """Keep a result, and the error bound of the optimal values behind it.
 
-        Nothing is kept where the folder cannot be written to (another's, or a full disk).
+        Nothing is kept if the folder cannot be written to (another's, or a full disk).
         """
         if self.path is None or measure.version is None:
             return
@@ -334,7 +336,7 @@ class ResultsFile:
             return
         with contextlib.suppress(OSError):
             results = {**self._read(), entry["key"]: entry}
-            storage.replace_json(self.path, {"format": FORMAT, "results": results}, durable=False)
+            storage.replace_json(self.path, {"format": REPORT_FORMAT, "results": results}, durable=False)
 
     def _key(self, measure: Measure) -> str:
         everything = tuple(sorted(self.conventions))
@@ -356,7 +358,7 @@ class ResultsFile:
         return digest.hexdigest()
 
     def _read(self) -> dict[str, Any]:
-        """Entries by key; none where the file is missing, of another format, or damaged."""
+        """Entries by key; none if the file is missing, of another format, or damaged."""
         assert self.path is not None
         try:
             storage.check_regular(self.path)
@@ -365,9 +367,9 @@ class ResultsFile:
             return {}
         try:
             stored = json.loads(text)
-            if stored["format"] < FORMAT:  # of an older pharos, without digests
+            if stored["format"] < REPORT_FORMAT:  # of an older pharos, without digests
                 return {}
-            if stored["format"] == FORMAT and all(isinstance(each, dict) for each in stored["results"].values()):
+            if stored["format"] == REPORT_FORMAT and all(isinstance(each, dict) for each in stored["results"].values()):
                 return dict(stored["results"])
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             pass
@@ -381,8 +383,8 @@ class ResultsFile:
             warnings.warn(f"{self.path}: {what}; it is measured anew", stacklevel=2)
 
 
-def _check(value: object) -> None:
-    """ValueError where a value cannot be one: an interval whose ends are the wrong way round, or NaN."""
+def _check_value(value: object) -> None:
+    """ValueError if a value cannot be one: an interval whose ends are the wrong way round, or NaN."""
     if isinstance(value, Mapping):
         lower, upper = value.get("lower"), value.get("upper")
         if lower is not None and upper is not None and not lower <= upper:

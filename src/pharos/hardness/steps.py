@@ -14,7 +14,7 @@ import numpy as np
 
 from pharos.errors import PrecisionError, UndefinedMeasure
 from pharos.mdp import (
-    STEPS,
+    STEPS_EXPECTED,
     ExpandedMDP,
     PolicyTable,
     TabularMDP,
@@ -26,26 +26,26 @@ from pharos.mdp import (
 from pharos.solvers import TablePolicy
 
 # In units of return: an action is optimal if its value is within this of the best (theirs).
-TIE = 1e-4
+OPTIMAL_TIE = 1e-4
 # Bytes that the tables of all steps may take.
 MEMORY = 8 * 2**30
 # Of returns whose squares 64-bit floats hold.
-LARGEST = 1e150
+HUGE_RETURN = 1e150
 
 
 def steps_of(name: str, mdp: TabularMDP, horizon: int | None) -> int:
-    """T: the argument, else the horizon of the MDP; UndefinedMeasure where there is neither."""
+    """T: the argument, else the horizon of the MDP; UndefinedMeasure if there is neither."""
     steps = mdp.horizon if horizon is None else horizon
     if steps is None:
         raise UndefinedMeasure(f"{name} is defined for episodes of T steps: give a horizon")
-    return whole_number(steps, "horizon", STEPS)
+    return whole_number(steps, "horizon", STEPS_EXPECTED)
 
 
 def check_returns(name: str, mdp: TabularMDP, steps: int) -> None:
-    """PrecisionError where returns of so many steps may have squares that 64-bit floats do not hold."""
-    if not steps * max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest)) <= LARGEST:
+    """PrecisionError if returns of so many steps may have squares that 64-bit floats do not hold."""
+    if not steps * max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest)) <= HUGE_RETURN:
         raise PrecisionError(
-            f"{name}: returns of {steps} steps may pass {LARGEST:g}, and 64-bit floats do not hold their squares; "
+            f"{name}: returns of {steps} steps may pass {HUGE_RETURN:g}, and 64-bit floats do not hold their squares; "
             f"use smaller rewards"
         )
 
@@ -54,16 +54,16 @@ class FiniteHorizonValues:
     """Values at every step t = 1, ..., T (index t - 1) of optimal, worst and exploring play, on the nodes of an MDP.
 
     Attributes:
-        choices: the MDP written out; rewards (N, A); table (N, A) where each choice has one outcome, else None.
+        choices: the MDP written out; rewards (N, A); table (N, A) if each choice has one outcome, else None.
         best, worst, explored: (T, N, A) action values; explored_value (T, N), clipped to [worst, best].
         optimal: (T, N, A) bool.
-        sets: (N, A) bool, the available actions; None: all are everywhere. All are where an episode is over.
+        sets: (N, A) bool, the available actions; None: all are everywhere. All are if an episode is over.
         first: (N,) bool, the start nodes. num_visitable: states (pairs under sticky actions) that can be visited.
     """
 
-    def __init__(self, mdp: TabularMDP, steps: int, tell: Callable[[str], object] = str):
-        """tell: called with a line for each step."""
-        self.tell = tell
+    def __init__(self, mdp: TabularMDP, steps: int, report: Callable[[str], object] = str):
+        """report: called with a line for each step."""
+        self.report = report
         size = (mdp.num_states + 1) * mdp.policy_width
         needed = 40 * steps * size * mdp.num_actions
         if needed > MEMORY:
@@ -85,14 +85,14 @@ class FiniteHorizonValues:
         self.explored_value = np.empty(shape[:2])
         self.best[-1] = self.worst[-1] = self.explored[-1] = self.rewards
         for t in range(steps - 1, -1, -1):
-            tell(f"values of step {t} of {steps}")
+            report(f"values of step {t} of {steps}")
             if t < steps - 1:
                 self.best[t] = self.backup(self.best[t + 1].max(axis=1))
                 self.worst[t] = self.backup(self.worst[t + 1].min(axis=1))
                 self.explored[t] = self.backup(self.explored_value[t + 1])
             mean = mean_of_actions(self.explored[t]) if shares is None else (self.explored[t] * shares).sum(axis=1)
             self.explored_value[t] = mean.clip(self.worst[t].min(axis=1), self.best[t].max(axis=1))
-        self.optimal = self.best >= self.best.max(axis=2, keepdims=True) - TIE
+        self.optimal = self.best >= self.best.max(axis=2, keepdims=True) - OPTIMAL_TIE
         self.first = np.zeros(self.num_nodes, np.bool_)
         self.first[[node for node, _ in self.starts]] = True
         everything = np.ones((self.num_nodes, self.num_actions), np.bool_)
@@ -130,7 +130,7 @@ class FiniteHorizonValues:
 # Returns of an episode ------------------------------------------------------------------------------------------------
 
 
-SAME = 1e-9  # returns closer than this are one return
+SAME_RETURN = 1e-9  # returns closer than this are one return
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,14 +182,14 @@ def return_distribution(
 
     Args:
         policy: as for `evaluate_policy`; None: uniform.
-        horizon: T; None: that of the MDP.
+        horizon: T; None: the MDP's.
     Raises:
         UndefinedMeasure: there is no horizon, or there are so many different returns that a table of states by returns
             does not fit into 8 GiB.
         ParameterError: the policy or the horizon is wrong.
     Exactness: exact; returns within 1e-9 of each other count as one. Of general MDPs the reward r(s, a) is paid as it
-        is, even where it is an expectation.
-    Cost: T passes over S A K, where K returns are possible; two tables of S A K.
+        is, even if it is an expectation.
+    Cost: T passes over S A K, if K returns are possible; two tables of S A K.
     Source: Bellemare, Dabney and Rowland (2023), "Distributional reinforcement learning", chapter 2.
     """
     steps = steps_of("return_distribution", mdp, horizon)
@@ -213,7 +213,7 @@ def _backward(mdp: TabularMDP, policy: TablePolicy | None, steps: int) -> tuple[
     for t in range(steps - 1, -1, -1):
         # Returns that are possible from this step on.
         sums = np.sort(np.append((distinct[:, None] + support).ravel(), 0.0))  # ended episodes have return 0
-        returns = sums[np.concatenate([[True], np.diff(sums) > SAME])]
+        returns = sums[np.concatenate([[True], np.diff(sums) > SAME_RETURN])]
         if 8 * states * num_actions * len(returns) * 3 > MEMORY:
             raise UndefinedMeasure(
                 f"return_distribution: {len(returns)} returns are possible in {steps - t} steps from {states} "
@@ -224,9 +224,9 @@ def _backward(mdp: TabularMDP, policy: TablePolicy | None, steps: int) -> tuple[
         after = mdp.dynamics.expected(values)
         for i, reward in enumerate(distinct):
             s, a = np.nonzero(which == i)
-            place = np.searchsorted(returns, reward + support + SAME / 2) - 1
+            index = np.searchsorted(returns, reward + support + SAME_RETURN / 2) - 1
             block = np.zeros((len(s), len(returns)))
-            block[:, np.maximum(place, 0)] = after[s, a]
+            block[:, np.maximum(index, 0)] = after[s, a]
             executed[s, a] = block
         if mdp.is_sticky and t == 0:
             choice = chance.first.choice(executed, table.first_value(executed))

@@ -2,13 +2,13 @@
 
 `hitting_times` bounds the hitting times of one target; here the targets are chosen. A target whose upper bound falls
 below the largest hitting time proven so far is dropped at once. Solved targets bound the others (`HubBounds`), so that
-there is an interval whenever the budget ends. Where a look at each target would take longer than that, the target with
+there is an interval whenever the budget ends. If a look at each target would take longer than that, the target with
 the largest upper bound is always the next. So it is for the start eccentricity, whose first bounds are those from the
 start; solved targets are hubs for others as long as they rule some out.
 
 Upper bounds for all targets at once, from the solution of one of them (`HubBounds`). Let E(s, y) be the least expected
 number of steps from s to y, and h a hub with E(s, h) <= U(s) for all s. To go from x to y, choose an action a that may
-lead there. With probability P(s') it leads to s' != y instead. From there take a short way back to y where there is
+lead there. With probability P(s') it leads to s' != y instead. From there take a short way back to y if there is
 one, each of its steps in the same manner; else give up, and go to the hub. This attempt takes at most c(x, a, y)
 expected steps and is given up with probability at most l(x, a, y), where
 
@@ -25,17 +25,17 @@ and Dijkstra's algorithm finds the best x and a for every y: E(h, y) <= V(y). Th
 then at most the largest U(s) plus V(e). Under sticky actions sums are the largest over the previously executed action,
 and so is U.
 
-Where slips cannot be taken back, but lead on to where the way goes on as well, y need not be the next node: with the
-nodes around y, those on short ways from h to y, the nearest to y first, as a problem of its own in which to leave them
-is to give up,
+If slips cannot be taken back, but lead on to nodes from which the way goes on as well, y need not be the next node:
+with the nodes around y, those on short ways from h to y, the nearest to y first, as a problem of its own in which to
+leave them is to give up,
 
     E(x, y) <= c(x) + l(x) E(h, y), where c(y) = l(y) = 0, and outside c = U, l = 1,
 
 holds for c = U, l = 1 everywhere, and goes on to hold where c(x), l(x) become 1 + sum P c and sum P l under any action,
-node by node (`shortened`). So E(h, y) <= (E(h, x) + c(x)) / (1 - l(x)) for every x around y, and what was a slip at
-each step on the way is one for as many steps as lie between x and y. Each x on the way still has to be met exactly, at
-a factor of 1 / (1 - l(x)) each time. So a few targets, drawn at random, are bounded by long ways of thousands of nodes
-from each other, and every target by a short way from one of them: a few factors instead of hundreds.
+node by node (`shortened_bounds`). So E(h, y) <= (E(h, x) + c(x)) / (1 - l(x)) for every x around y, and what was a slip
+at each step on the way is one for as many steps as lie between x and y. Each x on the way still has to be met exactly,
+at a factor of 1 / (1 - l(x)) each time. So a few targets, drawn at random, are bounded by long ways of thousands of
+nodes from each other, and every target by a short way from one of them: a few factors instead of hundreds.
 """
 
 import itertools
@@ -47,11 +47,11 @@ from functools import cached_property
 
 import numpy as np
 
-from pharos.hardness.hitting_times import SWEEPS, HittingTimes
+from pharos.hardness.hitting_times import SWEEPS_BEFORE_SOLVING, HittingTimes
 from pharos.hardness.interval import MORE, BudgetClock, Interval
 from pharos.kernels import hitting
 from pharos.kernels.hitting import UNIT
-from pharos.mdp import ExpandedMDP, TabularMDP, outcomes_of
+from pharos.mdp import ExpandedMDP, TabularMDP, outcome_matrix
 from pharos.system.workers import usable_workers
 
 # Nodes around each state among which ways back are looked for: a few steps in all directions of a grid.
@@ -66,16 +66,16 @@ SQUARE = 64
 PASSES = 100
 ACCURACY = 1e-4
 # Outcomes below which threads are not worth their start.
-SMALL = 100_000
+FEW_OUTCOMES = 100_000
 # Sweeps over the nodes around a target, at most, and parts of all targets, in the order of their bounds: each part
 # knows the bounds of those before it, and threads share a part, so that results do not depend on their number.
-ROUNDS, PARTS = 30, 64
+WAY_ROUNDS, TARGET_PARTS = 30, 64
 # More than the relative rounding of sums of positive numbers along any way.
-ROUNDING = 1 + 1e-9
+SUM_SLACK = 1 + 1e-9
 
 
 class HubBounds:
-    """The bounds of an MDP; nodes are its states, and the implicit end where there is one.
+    """The bounds of an MDP; nodes are its states, and the implicit end if there is one.
 
     Cost: two searches of 64 nodes around each state, once; for a hub some passes over the ways back and one run of
         Dijkstra's algorithm. Memory: some 30 bytes for each outcome of each action and a byte for each pair of outcomes
@@ -91,13 +91,13 @@ class HubBounds:
             chance.first_chosen,
             chance.first_uniform / num_actions,
         )
-        self._outcomes = _outcomes(mdp, restart)
+        self._outcomes = _outcome_lists(mdp, restart)
         first, _, node, _ = self._outcomes
         owner = np.repeat(np.arange(len(first) - 1), np.diff(first))
         self._num_actions = num_actions
         self._steps = -1, np.empty(0, np.int32)  # a hub, and those from it to each node
         self._fixed = (self._outcomes, owner, weights, mdp.policy_width - 1)
-        self._threads = usable_workers(None) if len(node) > SMALL else 1
+        self._threads = usable_workers(None) if len(node) > FEW_OUTCOMES else 1
         with ThreadPoolExecutor(self._threads) as pool:
             self._find_ways_back(owner, pool)
         self.leak = self._solve(0.0, np.ones(len(first) - 1))
@@ -142,7 +142,9 @@ class HubBounds:
             for passes in range(PASSES):
                 # twice with all arrays, as two take turns
                 arrays: tuple[object, ...] = (*self._fixed, *self._ways, own, times, value, new, passes < 2)
-                parts = [pool.submit(hitting.attempt, low, high, *arrays) for low, high in itertools.pairwise(edges)]
+                parts = [
+                    pool.submit(hitting.attempt_costs, low, high, *arrays) for low, high in itertools.pairwise(edges)
+                ]
                 short = max(part.result() for part in parts)
                 if short <= ACCURACY * (1 - self._rho):
                     break
@@ -153,12 +155,12 @@ class HubBounds:
         """(N,) V: upper bounds of the expected steps from the hub to each node, given those from each node to the
         hub."""
         first, _, node, _ = self._outcomes
-        return hitting.times_from(hub, first, node, self._solve(1.0, times), self.leak) * ROUNDING
+        return hitting.times_from(hub, first, node, self._solve(1.0, times), self.leak) * SUM_SLACK
 
     def shortened(
         self, times: np.ndarray, bound: np.ndarray, targets: np.ndarray, size: int, is_over: Callable[[], bool]
     ) -> np.ndarray:
-        """(N,) `bound`, or less where the way through the nodes around a target is shorter.
+        """(N,) `bound`, or less if the way through the nodes around a target is shorter.
 
         Args:
             times, bound: (N,) upper bounds of the expected steps to the hub, and from it.
@@ -174,7 +176,7 @@ class HubBounds:
                 np.zeros(num_nodes, np.int32),
                 np.empty(size, np.int64),
                 np.empty((4 * size, 2), np.int64),
-                np.empty(hitting.TURNS, np.int64),
+                np.empty(hitting.MOST_TURNS, np.int64),
                 *np.empty((2, size, num_previous + 1)),
             )
             for _ in range(self._threads)
@@ -182,10 +184,10 @@ class HubBounds:
         bound, new = bound.copy(), np.empty(num_nodes)
         graph = (outcomes, owner, self._into, self._steps_from(int(np.argmin(bound))))
         chance = (weights, num_previous, self._num_actions)
-        fixed = (graph, chance, times, bound, new, ROUNDS)
+        fixed = (graph, chance, times, bound, new, WAY_ROUNDS)
         with ThreadPoolExecutor(self._threads) as pool:
             order = targets[np.argsort(bound[targets], kind="stable")]
-            for part in np.array_split(order, min(PARTS, max(len(order), 1))):
+            for part in np.array_split(order, min(TARGET_PARTS, max(len(order), 1))):
                 if is_over():
                     break
                 edges = np.linspace(0, len(part), self._threads + 1).astype(np.int64)
@@ -212,10 +214,10 @@ class HubBounds:
         return self._steps[1]
 
 
-def _outcomes(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _outcome_lists(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(first, action, node, probability) of the outcomes of executing each action in each state; action -1: any."""
     terminal = np.asarray(mdp.terminal)
-    executed, ends = outcomes_of(mdp, terminal)
+    executed, ends = outcome_matrix(mdp, terminal)
     num_states, num_actions = mdp.num_states, mdp.num_actions
     starts = np.flatnonzero(np.asarray(mdp.start_probabilities) > 0)
     ended = np.append(np.flatnonzero(terminal), np.full(int(ends), num_states, np.int64)).astype(np.int64)
@@ -227,10 +229,10 @@ def _outcomes(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, n
     node, prob = np.empty(action.size, np.int64), np.empty(action.size)
     of_live = np.ones(action.size, np.bool_)
     if restart:
-        places = (first[ended][:, None] + np.arange(len(starts))).ravel()
-        of_live[places] = False
-        node[places] = np.tile(np.asarray(mdp.start_states)[starts], len(ended))
-        prob[places] = np.tile(np.asarray(mdp.start_probabilities)[starts], len(ended))
+        indices = (first[ended][:, None] + np.arange(len(starts))).ravel()
+        of_live[indices] = False
+        node[indices] = np.tile(np.asarray(mdp.start_states)[starts], len(ended))
+        prob[indices] = np.tile(np.asarray(mdp.start_probabilities)[starts], len(ended))
     rows = np.repeat(np.arange(num_states * num_actions), np.diff(executed.indptr))
     action[of_live], node[of_live], prob[of_live] = rows % num_actions, executed.indices, executed.data
     return first, action, node, prob
@@ -241,7 +243,7 @@ def _outcomes(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, n
 
 # Most targets that threads look at before they learn of a larger hitting time: a target may be looked at in vain that
 # often.
-BATCH = 64
+TARGET_BATCH = 64
 # Nodes times targets from which on one search for each target, to find the most promising, takes minutes.
 MANY = 10**9
 # Targets that are solved before it is judged whether their bounds rule out others.
@@ -250,16 +252,16 @@ TRIAL = 16
 # looking at the others one by one is quicker.
 RULED_OUT = 40
 # Nodes on the way to a target through which its bound is shortened, and one in how many targets, drawn by their
-# numbers: a few are bounded by long ways, and the others from these by short ones. 0: those of the largest bounds, as
-# many as of the long ways.
-WAYS = ((64, 1), (4096, 64), (1024, 16), (256, 1), (4096, 0))
+# numbers: a few are bounded by long ways, and the others from these by short ones. 0: the ones with the largest bounds,
+# as many as of the long ways.
+WAY_STAGES = ((64, 1), (4096, 64), (1024, 16), (256, 1), (4096, 0))
 # Nodes there must be for each node on a way; the share that is left of the median and of the largest of the bounds
 # beyond which no more is tried; and times as long as the ways before take the next ones.
-NODES_EACH, TAKEN, LONGER = 8, 0.95, 5
+NODES_EACH, MOST_LEFT, LONGER = 8, 0.95, 5
 # Mixes the numbers of targets, neighbours among which are alike.
 _MIX = np.uint64(0x9E3779B97F4A7C15)
-# Targets that are solved before that, where there are too many for a look at each, or bounds are so many times apart.
-FIRST, APART = 3, 2.0
+# Targets that are solved before that, if there are too many for a look at each, or bounds are so many times apart.
+FIRST_TARGETS, APART = 3, 2.0
 # `crude_upper` is a product of up to N rounded factors.
 CRUDE = 1.01
 
@@ -276,7 +278,7 @@ class TargetBounds:
 
     Attributes:
         farther: the words for a target that may exceed it.
-        upper: (targets,) of the time to each; -inf where it is settled.
+        upper: (targets,) of the time to each; -inf if it is settled.
         lower: the largest time that is proven. settled_upper: the largest upper bound of settled targets.
         limited: targets whose bounds are as close as floats allow, and no closer than the tolerance.
     """
@@ -324,7 +326,7 @@ class TargetBounds:
         if self._first is None or self._travel is None or self._is_short:
             return
         (to_hub, times, away), self._is_short = self._first, True
-        for shorter in shortened(self._travel, times, away, self.spending):
+        for shorter in shortened_bounds(self._travel, times, away, self.spending):
             np.minimum(self.upper, to_hub + shorter, out=self.upper)
             self.drop()
             self.report()
@@ -372,7 +374,7 @@ class _Diameter(TargetBounds):
             if connected:
                 for batch in self._widest():
                     self._solve_batch(batch, pool, bounding=True)
-            if not self.many:  # else, where not connected: it is infinite, and that is all that can be said
+            if not self.many:  # else, if not connected: it is infinite, and that is all that can be said
                 for batch in self._promising():
                     self._solve_batch(batch, pool, bounding=False)
         left, is_infinite = self.num_open, bool(self.unreachable) or not connected
@@ -410,19 +412,19 @@ class _Diameter(TargetBounds):
             batch, order = order[: int(min(size, left))], order[int(min(size, left)) :]
             if batch:
                 yield batch
-            size = min(2 * size, BATCH)
+            size = min(2 * size, TARGET_BATCH)
 
     def _widest(self) -> Iterator[list[int]]:
         """A start state, then the targets of the largest upper bounds, two at once, as long as this rules out others.
 
-        Where there are too many targets for a look at each, to the end of the budget.
+        If there are too many targets for a look at each, to the end of the budget.
         """
         batch = [int(self.choices.underlying[self.choices.starts[0][0]])]
         apart = self.choices.num_targets // 64 + 1
         trial, left_before = TRIAL, self.num_open
         while batch and not self.spending.is_over:
             yield batch
-            if self.spending.searches >= FIRST and (self.many or self._upper() > APART * self.lower):
+            if self.spending.searches >= FIRST_TARGETS and (self.many or self._upper() > APART * self.lower):
                 self.shorten()
             if not self.many and self.spending.searches >= trial:
                 if left_before - self.num_open < min(RULED_OUT * TRIAL, left_before / 2):
@@ -439,7 +441,8 @@ class _Diameter(TargetBounds):
     def _solve_batch(self, batch: list[int], pool: ThreadPoolExecutor, bounding: bool) -> None:
         """Solve the targets of a batch, in threads. What a target must exceed is the same for all of a batch.
 
-        So results do not depend on the number of threads. `bounding`: their hitting times bound those of other targets.
+        So results do not depend on the number of threads. `bounding`: their hitting times bound the hitting times of
+        other targets.
         """
         threads = self.threads
         scaling = bounding or not self.spending.searches
@@ -481,23 +484,27 @@ class _Diameter(TargetBounds):
         return looks
 
 
-def shortened(travel: HubBounds, times: np.ndarray, away: np.ndarray, spending: BudgetClock) -> Iterator[np.ndarray]:
+def shortened_bounds(
+    travel: HubBounds, times: np.ndarray, away: np.ndarray, spending: BudgetClock
+) -> Iterator[np.ndarray]:
     """Bounds of the times from a hub to each target, ever shorter, while this helps and the budget allows for more.
 
     times, away: (targets,) upper bounds of the expected steps to the hub, and from it.
     """
     count = len(away)
     drawn = np.argsort(np.arange(count, dtype=np.uint64) * _MIX, kind="stable")
-    for size, every in WAYS:
+    for size, every in WAY_STAGES:
         if size * NODES_EACH > count:
             continue
-        began, long = spending.seconds, count // WAYS[1][1]
+        began, long = spending.seconds, count // WAY_STAGES[1][1]
         targets = np.sort(drawn[: count // every]) if every else np.argpartition(away, count - long)[count - long :]
         before, away = away, travel.shortened(times, away, targets, size, lambda: spending.is_over)
         yield away
         if spending.is_over or LONGER * (spending.seconds - began) > spending.budget.seconds - spending.seconds:
             return
-        if size > WAYS[0][0] and all(f(away[targets]) > TAKEN * f(before[targets]) for f in (np.median, np.max)):
+        if size > WAY_STAGES[0][0] and all(
+            f(away[targets]) > MOST_LEFT * f(before[targets]) for f in (np.median, np.max)
+        ):
             return
 
 
@@ -508,7 +515,7 @@ class _TargetResult:
     Attributes:
         limited: whether floats allow no closer bounds.
         scale: 99th percentile of hitting time divided by distance.
-        times: (nodes,) upper bounds of the hitting times, where other targets are to be bounded.
+        times: (nodes,) upper bounds of the hitting times, if other targets are to be bounded.
     """
 
     target: int
@@ -575,7 +582,7 @@ class _Eccentricity(TargetBounds):
         self.spending.report(self.lower, max(self.settled_upper, float(self.upper.max())), self.num_open)
 
     def _settle(self, target: int) -> np.ndarray | None:
-        """Settle a target; returns upper bounds (nodes,) of its hitting times, where all are known."""
+        """Settle a target; returns upper bounds (nodes,) of its hitting times, if all are known."""
         targets, rounding = self.targets, 1 + (len(self.nodes) + 8) * UNIT
         self.spending.searches += 1
         before, self.upper[target] = float(self.upper[target]), -math.inf
@@ -583,7 +590,7 @@ class _Eccentricity(TargetBounds):
         if lost is not None and lost[self.nodes].any():
             self.infinite = True
             return None
-        bounds = targets.sweep(j, count, SWEEPS, 0.0, self.spending)
+        bounds = targets.sweep(j, count, SWEEPS_BEFORE_SOLVING, 0.0, self.spending)
         if bounds.at_most(self._mean(j)) * rounding > self.settled_upper:
             bounds = targets.solve(j, count, self.tolerance, 0.0, self.spending)
             mean = self._mean(j)

@@ -1,21 +1,22 @@
 """The diameter of a graph by directed ExactSumSweep, searches from many nodes at once, and the argument of clocks.
 
-`Graph` is that of a deterministic MDP, with searches forward and backward. `GraphLayers` are those of a graph that
-contains a clock: every edge leads from one layer of nodes to the next, and round again. `orbits` are states that cannot
-be told apart by where actions lead. Source: Borassi et al. (2015); Then et al. (2014). Clocks are an argument of ours.
+`Graph` is the graph of a deterministic MDP, with searches forward and backward. `GraphLayers` are the layers of a graph
+that contains a clock: every edge leads from one layer of nodes to the next, and round again. `orbits` are states that
+cannot be told apart by the states that actions lead to. Source: Borassi et al. (2015); Then et al. (2014). Clocks are
+an argument of ours.
 
 Clocks that the restart hides: the largest distances to many states, by searches that stand in the same layer. Let H be
 the graph without the edges of states that end, and e(u) the least number of steps from u to a state that ends, and one
-more. A shortest path from the start s does not pass it again, so d(s, v) is that of H, and
+more. A shortest path from the start s does not pass it again, so d(s, v) is the distance in H, and
 
     d(u, v) = min(d_H(u, v), e(u) + d(s, v)).
 
-e and d(s, .) come from the searches from the start. Where all cycles of H are multiples of P steps long, as where
+e and d(s, .) come from the searches from the start. If all cycles of H are multiples of P steps long, as if
 traffic goes by, all edges of H lead from one layer {v: d(s, v) = j modulo P} to the next. Searches in H backward from
-many targets then stand in one layer if each begins when that of its target has its turn (`kernels.search_in_step`):
-that one layer is read for all targets, while levels, counted from each target, are as many layers as targets have. They
-end after as many steps as the other way has. Restarts, which lead from all layers to the first, make the common length
-of cycles 1 and would spread every search over all layers; in H they do not exist.
+many targets then stand in one layer if each begins when the layer of its target has its turn
+(`kernels.search_in_step`): that one layer is read for all targets, while levels, counted from each target, are as many
+layers as targets have. They end after as many steps as the other way has. Restarts, which lead from all layers to the
+first, make the common length of cycles 1 and would spread every search over all layers; in H they do not exist.
 """
 
 import math
@@ -37,9 +38,9 @@ class Graph:
     """The graph of a deterministic MDP, with restart edges and the implicit end; see `pharos.kernels.graph`.
 
     Attributes:
-        num_nodes: N, the states and, where some transition of a state that is not terminal is -1, the end.
+        num_nodes: N, the states and, if some transition of a state that is not terminal is -1, the end.
         start: the node that terminal states lead to; -1: they lead nowhere.
-        pivot: a start state, where searches begin.
+        pivot: a start state, at which searches begin.
     """
 
     def __init__(self, next_states: Indices, terminal: np.ndarray, start: int, pivot: int):
@@ -54,7 +55,7 @@ class Graph:
 
     @staticmethod
     def of(mdp: TabularMDP, restart: bool) -> "Graph | None":
-        """The graph of `mdp`; None where a choice or a restart has several outcomes."""
+        """The graph of `mdp`; None if a choice or a restart has several outcomes."""
         if not mdp.chance.is_none:
             return None
         table = mdp.dynamics.deterministic_table()
@@ -103,15 +104,15 @@ def _leads_to_end(table: Indices, terminal: np.ndarray) -> bool:
 
 
 # Nodes of a layer beyond which layers are not narrow: a set of them no longer fits into a core's cache.
-WIDE = 1024
+WIDE_LAYER = 1024
 
 
 class GraphLayers(NamedTuple):
     """The nodes of a graph by layer.
 
     Attributes:
-        order: (N,) nodes by layer. first: (P + 1,) where each layer begins in it.
-        position: (N,) int32, the place of a node in its layer.
+        order: (N,) nodes by layer. first: (P + 1,) the beginning of each layer in it.
+        position: (N,) int32, the index of a node in its layer.
     """
 
     order: np.ndarray
@@ -122,7 +123,7 @@ class GraphLayers(NamedTuple):
     def of(layer: np.ndarray, widths: np.ndarray, dtype: DTypeLike) -> "GraphLayers":
         """
         Args:
-            layer: (N,) that of each node. widths: (P,) how many nodes each has. dtype: of nodes.
+            layer: (N,) the layer of each node. widths: (P,) how many nodes each has. dtype: of nodes.
         """
         first = np.concatenate([[0], np.cumsum(widths)])
         order = np.argsort(layer, kind="stable").astype(dtype)
@@ -164,7 +165,7 @@ class HiddenClock(NamedTuple):
 
     @staticmethod
     def of(graph: Graph, home: np.ndarray, away: np.ndarray) -> "HiddenClock | None":
-        """The clock of a graph with restarts; None where there is none, or its layers do not pay.
+        """The clock of a graph with restarts; None if there is none, or its layers do not pay.
 
         Args:
             home, away: (N,) distances to the start, and from it.
@@ -177,12 +178,12 @@ class HiddenClock(NamedTuple):
             return None
         layer = away % cycle
         widths = np.bincount(layer, minlength=cycle)
-        if int(widths.max()) > WIDE:
+        if int(widths.max()) > WIDE_LAYER:
             return None
         return HiddenClock(home.copy(), away.copy(), GraphLayers.of(layer, widths, graph.dtype))
 
     def largest_to(self, graph: Graph, targets: np.ndarray, best: int) -> tuple[np.ndarray, int]:
-        """((targets,) max over u of d(u, target), or `best` where that is larger; table entries read)."""
+        """((targets,) max over u of d(u, target), or `best` if that is larger; table entries read)."""
         cycle = self.layers.number
         of_target = self.away[targets] % cycle
         order = np.argsort(-of_target, kind="stable")
@@ -227,7 +228,7 @@ _FEW_ORBITS = 64
 # Bytes that searches from many nodes may take.
 _BATCH_MEMORY = 2**31
 COUNTING = 10.0  # seconds for counting the pairs of an infinite diameter, unless a budget is given
-DEFAULTS = (Budget(), Budget(seconds=COMMAND_SECONDS))
+DEFAULT_BUDGETS = (Budget(), Budget(seconds=COMMAND_SECONDS))
 # Table entries that are followed in a second on a slow core, to know how many a budget allows for.
 READS = 10**8
 
@@ -281,7 +282,7 @@ class SumSweep:
     # Searches ---------------------------------------------------------------------------------------------------------
 
     def _pivot(self, p: int) -> bool:
-        """Search from p in both directions; False where p does not reach all nodes, or not all reach p."""
+        """Search from p in both directions; False if p does not reach all nodes, or not all reach p."""
         forward, out_pivot, _ = self.graph.search_forward(p, self.away)
         backward, in_pivot, _ = self.graph.search_backward(p, self.to)
         self.spending.searches += 2
@@ -324,10 +325,10 @@ class SumSweep:
     # The sweep --------------------------------------------------------------------------------------------------------
 
     def _sweep(self) -> None:
-        """Search where it pays: the kind that closed most nodes for its cost, the others now and then.
+        """Search in the way that pays: the kind that closed most nodes for its cost, the others now and then.
 
         The kinds: from the node of the largest upper bound forward, or backward; from the middle in both directions;
-        from up to 512 open nodes at once, pushing to neighbours or, where levels are few, pulling from them. Costs are
+        from up to 512 open nodes at once, pushing to neighbours or, if levels are few, pulling from them. Costs are
         counted in table entries read, not in seconds, so that the searches made are the same on every machine.
         """
         one = max(1, self.graph.num_nodes * self.graph.next_states.shape[1])
@@ -367,7 +368,7 @@ class SumSweep:
         return int(min(64 * words, max(1, self.spending.budget.searches - self.spending.searches)))
 
     def _farthest(self, upper: np.ndarray, words: int) -> np.ndarray:
-        """Open nodes, those of the largest upper bounds first, as many as are searched from at once."""
+        """Open nodes, the largest upper bounds first, as many as are searched from at once."""
         nodes = np.flatnonzero(np.greater(upper, self.best))
         return nodes[np.argsort(-upper[nodes].astype(np.int64), kind="stable")[: self._limit(words)]]
 
@@ -392,7 +393,7 @@ class SumSweep:
     def _search_densely(self) -> int:
         """Find the exact in(v) of up to 512 open nodes, and bounds along edges; return the cost, in table entries.
 
-        Where most eccentricities are nearly equal, as in puzzles whose moves can be taken back, no pivot rules many
+        If most eccentricities are nearly equal, as in puzzles whose moves can be taken back, no pivot rules many
         nodes out; but a node with in(u) < D does so for its successors, as in(v) <= 1 + in(u). So none of the nodes is
         a successor of another one, and those with many successors come first: they lie in the middle and close most.
         A line that is pulled takes an eighth of the time of one that is pushed (512 nodes of the 8-puzzle: 0.25 s in
@@ -422,7 +423,7 @@ class SumSweep:
     # Symmetries -------------------------------------------------------------------------------------------------------
 
     def _search_orbits(self) -> None:
-        """Find the exact out(v) of all states by a search from one of each orbit, where symmetries leave few orbits."""
+        """Find the exact out(v) of all states by a search from one of each orbit, if symmetries leave few orbits."""
         graph = self.graph
         orbit = orbits(graph.next_states, graph.ends, graph.start, graph.pivot, lambda: self.spending.is_over)
         if orbit is None:
@@ -440,7 +441,7 @@ class SumSweep:
     # Clocks -----------------------------------------------------------------------------------------------------------
 
     def _search_in_step(self) -> None:
-        """Find in(v) of all open nodes, the farthest first, where the graph without restarts has a clock."""
+        """Find in(v) of all open nodes, the farthest first, if the graph without restarts has a clock."""
         is_tried = self._open()[0] and self._fits(1)
         clock = HiddenClock.of(self.graph, self.to, self.away) if is_tried else None
         while clock is not None and self._open()[0] and not self.spending.is_over:
@@ -466,7 +467,7 @@ class SumSweep:
         in R_g(u). All walks from u to v have a length of g modulo P; g itself is none, and as g < P nothing smaller is,
         so d(u, v) >= g + P. For g = -1 every layer is one node and the graph is a cycle of P nodes: D = P - 1.
 
-        The sets are found for one layer at a time, a bit for each of its nodes; this pays where layers are narrow.
+        The sets are found for one layer at a time, a bit for each of its nodes; this pays if layers are narrow.
         """
         graph = self.graph
         if graph.num_nodes < 64:
@@ -477,7 +478,7 @@ class SumSweep:
         layer = self.away % cycle
         widths = np.bincount(layer, minlength=cycle)
         widest = int(widths.max())
-        if widest > WIDE:
+        if widest > WIDE_LAYER:
             return f"all cycles have multiples of {cycle} steps, but a layer of {widest} states is too wide to follow"
         layers = GraphLayers.of(layer, widths, graph.dtype)
         now, later = (np.empty((widest, -(-widest // 64)), np.uint64) for _ in range(2))
@@ -498,7 +499,7 @@ def _infinite_diameter(graph: Graph, spending: BudgetClock) -> Interval:
     The value is known before any pair is counted, so of the default budget no more than COUNTING seconds go into that.
     """
     size = graph.num_nodes
-    end = spending.seconds + COUNTING if spending.budget in DEFAULTS else math.inf
+    end = spending.seconds + COUNTING if spending.budget in DEFAULT_BUDGETS else math.inf
     words = 8 if 24 * 8 * size <= _BATCH_MEMORY else 1
     origins, front, coming = (np.zeros((size, words), np.uint64) for _ in range(3))
     scratch = (origins, front, coming, graph.queue, np.empty_like(graph.queue))
@@ -536,10 +537,10 @@ _CANDIDATES, _IN_VAIN = 200, 3
 def orbits(
     next_states: Indices, ends: np.ndarray, start: int, pivot: int, is_over: Callable[[], bool]
 ) -> np.ndarray | None:
-    """Return (S,) integers: for each state the smallest one of its orbit; None where no symmetry was found.
+    """Return (S,) integers: for each state the smallest one of its orbit; None if no symmetry was found.
 
     A symmetry maps the states onto each other so that every action does the same; it keeps all distances. There are
-    many where states can be renamed, as the tiles of a tray, or the positions of a cube without an end. The image of
+    many if states can be renamed, as the tiles of a tray, or the positions of a cube without an end. The image of
     one state decides it, so that it takes one pass over the table at most, and mostly a few steps, to find the symmetry
     that takes `pivot` to a state drawn at random, or that there is none.
 

@@ -23,7 +23,7 @@ from pharos.mdp import (
 from pharos.solvers import Solution
 
 # States at once: values of all their outcomes are in memory.
-_BLOCK = 1 << 16
+_VARIANCE_BLOCK = 1 << 16
 _UNIT = 2.0**-53
 # Relative width up to which an interval counts as the value.
 _NARROW = 1e-6
@@ -36,7 +36,7 @@ def environmental_value_norm(mdp: TabularMDP, solution: Solution | None = None) 
         max over s, a of sqrt(Var(V*(s') : s' ~ p(. | s, a)))
 
     over the states that can be reached; 0 for deterministic MDPs. Under sticky actions s is a pair (state, previously
-    executed action), and so is s'. With a horizon, V* is that of the first step.
+    executed action), and so is s'. With a horizon, V* belongs to the first step.
 
     Args:
         solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, or what floats reach.
@@ -66,9 +66,9 @@ def certified_value_norm(
     states, largest = np.flatnonzero((lone | nodes.any(axis=1)) & live), 0.0
     size = float(np.abs(solution.x).max(initial=0.0))
     scale = 2.0 ** math.frexp(size)[1] if 0 < size < math.inf else 1.0  # squares of 1e160 and 1e-170 are no floats
-    for number, block in enumerate(np.array_split(states, max(1, -(-states.size // _BLOCK)))):
-        progress(f"state {number * _BLOCK:,} of {states.size:,}")
-        means, within = _outcomes(mdp, solution.x, block, scale)
+    for number, block in enumerate(np.array_split(states, max(1, -(-states.size // _VARIANCE_BLOCK)))):
+        progress(f"state {number * _VARIANCE_BLOCK:,} of {states.size:,}")
+        means, within = _moments(mdp, solution.x, block, scale)
         first = lone[block]
         largest = max(largest, _largest_variance(mdp.chance.first.at(block[first]), means[first], within[first], 0))
         for previous in range(mdp.width):
@@ -85,9 +85,9 @@ def certified_value_norm(
     return Certified(value, lower, upper, upper - lower <= _NARROW * upper or upper == 0.0)
 
 
-def _outcomes(mdp: TabularMDP, x: np.ndarray, states: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """((N, A) mean less that of the row, (N, A) variance) of the next state's value under each executed action, over
-    `scale`."""
+def _moments(mdp: TabularMDP, x: np.ndarray, states: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """((N, A) mean less the mean of the row, (N, A) variance) of the next state's value under each executed action,
+    over `scale`."""
     means = mdp.dynamics.expected(x, states) / scale
     within: np.ndarray = np.zeros_like(means)
     if not mdp.dynamics.is_deterministic:
@@ -124,11 +124,11 @@ class ActionGapRegularity:
     """Distribution of the action gap g(s) = V*(s) - max over actions that are not optimal of Q*(s, a).
 
     Attributes:
-        constant: the smallest c with P(0 < g(s) <= t) <= c t^zeta for all t > 0; 0 where there are no gaps.
+        constant: the smallest c with P(0 < g(s) <= t) <= c t^zeta for all t > 0; 0 if there are no gaps.
         zeta: the exponent.
         gaps: (K,) the different gaps, ascending.
         shares: (K,) P(0 < g(s) <= gaps[i]).
-        states: the number of states (of pairs and steps, where values have them) that were counted.
+        states: the number of states (of pairs and steps, if values have them) that were counted.
         tie_tolerance: gaps up to it count as none.
         conventions: what the values refer to.
     """

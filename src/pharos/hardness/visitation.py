@@ -1,13 +1,14 @@
 """Visits of policies and the time that they take: occupancy, exploration, covering, mixing.
 
 Occupancy measures: how often a policy is in a state and takes an action. Source: Puterman (1994), section 6.9. Measures
-of representations weigh states by `standard_occupancy`: half the visits of uniform play, half those of optimal play.
+of representations weigh states by `standard_occupancy`: half the visits of uniform play, half the visits of optimal
+play.
 
 Exploration time: how long uniform play takes to find a large reward, the cost of exploration without any learning.
 Covering: how long random play takes to see everything. Source: Laidlaw, Russell and Dragan (2023), appendix. The bound
 on the covering length: Even-Dar and Mansour (2003).
 
-Mixing time: how many steps until a policy has forgotten where it began. The distribution mismatch coefficient: how much
+Mixing time: how many steps until a policy has forgotten its start. The distribution mismatch coefficient: how much
 rarer an exploring policy visits the states of the optimal policy.
 """
 
@@ -17,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy  # whose `sparse` is loaded where it is used
+import scipy  # whose `sparse` is loaded on first use
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.gaps import optimal_solution
@@ -25,7 +26,7 @@ from pharos.hardness.interval import Interval, fields_of, finite
 from pharos.hardness.steps import steps_of
 from pharos.kernels import occupancy as kernels
 from pharos.mdp import (
-    STEPS,
+    STEPS_EXPECTED,
     Chance,
     ExpandedMDP,
     PolicyStep,
@@ -41,7 +42,7 @@ from pharos.system.compiling import Stopwatch
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-_MEMORY = 8 << 30  # bytes that all steps together may take
+_STEPS_MEMORY = 8 << 30  # bytes that all steps together may take
 _LEAST = 1e-280  # mass that is not worth a step: smaller numbers lose their digits, and take a hundred times longer
 
 
@@ -54,7 +55,7 @@ class Occupancy:
         largest: (S, A) float64, the maximum over t of mu_t(s, a), without discount.
         steps: t that were gone through.
         error_bound: the entries of `visits` lack no more than this together; 0 with a horizon.
-        by_step: (T, S, A), mu_t(s, a), where all were asked for; else None.
+        by_step: (T, S, A), mu_t(s, a), if all were asked for; else None.
         conventions: gamma, horizon, and whether actions are chosen or executed ones.
     """
 
@@ -107,7 +108,7 @@ def occupancy(
     Args:
         policy: as for `evaluate_policy`: (S,) actions, (S, A) probabilities, under sticky actions also one for each
             previous action; None: uniform.
-        horizon: T, steps t = 0, ..., T - 1; None: that of the MDP; where it has none, until what is left is within
+        horizon: T, steps t = 0, ..., T - 1; None: the MDP's; if it has none, until what is left is within
             `tolerance`.
         executed: whether a_t is the action that is executed, after chance; otherwise the one that the policy chooses.
         keep_all: whether to keep mu_t for all t, with a horizon.
@@ -124,16 +125,17 @@ def occupancy(
     shape = (mdp.num_states, mdp.num_actions)
     if keep_all and walk.horizon is None:
         raise ParameterError("keep_all is for episodes of T steps: give a horizon")
-    if keep_all and 8 * walk.horizon * mdp.num_states * mdp.num_actions > _MEMORY:  # type: ignore[operator]
+    if keep_all and 8 * walk.horizon * mdp.num_states * mdp.num_actions > _STEPS_MEMORY:  # type: ignore[operator]
         raise ParameterError(
-            f"{walk.horizon} steps of {mdp.num_states} states need more than {_MEMORY >> 30} GiB; leave out keep_all"
+            f"{walk.horizon} steps of {mdp.num_states} states need more than {_STEPS_MEMORY >> 30} GiB; "
+            "leave out keep_all"
         )
     if not tolerance > 0:
         raise ParameterError(f"tolerance is {tolerance!r}; expected a number above 0")
     total, largest = np.zeros(shape), np.zeros(shape)
-    by_step, scale, steps, left, tell = [], 1.0, 0, 0.0, progress or str
+    by_step, scale, steps, left, report = [], 1.0, 0, 0.0, progress or str
     for now, first, alive in walk.distributions():
-        tell(f"visits of step {steps}")
+        report(f"visits of step {steps}")
         if walk.horizon is None:
             left = scale * alive / (1 - mdp.gamma)
             if left <= tolerance:
@@ -167,7 +169,7 @@ def discounted_visits(
     Args:
         policy, tolerance: as for `occupancy`.
     Returns:
-        (S,) float64, and the bound; it is above `tolerance` only where all that is left has less than 1e-280 in each
+        (S,) float64, and the bound; it is above `tolerance` only if all that is left has less than 1e-280 in each
         state.
     Raises:
         UndefinedMeasure: gamma is 1. ParameterError: the policy is wrong.
@@ -184,19 +186,19 @@ def discounted_arrivals(
     policy: TablePolicy | None = None,
     *,
     tolerance: float = 1e-9,
-    tell: Callable[[str], object] = str,
+    report: Callable[[str], object] = str,
 ) -> tuple[np.ndarray, float]:
     """Return the visits of states without a horizon, in terminal states and the end by arrival; and what they may lack
     together.
 
-        d(s) = sum over t of gamma^t P(s_t = s), times 1 - gamma where s is terminal or the end, which is never left
+        d(s) = sum over t of gamma^t P(s_t = s), times 1 - gamma if s is terminal or the end, which is never left
 
     Args, cost, errors: as for `discounted_visits`.
     Returns:
         (S + 1,) float64, entry S for the end; and the bound.
     """
     walk = Propagation(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
-    started, visits, left = walk.discounted(tolerance, tell)
+    started, visits, left = walk.discounted(tolerance, report)
     executed = walk.executed(started, visits)
     result = np.append(started + visits.sum(axis=1), 0.0)
     over = np.flatnonzero(~walk.live)
@@ -240,7 +242,7 @@ class Propagation:
     """
 
     def __init__(self, mdp: TabularMDP, policy: TablePolicy | None, horizon: int | None):
-        steps = mdp.horizon if horizon is None else whole_number(horizon, "horizon", STEPS)
+        steps = mdp.horizon if horizon is None else whole_number(horizon, "horizon", STEPS_EXPECTED)
         if steps is None and mdp.gamma == 1.0:
             raise UndefinedMeasure(
                 f"{mdp}: visits may be infinite, as gamma is 1 and there is no horizon; give one, or gamma < 1"
@@ -255,7 +257,7 @@ class Propagation:
     def after_the_start(self) -> tuple[np.ndarray, np.ndarray]:
         """((S,), (S, W)): under sticky actions the mass of the start, and that one step later; else 0, and the start.
 
-        The second is the first mass that moves by the rules of later steps. Without states where play ends.
+        The second is the first mass that moves by the rules of later steps. Without states in which play ends.
         """
         start = next(self.distributions())[0]
         started, now = np.zeros(len(start)), np.zeros((len(start), self.width))
@@ -269,11 +271,13 @@ class Propagation:
 
     def executed(self, started: np.ndarray, visits: np.ndarray) -> np.ndarray:
         """(S, A): the mass that executes each action: of started (S,) by the rules of the first step, of visits (S, W)
-        by those of later ones."""
+        by the rules of later steps."""
         later = self.later.chance.executed(visits, self.later.policy)
         return later + self.first.chance.executed(started[:, None], self.first.policy)
 
-    def discounted(self, tolerance: float, tell: Callable[[str], object] = str) -> tuple[np.ndarray, np.ndarray, float]:
+    def discounted(
+        self, tolerance: float, report: Callable[[str], object] = str
+    ) -> tuple[np.ndarray, np.ndarray, float]:
         """((S,), (S, W), bound): discounted visits of the first step, under sticky actions alone; of the others; and a
         bound on the visits that are missing."""
         started, waiting = self.after_the_start()
@@ -282,7 +286,7 @@ class Propagation:
         visits, before = np.zeros_like(waiting), math.inf
         while True:
             left = self.mdp.dynamics.accumulate_visits(self.later, gamma, _LEAST, waiting, visits) / (1 - gamma)
-            tell(f"visits are known to {left:.2g}")
+            report(f"visits are known to {left:.2g}")
             if left <= tolerance or left >= before:
                 return started, visits, left
             before = left
@@ -335,29 +339,29 @@ class StandardOccupancy:
 
 
 def standard_occupancy(
-    mdp: TabularMDP, gamma: float, episode: int, tell: Callable[[str], object] = str
+    mdp: TabularMDP, gamma: float, episode: int, report: Callable[[str], object] = str
 ) -> StandardOccupancy:
     """The mean of the undiscounted occupancies of uniform play and of optimal play over episodes of some steps.
 
     Args:
         gamma: the learner's discount, of the values that optimal play follows; its ties are chosen alike.
-        tell: called with a line for each sweep of values and each step of play.
+        report: called with a line for each sweep of values and each step of play.
     """
 
-    def tell_sweep(sweeps: int, _bound: float) -> None:
-        tell(f"sweep {sweeps} of the learner's values")
+    def report_sweep(sweeps: int, _bound: float) -> None:
+        report(f"sweep {sweeps} of the learner's values")
 
-    solution = value_iteration(mdp.with_gamma(gamma).with_horizon(None), progress=tell_sweep)
+    solution = value_iteration(mdp.with_gamma(gamma).with_horizon(None), progress=report_sweep)
     best = solution.optimal_actions(max(1e-8, 4 * solution.error_bound))
     plain, total = mdp.with_gamma(1.0), np.zeros(mdp.num_states)
     for policy in (None, best / best.sum(axis=1, keepdims=True)):
-        visits = occupancy(plain, policy, horizon=episode, progress=tell).states
+        visits = occupancy(plain, policy, horizon=episode, progress=report).states
         total += visits / (2 * visits.sum())
     return StandardOccupancy(total, solution.q)
 
 
-def drawn(weights: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
-    """(count,) different places, drawn by nine parts of weights (N,) and one of uniform chance, in random order."""
+def drawn_indices(weights: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
+    """(count,) different indices, drawn by nine parts of weights (N,) and one of uniform chance, in random order."""
     share = 0.9 * weights / weights.sum() + 0.1 / len(weights)
     return np.random.default_rng(seed).choice(len(weights), count, replace=False, p=share / share.sum())
 
@@ -373,7 +377,7 @@ class ExplorationTime:
     """Expected time until uniform play finds a large reward.
 
     Attributes:
-        steps: expected, episodes after episodes; infinite where it never does.
+        steps: expected, episodes after episodes; infinite if it never does.
         episodes: expected, the one in which it happens included: 1 / probability.
         probability: that an episode has one.
         threshold: a reward above it is large.
@@ -405,7 +409,7 @@ def exploration_time(
     rewards are costs alone, above the middle between the smallest and the largest.
 
     Args:
-        horizon: steps of an episode; None: that of the MDP.
+        horizon: steps of an episode; None: the MDP's.
         progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: there are no episodes, or all rewards are costs of one size.
@@ -426,9 +430,9 @@ def exploration_time(
     mass = np.zeros((mdp.num_states, 1))
     np.add.at(mass[:, 0], mdp.start_states, mdp.start_probabilities)
     probability = length = 0.0
-    chance, play, tell = mdp.chance.first, uniform_choice(mdp)[:, None], progress or str
+    chance, play, report = mdp.chance.first, uniform_choice(mdp)[:, None], progress or str
     for t in range(steps):
-        tell(f"step {t} of {steps}")
+        report(f"step {t} of {steps}")
         mass[~live] = 0.0
         total = mass.sum(axis=1, keepdims=True)
         length += float(total.sum())
@@ -482,13 +486,13 @@ def covering(
     """Return how rarely random play meets the rarest state and action.
 
         mu_t(s, a) = P(s_t = s, a_t = a) for uniform play from the start;  L <= ln(2 S A) / min over s, a of max over t
-        of mu_t(s, a); where actions are not available everywhere, S A is the number of pairs that there are
+        of mu_t(s, a); if actions are not available everywhere, S A is the number of pairs that there are
 
     Pairs run over the states that can be met within T steps and are not terminal; under sticky actions over pairs
     (state, previously executed action), and a start without one.
 
     Args:
-        horizon: T; None: that of the MDP.
+        horizon: T; None: the MDP's.
         progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: there is no horizon.
@@ -506,14 +510,14 @@ def covering(
     return Covering(omega_max, omega_sum, length, states, {"horizon": steps, "exploration": "uniform"})
 
 
-def _occupied(mdp: TabularMDP, steps: int, tell: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray, int]:
+def _occupied(mdp: TabularMDP, steps: int, report: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray, int]:
     """(max over t, sum over t) of the probability of each action in each node that uniform play meets and that is not
     terminal, and the number of these pairs."""
     walk = Propagation(mdp, None, steps)
     largest, total = np.zeros((mdp.num_states, walk.width)), np.zeros((mdp.num_states, walk.width))
     alone = np.zeros((0, 1))  # under sticky actions a start has no previous action: nodes of their own
     for t, (now, first, _) in enumerate(walk.distributions()):
-        tell(f"step {t} of {steps}")
+        report(f"step {t} of {steps}")
         if first and mdp.is_sticky:
             alone = now.copy()
             continue
@@ -532,16 +536,16 @@ def _occupied(mdp: TabularMDP, steps: int, tell: Callable[[str], object]) -> tup
 
 
 MOST_NODES = 4096
-ROUNDING = 1e-12  # of a distance, that a tie with epsilon is one
+DISTANCE_ROUNDING = 1e-12  # of a distance, that a tie with epsilon is one
 
 
 @dataclass(frozen=True)
 class MixingTime:
-    """Mixing time of a policy: steps until it has forgotten where it began.
+    """Mixing time of a policy: steps until it has forgotten its start.
 
     Attributes:
-        value: t_mix in steps; infinite where the chain does not converge.
-        period: of the recurrent class; 0 where there are several.
+        value: t_mix in steps; infinite if the chain does not converge.
+        period: of the recurrent class; 0 if there are several.
         distance: the total variation distance at t_mix.
         conventions: epsilon, restart, policy, nodes.
     """
@@ -583,7 +587,7 @@ def mixing_time(
         lazy: of the chain (I + P) / 2, which has no period.
         progress: called with a line now and then; an exception of its own ends the computation.
     Returns:
-        A MixingTime; infinite where the chain has a period, or several recurrent classes.
+        A MixingTime; infinite if the chain has a period, or several recurrent classes.
     Raises:
         UndefinedMeasure: there are more than 4096 nodes (states, under sticky actions pairs with the previous action).
         ParameterError: an option or the policy is wrong.
@@ -593,11 +597,11 @@ def mixing_time(
     if isinstance(epsilon, bool) or not isinstance(epsilon, int | float | np.floating) or not 0 < epsilon < 0.5:
         raise ParameterError(f"epsilon is {epsilon!r}; expected a number between 0 and 1/2")
     if mdp.num_states > 100 * MOST_NODES:  # too many to be written out, even if few can be reached
-        raise UndefinedMeasure(_too_many(mdp.num_states))
+        raise UndefinedMeasure(_too_large_for_matrix(mdp.num_states))
     choices = ExpandedMDP.of(mdp, restart).reachable()
     size = len(choices.underlying)
     if size > MOST_NODES:
-        raise UndefinedMeasure(_too_many(size))
+        raise UndefinedMeasure(_too_large_for_matrix(size))
     table = PolicyTable.of(mdp, policy)
     inside = np.minimum(choices.underlying, mdp.num_states - 1)
     actions = table.probabilities[inside, choices.previous if table.looks_back else 0]
@@ -607,7 +611,7 @@ def mixing_time(
     )
     chain = scipy.sparse.csr_matrix(owner @ chain)
     if mdp.is_sticky:
-        chain = _merged(chain, choices.underlying, np.append(np.asarray(mdp.terminal), True))
+        chain = _without_previous(chain, choices.underlying, np.append(np.asarray(mdp.terminal), True))
         size = chain.shape[0]
     chain.eliminate_zeros()
     if lazy:
@@ -622,19 +626,19 @@ def mixing_time(
     period = _period(chain)
     if period != 1:
         return MixingTime(math.inf, period, 1.0, conventions)
-    steps, distance = _time(chain.toarray(), float(epsilon), progress or str)
+    steps, distance = _mixing_time(chain.toarray(), float(epsilon), progress or str)
     return MixingTime(float(steps), 1, distance, conventions)
 
 
-def _merged(chain: "csr_matrix", underlying: np.ndarray, ended: np.ndarray) -> "csr_matrix":
+def _without_previous(chain: "csr_matrix", underlying: np.ndarray, ended: np.ndarray) -> "csr_matrix":
     """The chain in which an episode that has ended does not remember the previous action."""
     label = np.where(ended[underlying], underlying, len(ended) + np.arange(len(underlying)))
-    _, first, place = np.unique(label, return_index=True, return_inverse=True)
-    membership = scipy.sparse.csr_matrix((np.ones(len(place)), (np.arange(len(place)), place)))
+    _, first, index = np.unique(label, return_index=True, return_inverse=True)
+    membership = scipy.sparse.csr_matrix((np.ones(len(index)), (np.arange(len(index)), index)))
     return scipy.sparse.csr_matrix(chain[first] @ membership)
 
 
-def _too_many(nodes: int) -> str:
+def _too_large_for_matrix(nodes: int) -> str:
     return (
         f"mixing_time: {nodes} nodes are more than the {MOST_NODES} whose matrix fits; a smaller instance "
         f"would define it"
@@ -642,7 +646,7 @@ def _too_many(nodes: int) -> str:
 
 
 def _period(chain: "csr_matrix") -> int:
-    """The period of the recurrent class; 0 where there are several."""
+    """The period of the recurrent class; 0 if there are several."""
     count, labels = scipy.sparse.csgraph.connected_components(chain, directed=True, connection="strong")
     rows, columns = chain.nonzero()
     leaves = np.zeros(count, np.bool_)
@@ -660,10 +664,10 @@ def _period(chain: "csr_matrix") -> int:
     return int(np.gcd.reduce(level[rows] + 1 - level[columns]))
 
 
-def _time(chain: np.ndarray, epsilon: float, tell: Callable[[str], object]) -> tuple[int, float]:
+def _mixing_time(chain: np.ndarray, epsilon: float, report: Callable[[str], object]) -> tuple[int, float]:
     """(t_mix, distance there): squares until it is near enough, then bisection by the squares on the way."""
     size = len(chain)
-    epsilon += ROUNDING
+    epsilon += DISTANCE_ROUNDING
     system = chain.T - np.eye(size)  # of which one equation follows from the others
     system[-1] = 1.0
     stationary = np.linalg.solve(system, np.append(np.zeros(size - 1), 1.0))
@@ -675,13 +679,13 @@ def _time(chain: np.ndarray, epsilon: float, tell: Callable[[str], object]) -> t
         return 0, distance(np.eye(size))
     powers = [chain]
     while distance(powers[-1]) > epsilon:
-        tell(f"more than {2 ** (len(powers) - 1):,} steps")
+        report(f"more than {2 ** (len(powers) - 1):,} steps")
         powers.append(powers[-1] @ powers[-1])
         if len(powers) > 60:
             raise UndefinedMeasure("mixing_time: the chain takes more than 2^60 steps")
     steps, power = 0, np.eye(size)  # the largest t that is not near enough, and P^t
     for i in range(len(powers) - 2, -1, -1):
-        tell(f"between {steps + 1:,} and {steps + 2 ** (i + 1):,} steps")
+        report(f"between {steps + 1:,} and {steps + 2 ** (i + 1):,} steps")
         further = power @ powers[i]
         if distance(further) > epsilon:
             steps, power = steps + 2**i, further
@@ -704,8 +708,8 @@ def distribution_mismatch(
 
         max over s with d*(s) > 0 of d*(s) / d(s),   d(s) = sum over t of gamma^t P(s_t = s),   t = 0, 1, ...
 
-    over all states, terminal ones and the implicit end of an episode among them, which are never left. d* is that of
-    the optimal policy that takes the first of the best actions everywhere, d that of `policy`, both from the start. The
+    over all states, terminal ones and the implicit end of an episode among them, which are never left. d* belongs to
+    the optimal policy that takes the first of the best actions everywhere, d to `policy`, both from the start. The
     result is at least 1.
 
     Args:
@@ -714,7 +718,7 @@ def distribution_mismatch(
         tolerance: of the sums of d and of d*.
         progress: called with a line now and then; an exception of its own ends the computation.
     Returns:
-        An interval: it is wide where d(s) is not much larger than `tolerance`, and infinite at the upper end where it
+        An interval: it is wide if d(s) is not much larger than `tolerance`, and infinite at the upper end if it
         is smaller.
     Raises:
         UndefinedMeasure: gamma is 1, or there is a horizon: the optimal policy then depends on the step.
@@ -730,8 +734,8 @@ def distribution_mismatch(
             "distribution_mismatch is defined for discounted MDPs without a horizon: give gamma < 1 and no horizon"
         )
     solution = optimal_solution(mdp, solution)
-    best, lacking = discounted_arrivals(mdp, solution.policy, tolerance=tolerance, tell=progress or str)
-    other, missing = discounted_arrivals(mdp, policy, tolerance=tolerance, tell=progress or str)
+    best, lacking = discounted_arrivals(mdp, solution.policy, tolerance=tolerance, report=progress or str)
+    other, missing = discounted_arrivals(mdp, policy, tolerance=tolerance, report=progress or str)
     there = support_with_ends(mdp, solution.policy)
     # All numbers are sums of products, each of at most as many factors as there are steps that count.
     steps = mdp.num_states + 32 / (1 - mdp.gamma)

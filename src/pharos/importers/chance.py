@@ -21,9 +21,9 @@ import numpy.typing as npt
 
 from pharos.errors import RuleError
 
-MOST_DRAWS = 200
+MOST_PATH_DRAWS = 200
 """Draws with several outcomes in one step; more are taken for a rejection that never ends."""
-MOST_OUTCOMES = 3_000
+MOST_DRAW_OUTCOMES = 3_000
 """Ways in which the draws of one step may come out."""
 HIDDEN = ("pharos/importers/", "/numpy/", "site-packages/jax/", "<frozen", "<string>", "/random.py", "/functools.py")
 """Parts of the paths of files that are no code of an environment."""
@@ -36,7 +36,7 @@ class DrawError(RuleError):
 
 
 def line_of_code(frame: FrameType | None = None) -> str:
-    """The innermost line of the environment's code that is running, file and number; "" where there is none."""
+    """The innermost line of the environment's code that is running, file and number; "" if there is none."""
     frame = frame or sys._getframe(1)
     while frame is not None:
         path = frame.f_code.co_filename.replace("\\", "/")
@@ -47,7 +47,7 @@ def line_of_code(frame: FrameType | None = None) -> str:
 
 
 def placed(text: str, line: str) -> str:
-    """A text with a line of code behind it, where there is one."""
+    """A text with a line of code behind it, if there is one."""
     return f"{text} ({line})" if line else text
 
 
@@ -58,11 +58,11 @@ class DrawTree:
         most: runs of one step; more are an error.
     Attributes:
         probability: of the run that goes on, as an exact fraction.
-        sampler: draws one outcome at random in place of enumerating, where it is set.
+        sampler: draws one outcome at random in place of enumerating, if it is set.
         refusal: of the last draw that was refused, which the environment's code may have caught.
     """
 
-    def __init__(self, most: int = MOST_OUTCOMES):
+    def __init__(self, most: int = MOST_DRAW_OUTCOMES):
         self.most = most
         self.probability = ONE
         self.sampler: python_random.Random | None = None
@@ -116,7 +116,8 @@ class DrawTree:
         self._depth, self.probability = 0, ONE
 
     def draw(self, weights: Sequence[Fraction], *, are_positive: bool = False) -> int:
-        """Index of the outcome that this run has; weights are probabilities that sum to 1, those of 0 never drawn."""
+        """Index of the outcome that this run has; weights are probabilities that sum to 1; a weight of 0 is never
+        drawn."""
         live: Sequence[int] = range(len(weights))
         if not are_positive:
             live = [i for i, weight in enumerate(weights) if weight > 0]
@@ -124,9 +125,11 @@ class DrawTree:
             return live[0]
         if self.sampler is not None:
             return self.sampler.choices(live, [float(weights[i]) for i in live])[0]
-        if self._depth >= MOST_DRAWS:
+        if self._depth >= MOST_PATH_DRAWS:
             raise self.refused(
-                placed(f"more than {MOST_DRAWS} draws in one step: rejection sampling, which may never end", here())
+                placed(
+                    f"more than {MOST_PATH_DRAWS} draws in one step: rejection sampling, which may never end", here()
+                )
                 + "; start from one layout with a seed (--seed 0), or draw among what is accepted"
             )
         if self._depth == len(self._choices):

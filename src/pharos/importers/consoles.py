@@ -37,7 +37,7 @@ class Recording(NamedTuple):
         source: game, package, version and options, for people.
         num_raw_states: states before equal ones were merged.
         layers: number of them at each depth.
-        num_steps: steps that were played, not counting those of an earlier, killed import.
+        num_steps: steps that were played, without the steps of an earlier, killed import.
     """
 
     observations: DistinctRows
@@ -147,8 +147,8 @@ def procgen(  # noqa: PLR0913  (an option each)
     level = whole_number(level, "procgen: level", "the number of a level, from 0 on", 0, 2**31 - 1)
     actions = len(COMBINATIONS) if all_actions else PROCGEN[game].num_actions
     make = partial(ProcgenGame, game, level, mode, skip, noops, actions)
-    place = {"level": level, "mode": mode, "frame_skip": skip, "noops": noops, "actions": actions}
-    identity = {"game": f"procgen {game}", **_package("procgen-mirror", "procgen"), **place}
+    level_options = {"level": level, "mode": mode, "frame_skip": skip, "noops": noops, "actions": actions}
+    identity = {"game": f"procgen {game}", **_package("procgen-mirror", "procgen"), **level_options}
     words = [f"level {level}", mode, f"frame skip {skip}", f"{actions} actions"]
     words += [f"{noops} no-op steps"] * bool(noops)
     run = partial(explored, max_states=max_states, workers=workers, progress=progress, settles=False)
@@ -156,7 +156,7 @@ def procgen(  # noqa: PLR0913  (an option each)
 
 
 def building_folder(out: str | os.PathLike) -> Path:
-    """The folder of finished layers within that of an MDP, for `folder=`.
+    """The folder of finished layers within the folder of an MDP, for `folder=`.
 
     Raises:
         ParameterError: the folder of the MDP holds something else.
@@ -395,10 +395,10 @@ class ProcgenGame:
     num_actions: int
 
     def __post_init__(self) -> None:
-        place = {"start_level": self.level, "num_levels": 1} if self.mode != "exploration" else {}
+        levels = {"start_level": self.level, "num_levels": 1} if self.mode != "exploration" else {}
         try:
             self.env = _procgen().ProcgenGym3Env(
-                num=1, env_name=self.name, distribution_mode=self.mode, rand_seed=0, num_threads=0, **place
+                num=1, env_name=self.name, distribution_mode=self.mode, rand_seed=0, num_threads=0, **levels
             )
         except ImportError as error:  # of what it loads when it begins
             raise _incomplete(error) from None

@@ -52,7 +52,7 @@ def bridge(path: str | os.PathLike, horizon: int | None = None) -> TabularMDP:
 
 
 def bridge_screens(path: str | os.PathLike) -> np.ndarray:
-    """Return the screen of each state, (S, H, W, 3) uint8, where the file has screens.
+    """Return the screen of each state, (S, H, W, 3) uint8, if the file has screens.
 
     Raises:
         FileFormatError: it has none, or they do not fit.

@@ -15,14 +15,14 @@ from pharos.mdp import Names, OutcomeTable, Residual, TabularMDP, checked_sets, 
 from pharos.system import distinct_rows, mdp_files, storage
 from pharos.system.distinct_rows import DistinctRows
 from pharos.system.mdp_files import (
-    AGAIN,
-    COMMON,
-    FORMAT,
-    MANIFEST,
+    COMMON_ARRAYS,
     MATRIX,
-    OBSERVATIONS,
-    OUTCOMES,
+    MDP_FORMAT,
+    MDP_MANIFEST,
+    OUTCOME_ARRAYS,
     PAID,
+    REIMPORT,
+    SHOWN_NAME,
     TABLE,
     is_folder,
 )
@@ -32,7 +32,7 @@ class ImportedOutcomes(NamedTuple):
     """Outcomes of each state and action: next state, probability and reward.
 
     Attributes:
-        offsets: (S A + 1,) where the outcomes of row s A + a begin. next_states: (N,), -1 for the end of the episode.
+        offsets: (S A + 1,) index of the first outcome of row s A + a. next_states: (N,), -1 for the end of the episode.
         probabilities, rewards: (N,).
     """
 
@@ -42,10 +42,10 @@ class ImportedOutcomes(NamedTuple):
     rewards: np.ndarray
 
 
-IMAGE, GRID, VECTOR = "image", "grid", "vector"
+IMAGE_OBSERVATION, GRID_OBSERVATION, VECTOR_OBSERVATION = "image", "grid", "vector"
 BUILDING = ".building"
 """Folder, within that of an MDP, of what an import that is not finished has so far."""
-OBSERVED = {IMAGE: 4, GRID: 4, VECTOR: 2}
+OBSERVED = {IMAGE_OBSERVATION: 4, GRID_OBSERVATION: 4, VECTOR_OBSERVATION: 2}
 """Kinds of observations that a source may show -> dimensions of their array."""
 FOREIGN = ": is not empty and holds no imported MDP; choose another folder"
 
@@ -64,16 +64,16 @@ def save(
     """Write an MDP without chance into a folder.
 
     Args:
-        folder: made where it is not there; an MDP that lies there is replaced, file by file and the manifest last.
-            Where another process writes it at the moment, that one is waited for, with a warning.
-        source: where the MDP comes from, for people.
+        folder: made if it does not exist. An MDP in it is replaced, file by file and the manifest last. If another
+            process is writing it, `save` warns and waits for that process.
+        source: origin of the MDP, for people.
         actions: names of the actions; None: those of `mdp.names`, else their numbers. Labels, variables and names of
             choices of `mdp.names` are kept as well.
-        time_limit: steps after which training cuts an episode off where the MDP has no horizon; None: 1,000.
+        time_limit: steps after which training cuts an episode off if the MDP has no horizon; None: 1,000.
         observations: what the source shows of each state, which agents may see as the observation "recorded". Equal
             ones are stored once, and all are deflated.
         observed: what they are: "image", (S, H, W, 3) uint8; "grid", (S, columns, rows, C) uint8 codes of things;
-            "vector", (S, N) numbers; None: "image" where they are (S, H, W, 3), else "vector".
+            "vector", (S, N) numbers; None: "image" if they are (S, H, W, 3), else "vector".
         outcomes: of all states and actions, with the reward of each, which episodes are paid then; None: they are paid
             the mean reward.
     Raises:
@@ -89,7 +89,7 @@ def save(
     _check_without_chance(mdp)
     check_free(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    rows = distinct_rows.collected(shown) if isinstance(shown, np.ndarray) else shown
+    rows = distinct_rows.collect_rows(shown) if isinstance(shown, np.ndarray) else shown
     arrays = _arrays_of(mdp) | outcome_arrays | ({} if rows is None else {mdp_files.INDEX: _narrow(rows.index)})
     version = mdp_files.PAID_VERSION if outcome_arrays else mdp_files.VERSION
     version = version if mdp.available is None else mdp_files.SETS_VERSION
@@ -98,14 +98,14 @@ def save(
         if _is_foreign(folder):
             raise ParameterError(f"{folder}{FOREIGN}")
         if not is_folder(folder):  # a mark, so that a killed import is repeated there
-            storage.replace_json(folder / MANIFEST, {"format": FORMAT, "format_version": "unfinished"})
+            storage.replace_json(folder / MDP_MANIFEST, {"format": MDP_FORMAT, "format_version": "unfinished"})
         checksums = _written(folder, arrays)
-        stored = {} if rows is None else {mdp_files.ROWS: mdp_files.write_rows(folder, rows)}
+        stored = {} if rows is None else {mdp_files.ROWS_NAME: mdp_files.write_rows(folder, rows)}
         names, name_arrays = _names_of(mdp)
         if names:
-            description[mdp_files.NAMES] = {**names, "arrays": _written(folder, name_arrays)}
+            description[mdp_files.NAMES_NAME] = {**names, "arrays": _written(folder, name_arrays)}
         manifest = {
-            "format": FORMAT,
+            "format": MDP_FORMAT,
             "format_version": version,
             "source": source,
             "num_states": mdp.num_states,
@@ -115,10 +115,10 @@ def save(
             "arrays": checksums,
             **description,
             **stored,
-            **({mdp_files.RESIDUAL: list(mdp.residual)} if any(mdp.residual) else {}),
-            **({mdp_files.ROUNDING: mdp.reward_table.rounding} if mdp.reward_table.rounding else {}),
+            **({mdp_files.RESIDUAL_NAME: list(mdp.residual)} if any(mdp.residual) else {}),
+            **({mdp_files.ROUNDING_NAME: mdp.reward_table.rounding} if mdp.reward_table.rounding else {}),
         }
-        storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
+        storage.replace_json(folder / MDP_MANIFEST, storage.sealed(manifest))
         (folder / storage.LOCK).unlink()  # whoever waits for it replaces what is whole
     return folder
 
@@ -232,14 +232,14 @@ def _description(
     if time_limit is not None:
         description["time_limit"] = whole_number(time_limit, "time_limit", "a number of steps of at least 1")
     if shown is not None:
-        kind = observed or (IMAGE if shown.ndim == 4 else VECTOR)
+        kind = observed or (IMAGE_OBSERVATION if shown.ndim == 4 else VECTOR_OBSERVATION)
         fits = kind in OBSERVED and shown.ndim == OBSERVED[kind] and len(shown) == mdp.num_states and all(shown.shape)
-        if not fits or (shown.dtype.kind not in "biuf" if kind == VECTOR else shown.dtype != np.uint8):
+        if not fits or (shown.dtype.kind not in "biuf" if kind == VECTOR_OBSERVATION else shown.dtype != np.uint8):
             raise ParameterError(
                 f"observations have shape {shown.shape} and type {shown.dtype}; expected {mdp.num_states} images "
                 f"(S, H, W, 3) uint8, grids (S, columns, rows, C) uint8, or vectors (S, N)"
             )
-        description[OBSERVATIONS] = kind
+        description[SHOWN_NAME] = kind
     return description
 
 
@@ -247,8 +247,8 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
     """Return the environment whose rules are the table of an imported MDP: to train on, to step and to draw.
 
     Args:
-        mdp: a folder that `save` wrote; or an MDP without sticky, random or lazy actions, which is kept in the user's
-            cache where it has no such folder. Its discount is left to the task.
+        mdp: a folder that `save` wrote; or an MDP without sticky, random or lazy actions, which is stored in the user's
+            cache if it has no such folder. Its discount is left to the task.
     Raises:
         FileFormatError: the folder holds none, or was changed. ParameterError: the MDP has sticky, random or lazy
             actions.
@@ -258,7 +258,7 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
     _check_without_chance(mdp)
     if mdp.folder is not None and is_folder(mdp.folder):
         return make("imported", folder=os.fspath(mdp.folder))
-    place = storage.cache_directory() / "imported"
+    imported = storage.cache_directory() / "imported"
     parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
     shape = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon]
     contents: list[Any] = [*shape, str(mdp.chance), sorted(parts.items())]
@@ -267,8 +267,8 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
         digests = [storage.digest_of_bytes(np.ascontiguousarray(each).data) for each in name_arrays.values()]
         contents += [names, digests, mdp.names.actions]
     contents += [*mdp.residual] if any(mdp.residual) else []
-    contents += [mdp_files.ROUNDING, mdp.reward_table.rounding] if mdp.reward_table.rounding else []
-    folder = place / storage.digest_of_json(contents)
+    contents += [mdp_files.ROUNDING_NAME, mdp.reward_table.rounding] if mdp.reward_table.rounding else []
+    folder = imported / storage.digest_of_json(contents)
     return make("imported", folder=os.fspath(folder if is_folder(folder) else save(mdp, folder)))
 
 
@@ -297,7 +297,7 @@ def load(folder: str | os.PathLike) -> TabularMDP:
         FileFormatError: there is none, or a file is missing, damaged or changed.
     """
     folder = Path(folder)
-    manifest = mdp_files.read_manifest(folder)
+    manifest = mdp_files.read_mdp_manifest(folder)
     try:
         mdp = _mdp(manifest, mdp_files.read_arrays(folder, manifest))
         residual = mdp.residual.plus(Residual(*mdp_files.residual_of(manifest)))
@@ -307,7 +307,7 @@ def load(folder: str | os.PathLike) -> TabularMDP:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, MemoryError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise FileFormatError(f"{folder}: the imported MDP is damaged: {reason}; {AGAIN}") from None
+        raise FileFormatError(f"{folder}: the imported MDP is damaged: {reason}; {REIMPORT}") from None
     return replace(mdp, folder=folder, residual=residual, reward_table=rewards, names=names)
 
 
@@ -330,8 +330,8 @@ def _filled_mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
     options = {"gamma": manifest["gamma"], "horizon": manifest["horizon"], "initial": initial}
     if TABLE[0] in arrays:
         return TabularMDP.from_arrays(arrays[TABLE[0]], rewards, terminal=arrays["terminal"], **options)
-    if OUTCOMES[0] in arrays:
-        others = (*COMMON, *PAID, mdp_files.AVAILABLE)
+    if OUTCOME_ARRAYS[0] in arrays:
+        others = (*COMMON_ARRAYS, *PAID, mdp_files.AVAILABLE)
         parts = {name: array for name, array in arrays.items() if name not in others}
         dynamics = OutcomeTable(num_actions=rewards.shape[1], **parts)
         dynamics.check()

@@ -19,7 +19,7 @@ class FreshPlay:
     Args:
         horizon: of the exploration, whose last states were not made.
     Attributes:
-        tolerance: of rewards, relative where they exceed 1.
+        tolerance: of rewards, relative if they exceed 1.
     """
 
     tolerance = 0.0
@@ -56,7 +56,7 @@ class FreshPlay:
         return env
 
     def _start(self, env: Stepped, episode: int) -> tuple[Stepped, int]:
-        """(the environment at the start of an episode, the number of its state); a new environment where needed."""
+        """(the environment at the start of an episode, the number of its state); a new environment if needed."""
         for attempt in range(2):
             if attempt:
                 env = self._made()

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, RuleError, StateSpaceTooLarge
 from pharos.importers.files import MINIGRID_STEPS
 from pharos.importers.folder import ImportedOutcomes
-from pharos.importers.wrappers import Layers, as_integer, check_wrappers, first_number, parts_of, reset
+from pharos.importers.wrappers import Layers, as_integer, check_wrappers, first_number, reset, step_parts
 from pharos.mdp import Names, Residual, Rewards, TabularMDP, normalized_rows, rounding_of_mean
 from pharos.system.wording import capped
 
@@ -64,8 +64,8 @@ def gymnasium(
             must change nothing of the MDP: time limits, recorders and wrappers of observations pass; any other is
             stepped beside the environment below it, in every outcome of the table, and refused if they differ.
         gamma, horizon: of the MDP; Gymnasium's time limit is not taken over.
-        check: whether an environment is stepped SAMPLED_STEPS times, as a copy where it can be copied, and compared
-            with its table: some have chance that is not in it, such as Taxi with `fickle_passenger=True`. Outcomes that
+        check: whether an environment is stepped SAMPLED_STEPS times, as a copy if it can be copied, and compared
+            with its table. Some have chance that is not in it, such as Taxi with `fickle_passenger=True`. Outcomes that
             the table does not hold are refused, and frequencies that it makes too unlikely (exact binomial tests).
         initial: a start state, a sequence of equally likely ones (fewer than S), or (S,) probabilities. None: what the
             environment says in `initial_state_distrib` or `isd`, compared with its resets; if it says nothing, the
@@ -73,8 +73,8 @@ def gymnasium(
         rewards: in place of the table's, (S, A) numbers, or a function (state, action, next state, reward of the table)
             -> reward.
     Returns:
-        A table of next states where every action has one outcome, else a general MDP. A transition that terminates ends
-        the episode after its reward, wherever it leads. States have the numbers of the table.
+        A table of next states if every action has one outcome, else a general MDP. A transition that terminates ends
+        the episode after its reward, in whichever state it ends. States have the numbers of the table.
         The probabilities of a row that sum to 1 within 1e-6 are divided by their sum, which error bounds of values
         count (`TabularMDP.residual`).
     Raises:
@@ -132,7 +132,7 @@ def _names_of(inner: object, num_states: int, num_actions: int) -> Names | None:
 def gymnasium_outcomes(env: object, *, rewards: OutcomeRewards | None = None) -> ImportedOutcomes | None:
     """Return the outcomes of the same table with the reward of each, for `importers.save(..., outcomes=)`.
 
-    None where no action pays different rewards, so that the MDP says it all.
+    None if no action pays different rewards: the MDP then says it all.
 
     Args:
         rewards: as for `gymnasium`.
@@ -204,7 +204,7 @@ def name_of(env: object) -> str:
 
 
 def _rows(env: object) -> tuple[Any, list[list[list]]]:
-    """(the environment without wrappers, rows[s][a] of its table); FileFormatError where it has none."""
+    """(the environment without wrappers, rows[s][a] of its table); FileFormatError if it has none."""
     inner = getattr(env, "unwrapped", env)
     table = getattr(inner, "P", inner)
     if isinstance(table, str | bytes) or not isinstance(table, _Numbered):
@@ -265,7 +265,7 @@ def _filled(rows: list[list[list]]) -> list[list[list]]:
 
 
 def _entry(table: _Numbered, number: int) -> object:
-    """table[number]; None where there is none."""
+    """table[number]; None if there is none."""
     try:
         return table[number]
     except (KeyError, IndexError, TypeError):
@@ -428,7 +428,7 @@ def _compare_with_steps(env: object, inner: object, rows: list[list[list]]) -> N
         least = np.flatnonzero(tries[state] == tries[state].min())
         action = int(least[rng.integers(len(least))])
         tries[state, action] += 1
-        observation, reward, ended, _ = parts_of(stepped.step(action + first_action))
+        observation, reward, ended, _ = step_parts(stepped.step(action + first_action))
         next_state = _state_number(observation, len(rows), first_state)
         outcome = (next_state, float(reward), bool(ended))
         if outcome not in probabilities[state][action]:
@@ -443,7 +443,7 @@ def _compare_with_steps(env: object, inner: object, rows: list[list[list]]) -> N
 
 
 def _reason(outcome: tuple, expected: Mapping[tuple, float]) -> str:
-    """Why an outcome that was seen is likely not among those of the table."""
+    """Why an outcome that was seen is likely not in the table."""
     next_state, reward, ended = outcome
     rewards = [other[1] for other in expected if (other[0], other[2]) == (next_state, ended)]
     if rewards:
@@ -467,7 +467,7 @@ def _probabilities(options: list) -> dict[tuple[int, float, bool], float]:
 
 
 def _compare_frequencies(env: object, inner: object, table: list, samples: dict[tuple[int, int], Counter]) -> None:
-    """FileFormatError where the sampled frequencies of a state and action, or of all with the same probabilities in the
+    """FileFormatError if the sampled frequencies of a state and action, or of all with the same probabilities in the
     table, are too unlikely; the first test that fails is named."""
     groups: dict[tuple[float, ...], np.ndarray] = {}
     named: dict[tuple[float, ...], tuple[int, int]] = {}
@@ -531,8 +531,8 @@ def matrices(
 # MiniGrid -------------------------------------------------------------------------------------------------------------
 
 
-MOST_STATES = 1_000_000
-DONE = 6  # the action that most tasks ignore
+MOST_MINIGRID_STATES = 1_000_000
+NO_OP = 6  # the action that most tasks ignore
 _NOT_STATE = frozenset(
     [
         "step_count",
@@ -561,7 +561,7 @@ def minigrid(
     actions: Sequence[int] | None = None,
     gamma: float = 1.0,
     horizon: int | None = MINIGRID_STEPS,
-    max_states: int = MOST_STATES,
+    max_states: int = MOST_MINIGRID_STATES,
     remember_carried: bool = False,
 ) -> TabularMDP:
     """Return the MDP of a MiniGrid environment, by stepping the environment from every state that can be reached.
@@ -576,13 +576,13 @@ def minigrid(
             somewhere. Wrappers of observations pass, and MiniGrid's NoDeath is taken over; any other must change
             nothing in any state.
         seed: of the reset that draws the layout.
-        actions: those of the MDP, in their order; None: all of the environment, without `done` where it never does
+        actions: actions of the MDP, in their order; None: all of the environment, without `done` if it never does
             anything.
-        gamma, horizon: of the MDP; 100 steps are those of BRIDGE. The environment's own time limit is not taken over.
+        gamma, horizon: of the MDP; BRIDGE has 100 steps. The environment's time limit is not taken over.
         max_states: more are an error.
-        remember_carried: each object knows whether it has ever been carried, as in BRIDGE, whose states keep that for
-            rewards of progress; so a key put back where it was is another state, though nothing that can happen from
-            there is different.
+        remember_carried: each object knows whether it has ever been carried, as in BRIDGE, which needs that for rewards
+            of progress. So a key that is put back into its cell gives another state, although nothing that can happen
+            from there is different.
     Raises:
         MissingExtra: the package minigrid is not installed.
         ParameterError: there is no such environment, it is none of MiniGrid, an action is none of its own, or a wrapper
@@ -611,7 +611,7 @@ def minigrid_recording(
         What is carried is not to be seen.
     """
     driver = _Driver(env, seed, remember_carried)
-    table, rewards = driver.explore(None, MOST_STATES)
+    table, rewards = driver.explore(None, MOST_MINIGRID_STATES)
     names = tuple(action.name for action in driver.env.actions)[: table.shape[1]]
     grids = np.stack([driver.image(state) for state in driver.snapshots])
     mdp = TabularMDP.from_arrays(table, rewards, gamma=1.0, horizon=horizon)
@@ -623,7 +623,7 @@ def minigrid_grids(
     *,
     seed: int = 0,
     actions: Sequence[int] | None = None,
-    max_states: int = MOST_STATES,
+    max_states: int = MOST_MINIGRID_STATES,
     remember_carried: bool = False,
 ) -> np.ndarray:
     """Return the observation of each state of `minigrid` with the same arguments, as in `minigrid_recording`.
@@ -676,7 +676,7 @@ class _Driver:
         if not actions or not set(actions) <= set(range(num_actions)) or len(set(actions)) < len(actions):
             raise ParameterError(f"actions are {actions}; expected different ones from 0 to {num_actions - 1}")
         try:
-            return self._explore(actions, max_states, drop_done=selection is None and num_actions == DONE + 1)
+            return self._explore(actions, max_states, drop_done=selection is None and num_actions == NO_OP + 1)
         finally:
             vars(self.env).pop("gen_obs", None)
 
@@ -707,10 +707,10 @@ class _Driver:
                 row.append(number)
             rows.append(row)
             reward_rows.append(pay)
-        # Without the action `done` where it does nothing in any state
+        # Without the action `done` if it does nothing in any state
         table, rewards = np.array(rows, np.int64), np.array(reward_rows)
-        if drop_done and (table[:, DONE] == np.arange(len(table))).all() and (rewards[:, DONE] == 0).all():
-            table, rewards = table[:, :DONE], rewards[:, :DONE]
+        if drop_done and (table[:, NO_OP] == np.arange(len(table))).all() and (rewards[:, NO_OP] == 0).all():
+            table, rewards = table[:, :NO_OP], rewards[:, :NO_OP]
         return table, rewards
 
     def step(self, action: int, state: int) -> tuple[float, bool]:
@@ -734,7 +734,7 @@ class _Driver:
 
     @cached_property
     def _is_paid_by_package(self) -> bool:
-        """Whether the rewards are those of the package, and no class or wrapper adds to them."""
+        """Whether the rewards come from the package, and no class or wrapper adds to them."""
         functions = (getattr(self.env, name) for name in ("step", "_reward"))
         is_bare = self.layers.top is self.layers.bottom
         return is_bare and all(str(getattr(each, "__module__", "")).startswith("minigrid.") for each in functions)
@@ -800,10 +800,10 @@ class _Driver:
     def key(self) -> bytes:
         """Key of the state: equal for equal states, and for no others."""
         flat: list[Any] = []
-        places: dict[int, int] = {}
+        indices: dict[int, int] = {}
         for name, value in self._attributes():
             flat.append(name)
-            self._flatten(value, flat, places)
+            self._flatten(value, flat, indices)
         return repr(flat).encode()
 
     def _attributes(self) -> Iterator[tuple[str, Any]]:
@@ -813,7 +813,7 @@ class _Driver:
             if name not in _NOT_STATE:
                 yield name, attributes[name]
 
-    def _flatten(self, value: object, flat: list[Any], places: dict[int, int]) -> None:
+    def _flatten(self, value: object, flat: list[Any], indices: dict[int, int]) -> None:
         if isinstance(value, np.ndarray | np.generic):
             value = value.tolist()
         if value is None or isinstance(value, bool | int | float | str):
@@ -823,19 +823,19 @@ class _Driver:
         elif isinstance(value, tuple | list):  # MiniGrid writes positions as either
             flat.append(("list", len(value)))
             for item in value:
-                self._flatten(item, flat, places)
+                self._flatten(item, flat, indices)
         elif isinstance(value, dict):
             flat.append(("dict", len(value)))
             for name, item in value.items():
-                self._flatten(name, flat, places)
-                self._flatten(item, flat, places)
+                self._flatten(name, flat, indices)
+                self._flatten(item, flat, indices)
         elif value is self.env or callable(value) or isinstance(value, self.fixed_types):
             flat.append(type(value).__name__)
-        elif id(value) in places:
-            flat.append(("again", places[id(value)]))
+        elif id(value) in indices:
+            flat.append(("again", indices[id(value)]))
         elif hasattr(value, "__dict__"):  # grids, rooms, doors, keys, ...
-            places[id(value)] = len(places)
+            indices[id(value)] = len(indices)
             flat.append(type(value).__name__)
-            self._flatten(vars(value), flat, places)
+            self._flatten(vars(value), flat, indices)
         else:
             raise RuleError(f"{self.name}: keeps a {type(value).__name__}, which cannot be told apart from others")

@@ -23,11 +23,11 @@ from pharos.importers.chance import DrawError, here, placed
 
 Traced: TypeAlias = Any
 """An array of JAX or a tree of such, traced or not, or a number."""
-MOST_DRAWS = 64
+MOST_TRACED_DRAWS = 64
 """Draws of one step."""
-KEYS = ("key", "PRNGKey", "split", "fold_in", "clone", "key_data", "wrap_key_data", "key_impl")
+KEY_FUNCTIONS = ("key", "PRNGKey", "split", "fold_in", "clone", "key_data", "wrap_key_data", "key_impl")
 """Functions that draw nothing."""
-BITS = frozenset(["random_bits", "random_gamma", "threefry2x32", "rng_bit_generator", "rng_uniform"])
+BIT_DRAWS = frozenset(["random_bits", "random_gamma", "threefry2x32", "rng_bit_generator", "rng_uniform"])
 """Operations of draws that were not replaced."""
 
 
@@ -36,7 +36,7 @@ class Draw(NamedTuple):
 
     Attributes:
         words: its function and line, for messages. size: number of outcomes.
-        weights: their probabilities; None where they depend on the state.
+        weights: their probabilities; None if they depend on the state.
     """
 
     words: str
@@ -69,9 +69,9 @@ class TracedFunction:
                 return jax.tree.map(jnp.asarray, function(key, *rest)), tuple(tape.shares)
 
         with jax.disable_jit():  # what was compiled before would keep its draws
-            start = jax.random.key(0), jnp.zeros(MOST_DRAWS, jnp.int32)
+            start = jax.random.key(0), jnp.zeros(MOST_TRACED_DRAWS, jnp.int32)
             traced, shapes = jax.make_jaxpr(program, return_shape=True)(*start, *arguments)
-        if BITS & _operations(traced.jaxpr):
+        if BIT_DRAWS & _operations(traced.jaxpr):
             raise DrawError(f"{what} draws by other ways than the functions of jax.random, which cannot be followed")
         sizes = [draw.size for draw in tape.draws]
         if math.prod(sizes) > most:
@@ -80,7 +80,7 @@ class TracedFunction:
             advice = "; start from one state with a seed (--seed 0)" if what == "reset()" else ""
             raise DrawError(f"{what} has more than {most:,} outcomes ({words}){advice}")
         combinations = list(itertools.product(*map(range, sizes)))
-        self.tapes = np.zeros((len(combinations), MOST_DRAWS), np.int32)
+        self.tapes = np.zeros((len(combinations), MOST_TRACED_DRAWS), np.int32)
         self.tapes[:, : len(sizes)] = np.array(combinations, np.int32).reshape(len(combinations), len(sizes))
         self.weights = [
             math.prod(
@@ -96,7 +96,7 @@ class TracedFunction:
 
 
 def _operations(jaxpr: Traced) -> set[str]:
-    """Names of the operations of a program, those of its branches and loops included."""
+    """Names of the operations of a program, with its branches and loops."""
     names = set[str]()
     for equation in jaxpr.eqns:
         names.add(equation.primitive.name)
@@ -124,8 +124,8 @@ class Tape:
     def one_of(self, name: str, key: Traced, weights: Sequence[Fraction] | Any) -> Traced:
         """Traced number of the outcome of a draw with these probabilities, fractions or a traced vector."""
         words = placed(f"{name}()", here())
-        if len(self.draws) == MOST_DRAWS:
-            raise DrawError(f"drew more than {MOST_DRAWS} times in one step, at last {words}")
+        if len(self.draws) == MOST_TRACED_DRAWS:
+            raise DrawError(f"drew more than {MOST_TRACED_DRAWS} times in one step, at last {words}")
         if any(type(each).__name__ == "BatchTracer" for each in (key, weights)):
             raise DrawError(f"drew {words} under jax.vmap, one draw for many; draw an array with shape=")
         value = self.values[len(self.draws)]
@@ -167,24 +167,24 @@ def _replaced(tape: Tape) -> Iterator[None]:
     """Let the functions of jax.random draw from a tape, and branches be taken both, as `vmap` takes them."""
     names = ("bernoulli", "randint", "choice", "categorical", "permutation", "uniform")
     draws: dict[str, Callable[..., Any]] = {name: globals()[f"_{name}"] for name in names}
-    places: list[tuple[Any, str, Any]] = [(jax.lax, "cond", _both), (jax.lax, "switch", _all_branches)]
+    patches: list[tuple[Any, str, Any]] = [(jax.lax, "cond", _both), (jax.lax, "switch", _all_branches)]
     for name, original in vars(jax.random).items():
-        if name in KEYS:
-            places.append((jax.random, name, _concretely(original)))
+        if name in KEY_FUNCTIONS:
+            patches.append((jax.random, name, _concretely(original)))
         elif not name.startswith("_") and callable(original) and not isinstance(original, type):
-            places.append((jax.random, name, _drawing(name, original, draws.get(name), tape)))
-    before = [(place, name, getattr(place, name)) for place, name, _ in places]
+            patches.append((jax.random, name, _drawing(name, original, draws.get(name), tape)))
+    before = [(module, name, getattr(module, name)) for module, name, _ in patches]
     try:
-        for place, name, function in places:
-            setattr(place, name, function)
+        for module, name, function in patches:
+            setattr(module, name, function)
         yield
     finally:
-        for place, name, original in before:
-            setattr(place, name, original)
+        for module, name, original in before:
+            setattr(module, name, original)
 
 
 def _concretely(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, evaluated at once where nothing is traced: a fixed key makes fixed draws."""
+    """The function, evaluated at once if nothing is traced: a fixed key makes fixed draws."""
 
     @wraps(function)
     def evaluated(*arguments: Traced, **options: object) -> Traced:
@@ -309,21 +309,21 @@ def _normalized(weights: Traced) -> Traced:
 class _Uniform:
     """Numbers drawn evenly from [low, high), each of which may be compared once."""
 
-    def __init__(self, draw: Callable[[Any], Any], places: np.ndarray, low: Traced, high: Traced, compared: set[int]):
-        self._draw, self._places, self._low, self._high, self._compared = draw, places, low, high, compared
-        self.shape = places.shape
+    def __init__(self, draw: Callable[[Any], Any], indices: np.ndarray, low: Traced, high: Traced, compared: set[int]):
+        self._draw, self._indices, self._low, self._high, self._compared = draw, indices, low, high, compared
+        self.shape = indices.shape
 
-    def __getitem__(self, place: Traced) -> "_Uniform":
-        return _Uniform(self._draw, self._places[place], self._low, self._high, self._compared)
+    def __getitem__(self, index: Traced) -> "_Uniform":
+        return _Uniform(self._draw, self._indices[index], self._low, self._high, self._compared)
 
     def _is_below(self, limit: Traced) -> Traced:
-        places = self._places.ravel().tolist()
-        if isinstance(limit, _Uniform) or np.shape(limit) not in ((), self.shape) or self._compared & set(places):
+        indices = self._indices.ravel().tolist()
+        if isinstance(limit, _Uniform) or np.shape(limit) not in ((), self.shape) or self._compared & set(indices):
             raise _refusal("uniform", "its number may be compared once, with one number")
-        self._compared |= set(places)
+        self._compared |= set(indices)
         share = limit if (self._low, self._high) == (0, 1) else (limit - self._low) / (self._high - self._low)
-        flat = [share] * len(places) if np.ndim(share) == 0 else share.ravel()
-        drawn = [self._draw(flat[i]) for i in range(len(places))]
+        flat = [share] * len(indices) if np.ndim(share) == 0 else share.ravel()
+        drawn = [self._draw(flat[i]) for i in range(len(indices))]
         return jnp.stack(drawn).reshape(self.shape) if self.shape else drawn[0]
 
     def __lt__(self, limit: Traced) -> Traced:
@@ -354,8 +354,8 @@ def _uniform(
     **_: object,
 ) -> Traced:
     shape = _shape(shape)
-    places = np.arange(math.prod(shape)).reshape(shape)
-    return _Uniform(partial(_coin, tape, "uniform", key), places, minval, maxval, set())
+    indices = np.arange(math.prod(shape)).reshape(shape)
+    return _Uniform(partial(_coin, tape, "uniform", key), indices, minval, maxval, set())
 
 
 # Branches -------------------------------------------------------------------------------------------------------------

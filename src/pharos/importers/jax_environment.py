@@ -1,4 +1,4 @@
-"""Pure functions of JAX as a source of states: those of the frontier are stepped as one program, mapped over states,
+"""Pure functions of JAX as a source of states. The frontier is stepped as one program, mapped over states,
 actions and outcomes of the draws (`jax_chance`).
 """
 
@@ -34,7 +34,7 @@ from pharos.importers.stepped_environment import (
 )
 from pharos.system.wording import capped
 
-OUTCOMES = 4_096
+OUTCOMES_AT_ONCE = 4_096
 """Outcomes that one call of the program computes, about."""
 MOST_AT_ONCE = 512
 WALKERS = 64
@@ -194,7 +194,7 @@ class JaxEnvironment:
             raise UnknownName(f"field of the states of {self.name}", name, names)
         tapes, actions = jnp.asarray(self._step.tapes), jnp.asarray(self.actions)
         each = len(tapes) * len(actions)
-        self.at_once = min(max(OUTCOMES // each, 4), MOST_AT_ONCE)
+        self.at_once = min(max(OUTCOMES_AT_ONCE // each, 4), MOST_AT_ONCE)
         mapped = jax.vmap(jax.vmap(jax.vmap(self._step.run, (0, None, None)), (None, None, 0)), (None, 0, None))
         self._program = jax.jit(lambda states: mapped(tapes, states, actions))
         self._single = jax.jit(self._step.run)
@@ -331,7 +331,7 @@ class JaxEnvironment:
         return Arrival(probability, reward, key, script=script)
 
     def arrive(self, saved: bytes | None, action: int, script: Sequence[int]) -> Arrival:
-        """Go where a step with this tape went before: from a saved state, or from the reset (None)."""
+        """Repeat an earlier step with this tape, from a saved state or from the reset (None)."""
         if saved is None:
             return next(each for each in self._all_starts() if each.script == tuple(script))
         state = jax.tree.map(lambda leaf: leaf[0], self.layout.unpacked([saved]))
@@ -450,7 +450,7 @@ def _space(shown: Traced) -> Traced:
 
 
 def _probabilities(weights: list[Fraction], shares: list[np.ndarray], count: int) -> list[Any]:
-    """Probability of each outcome: exact fractions, or floats where some depend on the state."""
+    """Probability of each outcome: exact fractions, or floats if some depend on the state."""
     repeated = weights * (count // len(weights))
     if not shares:
         return repeated

@@ -8,10 +8,10 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from pharos.errors import MissingExtra, ParameterError
-from pharos.importers.chance import MOST_OUTCOMES
+from pharos.importers.chance import MOST_DRAW_OUTCOMES
 from pharos.importers.search import SteppedStates
 from pharos.importers.stepped_environment import Payment, SteppingOptions
-from pharos.importers.stepping import MOST_STATES, SteppingRun, StepRecording
+from pharos.importers.stepping import MOST_STEPPED_STATES, SteppingRun, StepRecording
 from pharos.mdp import TabularMDP, whole_number
 from pharos.system.wording import in_one_line
 
@@ -25,7 +25,7 @@ class JaxFunctions:
         reset: key -> (observation, state).
         actions: their number, or what `step` takes.
         name: for messages. time_limit: in steps; None: it has none.
-        action_names: None: numbers. counters: fields of a state that are left out where they turn
+        action_names: None: numbers. counters: fields of a state that are left out if they turn
             out to decide nothing.
     """
 
@@ -48,12 +48,12 @@ def jax_stepping(  # noqa: PLR0913  (options of one import)
     reward: Payment | None = None,
     gamma: float | None = None,
     horizon: int | None = None,
-    max_states: int = MOST_STATES,
-    max_outcomes: int = MOST_OUTCOMES,
+    max_states: int = MOST_STEPPED_STATES,
+    max_outcomes: int = MOST_DRAW_OUTCOMES,
     check: bool = True,
     progress: Callable[[SteppedStates, float, bool], None] | None = None,
 ) -> tuple[TabularMDP, StepRecording]:
-    """Return the exact MDP of an environment in JAX, such as those of gymnax and pgx, by stepping all of its states.
+    """Return the exact MDP of an environment in JAX, such as one of gymnax or pgx, by stepping all of its states.
 
     Draws of `jax.random` among finitely many outcomes are enumerated: `bernoulli`, `randint`, `choice`, `categorical`,
     `permutation`, and comparisons of `uniform`. Probabilities that the code gives as numbers are exact; those that
@@ -76,7 +76,7 @@ def jax_stepping(  # noqa: PLR0913  (options of one import)
             depends on the state. The line of the environment's code is named.
         StateSpaceTooLarge: there are more than `max_states` states.
     Cost: seconds to compile; then 10,000 to 200,000 outcomes a second. All combinations of the draws of a step are run,
-        those of both sides of a branch included.
+        on both sides of a branch.
     """
     functions = JaxFunctions(step_env, reset_env, actions)
     options = SteppingOptions(

@@ -22,9 +22,9 @@ from pharos.system import distinct_rows, storage
 from pharos.system.distinct_rows import DistinctRows, RowCollector
 from pharos.system.workers import end_cleanly, end_with_parent, without_main
 
-FORMAT, MANIFEST = "pharos layers", "manifest.json"
+LAYERS_FORMAT, LAYERS_MANIFEST = "pharos layers", "manifest.json"
 END = -1
-BLOCK = 16
+STATES_PER_JOB = 16
 """States that a process expands at a time."""
 LARGEST_STATE = 1 << 24
 
@@ -171,8 +171,8 @@ class LayerSearch:
     """States in the order in which they are met first: breadth first, by action.
 
     Attributes:
-        dictionary: a saved state like which those of the frontier are deflated: the first one of the layer before, as
-            random generators of a console are renewed every few hundred frames.
+        dictionary: a saved state; the states of the frontier are deflated with it. It is the first one of the layer
+            before, as random generators of a console are renewed every few hundred frames.
         keys: number of each state by its key.
         sizes: number of states of each depth so far.
         rows, rewards: one array of each expanded layer.
@@ -277,7 +277,7 @@ def _layers(search: LayerSearch, horizon: int, steps: int, actions: tuple[str, .
     rewards = np.concatenate(search.rewards[: len(sizes)])
     screens = search.collector.rows(np.array(search.screen_numbers[:count], np.int64))
     if count < len(search.screen_numbers):  # layers of a longer horizon
-        screens = distinct_rows.shortened(screens, search.shown[len(sizes) - 1])
+        screens = distinct_rows.shorten_rows(screens, search.shown[len(sizes) - 1])
     return ConsoleLayers(np.where(table >= count, END, table), rewards, screens, sizes, steps, actions)
 
 
@@ -329,7 +329,7 @@ class Team:
 
     def expanded(self, task: LayerTask, states: Sequence[bytes]) -> Iterator[tuple[int, list[ConsoleStep]]]:
         """Yield (states done, steps) of the blocks of a layer, in order."""
-        blocks = [states[first : first + BLOCK] for first in range(0, len(states), BLOCK)]
+        blocks = [states[first : first + STATES_PER_JOB] for first in range(0, len(states), STATES_PER_JOB)]
         done = 0
         for block, steps in zip(blocks, self._steps(task, blocks), strict=True):
             done += len(block)
@@ -373,11 +373,11 @@ class KeptLayers:
 
     def restore(self, search: LayerSearch, most: int) -> None:
         """Put the layers that lie there, at most so many, into a new search, up to the first damaged one."""
-        path = self.folder / MANIFEST
+        path = self.folder / LAYERS_MANIFEST
         if not path.exists():
             return
         manifest = storage.read_json(path)
-        if not isinstance(manifest, dict) or manifest.get("format") != FORMAT or not storage.is_intact(manifest):
+        if not isinstance(manifest, dict) or manifest.get("format") != LAYERS_FORMAT or not storage.is_intact(manifest):
             return
         if manifest["identity"] != self.identity:
             before, now = manifest["identity"], self.identity
@@ -406,10 +406,10 @@ class KeptLayers:
         search.sizes.append(len(search.keys) - max(before, 1))
         search.screen_numbers += arrays["seen"].tolist()
         search.dictionary = arrays["dictionary"].tobytes()
-        search.frontier = split(arrays["saved"], arrays["saved_lengths"])
+        search.frontier = split_chunks(arrays["saved"], arrays["saved_lengths"])
         digests = arrays["screen_keys"].tobytes()
         search.collector.resume(
-            split(arrays["chunks"], arrays["chunk_lengths"]),
+            split_chunks(arrays["chunks"], arrays["chunk_lengths"]),
             bytes(arrays["pending"]),
             [digests[first : first + 16].hex() for first in range(0, len(digests), 16)],
         )
@@ -421,8 +421,8 @@ class KeptLayers:
         depth = len(search.rows) - 1
         since = 0 if depth == 0 else sum(search.sizes[:-1])  # the start state comes with the first layer
         shown = 0 if depth == 0 else search.shown[-2]
-        saved, saved_lengths = joined(search.frontier)
-        chunks, chunk_lengths = joined(search.collector.chunks[self._written :])
+        saved, saved_lengths = join_chunks(search.frontier)
+        chunks, chunk_lengths = join_chunks(search.collector.chunks[self._written :])
         keys = list(search.keys)[since:]
         arrays = {
             "next_states": search.rows[-1],
@@ -442,17 +442,17 @@ class KeptLayers:
             np.savez(target, allow_pickle=False, **arrays)
         self._written = len(search.collector.chunks)
         self.digests = [*self.digests[:depth], storage.digest_of_file(file)]
-        manifest = {"format": FORMAT, "identity": self.identity, "layers": self.digests}
-        storage.replace_json(self.folder / MANIFEST, storage.sealed(manifest))
+        manifest = {"format": LAYERS_FORMAT, "identity": self.identity, "layers": self.digests}
+        storage.replace_json(self.folder / LAYERS_MANIFEST, storage.sealed(manifest))
 
 
-def joined(parts: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:
+def join_chunks(parts: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:
     """(bytes one after another, length of each)."""
     return np.frombuffer(b"".join(parts), np.uint8), np.array([len(part) for part in parts], np.int64)
 
 
-def split(data: np.ndarray, lengths: np.ndarray) -> list[bytes]:
-    """The parts that `joined` put together."""
+def split_chunks(data: np.ndarray, lengths: np.ndarray) -> list[bytes]:
+    """The parts that `join_chunks` put together."""
     ends = np.cumsum(lengths).tolist()
     text = data.tobytes()
     return [text[end - length : end] for end, length in zip(ends, lengths.tolist(), strict=True)]

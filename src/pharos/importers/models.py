@@ -24,11 +24,11 @@ from pharos.mdp import Names, Residual, TabularMDP, lacking, normalized_rows, wi
 from pharos.system import storage
 from pharos.system.wording import capped
 
-TARGET = "target"
+TARGET_LABEL = "target"
 """Label under which the states of an expression or of a property are kept."""
 MAXIMUM, MINIMUM, LEAST_COST, LARGEST_COST = "maximum", "minimum", "least_cost", "largest_cost"
 """Answers of `pharos.reach`, by which properties are answered."""
-STEPS = "the number of steps"
+STEPS_REWARD = "the number of steps"
 """Stands for a reward structure, in properties Tmin and Tmax."""
 LARGEST_TOTAL, LEAST_TOTAL = "largest_total", "least_total"
 """Answers of properties R [C]: the optimal and the worst value at gamma 1 without a horizon."""
@@ -83,7 +83,7 @@ def storm(
     Args:
         path: a model in PRISM's language (.prism, .nm, .pm), in JANI (.jani), or an explicit one (.drn).
         constants: values of its undefined constants, such as "N=3,K=2".
-        reward: name of a reward structure; None: the only one, where there is no target. State rewards are paid with
+        reward: name of a reward structure; None: the only one, if there is no target. State rewards are paid with
             every action there; the MDP pays rewards of transitions on average.
         target: a label or an expression, such as "finished & !agree", whose states end the episode; without a reward
             structure, reaching one pays 1, so that the optimal value at gamma 1 is the maximal probability of reaching
@@ -116,7 +116,7 @@ def storm_recording(
 ) -> tuple[TabularMDP, ImportedOutcomes | None]:
     """Return the MDP of `storm`, and its outcomes with the reward of each, for `importers.save(..., outcomes=)`.
 
-    The outcomes are None where no choice pays different rewards, so that the MDP says it all.
+    The outcomes are None if no choice pays different rewards: the MDP then says it all.
 
     Args, errors: as of `storm`.
     """
@@ -149,7 +149,7 @@ def storm_import(
     query, ended = built.query, np.zeros(model.nr_states, np.bool_)
     if query is not None:
         reward = query.reward
-        if reward == "" or (reward not in (None, STEPS, *names)):
+        if reward == "" or (reward not in (None, STEPS_REWARD, *names)):
             if reward or len(names) != 1:
                 raise UnknownName(f"reward structure of {path}", reward, names)
             reward = names[0]
@@ -158,7 +158,7 @@ def storm_import(
         ended[list(model.labeling.get_states(target))] = True
     elif reward is None and len(names) == 1:
         reward = names[0]
-    if reward not in (None, STEPS, *names):
+    if reward not in (None, STEPS_REWARD, *names):
         raise UnknownName(f"reward structure of {path}", reward, names)
     if reward is None and target is None and property is None:
         raise ParameterError(
@@ -166,7 +166,7 @@ def storm_import(
             f"target: a label ({', '.join(labels)}) or an expression; or a property"
         )
     goal = ended if query is None else query.goal
-    paying = Steps() if reward == STEPS else None if reward is None else model.reward_models[reward]
+    paying = Steps() if reward == STEPS_REWARD else None if reward is None else model.reward_models[reward]
     outcomes = _outcomes(model, ended, goal, paying)
     actions = (len(outcomes.offsets) - 1) // model.nr_states
 
@@ -201,7 +201,7 @@ def _names(model: Any, num_actions: int, query: "Query | None") -> tuple[Names, 
         if label != OUT_OF_BOUNDS and not label.startswith(("(", "!")):  # those are expressions of properties
             labels[label] = np.zeros(states, np.bool_)
             labels[label][list(model.labeling.get_states(label))] = True
-    reach = TARGET
+    reach = TARGET_LABEL
     if query is not None:
         goal = query.goal
         same = [label for label, mask in labels.items() if f'"{label}"' in query.text and (mask == goal).all()]
@@ -328,7 +328,7 @@ class Query(NamedTuple):
     """States of a target or a property, and what it asks.
 
     Attributes:
-        text: the property. goal, failed: (S,) bool, where it has come true, and where it cannot any more.
+        text: the property. goal, failed: (S,) bool, whether it has come true, and whether it no longer can.
         reward: name of its reward structure, "" for the only one, STEPS for steps; None: probabilities.
         answer, of_starts: as of `Question`. is_total: whether rewards are added up for ever.
     """
@@ -490,7 +490,7 @@ def _query_of(model: Any, prop: Any) -> Query:
     query = Query(text, nothing, nothing, None, MINIMUM if is_least else MAXIMUM, of_starts)
     shape = type(path).__name__
     if kind == "T":
-        query = query._replace(reward=STEPS, answer=LEAST_COST if is_least else LARGEST_COST)
+        query = query._replace(reward=STEPS_REWARD, answer=LEAST_COST if is_least else LARGEST_COST)
     if kind == "R":
         named = re.match(r'R\{"([^"]*)"\}', text)  # its `reward_name` fails if there is none
         query = query._replace(reward=named[1] if named else "", answer=LEAST_COST if is_least else LARGEST_COST)

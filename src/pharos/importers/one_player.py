@@ -15,7 +15,7 @@ MOST_TURNS = 10_000
 class OnePlayer:
     """A turn-based game of PettingZoo with Gymnasium's interface, as one of its players sees it.
 
-    A step is the player's move and those of the others until it is the player's turn again. Its reward is the sum of
+    A step is the player's move and the others' moves until it is the player's turn again. Its reward is the sum of
     the player's rewards meanwhile. The others may draw from the generator that they get, `np_random`, whose chance
     `stepping` enumerates.
 

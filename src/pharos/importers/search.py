@@ -1,8 +1,8 @@
-"""Breadth-first enumeration of whatever can be saved, restored and stepped: `explore`, and the MDP of what it found.
+"""Breadth-first enumeration of anything that can be saved, restored and stepped: `explore`, and the MDP that results.
 
 A source hands over saved states and takes them back: bytes of a console, pickles of an environment. States have keys;
-equal keys are one state. Saved states are dropped as soon as they have been expanded, so that memory holds those of the
-frontier only.
+equal keys are one state. A saved state is dropped as soon as it has been expanded, so that memory holds only the
+frontier.
 """
 
 import time
@@ -26,12 +26,12 @@ class Arrival(NamedTuple):
     """An outcome of a step, or of a reset.
 
     Attributes:
-        probability: a float or an exact fraction; those of a step sum to 1.
+        probability: a float or an exact fraction; the probabilities of a step sum to 1.
         reward: of the step.
-        key: of the state that was arrived in; None where the episode ended.
-        saved: that state, as the source restores it; None where the source has handed it over before.
-        observation: of that state, where `saved` is there.
-        script: how the draws of the step came out, with which the source can step there again.
+        key: of the state that was arrived in; None if the episode ended.
+        saved: that state, as the source restores it; None if the source has handed it over before.
+        observation: of that state, if `saved` is there.
+        script: how the draws of the step came out. With it the source can step there again.
     """
 
     probability: Fraction | float
@@ -106,7 +106,7 @@ class ExpansionsHere:
 
 @dataclass
 class SteppedStates:
-    """States and transitions so far: those of the states below `num_expanded`, in the order of their discovery.
+    """States so far, in the order of discovery, and the transitions of the first `num_expanded`.
 
     Attributes:
         keys, depths, observations: of all states. parents, parent_actions, scripts: how each was first met; END and 0
@@ -264,7 +264,7 @@ class BreadthFirst:
 def mdp_of(
     exploration: SteppedStates, *, gamma: float, horizon: int | None
 ) -> tuple[TabularMDP, ImportedOutcomes | None]:
-    """The MDP of a finished exploration; and its outcomes, None where no action pays different rewards."""
+    """The MDP of a finished exploration; and its outcomes, None if no action pays different rewards."""
     outcomes, actions = exploration.outcomes(), exploration.num_actions
     states, begin = exploration.num_states, outcomes.offsets[:-1]
     initial: int | np.ndarray = next(iter(exploration.starts))

@@ -30,7 +30,7 @@ CLOCKS = frozenset(
 """Names of functions in C whose answers change from call to call."""
 HEADLESS = {"SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy", "PYGAME_HIDE_SUPPORT_PROMPT": "1"}
 LONGEST_LINE = 120
-COLORS = re.compile("\x1b\\[[0-9;]*m")
+COLOR_CODES = re.compile("\x1b\\[[0-9;]*m")
 
 
 class _Printed:
@@ -42,7 +42,7 @@ class _Printed:
     def add(self, text: str) -> None:
         self.count += text.count("\n")
         if not self.first:
-            self.first = capped(" ".join(COLORS.sub("", text).split()), LONGEST_LINE)
+            self.first = capped(" ".join(COLOR_CODES.sub("", text).split()), LONGEST_LINE)
 
 
 class _Sink:
@@ -106,7 +106,7 @@ class SideEffects:
             yield
 
     def _on_warning(self, message: Warning | str, *_: object, **__: object) -> None:
-        text = capped(COLORS.sub("", str(message)), LONGEST_LINE)
+        text = capped(COLOR_CODES.sub("", str(message)), LONGEST_LINE)
         if text in self._warnings or len(self._warnings) < 100:
             self._warnings[text] = self._warnings.get(text, 0) + 1
 

@@ -28,7 +28,7 @@ from pharos.importers.chance import (
     DrawTree,
     RandomNumber,
 )
-from pharos.importers.wrappers import LIBRARIES, SILENT, Stepped, named
+from pharos.importers.wrappers import SILENT, WRAPPER_LIBRARIES, Stepped, wrapper_name
 from pharos.system.wording import capped
 
 GENERATORS = (np.random.Generator, np.random.RandomState, np.random.BitGenerator, python_random.Random)
@@ -44,7 +44,7 @@ DROPPED = SILENT | {"OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatist
 LIMITS = ("_max_episode_steps", "max_episode_steps")
 OUTSIDE = ("pygame", "pyglet", "matplotlib", "weakref", "threading", "logging", "_thread")
 """Libraries whose objects are no state: windows, figures, locks."""
-PLAIN = frozenset([int, float, bool, str, bytes, type(None), complex])
+PLAIN_TYPES = frozenset([int, float, bool, str, bytes, type(None), complex])
 CONTAINERS = frozenset([dict, list, set, frozenset, np.ndarray])
 HEAP_TYPE = 1 << 9
 """Flag of classes that are written in Python."""
@@ -59,7 +59,7 @@ def bare(env: Stepped) -> tuple[Stepped, int | None]:
     current, inner = env, getattr(env, "unwrapped", env)
     while current is not inner and hasattr(current, "env"):
         kind = type(current)
-        if kind.__module__.split(".")[0] in LIBRARIES and kind.__name__ in DROPPED:
+        if kind.__module__.split(".")[0] in WRAPPER_LIBRARIES and kind.__name__ in DROPPED:
             if kind.__name__ == "TimeLimit":
                 limits += [int(vars(current)[name]) for name in LIMITS if vars(current).get(name) is not None]
             if above is None:
@@ -177,7 +177,7 @@ class EnvironmentSnapshots:
         self.is_strict = self.is_closed = False
         self.constants: dict[tuple[int, str], bytes] = {}
         self._outside: list[Any] = []
-        self._places: dict[tuple[int, str], int] = {}
+        self._indices: dict[tuple[int, str], int] = {}
         self._adopted: list[Any] = []
         self._numbers: dict[int, int] = {}
         self._templates: dict[types.CodeType, _Template] = {}
@@ -230,13 +230,13 @@ class EnvironmentSnapshots:
                 try:
                     self._pickler(io.BytesIO()).dump(value)
                 except Exception:
-                    return f"field {name} of {named(each)} ({type(value).__name__}): "
+                    return f"field {name} of {wrapper_name(each)} ({type(value).__name__}): "
         return ""
 
     def _reference(self, value: object) -> object:
         """Name of an object that is outside a snapshot; None for the others."""
         kind = type(value)
-        if kind in PLAIN:
+        if kind in PLAIN_TYPES:
             return None
         number = self._numbers.get(id(value))
         if number is not None:
@@ -290,29 +290,29 @@ class EnvironmentSnapshots:
         play(twin, PROBING_STEPS)
         after = dict(self._tables(twin))
         chain = chain_of(env)
-        for (place, name), data in before.items():
-            value = vars(chain[place]).get(name)
-            if name in copied or after.get((place, name)) != data or not _is_plain(value):
+        for (index, name), data in before.items():
+            value = vars(chain[index]).get(name)
+            if name in copied or after.get((index, name)) != data or not _is_plain(value):
                 continue
             if id(value) not in self._numbers and self.save(value) == data:
-                self._places[place, name] = self._add_outside(value)
-                self.constants[place, name] = data
+                self._indices[index, name] = self._add_outside(value)
+                self.constants[index, name] = data
 
     def _tables(self, env: Stepped) -> Iterator[tuple[tuple[int, str], bytes]]:
         """Yield the large fields of an environment: (position, name), bytes."""
-        for place, each in enumerate(chain_of(env)):
+        for index, each in enumerate(chain_of(env)):
             for name, value in vars(each).items():
                 if isinstance(value, dict | list | tuple | np.ndarray) and _is_plain(value):
                     data = self.save(value)
                     if len(data) > LEAST_SHARED_BYTES:
-                        yield (place, name), data
+                        yield (index, name), data
 
     def changed_constant(self, env: Stepped) -> str | None:
         """The field of a shared table that a step has changed; None if there is none."""
         chain = chain_of(env)
         plain = EnvironmentSnapshots(DrawTree())
-        for (place, name), data in self.constants.items():
-            if plain.save(vars(chain[place]).get(name)) != data:
+        for (index, name), data in self.constants.items():
+            if plain.save(vars(chain[index]).get(name)) != data:
                 return name
         return None
 
@@ -327,15 +327,15 @@ class EnvironmentSnapshots:
         hasher = hashlib.blake2b(digest_size=16)
         feeder = _Feeder(hasher.update, frozenset() if complete else self.ignore)
         chain = chain_of(env)
-        for place, each in enumerate(chain):
-            feeder.places[id(each)] = (place, each)
-        for place, each in enumerate(chain):
+        for index, each in enumerate(chain):
+            feeder.indices[id(each)] = (index, each)
+        for index, each in enumerate(chain):
             hasher.update(type(each).__qualname__.encode())
             for name, value in sorted(_fields_of(each).items()):
                 if name in OWNED or name == "env" or name in feeder.ignore:
                     continue
                 hasher.update(name.encode())
-                if (place, name) in self.constants and id(value) in self._numbers:
+                if (index, name) in self.constants and id(value) in self._numbers:
                     continue
                 feeder.feed(value)
         return hasher.digest()
@@ -343,17 +343,17 @@ class EnvironmentSnapshots:
     def outside_digest(self) -> bytes:
         """Digest of the objects outside: two processes with the same can restore each other's snapshots."""
         names = [(type(each).__qualname__, getattr(each, "__qualname__", "")) for each in self._outside]
-        return digest_of([*names, *(data for data in self.constants.values())])
+        return snapshot_digest([*names, *(data for data in self.constants.values())])
 
     def adopt(self, env: Stepped) -> str | None:
         """Take the tables of another environment for those that are shared; the name of one that differs, if any."""
         chain = chain_of(env)
-        for place, name in self.constants:
-            value = vars(chain[place]).get(name) if place < len(chain) else None
-            shared = self._outside[self._places[place, name]]
-            if digest_of(value) != digest_of(shared):
+        for index, name in self.constants:
+            value = vars(chain[index]).get(name) if index < len(chain) else None
+            shared = self._outside[self._indices[index, name]]
+            if snapshot_digest(value) != snapshot_digest(shared):
                 return name
-            self._numbers[id(value)] = self._places[place, name]
+            self._numbers[id(value)] = self._indices[index, name]
             self._adopted.append(value)  # so that no other object gets its number
         return None
 
@@ -364,10 +364,10 @@ def field_names(env: Stepped) -> set[str]:
     for each in chain_of(env):
         names |= set(_fields_of(each))
         feeder.feed(each)
-    return names.union(*(_fields_of(value) for _, value in feeder.places.values()))
+    return names.union(*(_fields_of(value) for _, value in feeder.indices.values()))
 
 
-def digest_of(value: object) -> bytes:
+def snapshot_digest(value: object) -> bytes:
     """Digest of any value, as of the field of an environment."""
     hasher = hashlib.blake2b(digest_size=16)
     _Feeder(hasher.update, frozenset()).feed(value)
@@ -375,16 +375,16 @@ def digest_of(value: object) -> bytes:
 
 
 class _Feeder:
-    """Writes values canonically: equal bytes for equal values, shared objects by where they were met first."""
+    """Writes values canonically: equal bytes for equal values, shared objects by their first position."""
 
     def __init__(self, put: Callable[[bytes], object], ignore: frozenset[str]):
         self.put, self.ignore = put, ignore
-        self.places: dict[int, tuple[int, Any]] = {}
+        self.indices: dict[int, tuple[int, Any]] = {}
 
     def feed(self, value: object) -> None:
         """Write a value."""
         kind = type(value)
-        if kind in PLAIN:
+        if kind in PLAIN_TYPES:
             self.put(f"{kind.__name__}{value!r};".encode())
         elif kind is tuple:
             self._feed_items("(", value)
@@ -394,11 +394,11 @@ class _Feeder:
             self._feed_once(value)
 
     def _feed_once(self, value: object) -> None:
-        place = self.places.get(id(value))
-        if place is not None:
-            self.put(f"@{place[0]};".encode())
+        entry = self.indices.get(id(value))
+        if entry is not None:
+            self.put(f"@{entry[0]};".encode())
             return
-        self.places[id(value)] = (len(self.places), value)
+        self.indices[id(value)] = (len(self.indices), value)
         self._feed_object(value)
 
     def _is_fed_as_name(self, value: object) -> bool:
@@ -424,7 +424,7 @@ class _Feeder:
 
     def _feed_items(self, head: str, items: Any) -> None:
         self.put(f"{head}{len(items)}:".encode())
-        if set(map(type, items)) <= PLAIN:
+        if set(map(type, items)) <= PLAIN_TYPES:
             self.put(repr(list(items)).encode())
             return
         for item in items:
@@ -443,7 +443,7 @@ class _Feeder:
             self._feed_array(value)
         elif isinstance(value, dict):
             self.put(f"{{{type(value).__name__}{len(value)}:".encode())
-            if {*map(type, value), *map(type, value.values())} <= PLAIN:
+            if {*map(type, value), *map(type, value.values())} <= PLAIN_TYPES:
                 self.put(repr(list(value.items())).encode())
                 return
             for name, item in value.items():
@@ -478,7 +478,7 @@ class _Feeder:
         for item in value:
             hasher = hashlib.blake2b(digest_size=16)
             inner = _Feeder(hasher.update, self.ignore)
-            inner.places = self.places  # whatever hashes is rarely shared
+            inner.indices = self.indices  # whatever hashes is rarely shared
             inner.feed(item)
             digests.append(hasher.digest())
         self.put(f"s{len(digests)}:".encode() + b"".join(sorted(digests)))
@@ -528,7 +528,7 @@ def _contents(cell: Any) -> Any:
 
 
 def _fields_of(value: object) -> dict[str, Any]:
-    """Attributes of an object: those of its dictionary and of its slots."""
+    """Attributes of an object, from its dictionary and its slots."""
     fields = dict(getattr(value, "__dict__", ()))
     for kind in type(value).__mro__:
         slots = kind.__dict__.get("__slots__", ())
@@ -578,7 +578,7 @@ def _tame(value: object, generator: BranchingGenerator) -> None:
 
 def _is_plain(value: Any) -> bool:
     """Whether a value holds nothing but numbers, texts and containers of them, so that a copy is as good as itself."""
-    if type(value) in PLAIN or isinstance(value, np.generic):
+    if type(value) in PLAIN_TYPES or isinstance(value, np.generic):
         return True
     if type(value) is np.ndarray:
         return not value.dtype.hasobject and not isinstance(value.base, np.ndarray)

@@ -19,8 +19,8 @@ from pharos.importers.search import END, Arrival, BreadthFirst, SteppedStates
 from pharos.system import sealed, storage
 
 IDENTITY = "identity.json"
-WHAT = "part of an import"
-SECONDS = 2.0
+CHECKPOINT_KIND = "part of an import"
+LAYER_SECONDS = 2.0
 """Between two writes, at least."""
 KEY_BYTES = 16
 
@@ -29,18 +29,18 @@ class StepCheckpoint:
     """The finished part of an exploration.
 
     Args:
-        folder: made where it is not there; the caller holds its lock.
+        folder: made if it does not exist; the caller holds its lock.
         identity: what decides about the states, as JSON.
         seconds: between two writes, at least.
     """
 
-    def __init__(self, folder: Path, identity: Mapping[str, Any], seconds: float = SECONDS):
+    def __init__(self, folder: Path, identity: Mapping[str, Any], seconds: float = LAYER_SECONDS):
         self.folder, self.identity, self.seconds = folder, storage.plain(dict(identity)), seconds
         self._states = self._rows = 0
         self._due = time.monotonic() + seconds
 
     def resume(self, search: BreadthFirst) -> tuple[SteppedStates, dict[int, Any]]:
-        """(states so far, the saved states of those that are not expanded); a new beginning where there are none.
+        """(states so far, the saved states that are not expanded yet); a new beginning if there are none.
 
         Raises:
             ParameterError: the folder holds a part of another import.
@@ -73,7 +73,7 @@ class StepCheckpoint:
         arrays = self._state_arrays(states, last) | self._row_arrays(states, rows)
         record = {"first_state": self._states, "first_row": self._rows}
         name = f"part-{self._states:09d}-{self._rows:010d}{sealed.SUFFIX}"
-        sealed.write_sealed(self.folder / name, record, arrays, WHAT)
+        sealed.write_sealed(self.folder / name, record, arrays, CHECKPOINT_KIND)
         self._states, self._rows = last, rows
 
     @property
@@ -129,7 +129,7 @@ class StepCheckpoint:
         """The states of all parts that follow each other."""
         states = SteppedStates(num_actions)
         for path in sorted(self.folder.glob(f"part-*{sealed.SUFFIX}")):
-            sealed.read_sealed(path, WHAT, lambda record, arrays: self._append(states, record, arrays))
+            sealed.read_sealed(path, CHECKPOINT_KIND, lambda record, arrays: self._append(states, record, arrays))
         return states
 
     @staticmethod

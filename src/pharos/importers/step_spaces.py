@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.importers.folder import IMAGE, VECTOR
+from pharos.importers.folder import IMAGE_OBSERVATION, VECTOR_OBSERVATION
 from pharos.importers.wrappers import Stepped, as_integer
 from pharos.system.wording import capped
 
@@ -35,7 +35,7 @@ def listed_actions_of(
 
 
 def _listed_actions(space: Any) -> tuple[Any, ...] | None:
-    """All actions of a space; None where they are not finitely many, or no product of numbers."""
+    """All actions of a space; None if they are not finitely many, or no product of numbers."""
     kind = type(space).__name__
     if kind == "Discrete":
         start = int(getattr(space, "start", 0))
@@ -55,7 +55,7 @@ def _listed_actions(space: Any) -> tuple[Any, ...] | None:
 
 
 def _action_names(env: Stepped, actions: tuple[Any, ...]) -> tuple[str, ...] | None:
-    """Names that an environment gives to its actions; None where it gives none."""
+    """Names that an environment gives to its actions; None if it gives none."""
     names: list[str] = []
     if hasattr(env, "get_action_meanings"):
         names = [str(each) for each in env.get_action_meanings()]
@@ -101,7 +101,7 @@ class SpaceRecorder:
             return False
 
     def shown(self, observation: Any) -> np.ndarray | None:
-        """An observation as an array; None where none are recorded."""
+        """An observation as an array; None if none are recorded."""
         if not self._is_shown:
             return None
         if self._is_image:
@@ -122,4 +122,4 @@ class SpaceRecorder:
         array = np.stack(rows)
         if array.dtype.kind in "iu" and array.size and array.min() >= 0 and array.max() <= 255:
             array = array.astype(np.uint8)
-        return array, IMAGE if self._is_image else VECTOR
+        return array, IMAGE_OBSERVATION if self._is_image else VECTOR_OBSERVATION

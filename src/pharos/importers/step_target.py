@@ -15,7 +15,7 @@ from pharos.errors import FolderLocked, ParameterError, RuleError
 from pharos.importers.folder import BUILDING, check_free, save
 from pharos.importers.jax_stepping import GymnaxEnvironment, PgxEnvironment, jax_source
 from pharos.importers.search import SteppedStates
-from pharos.importers.step_checkpoint import SECONDS, StepCheckpoint
+from pharos.importers.step_checkpoint import LAYER_SECONDS, StepCheckpoint
 from pharos.importers.stepped_environment import SteppedEnvironment
 from pharos.importers.stepping import SteppingOptions, SteppingRun, StepRecording
 from pharos.importers.wrappers import Stepped
@@ -25,7 +25,7 @@ from pharos.system.wording import in_one_line
 
 JAX = "jax:"
 ENTRY_POINTS = "gymnasium.envs"
-FORMAT = 1
+TARGET_FORMAT = 1
 """Of the files of an unfinished import; raised when states get other keys."""
 
 
@@ -34,7 +34,7 @@ class NamedCode:
     """A function of the user's own by its name, which any process can import and call.
 
     Attributes:
-        name: module:function or file.py:function. folder: where relative ones are looked for.
+        name: module:function or file.py:function. folder: base of relative paths.
         options: keyword arguments.
     """
 
@@ -49,12 +49,12 @@ class NamedCode:
     @property
     def source(self) -> sources.Source:
         """File and checksum."""
-        return sources.find(self.name, self.folder)
+        return sources.find_source(self.name, self.folder)
 
     @property
     def function(self) -> Callable[..., Any]:
         """The function itself; ParameterError if there is none."""
-        function = sources.load(self.source)
+        function = sources.load_source(self.source)
         if not callable(function):
             raise ParameterError(f"{self.name!r}: is {function!r}; expected a function or a class of that name")
         return function
@@ -114,7 +114,7 @@ class StepTarget:
     """An environment named on the command line, with what is named beside it.
 
     Args:
-        target: gymnasium:ID, gymnax:ID, pgx:ID, module:factory or file.py:factory; jax: before these where the
+        target: gymnasium:ID, gymnax:ID, pgx:ID, module:factory or file.py:factory; jax: before these if the
             factory returns `JaxFunctions`.
         options: of the environment or the factory.
         key, reward: names of functions, see `stepping`. weights: "1,0.5", of a vector of rewards.
@@ -167,7 +167,7 @@ class StepTarget:
         max_outcomes: int,
         gamma: float | None = None,
         progress: Callable[[SteppedStates, float, bool], None] | None = None,
-        seconds: float = SECONDS,
+        seconds: float = LAYER_SECONDS,
         **options: Any,
     ) -> tuple[TabularMDP, StepRecording]:
         """Import the environment into a folder, or finish an import that was begun there.
@@ -199,7 +199,7 @@ class StepTarget:
             if checkpoint.is_empty:
                 shutil.rmtree(building, ignore_errors=True)
                 with contextlib.suppress(OSError):
-                    folder.rmdir()  # where it is empty
+                    folder.rmdir()  # if it is empty
         return mdp, recording
 
     def _identity(self, options: SteppingOptions, horizon: int | None) -> dict[str, Any]:
@@ -207,7 +207,7 @@ class StepTarget:
         packages = ["gymnasium", *["jax", "gymnax", "pgx"] * (self.source_of is jax_source)]
         codes = {"factory": self.factory, "key": self.key, "reward": self.reward}
         return {
-            "format": FORMAT,
+            "format": TARGET_FORMAT,
             "target": self.words,
             "code": {name: code.source.checksum for name, code in codes.items() if isinstance(code, NamedCode)},
             "seed": options.seed,

@@ -1,7 +1,7 @@
 """Processes that expand the states of one environment together.
 
-Each process makes the environment for itself. States travel between them in memory as pickles of this program's own;
-the order of results is that of the states, so that the MDP is the same with any number of processes.
+Each process makes the environment for itself. States travel between them in memory as pickles of this program.
+Results keep the order of the states, so that the MDP is the same with any number of processes.
 """
 
 import pickle  # noqa: TID251  (the error of a factory that no other process can import)
@@ -17,7 +17,7 @@ from pharos.system.workers import Workers
 if TYPE_CHECKING:
     from pharos.importers.stepped_environment import SteppedEnvironment
 
-BLOCK = 16
+STATES_PER_TASK = 16
 """States that a process gets at once. It gets the next when it has handed over their outcomes: one that sends does not
 listen."""
 BLOCKS_AHEAD = 3
@@ -53,7 +53,7 @@ class ExpansionsElsewhere:
     """
 
     def __init__(self, source: "SteppedEnvironment", workers: int):
-        self.room = BLOCK * BLOCKS_AHEAD * workers
+        self.room = STATES_PER_TASK * BLOCKS_AHEAD * workers
         self._buffer: list[Any] = []
         self._waiting: deque[tuple[int, list[Any]]] = deque()
         self._at_work: dict[int, str] = {}
@@ -90,7 +90,7 @@ class ExpansionsElsewhere:
     def submit(self, saved: object) -> None:
         """Add a state."""
         self._buffer.append(saved)
-        if len(self._buffer) == BLOCK:
+        if len(self._buffer) == STATES_PER_TASK:
             self._flush()
 
     def fetch(self) -> list[list[Arrival]]:

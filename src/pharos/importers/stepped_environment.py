@@ -16,11 +16,11 @@ import numpy as np
 
 from pharos.errors import ParameterError, PharosError, RuleError, UnknownName
 from pharos.importers import side_effects
-from pharos.importers.chance import MOST_OUTCOMES, DrawError, DrawTree, line_of_code, placed
+from pharos.importers.chance import MOST_DRAW_OUTCOMES, DrawError, DrawTree, line_of_code, placed
 from pharos.importers.fresh_play import FreshPlay
 from pharos.importers.search import Arrival, Expansions, ExpansionsHere, SteppedStates
 from pharos.importers.side_effects import SideEffects
-from pharos.importers.snapshots import EnvironmentSnapshots, bare, chain_of, digest_of, field_names, integers_of
+from pharos.importers.snapshots import EnvironmentSnapshots, bare, chain_of, field_names, integers_of, snapshot_digest
 from pharos.importers.step_spaces import SpaceRecorder, listed_actions_of
 from pharos.importers.step_workers import ExpansionsElsewhere
 from pharos.importers.wrappers import Stepped, reset
@@ -51,7 +51,7 @@ class SteppingOptions:
         ignore: names of fields that are no part of the state.
         key: (environment) -> anything hashable, equal for equal states; None: a digest of all its fields.
         reward: (reward of the environment) -> number, or weights of a vector of rewards.
-        actions: in place of those of a discrete action space.
+        actions: in place of the actions of a discrete action space.
         max_outcomes: in which the draws of one step may come out.
         copied: fields that are never shared between copies, though they seem constant, nor left out as counters.
     """
@@ -61,7 +61,7 @@ class SteppingOptions:
     key: Callable[[Stepped], Hashable] | None = None
     reward: Payment | None = None
     actions: tuple[Any, ...] | None = None
-    max_outcomes: int = MOST_OUTCOMES
+    max_outcomes: int = MOST_DRAW_OUTCOMES
     copied: frozenset[str] = frozenset()
 
 
@@ -116,7 +116,7 @@ class SteppedEnvironment:
         if self.options.key is None:
             return self.snapshots.digest(env)
         value = self._calling("the key", partial(self.options.key, env))
-        return digest_of(value)
+        return snapshot_digest(value)
 
     def starts(self) -> list[Arrival]:
         """The states in which episodes start, with their probabilities."""
@@ -133,7 +133,7 @@ class SteppedEnvironment:
         return rows
 
     def arrive(self, saved: bytes | None, action: int, script: Sequence[int]) -> Arrival:
-        """Go where a step with these draws went before: from a saved state, or from the reset (None)."""
+        """Repeat an earlier step with these draws, from a saved state or from the reset (None)."""
         with self.effects.watched():
             self.draws.replay(script)
             env = self.snapshots.restore(self._blank if saved is None else saved)
@@ -319,7 +319,7 @@ class SteppedEnvironment:
     # Arrivals ---------------------------------------------------------------------------------------------------------
 
     def _new_arrival(self, env: Stepped, key: bytes | None, observation: Any, payment: float) -> Arrival:
-        """The outcome that was just stepped to; with the state where this is the first time."""
+        """The outcome that was just stepped to; with the state if this is the first time."""
         probability, script = self.draws.probability, self.draws.script
         if key is not None and key not in self._sent:
             self._sent.add(key)
@@ -460,10 +460,10 @@ def _name_of(env: Stepped) -> str:
 
 @dataclass
 class ClockSearch:
-    """Fields that count steps: their value is that of the first state plus the depth, in each state that is looked at.
+    """Fields that count steps: in each state that is looked at, their value is the first state's value plus the depth.
 
     Attributes:
-        fields: names -> value at depth 0, those that did so far.
+        fields: names -> value at depth 0, of the fields that have counted steps so far.
     """
 
     source: Any

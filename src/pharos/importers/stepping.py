@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pharos.importers import side_effects
-from pharos.importers.chance import MOST_OUTCOMES
+from pharos.importers.chance import MOST_DRAW_OUTCOMES
 from pharos.importers.folder import ImportedOutcomes
 from pharos.importers.search import BreadthFirst, SteppedStates, mdp_of
 from pharos.importers.step_checkpoint import StepCheckpoint
@@ -29,17 +29,17 @@ from pharos.mdp import TabularMDP, whole_number
 from pharos.system.wording import pluralize
 from pharos.system.workers import usable_workers
 
-MOST_STATES = 100_000
+MOST_STEPPED_STATES = 100_000
 
 
 class StepRecording(NamedTuple):
-    """Observations, names and notes beside the MDP of `stepping`; `arguments()` are those of `importers.save`.
+    """Observations, names and notes beside the MDP of `stepping`; `arguments()` are arguments of `importers.save`.
 
     Attributes:
         observations: what the environment shows of each state: images (S, H, W, 3) uint8, or vectors (S, N) as
-            Gymnasium flattens its space; None where it cannot be flattened.
+            Gymnasium flattens its space; None if it cannot be flattened.
         observed: "image", "vector" or None.
-        outcomes: each outcome with its reward; None where the MDP says it all.
+        outcomes: each outcome with its reward; None if the MDP says it all.
         actions: names of the actions; None: numbers.
         time_limit: of the environment's TimeLimit, in steps; None: it has none.
         depths: (S,) the least number of steps to each state.
@@ -69,8 +69,8 @@ def stepping(  # noqa: PLR0913  (options of one import)
     actions: Sequence[Any] | None = None,
     gamma: float | None = None,
     horizon: int | None = None,
-    max_states: int = MOST_STATES,
-    max_outcomes: int = MOST_OUTCOMES,
+    max_states: int = MOST_STEPPED_STATES,
+    max_outcomes: int = MOST_DRAW_OUTCOMES,
     workers: int = 1,
     check: bool = True,
     progress: Callable[[SteppedStates, float, bool], None] | None = None,
@@ -132,7 +132,7 @@ class SteppingRun:
     factory: Factory
     options: SteppingOptions
     horizon: int | None = None
-    max_states: int = MOST_STATES
+    max_states: int = MOST_STEPPED_STATES
     check: bool = True
     checkpoint: StepCheckpoint | None = None
     workers: int = 1

@@ -18,7 +18,7 @@ Stepped: TypeAlias = Any
 Returned: TypeAlias = Any
 """Answer of one: an observation, alone or with what comes with it."""
 
-LIBRARIES = ("gymnasium", "minigrid", "stable_baselines3")
+WRAPPER_LIBRARIES = ("gymnasium", "minigrid", "stable_baselines3")
 SILENT = frozenset(["Autoreset", "HumanRendering", "Monitor", "RecordVideo", "RenderCollection"])
 """Wrappers that change nothing, and reset, write files or open windows: copies of environments are stepped without."""
 UNCHANGING = SILENT | frozenset(
@@ -41,8 +41,8 @@ UNCHANGING = SILENT | frozenset(
 WITHOUT_MEMORY = ("minigrid.wrappers:NoDeath",)
 """Wrappers whose rewards and ends are functions of state and action: stepping in every state takes them over."""
 EPISODE = 200
-MOST_OUTCOMES = 100_000
-OWN = "import env.unwrapped"
+MOST_STEP_OUTCOMES = 100_000
+UNWRAP = "import env.unwrapped"
 
 
 class Call(NamedTuple):
@@ -76,21 +76,21 @@ class Recorder:
     def reset(self, *, seed: int | None = None, options: object = None) -> Returned:
         answer = _reset(self.env, seed, options)
         self.observation = first_of(answer)
-        self.calls.append(Call(None, None, state_of(self.env)))
+        self.calls.append(Call(None, None, table_state(self.env)))
         return answer
 
     def step(self, action: object) -> Returned:
-        if self.script is not None and state_of(self.env) is not None:
+        if self.script is not None and table_state(self.env) is not None:
             self.env.unwrapped.s = self.script[0]
-        before = state_of(self.env)
+        before = table_state(self.env)
         answer = self.env.step(action)
         if self.script is not None:
             _, next_state, reward, ended = self.script
             if before is not None:
                 self.env.unwrapped.s = next_state
             answer = (next_state + first_number(self.env, "observation"), reward, ended, *answer[3:])
-        self.observation, reward, ended, truncated = parts_of(answer)
-        self.calls.append(Call(as_integer(action), before, state_of(self.env), float(reward), ended, truncated))
+        self.observation, reward, ended, truncated = step_parts(answer)
+        self.calls.append(Call(as_integer(action), before, table_state(self.env), float(reward), ended, truncated))
         return answer
 
     def __getattr__(self, name: str) -> Returned:
@@ -104,7 +104,7 @@ class Recorder:
 
 
 def as_integer(value: Returned) -> Returned:
-    """A number or an array of one number as an int where it is whole; anything else as it is."""
+    """A number or an array of one number as an int if it is whole; anything else as it is."""
     try:
         return int(value) if int(value) == value else value
     except (TypeError, ValueError, OverflowError):
@@ -117,7 +117,7 @@ def first_number(env: Stepped, kind: str) -> int:
     return number if isinstance(number, int) else 0
 
 
-def state_of(env: Stepped) -> int | None:
+def table_state(env: Stepped) -> int | None:
     """Number of the state that an environment with a table keeps in `s`; None if there is none."""
     value = as_integer(getattr(getattr(env, "unwrapped", env), "s", None))
     return value if isinstance(value, int) else None
@@ -140,7 +140,7 @@ def first_of(answer: Returned) -> Returned:
     return answer[0] if isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], dict) else answer
 
 
-def parts_of(answer: Sequence[Returned]) -> tuple[Returned, float, bool, bool]:
+def step_parts(answer: Sequence[Returned]) -> tuple[Returned, float, bool, bool]:
     """(observation, reward, terminated, truncated) of what `step` returned, with four parts (old gym's) or five."""
     observation, reward, ended, *rest = answer
     return observation, reward, bool(ended), bool(rest[0]) if len(rest) > 1 else False
@@ -156,13 +156,13 @@ def wrappers_of(env: Stepped) -> list[Stepped]:
     while env is not inner:
         below = getattr(env, "env", None)
         if below is None or len(chain) > 100:
-            raise ParameterError(f"{named(env)}: has no attribute env, the environment that it wraps; {OWN}")
+            raise ParameterError(f"{wrapper_name(env)}: has no attribute env, the environment that it wraps; {UNWRAP}")
         chain.append(env)
         env = below
     return chain
 
 
-def named(env: object) -> str:
+def wrapper_name(env: object) -> str:
     """Name of the class of an environment or wrapper."""
     return type(env).__name__
 
@@ -172,7 +172,7 @@ def changes_nothing(wrapper: Stepped) -> bool:
     from gymnasium import ObservationWrapper
 
     kind = type(wrapper)
-    if kind.__module__.split(".")[0] in LIBRARIES and kind.__name__ in UNCHANGING:
+    if kind.__module__.split(".")[0] in WRAPPER_LIBRARIES and kind.__name__ in UNCHANGING:
         return True
     own = ObservationWrapper
     return issubclass(kind, own) and (kind.step, kind.reset) == (own.step, own.reset)
@@ -183,7 +183,7 @@ class Layers:
 
     Args:
         env: the environment as it was given.
-        copied: whether the environment below is copied as well, where it can be. If not, wrappers that are known to
+        copied: whether the environment below is copied as well, if it can be. Otherwise wrappers that are known to
             change nothing are left out.
     Attributes:
         top: the outermost one that may change something, to be stepped in place of `env`.
@@ -200,7 +200,7 @@ class Layers:
         while chain and changes_nothing(chain[0]):  # a time limit would hide what happens later
             del chain[0]
         if copied:
-            loud = [wrapper for wrapper in chain if named(wrapper) not in SILENT or not changes_nothing(wrapper)]
+            loud = [wrapper for wrapper in chain if wrapper_name(wrapper) not in SILENT or not changes_nothing(wrapper)]
             chain, inner = _copied(loud, inner)
         else:
             chain = [copy.copy(wrapper) for wrapper in chain if not changes_nothing(wrapper)]
@@ -217,7 +217,7 @@ class Layers:
             self.suspects.append((wrapper, self.top, below))
             own, others = (getattr(getattr(each, "action_space", None), "n", None) for each in (wrapper, below))
             if own != others:
-                raise ParameterError(f"{named(wrapper)}: has {own} actions, the environment {others}; {OWN}")
+                raise ParameterError(f"{wrapper_name(wrapper)}: has {own} actions, the environment {others}; {UNWRAP}")
 
     def reset(self, seed: int | None = None) -> Returned:
         """First observation of an episode; ParameterError if a wrapper changes how it begins."""
@@ -225,7 +225,7 @@ class Layers:
 
     def step(self, action: int) -> tuple[Returned, float, bool, bool]:
         """(observation, reward, terminated, truncated); ParameterError if a wrapper changes any but the observation."""
-        return self._checked(lambda: parts_of(self.top.step(action)))
+        return self._checked(lambda: step_parts(self.top.step(action)))
 
     def _checked(self, call: Callable[[], Returned]) -> Returned:
         for _, above, below in self.suspects:
@@ -239,9 +239,11 @@ class Layers:
         except PharosError:
             raise
         except Exception as error:  # of code of the caller's
-            names = ", ".join(named(wrapper) for wrapper, *_ in self.suspects)
+            names = ", ".join(wrapper_name(wrapper) for wrapper, *_ in self.suspects)
             reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-            raise ParameterError(f"{names}: cannot be compared with the environment below: {reason}; {OWN}") from error
+            raise ParameterError(
+                f"{names}: cannot be compared with the environment below: {reason}; {UNWRAP}"
+            ) from error
         for wrapper, above, below in self.suspects:
             _compare(wrapper, above.calls, below.calls)
         return answer
@@ -264,7 +266,7 @@ def check_wrappers(env: Stepped, steps: int, outcomes: Iterable[tuple[int, int, 
         if is_over or step % EPISODE == 0:
             layers.reset(0 if step == 0 else None)
         is_over = layers.step(first + int(rng.integers(actions)))[2]
-    share, is_over = MOST_OUTCOMES / max(count, 1), True
+    share, is_over = MOST_STEP_OUTCOMES / max(count, 1), True
     for number, (state, action, next_state, reward, ended) in enumerate(outcomes):
         if share < 1 and rng.random() >= share:
             continue
@@ -276,7 +278,7 @@ def check_wrappers(env: Stepped, steps: int, outcomes: Iterable[tuple[int, int, 
 
 
 def _copied(chain: list[Stepped], inner: Stepped) -> tuple[list[Stepped], Stepped]:
-    """Copies of wrappers and of the environment below; of the wrappers alone where it cannot be copied."""
+    """Copies of wrappers and of the environment below; of the wrappers alone if it cannot be copied."""
     linked = chain
     if any(above.env is not below for above, below in zip(chain, [*chain, inner][1:], strict=True)):
         linked = [copy.copy(wrapper) for wrapper in chain]
@@ -289,7 +291,7 @@ def _copied(chain: list[Stepped], inner: Stepped) -> tuple[list[Stepped], Steppe
 
 
 def _path(wrapper: object) -> str:
-    return f"{type(wrapper).__module__}:{named(wrapper)}"
+    return f"{type(wrapper).__module__}:{wrapper_name(wrapper)}"
 
 
 def _refuse_known(wrapper: Stepped) -> None:
@@ -302,7 +304,7 @@ def _refuse_known(wrapper: Stepped) -> None:
             way = (
                 "repeating an action several times is not among what pharos has"
                 if several
-                else (f"{OWN}, and add pharos.sticky_actions(mdp, {p:g}), or --sticky {p:g}")
+                else (f"{UNWRAP}, and add pharos.sticky_actions(mdp, {p:g}), or --sticky {p:g}")
             )
             raise ParameterError(f"StickyAction: repeats actions, which the table below it does not; {way}")
     elif path == "minigrid.wrappers:StochasticActionWrapper" and wrapper.prob < 1:
@@ -310,23 +312,25 @@ def _refuse_known(wrapper: Stepped) -> None:
         way = (
             "a fixed action at random is not among what pharos has"
             if wrapper.random_action is not None
-            else (f"{OWN} with actions=range({count}), and add pharos.random_actions(mdp, {p:g}), or --random {p:g}")
+            else (f"{UNWRAP} with actions=range({count}), and add pharos.random_actions(mdp, {p:g}), or --random {p:g}")
         )
         raise ParameterError(f"StochasticActionWrapper: executes other actions at random; {way}")
 
 
-ACTING = f"{OWN}; chance of acting is added by pharos.sticky_actions or random_actions (--sticky P, --random P)"
-PAYING = f"{OWN}, and give what it pays: rewards= of importers.gymnasium, StateSpace.mdp or TabularMDP.from_arrays"
-STARTING = f"{OWN}, and give initial= of importers.gymnasium"
-ENDING = f"{OWN}, and give a time limit as horizon=; other ends need a table P of their own"
+ACTING_WRAPPER = (
+    f"{UNWRAP}; chance of acting is added by pharos.sticky_actions or random_actions (--sticky P, --random P)"
+)
+PAYING = f"{UNWRAP}, and give what it pays: rewards= of importers.gymnasium, StateSpace.mdp or TabularMDP.from_arrays"
+STARTING = f"{UNWRAP}, and give initial= of importers.gymnasium"
+ENDING = f"{UNWRAP}, and give a time limit as horizon=; other ends need a table P of their own"
 
 
 def _compare(wrapper: object, above: list[Call], below: list[Call]) -> None:
     """ParameterError if calls above a wrapper are not those below it."""
-    name = named(wrapper)
+    name = wrapper_name(wrapper)
     if [call.action is None for call in above] != [call.action is None for call in below]:
         what = "reset" if above and above[0].action is None else "step"
-        raise ParameterError(f"{name}: makes {len(below)} calls of the environment in one {what}; {OWN}")
+        raise ParameterError(f"{name}: makes {len(below)} calls of the environment in one {what}; {UNWRAP}")
     for ours, theirs in zip(above, below, strict=True):
         if ours == theirs:
             continue
@@ -335,7 +339,7 @@ def _compare(wrapper: object, above: list[Call], below: list[Call]) -> None:
         if ours.action is None:
             text = f"starts episodes in state {ours.after} in place of {theirs.after}; {STARTING}"
         elif ours.action != theirs.action:
-            text = f"executes action {theirs.action} in place of {ours.action}; {ACTING}"
+            text = f"executes action {theirs.action} in place of {ours.action}; {ACTING_WRAPPER}"
         elif not np.array_equal(ours.reward, theirs.reward, equal_nan=True):
             text = f"pays {ours.reward:g}{where} in place of {theirs.reward:g}; {PAYING}"
         elif ours.ended != theirs.ended:
@@ -343,9 +347,9 @@ def _compare(wrapper: object, above: list[Call], below: list[Call]) -> None:
                 f"{'ends' if ours.ended else 'does not end'} the episode{where} as the environment does not; {ENDING}"
             )
         elif ours.truncated != theirs.truncated:
-            text = f"cuts the episode off{where}; {ENDING}" if ours.truncated else f"undoes a time limit; {OWN}"
+            text = f"cuts the episode off{where}; {ENDING}" if ours.truncated else f"undoes a time limit; {UNWRAP}"
         elif ours[1:3] != theirs[1:3]:
-            text = f"moves the environment{where} to state {ours.after} in place of {theirs.after}; {OWN}"
+            text = f"moves the environment{where} to state {ours.after} in place of {theirs.after}; {UNWRAP}"
         else:
             continue
         raise ParameterError(f"{name}: {text}")

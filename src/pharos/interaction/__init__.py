@@ -1,4 +1,4 @@
-"""Stepping an environment: one (Gymnasium), many at once (vector), and those of Stable-Baselines3.
+"""Stepping an environment: one (Gymnasium), many at once (vector), and for Stable-Baselines3.
 
 `import pharos` needs `registration` alone, so that everything else is loaded when it is first used.
 """

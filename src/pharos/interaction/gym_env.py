@@ -16,7 +16,7 @@ from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.interaction.simulator import FrameStack, Interaction, RewardChannel, SimulatedEnv, Simulator, Stream
 from pharos.observations import NO_ACTION, Index, Seen
-from pharos.system.records import split
+from pharos.system.records import split_options
 
 if TYPE_CHECKING:
     from pharos.drawing import Window
@@ -29,14 +29,14 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
     """An environment of pharos as a Gymnasium environment.
 
     Actions are 0 .. A-1, named by `action_names`. `info` has "state" (D,) int64, "executed_action" (-1 after reset),
-    and "index" where a state space was given. `reset(options={"state": ...})` starts in any state. Sticky and random
+    and "index" if a state space was given. `reset(options={"state": ...})` starts in any state. Sticky and random
     actions draw one number from `np_random` a step, then lazy ones another.
 
-    Where the rules have chance, an outcome of the executed action is drawn and its reward paid; `info["prob"]` is the
+    If the rules have chance, an outcome of the executed action is drawn and its reward paid; `info["prob"]` is the
     probability of that outcome, 1.0 after reset, as in Gymnasium's toy text. All numbers, for the start, for sticky and
     random actions, for lazy ones and, after these, for the outcome, then come from the stream that environment 0 of a
     `VectorEnv` has with the same seed: one seed, the same episodes in both. Without a seed, `np_random` seeds that
-    stream. Where rewards are paid late or with noise, `info["earned_reward"]` is what the rules pay for the step.
+    stream. If rewards are paid late or with noise, `info["earned_reward"]` is what the rules pay for the step.
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
@@ -51,7 +51,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "ansi"], "render_fps": 15}
 
     def __init__(self, environment: Environment | str, *, render_mode: str | None = None, **options: Any):
-        interaction, parameters = split(Interaction, options)
+        interaction, parameters = split_options(Interaction, options)
         self.simulator = simulator = Simulator(environment, interaction, parameters)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ParameterError(
@@ -86,10 +86,10 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._has_chance, self._stays, self._lazy = simulator.has_chance, simulator.chance[0], simulator.lazy
         self._has_outcomes, self._num_outcomes = simulator.has_outcomes, int(simulator.env.outcomes)
         self._outcome_one, self._has_sets = simulator.rules.outcome_one, simulator.has_sets
-        self._stream: Stream | None = None  # of random numbers, where the rules have chance
+        self._stream: Stream | None = None  # of random numbers, if the rules have chance
         self._is_index = simulator.context.is_plain and isinstance(observation, Index)
         self._frame_stack = FrameStack(simulator, 1) if simulator.context.has_more else None
-        self._last: Seen | None = None  # the observation, where it is more than a function of the state
+        self._last: Seen | None = None  # the observation, if it is more than a function of the state
         self._reward_channel = RewardChannel(interaction.chance, 1) if simulator.modifies_rewards else None
         space = simulator.state_space
         self._successors = None if space is None or self._has_outcomes else space.successors
@@ -114,7 +114,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         return np.asarray(self.simulator.action_masks(self._started()[None])[0])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; `options={"state": ...}` says where (D integers)."""
+        """Start an episode; `options={"state": ...}` is the start state (D integers)."""
         super().reset(seed=seed)
         simulator = self.simulator
         if self._reward_channel is not None:
@@ -211,7 +211,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         return observation, 0.0, True, self._elapsed >= self._limit, info
 
     def render(self) -> str | np.ndarray | None:
-        """The current state in the render mode: text, a picture, or None where there is a window."""
+        """The current state in the render mode: text, a picture, or None if there is a window."""
         if self.render_mode is None:
             return None
         from pharos.drawing import human, text_drawing  # which an environment without pictures does not load

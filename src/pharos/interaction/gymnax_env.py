@@ -91,7 +91,7 @@ class GymnaxEnv(environment.Environment):
         self._space = spaces.Box(low, high, observations.shape[1:], observations.dtype)
         nothing = np.zeros_like(observations[:1])
         cumulative = np.cumsum(mdp.start_probabilities)
-        successors, probabilities = _outcomes(mdp)
+        successors, probabilities = _padded_outcomes(mdp)
         ends = np.append(np.asarray(mdp.terminal, np.bool_), True)
         rewards = np.vstack([np.where(ends[:-1, None], 0.0, mdp.rewards), np.zeros((1, mdp.num_actions))])
         params_class: Any = EnvParams  # whose fields flax declares
@@ -146,10 +146,10 @@ class GymnaxEnv(environment.Environment):
         later = jnp.where(u < p_action, action, jnp.where(u < p_action + p_previous, state.previous, uniform))
         first = jnp.where(u < p_first_action, action, uniform)
         executed = jnp.where(is_first, first, later).astype(jnp.int32)
-        outcome = _drawn(params.cumulative[state.index, executed], jax.random.uniform(key_outcome))
+        outcome = _first_above(params.cumulative[state.index, executed], jax.random.uniform(key_outcome))
         next_index = params.successors[state.index, executed, outcome]
         reward = params.rewards[state.index, executed]
-        if self._reward_noise:  # its key leaves those of the steps what they are
+        if self._reward_noise:  # its key does not change the keys of the steps
             reward += self._reward_noise * jax.random.normal(jax.random.fold_in(key, 3))
         after = EnvState(time=state.time + 1, index=next_index, previous=executed)
         is_over = params.ends[next_index]
@@ -160,7 +160,7 @@ class GymnaxEnv(environment.Environment):
 
     def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, EnvState]:
         """A start state: (observation, state)."""
-        index = params.starts[_drawn(params.start_cumulative, jax.random.uniform(key))]
+        index = params.starts[_first_above(params.start_cumulative, jax.random.uniform(key))]
         state = EnvState(
             time=jnp.zeros((), jnp.int32), index=index, previous=jnp.full((), self._num_actions, jnp.int32)
         )
@@ -210,12 +210,12 @@ class JoinedEnds(GymnaxEnv):
         return observation, after, reward, jnp.logical_or(terminated, truncated), info
 
 
-def _drawn(cumulative: jax.Array, u: jax.Array) -> jax.Array:
+def _first_above(cumulative: jax.Array, u: jax.Array) -> jax.Array:
     """The first entry whose cumulated probability exceeds u; entries that cannot be drawn come after all others."""
     return jnp.minimum(jnp.sum(u >= cumulative), len(cumulative) - 1)
 
 
-def _outcomes(mdp: TabularMDP) -> tuple[np.ndarray, np.ndarray]:
+def _padded_outcomes(mdp: TabularMDP) -> tuple[np.ndarray, np.ndarray]:
     """(S + 1, A, K) next states, S for the end, and cumulated probabilities; 1 from the last possible outcome on."""
     num_states, num_actions = mdp.num_states, mdp.num_actions
     states = np.repeat(np.arange(num_states), num_actions)
@@ -223,11 +223,11 @@ def _outcomes(mdp: TabularMDP) -> tuple[np.ndarray, np.ndarray]:
     which = np.asarray(outcomes.which)
     order = np.argsort(which, kind="stable")
     which = which[order]
-    place = np.arange(len(which)) - np.searchsorted(which, which)
-    pairs, width = num_states * num_actions, int(place.max(initial=0)) + 1
+    index = np.arange(len(which)) - np.searchsorted(which, which)
+    pairs, width = num_states * num_actions, int(index.max(initial=0)) + 1
     successors, cumulative = np.full((pairs, width), num_states), np.zeros((pairs, width))
-    successors[which, place] = np.asarray(outcomes.states)[order]
-    cumulative[which, place] = np.asarray(outcomes.probabilities)[order]
+    successors[which, index] = np.asarray(outcomes.states)[order]
+    cumulative[which, index] = np.asarray(outcomes.probabilities)[order]
     counts = np.bincount(which, minlength=pairs)
     cumulative = np.cumsum(cumulative, axis=1)
     cumulative[np.arange(width) >= counts[:, None] - 1] = 1.0

@@ -14,7 +14,7 @@ from pharos.state_space import StateSpace
 if TYPE_CHECKING:
     from pharos.interaction.gymnax_env import GymnaxEnv
 
-BLOCK = 1 << 14  # states that are observed at once
+EXPORT_BLOCK = 1 << 14  # states that are observed at once
 
 
 def to_gymnax(
@@ -30,7 +30,7 @@ def to_gymnax(
     `step`.
 
     Its tables are in `env.default_params`. What is executed and what follows is drawn as the MDP says: sticky, random
-    and lazy actions, chance of the rules. The mean reward of what is executed is paid. Where some actions are not
+    and lazy actions, chance of the rules. The mean reward of what is executed is paid. If some actions are not
     available in some states, a choice of one acts as the first available action, as in `GymEnv`;
     `env.action_mask(state)` and `info["action_mask"]` say which are.
 
@@ -38,7 +38,7 @@ def to_gymnax(
         source: a built space; or an MDP, with its chance.
         observation, observation_options: what is seen, as `pharos.observe` takes it; or an array (S, ...). Of an MDP
             that was not made from a space only an array.
-        time_limit: steps of an episode; None: those of the MDP's horizon, else of the environment.
+        time_limit: steps of an episode; None: the MDP's horizon, else the limit of the environment.
         joined_ends: whether `step` returns one `done` in place of terminated and truncated, as before gymnax 1.0 and
             as rejax 0.1 expects.
         reward_noise: standard deviation of what is added to each reward.
@@ -77,7 +77,10 @@ def _observed(
 ) -> tuple[np.ndarray, float, float]:
     """(S, ...) observations of all states, and their bounds."""
     observation = observe(env, name, state_space=space, **options)
-    blocks = [observation(space.states(slice(first, first + BLOCK))) for first in range(0, space.num_states, BLOCK)]
+    blocks = [
+        observation(space.states(slice(first, first + EXPORT_BLOCK)))
+        for first in range(0, space.num_states, EXPORT_BLOCK)
+    ]
     observations = np.concatenate(blocks)
     if observations.ndim == 1:
         observations = observations[:, None]

@@ -22,7 +22,7 @@ class SB3VecEnv(VecEnv):
     Discrete observations such as "index" come as (N,) int64.
 
     Attributes:
-        earned: (N,) float32, what the rules paid for the last step; where rewards are paid late or with noise, that is
+        earned: (N,) float32, what the rules paid for the last step. If rewards are paid late or with noise, that is
             not what `step` returned.
     """
 
@@ -109,7 +109,7 @@ def make_sb3_vec(
     Args:
         env: a name that `pharos.make` knows, or an Environment.
         seed: of the first reset; environment i is seeded with seed + i.
-        options: see `pharos.interaction.Interaction`, and the parameters of the environment where `env`
+        options: see `pharos.interaction.Interaction`, and the parameters of the environment if `env`
             is a name.
     Raises:
         ParameterError: an option or parameter is wrong.

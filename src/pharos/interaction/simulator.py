@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Rows = slice | np.ndarray  # which environments of a batch
 
-# States that are built on the way where the observation "index" is asked for without `space`.
+# States that are built on the way if the observation "index" is asked for without `space`.
 LARGEST_INDEX = 20_000_000
 
 
@@ -42,9 +42,9 @@ class Interaction:
             Gymnasium's StickyAction); the Arcade Learning Environment starts with its action "noop".
         previous_action: whether the agent sees the previously executed action.
         remaining_time: whether the agent sees the share of the time limit that is left.
-        time_limit: steps after which an episode is truncated; "default" for that of the class, None for no limit.
+        time_limit: steps after which an episode is truncated; "default" for the limit of the class, None for no limit.
         space: the built state space of the environment, or its folder; adds "index" to info. The observation "index"
-            needs it: where none is given, it is taken from the user's cache, or built.
+            needs it: if none is given, it is taken from the user's cache, or built.
     """
 
     observation: object = "vector"
@@ -63,7 +63,7 @@ class Simulator:
     Attributes:
         env, state_space, context, limit: as the options say; `context` maps states to what the agent gets.
         chance: (chosen, previous, uniform), weights of the executed action; they sum to 1.
-        first_chosen: the weight of the chosen action where there is no previous one; the rest is uniform.
+        first_chosen: the weight of the chosen action if there is no previous one; the rest is uniform.
         lazy: the probability that the executed action has no effect.
         modifies_rewards: whether rewards are paid late or with noise.
         has_chance: whether another than the chosen action may be executed.
@@ -349,9 +349,9 @@ class RewardChannel:
         paid_n = r_(n - delay) + ... + r_n + noise z_n
 
     z are independent standard normal numbers. So the sum of what is paid in an episode has the mean of what was earned,
-    however the episode ended. Where it is broken off by a reset, what was not paid yet is lost.
+    however the episode ended. If it is broken off by a reset, what was not paid yet is lost.
 
-    Noise is drawn from streams of its own, seeded as those of the steps are, so that steps stay what they are without.
+    Noise is drawn from separate streams, seeded as the streams of the steps, so that noise does not change the steps.
 
     Attributes:
         earned: (N,) of the last step.
@@ -378,7 +378,7 @@ class RewardChannel:
         """Return the rewards (N,) that agents get in a step.
 
         Args:
-            earned: (N,), 0 where nothing is played.
+            earned: (N,), 0 if nothing is played.
             is_step: (N,) bool, whether an environment was stepped, not reset.
             ended: (N,) bool, whether its episode is over, so that everything is due.
         """

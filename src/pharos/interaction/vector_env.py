@@ -2,9 +2,9 @@
 
 `make_vec("breakout", 1024, observation="vector", sticky=0.25)`, or
 `gymnasium.make_vec("pharos/Breakout-v0", num_envs=1024)`. Chance is drawn inside the loop, from one stream of random
-numbers for each environment: the start where there are several, then for each step what is executed under sticky or
-random actions, whether it has an effect under lazy ones, then the outcome where the rules have chance. Where there is
-but one possibility nothing is drawn.
+numbers for each environment: the start, if there are several; then for each step the executed action under sticky or
+random actions, whether it has an effect under lazy ones, and the outcome, if the rules have chance. If there is but one
+possibility, nothing is drawn.
 """
 
 from abc import ABC, abstractmethod
@@ -31,15 +31,15 @@ from pharos.kernels import stepping
 from pharos.kernels.stepping import DISABLED, SAME_STEP, EnvironmentBatch, first_outside
 from pharos.mdp import OutcomeTable, rewards_of_outcomes, rewards_of_staying, whole_number
 from pharos.observations import NO_ACTION, Index, Seen
-from pharos.system.arrays import as_array
-from pharos.system.records import split
+from pharos.system.arrays import as_index_array
+from pharos.system.records import split_options
 from pharos.system.threads import in_blocks
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
-BLOCK = 4096  # steps that are worth a thread's while
-LARGEST_TABLE = 1 << 28  # bytes of observations that are computed beforehand
+THREAD_STEPS = 4096  # steps that are worth a thread's while
+TABLE_BYTES = 1 << 28  # bytes of observations that are computed beforehand
 _NO_VECTORS = np.empty((0, 0), np.float32)
 
 
@@ -49,8 +49,9 @@ class Stepper(ABC):
     Kernels get Setting and Batch as plain tuples: named ones cost Numba a microsecond a call more.
 
     Attributes:
-        name: of a place, in `info`.
-        current, final: the places (N, ...) now, and at the ends of episodes that a step ended.
+        name: of a position in `info`: "state" or "index".
+        current, final: the positions (N, ...), states or their indices: now, and at the ends of episodes that a step
+            ended.
         final_elapsed: (N,) steps of the episode after the last step.
     """
 
@@ -64,19 +65,19 @@ class Stepper(ABC):
     def restart(self, mask: np.ndarray, rng: np.ndarray, state: object) -> None:
         """Begin episodes in the environments of mask (N,): in `state`, or in drawn start states."""
         if state is not None:
-            self.current[mask] = self.places(_states_of(self.simulator, state, len(mask))[mask])
+            self.current[mask] = self.positions(_states_of(self.simulator, state, len(mask))[mask])
             return
         numbers = np.zeros(len(mask), np.int64)
         stepping.draw_starts(self.simulator.start_cumulative, rng, mask, numbers)
         self.current[mask] = self.starts[numbers[mask]]
 
     @abstractmethod
-    def places(self, states: np.ndarray) -> np.ndarray:
-        """Places of states (N, D)."""
+    def positions(self, states: np.ndarray) -> np.ndarray:
+        """Positions of states (N, D)."""
 
     @abstractmethod
-    def states(self, places: np.ndarray) -> np.ndarray:
-        """States (n, D) of places (n, ...)."""
+    def states(self, positions: np.ndarray) -> np.ndarray:
+        """States (n, D) of positions (n, ...)."""
 
     def vectors(self) -> np.ndarray:
         """Buffer for vector observations of the next step; empty if the compiled step does not write them."""
@@ -86,12 +87,12 @@ class Stepper(ABC):
     def step(self, batch: EnvironmentBatch) -> None:
         """Advance every environment."""
 
-    def seen(self, places: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        """Observations of places (n, ...)."""
-        return self.simulator.context(self.states(places), previous, elapsed)
+    def seen(self, positions: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+        """Observations of positions (n, ...)."""
+        return self.simulator.context(self.states(positions), previous, elapsed)
 
     def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        """Observations of the current places."""
+        """Observations of the current positions."""
         return self.seen(self.current, previous, elapsed)
 
 
@@ -120,11 +121,11 @@ class RulesStepper(Stepper):
         self.__dict__.update(state)
         self._step_many = self.simulator.rules.step_many
 
-    def places(self, states: np.ndarray) -> np.ndarray:
+    def positions(self, states: np.ndarray) -> np.ndarray:
         return states
 
-    def states(self, places: np.ndarray) -> np.ndarray:
-        return places
+    def states(self, positions: np.ndarray) -> np.ndarray:
+        return positions
 
     def restart(self, mask: np.ndarray, rng: np.ndarray, state: object) -> None:
         self._vector = self._vector[:0]
@@ -145,7 +146,7 @@ class RulesStepper(Stepper):
             if fault >= 0:
                 faults.append(fault)
 
-        in_blocks(run, len(self.current), BLOCK)
+        in_blocks(run, len(self.current), THREAD_STEPS)
         if faults:
             i, component = divmod(min(faults), self.current.shape[1])
             self.simulator.raise_fault(self.current[i], int(batch.executed[i]), component)
@@ -162,7 +163,7 @@ class TableStepper(Stepper):
     def __init__(self, simulator: Simulator, space: "StateSpace", num_envs: int, mode: int):
         super().__init__(simulator, np.zeros(num_envs, np.int64))
         self.space = space
-        self.starts = self.places(simulator.start_states)
+        self.starts = self.positions(simulator.start_states)
         self._transitions, self._rewards = _tables(space)
         self._staying = rewards_of_staying(space).array if simulator.lazy else np.empty((0, 0))
         self._setting = tuple(simulator.setting(mode, np.zeros((2, 0), np.int64), np.zeros(0), self.starts))
@@ -170,14 +171,14 @@ class TableStepper(Stepper):
         self._is_index = context.is_plain and isinstance(context.observation, Index)
         self._table: np.ndarray | None = None
         one = np.prod(context.observation.space.shape or ()) * np.dtype(context.observation.space.dtype).itemsize
-        if context.is_plain and not self._is_index and one * space.num_states <= LARGEST_TABLE:
+        if context.is_plain and not self._is_index and one * space.num_states <= TABLE_BYTES:
             self._table = context.observation(space.states())
 
-    def places(self, states: np.ndarray) -> np.ndarray:
+    def positions(self, states: np.ndarray) -> np.ndarray:
         return self.space.indices(states)
 
-    def states(self, places: np.ndarray) -> np.ndarray:
-        return self.space.states(places)
+    def states(self, positions: np.ndarray) -> np.ndarray:
+        return self.space.states(positions)
 
     def step(self, batch: EnvironmentBatch) -> None:
         self.final_elapsed[:] = batch.elapsed + 1
@@ -187,20 +188,20 @@ class TableStepper(Stepper):
         def run(first: int, last: int) -> None:
             walk_table(self._transitions, self._rewards, self._staying, terminal, setting, arrays, first, last)
 
-        in_blocks(run, len(self.current), BLOCK)
+        in_blocks(run, len(self.current), THREAD_STEPS)
 
-    def seen(self, places: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
+    def seen(self, positions: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
         if self._is_index:
-            return places.copy()
+            return positions.copy()
         if self._table is not None:
-            return self._table.take(places, axis=0)
-        return super().seen(places, previous, elapsed)
+            return self._table.take(positions, axis=0)
+        return super().seen(positions, previous, elapsed)
 
 
 def _tables(space: "StateSpace") -> tuple[object, object]:
     """(successors, rewards) of executed actions, as `stepping.walk_table` takes them."""
     if not space.has_chance:
-        return as_array(space.successors), np.ascontiguousarray(space.mdp().rewards, np.float64)
+        return as_index_array(space.successors), np.ascontiguousarray(space.mdp().rewards, np.float64)
     dynamics = space.dynamics
     assert isinstance(dynamics, OutcomeTable)
     return dynamics.for_kernels, dynamics.for_kernels_with(rewards_of_outcomes(space))
@@ -222,11 +223,15 @@ _MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABL
 class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     """`num_envs` copies of one environment as a Gymnasium vector environment.
 
-    With `space` the built state space is walked as a table, and the rules are not run: `info` has "index" (N,) in place
-    of "state" (N, D). It always has "executed_action" (N,), -1 after a reset; and where the rules have chance "prob"
-    (N,), the probability of the outcome that was drawn, 1 after a reset; and where some actions are not available in
-    some states "action_mask" (N, A) int8, those that are in the state that the step has led to; and where rewards are
-    paid late or with noise "earned_reward" (N,), what the rules pay for the step. Arrays are fresh at every step.
+    With `space` the built state space is walked as a table, and the rules are not run. `info` has
+
+    - "state" (N, D), or "index" (N,) with `space`,
+    - "executed_action" (N,), -1 after a reset,
+    - "prob" (N,), if the rules have chance: the probability of the outcome that was drawn, 1 after a reset,
+    - "action_mask" (N, A) int8, if some actions are not available in some states: the available ones in the new state,
+    - "earned_reward" (N,), if rewards are paid late or with noise: what the rules pay for the step.
+
+    Arrays are fresh at every step.
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
@@ -234,7 +239,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         autoreset_mode: of Gymnasium. NEXT_STEP: the step after the end of an episode resets and ignores its action.
             SAME_STEP: the last step resets too; the last observation is in info["final_obs"]. DISABLED: the caller
             resets with `options={"reset_mask": mask}`.
-        seed: of the first reset, where that is given none.
+        seed: of the first reset, if that is given none.
         max_episode_steps: another name of `time_limit`, as `gymnasium.make_vec` calls it.
         render_mode: None; or "rgb_array": `render()` returns a picture of each environment.
         options: see `Interaction`, and the parameters of the environment, such as `height=12`.
@@ -257,7 +262,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     ):
         if max_episode_steps is not None:
             options["time_limit"] = None if max_episode_steps == -1 else max_episode_steps
-        interaction, parameters = split(Interaction, options)
+        interaction, parameters = split_options(Interaction, options)
         self.num_envs = whole_number(num_envs, "num_envs", "an integer of at least 1")
         self._mode = _MODES.index(_checked_mode(autoreset_mode))
         self.simulator = simulator = Simulator(environment, interaction, parameters)
@@ -294,7 +299,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         return self.simulator.action_masks(self.states)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """The picture for people of each environment, (H, W, 3) uint8, where render_mode is "rgb_array"; else None."""
+        """The picture for people of each environment, (H, W, 3) uint8, if render_mode is "rgb_array"; else None."""
         if self.render_mode is None:
             return None
         if self._rng is None:
@@ -310,8 +315,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
 
         Args:
             seed: environment i is seeded with seed + i, or with seed[i].
-            options: {"reset_mask": (N,) bool} resets these environments alone; {"state": (D,) or (N, D)} says where
-            they start.
+            options: {"reset_mask": (N,) bool} resets these environments alone; {"state": (D,) or (N, D)} is where
+                they start.
         """
         options = options or {}
         mask = self._checked_mask(options.get("reset_mask"))
@@ -386,17 +391,17 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     def _add_final(self, info: dict[str, Any], done: np.ndarray) -> None:
         """Add terminal observations and infos, as Gymnasium's own vector environments do."""
         rows, executed = np.flatnonzero(done), info["executed_action"]
-        context, places = (executed[rows], self._stepper.final_elapsed[rows]), self._stepper.final[rows]
+        context, positions = (executed[rows], self._stepper.final_elapsed[rows]), self._stepper.final[rows]
         if self._frame_stack is None:
-            last = self._stepper.seen(places, *context)
+            last = self._stepper.seen(positions, *context)
         else:
-            last = self._frame_stack.terminal(rows, self._stepper.states(places), *context)
+            last = self._frame_stack.terminal(rows, self._stepper.states(positions), *context)
         final = np.full(self.num_envs, None, object)
         for row, observation in zip(rows, _rows_of(last, len(rows)), strict=True):
             final[row] = observation
         name = self._stepper.name
         state = np.zeros_like(self._stepper.final)
-        state[rows] = places
+        state[rows] = positions
         info["final_obs"], info["_final_obs"] = final, done
         info["final_info"] = {
             name: state,

@@ -5,7 +5,7 @@ same counter and key give the same words, in whatever order they are drawn. A ke
 (draw, copy, step, stream).
 
 Each run has E copies of its environment. Every draw is named by its counter: the run is the key, and a step of a copy
-has one block of four words: a random action; the executed action; the outcome; the start of the next episode. Where
+has one block of four words: a random action; the executed action; the outcome; the start of the next episode. If
 actions may have no effect or rewards are noisy there is another block: whether there is an effect; two for the noise.
 Whether a run explores in a step is a block of its own, as one draw holds for all copies of a run.
 
@@ -14,15 +14,15 @@ Hasselt et al. (2016), double; Kingma and Ba (2015).
 
 PPO: advantages, minibatches, the clipped loss with its gradients. Sources: Schulman et al. (2016), generalised
 advantages; Schulman et al. (2017). Each function does for every run what Stable-Baselines3 does for one; docs/agents.md
-says where the arithmetic differs.
+lists the differences in arithmetic.
 """
 
 import numpy as np
-from numba import float32, njit, uint32, uint64
+from numba import float32, uint32, uint64
 from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at
-from pharos.kernels.kernel_cache import kernel
+from pharos.kernels.kernel_cache import inlined, kernel
 from pharos.kernels.outcomes import drawn_outcome, outcome, size_of
 from pharos.kernels.stepping import (
     delayed_reward,
@@ -37,17 +37,17 @@ from pharos.kernels.stepping import (
 
 MULTIPLIER_0, MULTIPLIER_1 = 0xD2511F53, 0xCD9E8D57
 WEYL_0, WEYL_1 = 0x9E3779B9, 0xBB67AE85
-ROUNDS = 10
+CIPHER_ROUNDS = 10
 MASK = 0xFFFFFFFF
-UNIT = 2.0**-32
+UINT32_UNIT = 2.0**-32
 
 
-@njit(forceinline=True)
+@inlined
 def philox(c0, c1, c2, c3, key):
     """Four words (uint64 below 2^32) of the counter (c0, c1, c2, c3) and a key of 64 bits, its low word first."""
     c0, c1, c2, c3 = uint64(c0), uint64(c1), uint64(c2), uint64(c3)
     k0, k1 = uint64(key) & uint64(MASK), uint64(key) >> uint64(32)
-    for _ in range(ROUNDS):
+    for _ in range(CIPHER_ROUNDS):
         low, high = uint64(MULTIPLIER_0) * c0, uint64(MULTIPLIER_1) * c2
         c0, c1, c2, c3 = (
             (high >> uint64(32)) ^ c1 ^ k0,
@@ -59,13 +59,13 @@ def philox(c0, c1, c2, c3, key):
     return c0, c1, c2, c3
 
 
-@njit(forceinline=True)
+@inlined
 def unit(word):
     """A word as a number in (0, 1): the middle of its interval of length 2^-32."""
-    return (np.float64(word) + 0.5) * UNIT
+    return (np.float64(word) + 0.5) * UINT32_UNIT
 
 
-@njit(forceinline=True)
+@inlined
 def below(word, n):
     """A word as an integer in [0, n), n < 2^32."""
     return np.int64((uint64(word) * uint64(n)) >> uint64(32))
@@ -82,7 +82,7 @@ def words(keys, stream, step, out):
 
 
 STEP, EXPLORE, SAMPLE, SHUFFLE, WEIGHTS, ACT = range(6)  # streams of random numbers
-DONE, TIMEOUT = 1, 2  # bits of a transition's flags
+ENDED, TIMEOUT = 1, 2  # bits of a transition's flags
 
 
 @kernel
@@ -103,7 +103,7 @@ def anneal(first, last, share, elapsed, out):
 
 
 @kernel
-def look_up(table, begins, states, out):
+def look_up_rows(table, begins, states, out):
     """out (W, pitch): the rows of a table (R, size), one after another, of the states (W, B) of each run.
 
     begins (W,): the row of each run's first state.
@@ -118,7 +118,7 @@ def look_up(table, begins, states, out):
 
 @kernel
 def choose(keys, step, explores, q, actions):
-    """Epsilon-greedy actions (W, E): random ones where a run explores, else the first of the best of q (W, E, A)."""
+    """Epsilon-greedy actions (W, E): random ones if a run explores, else the first of the best of q (W, E, A)."""
     for i in range(actions.shape[0]):
         for e in range(actions.shape[1]):
             if explores[i]:
@@ -152,7 +152,7 @@ def choose_of_sets(keys, step, explores, q, sets, actions):
 
 
 def outcome_reward(rewards, s, a, k):
-    """The reward of outcome k of (s, a), or the expected reward of (s, a) where only that is known."""
+    """The reward of outcome k of (s, a), or the expected reward of (s, a) if only that is known."""
 
 
 @overload(outcome_reward)
@@ -171,10 +171,10 @@ def start(keys, runs, starts, cumulative, state):
 
 
 @kernel
-def execute_in_sets(keys, step, chances, sets, previous, actions, executed):
+def execute_runs_in_sets(keys, step, chances, sets, previous, actions, executed):
     """executed (W, E): what is executed of chosen actions, in states with the sets (W, E, A) bool.
 
-    Draws what `advance` would draw. chances (W, 4): as in `stepping.Setting`; previous (W, E): -1 where there is none.
+    Draws what `advance` would draw. chances (W, 4): as in `stepping.Setting`; previous (W, E): -1 if there is none.
     """
     for i in range(actions.shape[0]):
         chance = (chances[i, 0], chances[i, 1], chances[i, 2], chances[i, 3])
@@ -193,14 +193,14 @@ def advance(
     """One step of every copy of `runs`, which share an MDP; episodes that have ended start anew.
 
     transitions: see kernels/outcomes.py; rewards: see `outcome_reward`; staying (S, A): the reward of an action without
-    effect, (0, 0) where all have one; terminal (S,); starts, cumulative: start states and their cumulated
+    effect, (0, 0) if all have one; terminal (S,); starts, cumulative: start states and their cumulated
     probabilities.
     setting: (keys (W,) uint64, step, chances (W, 4), limits (W,), gammas (W,)), as in `stepping.Setting`.
     knobs (W, 4): the probability that an action has no effect, the deviation of the noise of rewards, their delay in
     steps, and what they are divided by.
     pending (W, E, D): rewards earned and not paid yet; see `delayed_reward`.
     episodes: (state, previous, elapsed (W, E) int64, return, discount (W, E) float64) of the running episodes, and
-    (number, sum of returns (W,)) of the finished ones, which this step adds to where `counts` is true.
+    (number, sum of returns (W,)) of the finished ones, which this step adds to if `counts` is true.
     transition: (next state (W, E) int64, reward (W, E) float64, flags (W, E) uint8) of this step, written here; the
     reward is the paid one, returns are of earned rewards. A transition that ends an episode without a next state has
     the state itself there.
@@ -231,7 +231,7 @@ def advance(
             elapsed[i, e] += 1
             timeout = not ended and elapsed[i, e] >= limits[i]
             next_states[i, e] = s if t < 0 else t
-            flags[i, e] = (DONE if ended or timeout else 0) | (TIMEOUT if timeout else 0)
+            flags[i, e] = (ENDED if ended or timeout else 0) | (TIMEOUT if timeout else 0)
             reward[i, e] = earned / knobs[i, 3]
             if delay > 0:
                 reward[i, e] = delayed_reward(pending[i, e, :delay], elapsed[i, e] - 1, reward[i, e], ended or timeout)
@@ -276,19 +276,19 @@ def act(keys, step, scores, actions, log_probabilities):
 
 
 @kernel
-def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
+def sample(keys, step, draw, next_row, filled, gammas, num_steps, memory, batch):
     """Draw a minibatch of each run from its replay memory, uniformly, with returns of `num_steps` steps.
 
-    place: the row that is written next; filled: the number of rows that are; gammas (W,).
+    next_row: the row that is written next; filled: the number of rows that are; gammas (W,).
     memory: (state, next state (W, R, E), action (W, R, E), reward (W, R, E) float32, flags (W, R, E)).
     batch: (state, next state (W, B), action (W, B), reward (W, B) float32, discount (W, B) float32), written here:
-    discount is the factor of the value of the next state: gamma^n, 0 where the episode ended there. A return stops at
+    discount is the factor of the value of the next state: gamma^n, 0 if the episode ended there. A return stops at
     the end of an episode, at a time limit, and at the newest transition.
     """
     state, next_state, action, reward, flags = memory
     states, next_states, actions, rewards, discounts = batch
     size, copies = state.shape[1], state.shape[2]
-    last = (place - 1) % size
+    last = (next_row - 1) % size
     for i in range(states.shape[0]):
         for b in range(states.shape[1]):
             w = philox(b, draw, step, SAMPLE, keys[i])
@@ -298,23 +298,23 @@ def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
 
 
 @kernel
-def sample_histories(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
+def sample_histories(keys, step, draw, next_row, filled, gammas, num_steps, memory, batch):
     """`sample` from the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
 
     They are read from the rows before; the first state of an episode stands for those before it. Rows that were never
-    written have the flag DONE.
+    written have the flag ENDED.
     """
     state, next_state, action, reward, flags = memory
     states, next_states, actions, rewards, discounts = batch
     size, copies, frames = state.shape[1], state.shape[2], states.shape[2]
-    first, last = (place - filled) % size, (place - 1) % size
+    first, last = (next_row - filled) % size, (next_row - 1) % size
     for i in range(states.shape[0]):
         for b in range(states.shape[1]):
             w = philox(b, draw, step, SAMPLE, keys[i])
             row, e = (first + below(w[0], filled)) % size, below(w[1], copies)
             at, rewards[i, b], discounts[i, b] = _steps_from(i, row, e, last, gammas[i], num_steps, reward, flags)
             actions[i, b] = action[i, row, e]
-            # the next history is that of the last row, moved on by its next state
+            # the next history is the history of the last row, moved on by its next state
             _last_states(i, row, e, state, flags, states[i, b])
             _last_states(i, at, e, state, flags, next_states[i, b])
             for f in range(1, frames):
@@ -331,20 +331,20 @@ def _steps_from(i, row, e, last, gamma, num_steps, reward, flags):
         at = (row + n) % size
         total += factor * reward[i, at, e]
         factor *= gamma
-        if flags[i, at, e] & DONE or at == last:
+        if flags[i, at, e] & ENDED or at == last:
             break
-    ended = flags[i, at, e] & DONE and not flags[i, at, e] & TIMEOUT
+    ended = flags[i, at, e] & ENDED and not flags[i, at, e] & TIMEOUT
     return at, float32(total), float32(0.0) if ended else float32(factor)
 
 
 @kernel
 def _last_states(i, row, e, state, flags, out):
-    """out (k,) = the state of a row and those of the k - 1 rows before it, the oldest first, within its episode."""
+    """out (k,) = the state of a row and of up to k - 1 rows before it in its episode, the oldest first."""
     size = state.shape[1]
     for f in range(len(out) - 1, -1, -1):
         out[f] = state[i, row, e]
         before = row - 1 if row > 0 else size - 1
-        if not flags[i, before, e] & DONE:
+        if not flags[i, before, e] & ENDED:
             row = before
 
 
@@ -414,7 +414,7 @@ def adam(parameters, gradients, means, squares, counts, is_active, rates, max_no
 
 @kernel(fastmath={"contract"})
 def linear_row(parameters, weight, bias, x, is_relu, y):
-    """y (W, out) = x (W, in) w + b, at least 0 where `is_relu`; the weights of inputs that are 0 are not read.
+    """y (W, out) = x (W, in) w + b, at least 0 if `is_relu`; the weights of inputs that are 0 are not read.
 
     parameters (W, P) float32: w begins at `weight`, in rows of `out`, and b at `bias`.
     """
@@ -438,7 +438,7 @@ def linear_row(parameters, weight, bias, x, is_relu, y):
 def advantages(rewards, values, begins, last_values, ends, gammas, lambdas, out):
     """out (W, T, E) = generalised advantages of rollouts of T steps.
 
-    rewards, values, begins (W, T, E) float32: begins is 1 where a step is the first of an episode; last_values (W, E)
+    rewards, values, begins (W, T, E) float32: begins is 1 if a step is the first of an episode; last_values (W, E)
     of the states after the rollout, ends (W, E) whether the last step ended an episode; gammas, lambdas (W,).
     """
     num_steps, copies = rewards.shape[1], rewards.shape[2]
@@ -484,7 +484,7 @@ def gather(order, first, sources, targets):
 
 
 @kernel
-def normalize(advantages):
+def normalize_advantages(advantages):
     """Normalise advantages (W, B) in place: less the mean of each run, by its standard deviation + 1e-8; B >= 2."""
     number = advantages.shape[1]
     for i in range(advantages.shape[0]):
@@ -530,7 +530,7 @@ def clipped_loss(scores, values, minibatch, clip_ranges, entropy_weights, value_
             bound = advantage[i, b] * min(max(ratio, low), high)
             error = values[i, b, 0] - returns[i, b]
             total += -min(free, bound) - entropy_weights[i] * entropy + value_weights[i] * error * error
-            # gradients by value and scores; none through the ratio where clipping is active
+            # gradients by value and scores; none through the ratio if clipping is active
             of_log_p = -free / number if free <= bound else 0.0
             dvalues[i, b, 0] = value_weights[i] * 2.0 * error / number
             for a in range(num_actions):

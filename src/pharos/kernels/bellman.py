@@ -4,30 +4,31 @@ mdp/dynamics.py says what they mean, solvers/ proves their bounds.
 
 Common arguments: transitions: see kernels/outcomes.py; table, palette: see mdp/rewards.py; v (S + 1,) float64, under
 sticky actions (S + 1, A) by the previously executed action, with row S 0, so that index -1 reads 0; weights: (chosen,
-previous, uniform), where some actions are not available and chance depends on that with first_chosen and the sets (S,
+previous, uniform), if some actions are not available and chance depends on that with first_chosen and the sets (S,
 A) bool behind (`uniform` with the sets): means are over the available ones then, and a step after one that is not is
 as the first one; choice: 1.0 maximises, -1.0 minimises, (S,) integers are the actions of a policy; actions: A zeros,
-see `actions_of`. Each sweep goes from the last state to the first, of an order (S,) or, where that is None, of their
+see `actions_of`. Each sweep goes from the last state to the first, of an order (S,) or, if that is None, of their
 numbers, and returns the largest change of an entry.
 
-Topological orders, in which each state comes before those that it may lead to: (S,) states, or None for that of their
-numbers. Source: Kahn (1962). live (S,) bool: states whose transitions count; what leads to -1 leads nowhere. Strongly
-connected components: sets of states each of which can come to each other, in topological order. Source: Tarjan (1972);
-with one number for each state: Pearce (2016), "A space-efficient algorithm for finding strongly connected components".
+Topological orders, in which each state comes before those that it may lead to: (S,) states, or None for the order of
+their numbers. Source: Kahn (1962). live (S,) bool: states whose transitions count; what leads to -1 leads nowhere.
+Strongly connected components: sets of states each of which can come to each other, in topological order. Source: Tarjan
+(1972); with one number for each state: Pearce (2016), "A space-efficient algorithm for finding strongly connected
+components".
 """
 
 import numpy as np
-from numba import njit, types, uint64
+from numba import types, uint64
 
 from pharos.kernels.interpreted import interpreted_first, overload
-from pharos.kernels.kernel_cache import kernel
-from pharos.kernels.outcomes import expectation, fetch_values, outcome, outcomes_of, size_of
+from pharos.kernels.kernel_cache import inlined, kernel
+from pharos.kernels.outcomes import expectation, fetch_values, outcome, outcome_numbers, size_of
 
 # Orders ---------------------------------------------------------------------------------------------------------------
 
 
 def state_at(order, i):
-    """The state at place i of an order; i itself where the order is None."""
+    """The state at index i of an order; i itself if the order is None."""
 
 
 @overload(state_at)
@@ -48,7 +49,7 @@ def is_increasing(transitions, live, age):
     for s in range(num_states):
         if live[s]:
             for a in range(num_actions):
-                for k in outcomes_of(transitions, s, a):
+                for k in outcome_numbers(transitions, s, a):
                     t, _ = outcome(transitions, s, a, k)
                     if t >= 0 and state_at(age, t) <= state_at(age, s):
                         return s, a, np.int64(t)
@@ -58,7 +59,7 @@ def is_increasing(transitions, live, age):
 @interpreted_first()
 @kernel
 def topological_order(transitions, live):
-    """States in topological order, without those of a cycle and all that they lead to.
+    """States in topological order, without the states of cycles and all that these lead to.
 
     Cost: two passes over the transitions; 16 bytes a state.
     """
@@ -67,7 +68,7 @@ def topological_order(transitions, live):
     for s in range(num_states):
         if live[s]:
             for a in range(num_actions):
-                for k in outcomes_of(transitions, s, a):
+                for k in outcome_numbers(transitions, s, a):
                     t, _ = outcome(transitions, s, a, k)
                     if t >= 0:
                         waiting[t] += 1
@@ -86,7 +87,7 @@ def topological_order(transitions, live):
         if not live[s]:
             continue
         for a in range(num_actions):
-            for k in outcomes_of(transitions, s, a):
+            for k in outcome_numbers(transitions, s, a):
                 t, _ = outcome(transitions, s, a, k)
                 if t >= 0:
                     waiting[t] -= 1
@@ -108,7 +109,7 @@ def longest_path(transitions, live, order):
         if live[s]:
             edges = 0
             for a in range(num_actions):
-                for k in outcomes_of(transitions, s, a):
+                for k in outcome_numbers(transitions, s, a):
                     t, _ = outcome(transitions, s, a, k)
                     if t >= 0:
                         edges = max(edges, length[t] + 1)
@@ -120,18 +121,18 @@ def longest_path(transitions, live, order):
 # Backups --------------------------------------------------------------------------------------------------------------
 
 
-UNROLLED = 128  # actions
+UNROLLED_ACTIONS = 128  # actions
 # States between the one whose values are fetched and the one that is backed up: memory has that long to answer.
-AHEAD = 32
+FETCHED_AHEAD = 32
 
 
 def actions_of(num_actions: int, unrolled: bool) -> "tuple[int, ...] | np.ndarray":
     """The argument `actions`, A zeros: an array, or, if sweeps are unrolled (`is_unrolled`), a tuple.
 
     The compiler knows a tuple's length and unrolls the loops over actions: sweeps are 3 to 4 times as fast, and each
-    number of actions is compiled by itself (minutes, for more than UNROLLED).
+    number of actions is compiled by itself (minutes, for more than UNROLLED_ACTIONS).
     """
-    return (0,) * num_actions if num_actions <= UNROLLED and unrolled else np.zeros(num_actions, np.int8)
+    return (0,) * num_actions if num_actions <= UNROLLED_ACTIONS and unrolled else np.zeros(num_actions, np.int8)
 
 
 def reward_at(table, palette, s, a):
@@ -146,7 +147,7 @@ def _reward_at(table, palette, s, a):
 
 
 def set_has(weights, s, a):
-    """Whether action a is available in state s, by weights with sets behind; True where they have none."""
+    """Whether action a is available in state s, by weights with sets behind; True if they have none."""
 
 
 @overload(set_has, jit_options={"forceinline": True})
@@ -179,7 +180,7 @@ def _set_size(weights, s, actions):
 
 
 def as_first(weights, choice_value, mean):
-    """The value of a step as the first one, from that of the choice and the mean over available actions."""
+    """The value of a step as the first one, from the value of the choice and the mean over available actions."""
 
 
 @overload(as_first, jit_options={"forceinline": True})
@@ -241,11 +242,11 @@ def _backup_of(transitions, table, palette, gamma, uniform, choice, v, actions, 
 @interpreted_first()
 @kernel(makes_arrays=False)
 def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, actions, order, start, stop):
-    """v[s] = (1 - uniform) q(s, choice) + uniform mean_a q(s, a), in place, for places [start, stop) of the order."""
+    """v[s] = (1 - uniform) q(s, choice) + uniform mean_a q(s, a), in place, for indices [start, stop) of the order."""
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
-        if i >= start + AHEAD:
-            fetch_values(transitions, v, actions, state_at(order, i - AHEAD))
+        if i >= start + FETCHED_AHEAD:
+            fetch_values(transitions, v, actions, state_at(order, i - FETCHED_AHEAD))
         s = state_at(order, i)
         value = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
         change = max(change, abs(value - v[uint64(s)]))
@@ -260,12 +261,12 @@ def optimal_backup(transitions, table, palette, gamma, uniform, choice, v, out, 
     for i in range(len(runs)):
         stop = runs[i, 1]
         for s in range(runs[i, 0], stop):
-            if s + AHEAD < stop:
-                fetch_values(transitions, v, actions, s + AHEAD)
+            if s + FETCHED_AHEAD < stop:
+                fetch_values(transitions, v, actions, s + FETCHED_AHEAD)
             out[uint64(s)] = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
 
 
-@njit(forceinline=True)
+@inlined
 def _sticky_values(transitions, table, palette, gamma, weights, choice, v, actions, q, s):
     """q[a] = r(s, a) + gamma v(next, a). Returns (q of the choice, sum of q of available actions)."""
     total = 0.0
@@ -278,7 +279,7 @@ def _sticky_values(transitions, table, palette, gamma, weights, choice, v, actio
 
 
 def act_as_first(weights, q, actions, s):
-    """Replace entries of q (A,) of actions that are not available by that of the first one that is."""
+    """Replace entries of q (A,) of actions that are not available by the entry of the first one that is."""
 
 
 @overload(act_as_first, jit_options={"forceinline": True})
@@ -298,7 +299,7 @@ def _act_as_first(weights, q, actions, s):
 
 
 def _choice_value(choice, q, actions, s):
-    """The entry of q (A,) that `choice` takes: the best, the worst, or that of the policy's action."""
+    """The entry of q (A,) that `choice` takes: the best, the worst, or the entry of the policy's action."""
 
 
 @overload(_choice_value, jit_options={"forceinline": True})
@@ -320,13 +321,13 @@ def _choice_value_of(choice, q, actions, s):
 def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions, q, order, start, stop):
     """v[s, b] = chosen q(s, choice) + previous q(s, b) + uniform mean_a q(s, a), in place.
 
-    v (S + 1, A); q (A,) scratch; for places [start, stop) of the order.
+    v (S + 1, A); q (A,) scratch; for indices [start, stop) of the order.
     """
     chosen_weight, previous_weight, uniform_weight = weights[0], weights[1], weights[2]
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
-        if i >= start + AHEAD:
-            fetch_values(transitions, v, actions, state_at(order, i - AHEAD))
+        if i >= start + FETCHED_AHEAD:
+            fetch_values(transitions, v, actions, state_at(order, i - FETCHED_AHEAD))
         s = state_at(order, i)
         best, total = _sticky_values(transitions, table, palette, gamma, weights, choice, v, actions, q, s)
         shared = chosen_weight * best + uniform_weight * total / set_size(weights, s, actions)
@@ -347,8 +348,8 @@ def sticky_backup(transitions, table, palette, gamma, weights, choice, v, out, a
     for i in range(len(runs)):
         stop = runs[i, 1]
         for s in range(runs[i, 0], stop):
-            if s + AHEAD < stop:
-                fetch_values(transitions, v, actions, s + AHEAD)
+            if s + FETCHED_AHEAD < stop:
+                fetch_values(transitions, v, actions, s + FETCHED_AHEAD)
             best, total = _sticky_values(transitions, table, palette, gamma, weights, choice, v, actions, q, s)
             shared = chosen_weight * best + uniform_weight * total / set_size(weights, s, actions)
             for b in range(len(actions)):
@@ -357,7 +358,7 @@ def sticky_backup(transitions, table, palette, gamma, weights, choice, v, out, a
                     out[uint64(s), b] = as_first(weights, best, total / set_size(weights, s, actions))
 
 
-@njit(forceinline=True)
+@inlined
 def _policy_value(transitions, table, palette, gamma, weights, policy, v, actions, s):
     """sum_a (chosen policy[s, a] + uniform / A) q(s, a): the backup of v at s."""
     chosen_weight, uniform_share = weights[0], weights[2] / set_size(weights, s, actions)
@@ -390,7 +391,7 @@ def policy_backup(transitions, table, palette, gamma, weights, policy, v, out, a
             out[s] = _policy_value(transitions, table, palette, gamma, weights, policy, v, actions, s)
 
 
-@njit(forceinline=True)
+@inlined
 def _sticky_policy_values(transitions, table, palette, gamma, weights, policy, v, actions, q, values, s):
     """values[b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b); q (A,) scratch."""
     chosen_weight, previous_weight, uniform_weight = weights[0], weights[1], weights[2]
@@ -398,7 +399,7 @@ def _sticky_policy_values(transitions, table, palette, gamma, weights, policy, v
     looks_back = policy.shape[1] > 1
     for a in range(len(actions)):
         q[a] = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
-    # the mean under the policy, once where it does not depend on the previous action b
+    # the mean under the policy, once if it does not depend on the previous action b
     shared, choice_value, total = 0.0, 0.0, 0.0
     for b in range(len(actions)):
         if b == 0 or looks_back:
@@ -418,7 +419,7 @@ def _sticky_policy_values(transitions, table, palette, gamma, weights, policy, v
 def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, actions, q, values, order, start, stop):
     """v[s, b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b), in place.
 
-    v (S + 1, A). policy (S, B, A): B is A, or 1 where the previous action does not matter. q, values (A,) scratch.
+    v (S + 1, A). policy (S, B, A): B is A, or 1 if the previous action does not matter. q, values (A,) scratch.
     """
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
@@ -441,14 +442,14 @@ def sticky_policy_backup(transitions, table, palette, gamma, weights, policy, v,
 
 @interpreted_first()
 @kernel
-def chain_values(successor, reward, gamma, v, order):
+def solve_chain(successor, reward, gamma, v, order):
     """Exact values on the graph of a deterministic policy: successor (S,), -1 ends; reward (S,); v gets the values.
 
     Every walk runs into the end, into a state already done, or into a new cycle, whose value is the geometric series of
     its rewards. order (S,) is scratch. Returns a state on a cycle whose value is infinite (gamma = 1), or -1.
     """
     num_states = len(successor)
-    mark = np.zeros(num_states, np.int64)  # 0 new, i + 1 on the walk at place i, -1 done
+    mark = np.zeros(num_states, np.int64)  # 0 new, i + 1 on the walk at index i, -1 done
     for start in range(num_states):
         if mark[start] != 0:
             continue
@@ -461,7 +462,7 @@ def chain_values(successor, reward, gamma, v, order):
             mark[s] = length
             s = successor[s]
         last = length
-        if s >= 0 and mark[s] > 0:  # a new cycle: places mark[s] - 1 to length - 1
+        if s >= 0 and mark[s] > 0:  # a new cycle: indices mark[s] - 1 to length - 1
             first = mark[s] - 1
             total = 0.0
             factor = 1.0
@@ -501,11 +502,11 @@ def number_components(transitions, live, component, path, waiting):
     Cost: one look at each transition, in the order of a depth-first search; 9 bytes a state on top.
     """
     num_states, num_actions = size_of(transitions)
-    action = np.empty(num_states, np.int32)  # of the states on the path, where to go on looking
+    action = np.empty(num_states, np.int32)  # of the states on the path: the action to go on with
     branch = np.empty(num_states, np.int32)
     is_root = np.empty(num_states, np.bool_)  # whether a state of the path is the first one seen of its component
     component[:] = 0
-    number, last = 1, num_states  # numbers of states on the way go up from 1, those of finished components down from S
+    number, last = 1, num_states  # numbers of states on the way go up from 1, of finished components down from S
     tail = 0
     for start in range(num_states):
         depth = -1
@@ -523,7 +524,7 @@ def number_components(transitions, live, component, path, waiting):
             if live[s]:
                 a, k = np.int64(action[depth]), np.int64(branch[depth])
                 while a < num_actions and next_state == s:
-                    while k < len(outcomes_of(transitions, s, a)):
+                    while k < len(outcome_numbers(transitions, s, a)):
                         t, _ = outcome(transitions, s, a, k)
                         if t >= 0 and component[t] == 0:
                             next_state = np.int64(t)  # and look at this transition again, when it is finished
@@ -558,7 +559,7 @@ def number_components(transitions, live, component, path, waiting):
 
 @kernel(makes_arrays=False)
 def component_order(transitions, live, component, first, is_cyclic, order):
-    """order (S,) = the states by component, ascending in each; those of component c from first[c] to first[c + 1].
+    """order (S,) = the states by component, ascending in each; the states of component c from first[c] to first[c + 1].
 
     is_cyclic[c] = whether a state of c can be visited again. first (C + 1,): zero before.
     """
@@ -566,7 +567,7 @@ def component_order(transitions, live, component, first, is_cyclic, order):
     count = len(is_cyclic)
     for s in range(num_states):
         first[component[s]] += 1
-    # counting sort: sizes, then where each component begins; several states form a cycle
+    # counting sort: sizes, then the beginning of each component; several states form a cycle
     total = 0
     for c in range(count + 1):
         size = first[c]
@@ -579,7 +580,7 @@ def component_order(transitions, live, component, first, is_cyclic, order):
         first[c] += 1
         if live[s] and not is_cyclic[c]:
             for a in range(num_actions):
-                for k in outcomes_of(transitions, s, a):
+                for k in outcome_numbers(transitions, s, a):
                     t, _ = outcome(transitions, s, a, k)
                     is_cyclic[c] |= t == s
     # `first` points to the ends now: shift it back
@@ -589,7 +590,7 @@ def component_order(transitions, live, component, first, is_cyclic, order):
 
 
 @kernel
-def joined(first, is_cyclic, least):
+def joined_components(first, is_cyclic, least):
     """(starts (G + 1,) in the order, whether each group has a cycle): neighbouring components joined into groups.
 
     Components without a cycle are joined as long as they follow each other; one with a cycle is joined by those that
@@ -629,9 +630,9 @@ def sweep_groups(
 ):
     """Sweep group by group, from the last to the first, each until it changes by at most `target`, or by its rounding.
 
-    starts, has_cycle: as from `joined`; rounding: a change that is no more than rounding, relative to the values.
-    max_backups: after so many each group that is left is swept once. largest_before: the largest absolute value so far.
-    The other arguments are those of all backups.
+    starts, has_cycle: as from `joined_components`; rounding: a change that is no more than rounding, relative to the
+    values. max_backups: after so many each group that is left is swept once. largest_before: the largest absolute value
+    so far. The other arguments are the arguments of all backups.
     """
     for group in range(len(has_cycle) - 1, -1, -1):
         change, largest = np.inf, largest_before
@@ -652,7 +653,7 @@ def sweep_groups(
 def lengthen_paths(next_states, rewards, ends, v, is_reached, action):
     """Make the longest paths so far longer by single steps, in place, from the last state to the first.
 
-    v (S + 1,): what the path from each state to the end pays, where is_reached; row S is the end. rewards (S, A) and v
+    v (S + 1,): what the path from each state to the end pays, if is_reached; row S is the end. rewards (S, A) and v
     are whole numbers. action (S,): the first step of the path; -1: it stops there. Rows of ends (S,) bool do not count.
     Returns how many it changed. Source: Bellman (1958), Ford (1956).
     """

@@ -8,7 +8,7 @@ component is carried beside its rows: no difference from 1 is taken.
 Nodes come by strongly connected component, those that lead to no other one first: no component fills in another one.
 Row n has the entries node[k], weight[k] for k from first[n] to first[n + 1]; its component has the nodes begin[n] to
 stop[n]. In components the pattern of a factor is symmetric: row n of `upper` has the columns up_node of up_first[n] to
-up_first[n + 1], which are above n; that of `lower` low_node, below n.
+up_first[n + 1], which are above n; `lower` has low_node, below n.
 
 Numbers are float64; or pairs of them, held as complex numbers, whose sum real + imag has 106 bits.
 Source: Grassmann, Taksar and Heyman (1985); O'Cinneide (1993), "Entrywise perturbation theory and error analysis for
@@ -21,7 +21,7 @@ from numba import types
 from pharos.kernels.interpreted import interpreted_first, overload
 from pharos.kernels.kernel_cache import kernel
 
-ROUNDING = 2.0**-44  # more than sums lose
+SUM_LOSS = 2.0**-44  # more than sums lose
 SPLITTER = 2.0**27 + 1  # times a float, it splits it into halves of 26 bits
 
 
@@ -87,7 +87,7 @@ def substitute(first, node, weight, begin, stop, up_first, up_node, low_first, l
 @kernel(makes_arrays=False)
 def improve(first, node, weight, rows, rewards, backward, v, policy):
     """Sweep v (N + 1,) in place to the best of the rows of each node, from rows[n] to rows[n + 1], and keep that row in
-    policy (N,) where it is better beyond rounding; returns how many were."""
+    policy (N,) if it is better beyond rounding; returns how many were."""
     count, size = 0, len(policy)
     for i in range(size):
         n = size - 1 - i if backward else i
@@ -97,7 +97,7 @@ def improve(first, node, weight, rows, rewards, backward, v, policy):
                 total += weight[k] * v[node[k]]
                 leaving += weight[k]
             value = total / leaving
-            if value - v[n] > ROUNDING * (abs(value) + abs(v[n]) + abs(rewards[row]) / leaving):
+            if value - v[n] > SUM_LOSS * (abs(value) + abs(v[n]) + abs(rewards[row]) / leaving):
                 v[n], policy[n] = value, row
                 count += 1
     return count
@@ -107,11 +107,11 @@ def improve(first, node, weight, rows, rewards, backward, v, policy):
 
 
 def plus(x, y):
-    """x + y, as accurate as x is held; y may be a float where x is a pair."""
+    """x + y, as accurate as x is held; y may be a float if x is a pair."""
 
 
 def times(x, y):
-    """x y, as accurate as x is held; y may be a float where x is a pair."""
+    """x y, as accurate as x is held; y may be a float if x is a pair."""
 
 
 def over(x, y):

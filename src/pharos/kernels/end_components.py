@@ -2,7 +2,7 @@
 
 Common arguments: transitions: see kernels/outcomes.py. Node n = s W + b is the state s after the executed action b; W =
 A under sticky actions, else 1. A choice a of a node executes a, its b or any action, as the weights (chosen, previous,
-uniform) have it, and an executed action e leads from s to nodes t W + e, or t where W is 1. With first_chosen and the
+uniform) have it, and an executed action e leads from s to nodes t W + e, or t if W is 1. With first_chosen and the
 sets of available actions behind the weights, a b that is not available counts as none, and a uniform action is one that
 is. allowed (N, A) bool: the choices that count; count (N,) integers: how many a node has.
 
@@ -18,7 +18,7 @@ from numba import types
 from pharos.kernels.bellman import set_has
 from pharos.kernels.interpreted import interpreted_first, overload
 from pharos.kernels.kernel_cache import kernel
-from pharos.kernels.outcomes import outcome, outcomes_of, size_of
+from pharos.kernels.outcomes import outcome, outcome_numbers, size_of
 
 
 def weights_after(weights, s, b):
@@ -53,7 +53,7 @@ def may_execute(weights, allowed, count, n, s, b, e):
 
 @interpreted_first()
 @kernel
-def number_components(transitions, weights, allowed, count, component, path, waiting):
+def number_node_components(transitions, weights, allowed, count, component, path, waiting):
     """component[n] = the number of the strongly connected component of n; returns how many there are.
 
     A component has a smaller number than those that it leads to. component, path, waiting (N,) integers; the last two
@@ -62,11 +62,11 @@ def number_components(transitions, weights, allowed, count, component, path, wai
     num_states, num_actions = size_of(transitions)
     num_nodes = len(component)
     width = num_nodes // num_states
-    action = np.empty(num_nodes, np.int32)  # of the nodes on the path, where to go on looking
+    action = np.empty(num_nodes, np.int32)  # of the nodes on the path: the action to go on with
     branch = np.empty(num_nodes, np.int32)
     is_root = np.empty(num_nodes, np.bool_)  # whether a node of the path is the first one seen of its component
     component[:] = 0
-    number, last = 1, num_nodes  # numbers of nodes on the way go up from 1, those of finished components down from N
+    number, last = 1, num_nodes  # numbers of nodes on the way go up from 1, numbers of finished components down from N
     tail = 0
     for start in range(num_nodes):
         depth = -1
@@ -87,7 +87,7 @@ def number_components(transitions, weights, allowed, count, component, path, wai
                 if not may_execute(weights, allowed, count, n, s, n - s * width, e):
                     e, k = e + 1, np.int64(0)
                     continue
-                while k < len(outcomes_of(transitions, s, e)):
+                while k < len(outcome_numbers(transitions, s, e)):
                     t, _ = outcome(transitions, s, e, k)
                     if t >= 0:
                         m = np.int64(t) * width + (e if width > 1 else 0)
@@ -141,7 +141,7 @@ def remove_leaving(transitions, weights, component, allowed, count, leaves):
         for e in range(num_actions):
             leaves[e] = False
             if may_execute(weights, allowed, count, n, s, b, e):
-                for k in outcomes_of(transitions, s, e):
+                for k in outcome_numbers(transitions, s, e):
                     t, _ = outcome(transitions, s, e, k)
                     m = np.int64(t) * width + (e if width > 1 else 0)
                     if t < 0 or component[m] != component[n] or count[m] == 0:

@@ -2,9 +2,9 @@
 
 gap (N, A) float64 >= 0, 0 for the best actions; counted (N,) int64, how often a row counts.
 
-A tie is proven where equal values have equal rewards and next values. The map from a value to these: places (C, 3)
-int64, or (C, 5) where there are several previous actions, with open addressing: the bits of a value (FREE where there
-is none), of the reward and the value that follow, and of those of the previous action; C is a power of two.
+A tie is proven if equal values have equal rewards and next values. The map from a value to these: entries (C, 3)
+int64, or (C, 5) if there are several previous actions, with open addressing: the bits of a value (FREE if there
+is none), of the reward and the value that follow, and the same two of the previous action; C is a power of two.
 """
 
 import math
@@ -30,7 +30,7 @@ def empty_sums() -> np.ndarray:
 
 
 def empty_counts() -> np.ndarray:
-    """(3,) zeros: gaps that exceed the tolerance, those in (0, tolerance], and those of 0 beyond the first of a row."""
+    """(3,) zeros: gaps that exceed the tolerance, those in (0, tolerance], and gaps of 0 beyond the first of a row."""
     return np.zeros(3, np.int64)
 
 
@@ -72,7 +72,7 @@ def add_up(gap, weight, counted, minimal, tolerance, error, regularizer, sums, c
         regularized = 0.0
         for a in range(gap.shape[1]):
             regularized += 1.0 / (gap[i, a] + regularizer)
-        _add(sums, 3, weight[i] * regularized)
+        _add_exactly(sums, 3, weight[i] * regularized)
         # sums and counts of one row, added as often as it counts
         times = counted[i]
         if times == 0:
@@ -94,14 +94,14 @@ def add_up(gap, weight, counted, minimal, tolerance, error, regularizer, sums, c
         counts[1] += times * (gap.shape[1] - num_large - num_zero)
         counts[2] += times * (num_zero - 1)
         if num_large:
-            _add(sums, 0, times * total)
-            _add(sums, 1, times * low)
-            _add(sums, 2, times * high)
+            _add_exactly(sums, 0, times * total)
+            _add_exactly(sums, 1, times * low)
+            _add_exactly(sums, 2, times * high)
     return minimal
 
 
 @kernel
-def _add(sums, k, value):
+def _add_exactly(sums, k, value):
     """Add a value to sum k (Kahan's algorithm): its error is two units, however many numbers there are."""
     value -= sums[1, k]
     total = sums[0, k] + value
@@ -112,26 +112,26 @@ def _add(sums, k, value):
 # Ties -----------------------------------------------------------------------------------------------------------------
 
 
-FREE = -1  # the bits of a NaN, which no value is
+FREE_KEY = -1  # the bits of a NaN, which no value is
 
 
 @interpreted_first("gap")
 @kernel
-def extend(values, rewards, next_values, gap, counted, begin, places, filled):
-    """Map values[i, b] to (rewards, next_values) of the best actions; where there are several b, also to those of b.
+def extend(values, rewards, next_values, gap, counted, begin, entries, filled):
+    """Map values[i, b] to (rewards, next_values) of the best actions; if there are several b, also to those under b.
 
     values (N, W), rewards, next_values (N, A): int64, the bits of floats. The best actions of a row have the same
     value, so they must have the same rewards and next values; then one of them stands for all.
 
     Returns:
-        (i, filled): where it stopped, because all are done (i = N) or half of the places are taken, and how many those
-        are; i = -1 where a value has two different rows.
+        (i, filled): the row at which it stopped, because all are done (i = N) or half of the entries are taken, and how
+        many those are; i = -1 if a value has two different rows.
     """
     num_actions, width = gap.shape[1], values.shape[1]
     for i in range(begin, len(gap)):
         if counted[i] == 0:
             continue
-        if 2 * (filled + width) >= len(places):
+        if 2 * (filled + width) >= len(entries):
             return i, filled
         # a best action, with which all other ones must agree
         best = -1
@@ -146,7 +146,7 @@ def extend(values, rewards, next_values, gap, counted, begin, places, filled):
             continue
         # its reward and next value, by the value of the state
         for b in range(width):
-            put = _put(values[i, b], rewards[i, best], next_values[i, best], rewards[i, b], next_values[i, b], places)
+            put = _put(values[i, b], rewards[i, best], next_values[i, best], rewards[i, b], next_values[i, b], entries)
             if put < 0:
                 return -1, filled
             filled += put
@@ -155,43 +155,43 @@ def extend(values, rewards, next_values, gap, counted, begin, places, filled):
 
 @interpreted_first()
 @kernel
-def refill(old_places, places):
+def refill(old_entries, entries):
     """Copy a map into a larger one."""
-    for i in range(len(old_places)):
-        if old_places[i, 0] != FREE:
-            place = _place(old_places[i, 0], places)
-            for k in range(places.shape[1]):
-                places[place, k] = old_places[i, k]
+    for i in range(len(old_entries)):
+        if old_entries[i, 0] != FREE_KEY:
+            index = _entry_of(old_entries[i, 0], entries)
+            for k in range(entries.shape[1]):
+                entries[index, k] = old_entries[i, k]
 
 
 @kernel
-def _put(key, reward, next_value, other_reward, other_next_value, places):
-    """Enter a key with its row; returns 1 where the key is new, 0 where it has this row, -1 where it has another."""
-    place = _place(key, places)
-    is_new = places[place, 0] == FREE
+def _put(key, reward, next_value, other_reward, other_next_value, entries):
+    """Enter a key with its row; returns 1 if the key is new, 0 if it has this row, -1 if it has another."""
+    index = _entry_of(key, entries)
+    is_new = entries[index, 0] == FREE_KEY
     if is_new:
-        places[place, 0], places[place, 1], places[place, 2] = key, reward, next_value
-    elif places[place, 1] != reward or places[place, 2] != next_value:
+        entries[index, 0], entries[index, 1], entries[index, 2] = key, reward, next_value
+    elif entries[index, 1] != reward or entries[index, 2] != next_value:
         return -1
-    if places.shape[1] > 3:
+    if entries.shape[1] > 3:
         if is_new:
-            places[place, 3], places[place, 4] = other_reward, other_next_value
-        elif places[place, 3] != other_reward or places[place, 4] != other_next_value:
+            entries[index, 3], entries[index, 4] = other_reward, other_next_value
+        elif entries[index, 3] != other_reward or entries[index, 4] != other_next_value:
             return -1
     return 1 if is_new else 0
 
 
 @kernel
-def _place(key, places):
-    """The place of a key in the map, or the free one where it belongs.
+def _entry_of(key, entries):
+    """The index of a key in the map, or of the free entry in which it belongs.
 
-    Its hash is the finalizer of SplitMix64: similar floats go to different places.
+    Its hash is the finalizer of SplitMix64: similar floats go to different entries.
     """
     z = np.uint64(key)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    mask = len(places) - 1
-    place = np.int64(z ^ (z >> np.uint64(31))) & mask
-    while places[place, 0] != FREE and places[place, 0] != key:
-        place = (place + 1) & mask
-    return place
+    mask = len(entries) - 1
+    index = np.int64(z ^ (z >> np.uint64(31))) & mask
+    while entries[index, 0] != FREE_KEY and entries[index, 0] != key:
+        index = (index + 1) & mask
+    return index

@@ -1,10 +1,10 @@
 """Breadth-first searches, eccentricities, periods and symmetries of the graph of a deterministic MDP.
 
-Nodes are the S states and, where some transition is -1, one more: node S, the implicit end of an episode. `ends` (S,)
+Nodes are the S states and, if some transition is -1, one more: node S, the implicit end of an episode. `ends` (S,)
 bool marks states whose row is not followed (terminal states). With `start` >= 0 every such state and node S lead to
 `start` in one step, without that edge being stored; with `start` = -1 they lead nowhere.
 
-Searches go forward on the table of next states and backward on a reversed copy. Distances are in steps, -1 where there
+Searches go forward on the table of next states and backward on a reversed copy. Distances are in steps, -1 if there
 is no path. `queue` is scratch of one entry a node; after a search it holds the nodes found, in the order of their
 distance.
 
@@ -21,7 +21,7 @@ import numpy as np
 
 from pharos.kernels.interpreted import interpreted_first
 from pharos.kernels.kernel_cache import kernel
-from pharos.kernels.outcomes import outcome, outcomes_of, size_of
+from pharos.kernels.outcomes import outcome, outcome_numbers, size_of
 
 
 @interpreted_first()
@@ -29,7 +29,7 @@ from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 def search(table, reverse, start, source, distance, queue):
     """distance[v] = steps from `source` to v by the table, or from v to `source` by the reversed graph.
 
-    table: (next_states, ends), or None; reverse, where table is None: (first, previous) of `reversed_graph`, and the
+    table: (next_states, ends), or None; reverse, if table is None: (first, previous) of `reversed_graph`, and the
     nodes that lead to `start`. Returns (nodes found, largest distance, sum of distances).
     """
     if reverse is not None:
@@ -86,7 +86,7 @@ def search(table, reverse, start, source, distance, queue):
 def fill_predecessors(next_states, ends, first, previous):
     """previous[first[v] : first[v + 1]] = distinct predecessors of v other than v, by rows that are followed.
 
-    `first` is shifted by one place before: first[v + 1] is where v begins; the call moves it to where v ends. Where
+    `first` is shifted by one place before: first[v + 1] is the beginning of v; the call moves it to the end of v. If
     `previous` is None, the call counts only: first (zero before) becomes the number of predecessors, one place ahead.
     """
     num_states, num_actions = next_states.shape
@@ -122,7 +122,7 @@ def reversed_graph(next_states, ends, num_nodes):
     small = next_states.size < 2**31
     counts = np.zeros(num_nodes + 2, np.int32 if small else np.int64)
     fill_predecessors(next_states, ends, counts[1:], None)
-    first = np.cumsum(counts, dtype=counts.dtype)  # first[v + 1] is where v begins: the fill moves it to where v ends
+    first = np.cumsum(counts, dtype=counts.dtype)  # first[v + 1]: beginning of v; the fill moves it to its end
     previous = np.empty(first[-1], next_states.dtype)
     fill_predecessors(next_states, ends, first[:-1], previous)
     return first[:-1], previous
@@ -147,7 +147,7 @@ def bound_eccentricities(from_pivot, to_pivot, out_pivot, in_pivot, out_lower, o
 @interpreted_first()
 @kernel
 def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
-    """Summary of the nodes whose eccentricity may exceed `best`: how many are open, and where to search next.
+    """Summary of the nodes whose eccentricity may exceed `best`: how many are open, and the node to search from next.
 
     Returns (open out, open in, node of the largest upper bound out, the same in, open node in the middle): the middle
     is the least sum of lower bounds; ties of upper bounds go to the larger lower bound.
@@ -192,7 +192,7 @@ def onwards(transitions, nodes, n, next_nodes, is_visited):
     count = 0
     for i in range(n):
         for a in range(size_of(transitions)[1]):
-            for j in outcomes_of(transitions, nodes[i], a):
+            for j in outcome_numbers(transitions, nodes[i], a):
                 t, _ = outcome(transitions, nodes[i], a, j)
                 if t >= 0 and not is_visited[t]:
                     is_visited[t] = True
@@ -208,7 +208,7 @@ def onwards(transitions, nodes, n, next_nodes, is_visited):
 def lower_backward(next_states, ends, start, distance, far, first, stop):
     """distance[u] = min(distance[u], 1 + the least distance of its successors), for rows [first, stop), last one first.
 
-    Returns how many it lowered; -1 where a distance reaches `far`.
+    Returns how many it lowered; -1 if a distance reaches `far`.
     """
     num_states, num_actions = next_states.shape
     lowered = 0
@@ -233,7 +233,7 @@ def lower_backward(next_states, ends, start, distance, far, first, stop):
 def lower_forward(next_states, ends, start, distance, far, first, stop):
     """distance[v] = min(distance[v], distance[u] + 1) for the successors v of rows u in [first, stop), first one first.
 
-    Returns how many it lowered; -1 where a distance reaches `far`.
+    Returns how many it lowered; -1 if a distance reaches `far`.
     """
     num_states, num_actions = next_states.shape
     lowered = 0
@@ -273,7 +273,7 @@ def summary(distance, far):
 def period(next_states, ends, start, level, has_end):
     """Greatest common divisor of level(u) + 1 - level(v) over all edges (u, v), that is, of the lengths of all cycles.
 
-    level[v] = distance from some node to v. The graph must be strongly connected. 0 where there is no edge.
+    level[v] = distance from some node to v. The graph must be strongly connected. 0 if there is no edge.
     """
     num_states, num_actions = next_states.shape
     divisor = np.int64(0)
@@ -300,8 +300,8 @@ def last_gap(next_states, ends, start, order, layer_first, position, current, co
     """Largest k such that some node does not yet reach its whole layer in exactly k steps.
 
     Every edge leads from layer j to layer j + 1 modulo P. order (N,): the nodes by layer, layer_first (P + 1,),
-    position (N,): place of a node in its layer. current, coming: (widest layer, words) uint64 scratch.
-    Returns (gap, table entries read); the gap is -1 where layers are single nodes, -2 where it is at least P, -3 where
+    position (N,): index of a node in its layer. current, coming: (widest layer, words) uint64 scratch.
+    Returns (gap, table entries read); the gap is -1 if layers are single nodes, -2 if it is at least P, -3 if
     `max_reads` were not enough.
 
     f(j) = first k for which every node of layer j reaches layer j + k whole; f(j) <= f(j + 1) + 1. So going down from a
@@ -371,14 +371,14 @@ def search_in_step(
     """Search backward from many targets at once, a bit each, so that all searches stand in the same layer at each tick.
 
     Every edge leads from layer j to layer j + 1 modulo P; states that end lead nowhere. So a tick reads one layer,
-    where searches that keep step by their levels read as many as they have targets in different layers. From a node v
+    whereas searches that keep step by their levels read as many as they have targets in different layers. From a node v
     there is another way to target i, of home[v] + away[i] steps.
 
-    order (N,): the nodes by layer, layer_first (P + 1,), position (N,): place of a node in its layer. Target i joins at
-    tick offset[i], ascending from 0; `layer` is that of the first. scratch (2, widest layer, words) uint64; visits
-    (N, words) uint64, zero before: by place in `order`, the targets that a node reaches.
+    order (N,): the nodes by layer, layer_first (P + 1,), position (N,): index of a node in its layer. Target i joins at
+    tick offset[i], ascending from 0; `layer` is the layer of the first. scratch (2, widest layer, words) uint64; visits
+    (N, words) uint64, zero before: by index in `order`, the targets that a node reaches.
     Returns table entries read. largest[i], `best` before, becomes the largest over all nodes of the lesser of both
-    ways to target i, where that is more.
+    ways to target i, if that is more.
     """
     num_actions = next_states.shape[1]
     num_layers, words, num_targets = len(layer_first) - 1, visits.shape[1], len(targets)
@@ -419,9 +419,9 @@ def search_in_step(
         layer = layer - 1 if layer else num_layers - 1
     # nodes that the searches did not reach have the other way alone: the farthest of them counts
     unseen = np.zeros((farthest + 1, words), np.uint64)
-    for place in range(len(order)):
+    for index in range(len(order)):
         for w in range(words):
-            unseen[home[order[place]], w] |= ~visits[place, w]
+            unseen[home[order[index]], w] |= ~visits[index, w]
     for i in range(num_targets):
         steps = farthest
         while steps > 0 and not unseen[steps, i // 64] >> np.uint64(i % 64) & np.uint64(1):
@@ -448,7 +448,7 @@ def symmetry(next_states, ends, start, s, t, image, preimage, queue):
     """Find the map f with f(s) = t and f(next_states[u, a]) = next_states[f(u), a]; there is at most one.
 
     All states must be within reach of s. A state that ends the episode is mapped to such a one, the end (-1) to
-    itself, and so is `start` where states lead there as they end. image, preimage: (S,), zero before; afterwards, as
+    itself, and so is `start` if states lead there as they end. image, preimage: (S,), zero before; afterwards, as
     far as queue[:steps], image[u] = f(u) + 1 and preimage[f(u)] = u + 1.
     Returns (whether there is such a map, steps).
     """
@@ -483,7 +483,7 @@ def symmetry(next_states, ends, start, s, t, image, preimage, queue):
 @interpreted_first("steps")
 @kernel
 def forget(image, preimage, queue, steps):
-    """Set image and preimage back to zero where `symmetry` wrote."""
+    """Set image and preimage back to zero in all entries that `symmetry` wrote."""
     for i in range(steps):
         preimage[image[queue[i]] - 1] = 0
         image[queue[i]] = 0

@@ -8,17 +8,17 @@ of a state. -1 marks a free slot.
 
 In a search by several processes each state has an owner, the process that its hash names, whoever finds it. An owner
 has keys (capacity, W) uint64, states in the order in which it received them, and numbers (capacity,) int64: the number
-of a state, or -1 - place while it waits for one, where place is the first of the places in the block that lead to it.
-table (slots,) leads from the hash of a state to its entry, a row of keys and numbers.
+of a state, or -1 - index while it waits for one, `index` being the first of the indices in the block that lead to
+it. table (slots,) leads from the hash of a state to its entry, a row of keys and numbers.
 
 On disk each entry is a whole state and its index: entries (slots, W + 1) uint64, a mapped file, holds the W words of a
 state, then 1 + its index, 0 in a free slot, or NEW + j while candidate j waits for its number. Memory is read and
 written in order of slots: many candidates are first sorted by the 16 highest bits of their hash, their bucket, which
 are the highest bits of their slot in a table of any size. keys (M, W) uint64: candidates; indices (M,) int64:
--1 - bucket, or an index where it is known; order (M,) int32: candidates that are looked up, by bucket, each bucket in
+-1 - bucket, or an index if it is known; order (M,) int32: candidates that are looked up, by bucket, each bucket in
 the order of candidates.
 
-The last section packs states into words and unpacks them a few at a time, where NumPy (rules/layout.py) would take a
+The last section packs states into words and unpacks them a few at a time, whereas NumPy (rules/layout.py) would take a
 call for each component.
 """
 
@@ -27,11 +27,11 @@ from typing import Any
 import numba.extending
 import numpy as np
 from llvmlite import ir
-from numba import int64, njit, types, uint64
+from numba import int64, types, uint64
 from numba.core import cgutils
 
 from pharos.kernels.interpreted import in_python, interpreted_first
-from pharos.kernels.kernel_cache import kernel
+from pharos.kernels.kernel_cache import inlined, kernel
 
 intrinsic: Any = numba.extending.intrinsic  # whose types would hide those of the functions that it makes
 _BATCH = 32  # states whose slots are fetched from memory at the same time
@@ -71,8 +71,8 @@ def entry_at(typing_context, table, slot):
     """table[slot], by an acquiring load: all that another thread wrote before it published the entry is visible."""
 
     def codegen(context, builder, sig, args):
-        place = _entry(context, builder, sig.args[0], *args)
-        value = builder.load_atomic(place, "acquire", sig.args[0].dtype.bitwidth // 8)
+        address = _entry(context, builder, sig.args[0], *args)
+        value = builder.load_atomic(address, "acquire", sig.args[0].dtype.bitwidth // 8)
         return context.cast(builder, value, sig.args[0].dtype, types.int64)
 
     return types.int64(table, types.int64), codegen
@@ -80,19 +80,19 @@ def entry_at(typing_context, table, slot):
 
 @in_python(lambda table, slot, index: table.__setitem__(slot, index))
 @intrinsic
-def publish(typing_context, table, slot, index):
+def store_released(typing_context, table, slot, index):
     """Set table[slot] = index by a releasing store: threads that read it by `entry_at` see all earlier writes."""
 
     def codegen(context, builder, sig, args):
-        place = _entry(context, builder, sig.args[0], *args[:2])
+        address = _entry(context, builder, sig.args[0], *args[:2])
         value = context.cast(builder, args[2], types.int64, sig.args[0].dtype)
-        builder.store_atomic(value, place, "release", sig.args[0].dtype.bitwidth // 8)
+        builder.store_atomic(value, address, "release", sig.args[0].dtype.bitwidth // 8)
         return context.get_dummy_value()
 
     return types.void(table, types.int64, types.int64), codegen
 
 
-@njit(forceinline=True)
+@inlined
 def mixed(h):
     """A 64-bit mixer (two rounds of multiply and xor-shift): every input bit reaches the high bits of the result."""
     h ^= h >> uint64(32)
@@ -102,13 +102,13 @@ def mixed(h):
     return h
 
 
-@njit(forceinline=True)
+@inlined
 def slot_of(h, capacity):
     """The slot of hash h in a table of `capacity` slots, a multiple of 65536 below 2^40: floor(h / 2^64 * capacity)."""
     return int64(((h >> uint64(24)) * (uint64(capacity) >> uint64(16))) >> uint64(24))
 
 
-@njit(forceinline=True)
+@inlined
 def hash_of_row(states, i):
     """The hash of states[i], a row of words."""
     h = mixed(states[i, 0])
@@ -150,7 +150,7 @@ def fill_range(table, states, count, low, high, left_over):
     n, over = 0, 0
     for first in range(0, count, _BATCH):
         stop = min(first + _BATCH, count)
-        # collect the states of this range; n only grows where the slot is in it
+        # collect the states of this range; n only grows if the slot is in it
         for i in range(first, stop):
             slots[n] = slot_of(hash_of_row(states, i), capacity)
             indices[n] = i
@@ -188,7 +188,7 @@ def fill_more(table, states, indices):
 
 @interpreted_first("keys")
 @kernel
-def find(table, states, keys, out):
+def find_states(table, states, keys, out):
     """out[j] = index of keys[j] among the states, or -1. keys (N, W) uint64."""
     capacity = table.shape[0]
     words = states.shape[1]
@@ -247,10 +247,10 @@ def insert_missing(table, states, keys, indices, successors, progress):
                     index = count
                     for k in range(words):
                         states[count, k] = keys[j, k]
-                    publish(table, slot, count)
+                    store_released(table, slot, count)
                     count += 1
                     break
-                # an occupied slot: compare all words, and go on to the next slot where they differ
+                # an occupied slot: compare all words, and go on to the next slot if they differ
                 equal = True
                 for k in range(words):
                     equal = equal and states[index, k] == keys[j, k]
@@ -276,9 +276,9 @@ _OWNER_BITS = 24  # the lowest of a hash, which the slots of tables below 2^32 o
 def route(keys, indices, size, order, counts):
     """Sort candidates by their owners.
 
-    keys (M, W); indices (M,): negative where a candidate must be looked up by its owner. order (M,) int64 gets these
-    candidates, those of the first owner first and each owner's in their order; counts (size,) int64 gets the number of
-    each owner's.
+    keys (M, W); indices (M,): negative if a candidate must be looked up by its owner. order (M,) int64 gets these
+    candidates, the candidates of the first owner first and each owner's in their order; counts (size,) int64 gets the
+    number of each owner's.
     """
     owners = np.empty(len(keys), np.int64)
     counts[:] = 0
@@ -289,21 +289,21 @@ def route(keys, indices, size, order, counts):
             owners[j] = int64((low * uint64(size)) >> uint64(_OWNER_BITS))
             counts[owners[j]] += 1
     # counting sort: owner o begins behind all smaller owners
-    place = np.zeros(size, np.int64)
+    next_index = np.zeros(size, np.int64)
     for owner in range(1, size):
-        place[owner] = place[owner - 1] + counts[owner - 1]
+        next_index[owner] = next_index[owner - 1] + counts[owner - 1]
     for j in range(len(keys)):
         if indices[j] < 0:
-            order[place[owners[j]]] = j
-            place[owners[j]] += 1
+            order[next_index[owners[j]]] = j
+            next_index[owners[j]] += 1
 
 
 @kernel
-def claim(table, keys, numbers, count, candidates, places, entries):
+def claim_entries(table, keys, numbers, count, candidates, indices, entries):
     """Find the entry of each candidate that this owner is asked for, and make one for each that is new.
 
-    candidates (N, W), places (N,): states and where in the block they stand; entries (N,) int64 gets their entries. Of
-    the places that lead to a new state the first is kept, whatever the order in which they come. Returns the number of
+    candidates (N, W), indices (N,): states and their indices in the block; entries (N,) int64 gets their entries. Of
+    the indices that lead to a new state the first is kept, whatever the order in which they come. Returns the number of
     entries.
     """
     capacity, words = table.shape[0], keys.shape[1]
@@ -318,17 +318,17 @@ def claim(table, keys, numbers, count, candidates, places, entries):
                 entry = count
                 for k in range(words):
                     keys[count, k] = candidates[j, k]
-                numbers[count] = -1 - places[j]
+                numbers[count] = -1 - indices[j]
                 table[slot] = count
                 count += 1
                 break
-            # an occupied slot: a match without a number yet keeps the smallest place
+            # an occupied slot: a match without a number yet keeps the smallest index
             equal = True
             for k in range(words):
                 equal = equal and keys[entry, k] == candidates[j, k]
             if equal:
                 if numbers[entry] < 0:
-                    numbers[entry] = max(numbers[entry], -1 - places[j])
+                    numbers[entry] = max(numbers[entry], -1 - indices[j])
                 break
             slot = slot + 1 if slot + 1 < capacity else 0
         entries[j] = entry
@@ -343,9 +343,9 @@ _FEW = 1 << 12  # candidates that are not worth sorting
 _NEW = uint64(1 << 63)
 
 
-@njit(forceinline=True)
+@inlined
 def _slot_for(entries, keys, j):
-    """(slot, its entry) of keys[j]: the slot where it is, or the free one where it belongs, whose entry is 0."""
+    """(slot, its entry) of keys[j]: its slot, or the free one in which it belongs, whose entry is 0."""
     capacity, words = entries.shape[0], keys.shape[1]
     slot = slot_of(hash_of_row(keys, j), capacity)
     while True:
@@ -360,7 +360,7 @@ def _slot_for(entries, keys, j):
         slot = slot + 1 if slot + 1 < capacity else 0
 
 
-@njit(forceinline=True)
+@inlined
 def _enter(entries, slot, keys, j, entry):
     """Put keys[j] and its `entry`, the last word, into a slot."""
     words = keys.shape[1]
@@ -385,21 +385,21 @@ def sort_by_bucket(indices, first, order):
                 order[size] = j
                 size += 1
         return size
-    # counting sort by bucket: sizes, then where each bucket begins, then the candidates
-    place = np.zeros(BUCKETS + 1, np.int64)
+    # counting sort by bucket: sizes, then the beginning of each bucket, then the candidates
+    next_index = np.zeros(BUCKETS + 1, np.int64)
     for j in range(len(indices)):
         if indices[j] >= 0:
             indices[j] += first
         else:
-            place[-indices[j]] += 1
+            next_index[-indices[j]] += 1
             size += 1
     for bucket in range(BUCKETS):
-        place[bucket + 1] += place[bucket]
+        next_index[bucket + 1] += next_index[bucket]
     for j in range(len(indices)):
         if indices[j] < 0:
             bucket = -1 - indices[j]
-            order[place[bucket]] = j
-            place[bucket] += 1
+            order[next_index[bucket]] = j
+            next_index[bucket] += 1
     return size
 
 
@@ -407,7 +407,7 @@ def sort_by_bucket(indices, first, order):
 def look_up(entries, keys, order, low, high, indices, slots):
     """Look up candidates order[low:high], entering those that are new.
 
-    indices[j] becomes the index of candidate j; -1 where it is new, slots[j] then being its slot; -2 - i where it
+    indices[j] becomes the index of candidate j; -1 if it is new, slots[j] then being its slot; -2 - i if it
     equals the earlier candidate i, which is new.
     """
     capacity = entries.shape[0]
@@ -429,7 +429,7 @@ def look_up(entries, keys, order, low, high, indices, slots):
 
 
 @kernel
-def number(keys, indices, successors, states, appended, progress):
+def number_states(keys, indices, successors, states, appended, progress):
     """Number new states in the order of candidates, and write them to states[count - appended :].
 
     indices (M,): as `look_up` leaves them. Row i of successors (rows, A) belongs to state progress[FIRST] + i;

@@ -28,7 +28,7 @@ UNIT = 2.0**-53
 def backward_order(first, previous, goal, order, distance):
     """Order nodes by their distance to the goal, by a search on the reversed graph; returns how many reach it.
 
-    order (N,): these nodes, the goal first; distance (N,): in steps, -1 where there is no path.
+    order (N,): these nodes, the goal first; distance (N,): in steps, -1 if there is no path.
     """
     distance[:] = -1
     # level 0: the nodes of the goal
@@ -56,7 +56,7 @@ def backward_order(first, previous, goal, order, distance):
 def sweep_in_place(rows, common, shares_rows, goal, order, count, j, mode):
     """One sweep of j(n) = 1 + min_a sum p j, in place in the order given; j is 0 at the goal.
 
-    Where mode is not None, also mode(n) = sum p mode under the action that is best for j. What all actions of a node
+    If mode is not None, also mode(n) = sum p mode under the action that is best for j. What all actions of a node
     have in common is in its row of `common`, the rest in `rows` of each action.
     Returns (largest change of j, sum f f, sum f g, sum g g): f, what j has gained, g, what mode has lost in the sweep.
     """
@@ -113,15 +113,15 @@ def sweep_in_place(rows, common, shares_rows, goal, order, count, j, mode):
 
 @interpreted_first()
 @kernel
-def residuals(rows, common, shares_rows, goal, order, count, high, low, policy, residual, error):
+def residual_bounds(rows, common, shares_rows, goal, order, count, high, low, policy, residual, error):
     """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; T is one Bellman step.
 
     j = high; or j = high + low, two floats a node, so that j may be 1e16 times its differences. policy[n] = the action
-    that attains T j. residual, error (N,): T j - j, and by how much it may be off; None where low is.
+    that attains T j. residual, error (N,): T j - j, and by how much it may be off; None if low is.
 
     T j(n) - j(n) = 1 + min_a sum_m p(m | n, a) (j(m) - j(n)): written with differences, no rounding error grows with j
-    itself. Both bounds count all rounding: `operations` says how many units in the last place one sum may be off. The
-    error of a difference of two pairs is a unit of the difference and eight units of a unit of the numbers.
+    itself. Both bounds count all rounding: `rounding_units` says how many units in the last place one sum may be off.
+    The error of a difference of two pairs is a unit of the difference and eight units of a unit of the numbers.
     """
     first, node, weight = rows
     always, always_node, always_weight = common
@@ -160,7 +160,9 @@ def residuals(rows, common, shares_rows, goal, order, count, high, low, policy, 
                 magnitude += abs(step)
                 if low is not None:
                     extent += weight[k] * (abs(high[node[k]]) + abs(value))
-            slack = operations(num_actions, first[row + 1] - first[row] + always[n + 1] - always[n]) * UNIT * magnitude
+            slack = (
+                rounding_units(num_actions, first[row + 1] - first[row] + always[n + 1] - always[n]) * UNIT * magnitude
+            )
             if low is not None:
                 slack += 8 * UNIT * UNIT * extent
             total += shared
@@ -177,7 +179,7 @@ def residuals(rows, common, shares_rows, goal, order, count, high, low, policy, 
 
 
 @kernel
-def operations(num_actions, terms):
+def rounding_units(num_actions, terms):
     """Units in the last place by which a sum of `terms` products may be off, relative to the sum of their sizes.
 
     One for each product, difference and addition; num_actions + 8 for a probability, itself a sum over the actions that
@@ -188,7 +190,7 @@ def operations(num_actions, terms):
 
 @kernel
 def _difference(high, low, m, value, correction):
-    """(high[m] + low[m]) - (value + correction), to a unit of the difference; high[m] - value where low is None.
+    """(high[m] + low[m]) - (value + correction), to a unit of the difference; high[m] - value if low is None.
 
     The rounding error of high[m] - value is computed exactly, and added to the difference of the small parts.
     """
@@ -284,18 +286,18 @@ def proper_policy(first, node, weight, num_actions, goal, order, count, sure, po
 # Ways back ------------------------------------------------------------------------------------------------------------
 
 
-NONE = 255  # steps of a way back where there is none nearby
+NO_WAY = 255  # steps of a way back if there is none nearby
 # More than the rounding error of a sum of probabilities.
-ROUNDING = 1e-12
+MASS_ROUNDING = 1e-12
 # The distance from 1 to the next float.
 EPSILON = 2.0**-52
 
 
 @kernel
 def _execution(executed, choice, previous, weights):
-    """Probability that the action `executed` is executed where `choice` is chosen.
+    """Probability that the action `executed` is executed if `choice` is chosen.
 
-    executed = -1: whatever is executed. previous = -1: on the first step, or where it does not matter.
+    executed = -1: whatever is executed. previous = -1: on the first step, or if it does not matter.
     """
     if executed < 0:
         return 1.0
@@ -333,7 +335,7 @@ def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
     levels[y] = 1
     queue[0] = y
     head, tail = 0, 1
-    while head < tail and tail < ball and levels[queue[head]] < NONE:
+    while head < tail and tail < ball and levels[queue[head]] < NO_WAY:
         n = queue[head]
         head += 1
         for k in range(into_first[n], into_first[n + 1]):
@@ -353,9 +355,9 @@ def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
 def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball, levels, queue, via):
     """Shortest ways back to node[i], for outcomes i into nodes low..high, from the other outcomes of its state.
 
-    Where `way` is None: steps[square[i] + j] = length of the way from outcome j of the state to node[i]; NONE where the
+    If `way` is None: steps[square[i] + j] = length of the way from outcome j of the state to node[i]; NO_WAY where the
     `ball` nodes nearest to node[i] do not include it. Else way[start[i]] on = the outcomes along the ways whose length
-    is not NONE, one way after another. levels (N,) uint8 is zero before and after.
+    is not NO_WAY, one way after another. levels (N,) uint8 is zero before and after.
     """
     first, _, node, _ = outcomes
     into_first, into_outcome = into
@@ -371,8 +373,8 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
             for j in range(first[x + 1] - first[x]):
                 n = node[first[x] + j]
                 if way is None:
-                    steps[square[i] + j] = levels[n] - 1 if levels[n] > 0 else NONE
-                elif steps[square[i] + j] != NONE:
+                    steps[square[i] + j] = levels[n] - 1 if levels[n] > 0 else NO_WAY
+                elif steps[square[i] + j] != NO_WAY:
                     while n != y:
                         way[at] = via[n]
                         at += 1
@@ -387,7 +389,7 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
 def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, length):
     """Drop the longest ways back until the expected steps on the way back are at most `limit`, for every outcome.
 
-    steps: NONE where dropped; length[i] becomes the sum of the lengths of the ways that are left. Returns the largest
+    steps: NO_WAY if dropped; length[i] becomes the sum of the lengths of the ways that are left. Returns the largest
     expected number of steps.
     """
     first, action, node, prob = outcomes
@@ -401,7 +403,7 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
             for previous in range(-1, num_previous):
                 total = 0.0
                 for j in range(low, high):
-                    if steps[square[i] + j - low] != NONE:
+                    if steps[square[i] + j - low] != NO_WAY:
                         chance = prob[j] * _execution(action[j], action[i], previous, weights)
                         total += chance * steps[square[i] + j - low]
                 worst = max(worst, total)
@@ -411,26 +413,26 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
             # too many: drop all ways of the greatest length, and try again
             farthest = 0
             for j in range(low, high):
-                if steps[square[i] + j - low] != NONE:
+                if steps[square[i] + j - low] != NO_WAY:
                     farthest = max(farthest, steps[square[i] + j - low])
             for j in range(low, high):
                 if steps[square[i] + j - low] == farthest:
-                    steps[square[i] + j - low] = NONE
+                    steps[square[i] + j - low] = NO_WAY
         if square[i] >= 0:
             for j in range(low, high):
-                if steps[square[i] + j - low] != NONE:
+                if steps[square[i] + j - low] != NO_WAY:
                     length[i] += steps[square[i] + j - low]
     return largest
 
 
 @interpreted_first()
 @kernel
-def attempt(
+def attempt_costs(
     begin, end, outcomes, owner, weights, num_previous, square, steps, start, way, constant, times, value, new, once
 ):
-    """new[i] = constant + the expected cost of the outcomes that happen where outcome i is aimed at.
+    """new[i] = constant + the expected cost of the outcomes that happen if outcome i is aimed at.
 
-    Another outcome costs the sum of `value` along its way back to node[i], where there is one, else `times` of the node
+    Another outcome costs the sum of `value` along its way back to node[i], if there is one, else `times` of the node
     that it leads to. The largest expectation over the previously executed action counts. Returns the largest increase.
     `once`: also for outcomes without any way back, which depend on no values: they are worked out in one pass and stay
     as they are.
@@ -458,7 +460,7 @@ def attempt(
             at = start[i]
             for j in range(low, high):
                 chance = prob[j] * _execution(action[j], action[i], previous, weights)
-                if square[i] >= 0 and steps[square[i] + j - low] != NONE:
+                if square[i] >= 0 and steps[square[i] + j - low] != NO_WAY:
                     back = 0.0
                     for _ in range(steps[square[i] + j - low]):
                         back += value[way[at]]
@@ -477,7 +479,7 @@ def attempt(
 def times_from(hub, first, node, cost, leak):
     """(N,) least t with t(hub) = 0, t(y) = (t(x) + cost[i]) / (1 - leak[i]) over outcomes i from x to y (Dijkstra).
 
-    leak[i]: probability that the attempt at outcome i is given up. Where that is almost 1, 1 - leak is no more than the
+    leak[i]: probability that the attempt at outcome i is given up. If that is almost 1, 1 - leak is no more than the
     rounding of a sum of probabilities, which is taken off.
     """
     bound = np.full(len(first) - 1, np.inf)
@@ -491,7 +493,7 @@ def times_from(hub, first, node, cost, leak):
         done[x] = True
         for i in range(first[x], first[x + 1]):
             y = node[i]
-            remainder = 1 - leak[i] - ROUNDING
+            remainder = 1 - leak[i] - MASS_ROUNDING
             if not done[y] and remainder > 0:
                 candidate = (time + cost[i]) / remainder
                 if candidate < bound[y]:
@@ -503,15 +505,15 @@ def times_from(hub, first, node, cost, leak):
 # Vicinities -----------------------------------------------------------------------------------------------------------
 
 
-# Predecessors beyond which a node is not gone back from: those of a start state are all states in which episodes end.
+# Most predecessors of a node to go back from. All states in which episodes end are predecessors of a start state.
 CROWD = 64
 # Turns that a lost step costs among the nodes on the way to a target, and turns that are kept: ways that lose more
 # steps at once are not gone.
-DETOUR, TURNS = 2, 32
+DETOUR, MOST_TURNS = 2, 32
 # No way from the hub leads to a node.
-LOST = 1 << 30
+NEVER = 1 << 30
 # Part of a bound that a sweep must gain for another one to follow.
-GAIN = 1e-3
+LEAST_GAIN = 1e-3
 # More than the relative rounding of costs and leaks after all sweeps: some units in the last place for each update.
 UPDATES = 1 + 1e-9
 
@@ -525,13 +527,13 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
 
     graph: (outcomes, owner, into, steps from the hub to each node (N,)); chance: (weights, previous actions, actions).
     times (N,): expected steps from each node to the hub, at most; bound (N,): from the hub to each node, at most.
-    scratch: (place (N,) int32, zero before and after; queue, an entry for each node around z; pushed and turns, those
+    scratch: (index (N,) int32, zero before and after; queue, an entry for each node around z; pushed and turns, those
     of `_around`; cost and leak, one for each previously executed action as well, the last for none). x is reached with
     any of those, so c(x) is the largest.
     """
     outcomes, owner, into, steps = graph
     weights, num_previous, num_actions = chance
-    place, queue, pushed, turns, cost, leak = scratch
+    index, queue, pushed, turns, cost, leak = scratch
     first, action, node, prob = outcomes
     none = cost.shape[1] - 1
     now, before, uniform, first_now, first_uniform = weights
@@ -539,7 +541,7 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
     for k in range(begin, end):
         z = targets[k]
         # the nodes around z; at first each of them gives up at once: c = times, l = 1, and 0 at z
-        size, count = _around(z, owner, into, steps, place, (queue, pushed, turns))
+        size, count = _around(z, owner, into, steps, index, (queue, pushed, turns))
         guess = min(bound[z], 1e300)
         for i in range(size):
             cost[i], leak[i] = times[queue[i]], 1.0
@@ -552,7 +554,7 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
                 # expected c and l of the next node: of outcomes of any action, by action, and of all actions
                 always_cost, always_leak, all_cost, all_leak = 1.0, 0.0, 0.0, 0.0
                 for j in range(first[x], first[x + 1]):
-                    p, a = place[node[j]], action[j]
+                    p, a = index[node[j]], action[j]
                     then = a if num_previous > 0 and a >= 0 else none
                     c = prob[j] * (cost[p - 1, then] if p > 0 else times[node[j]])
                     left = prob[j] * (leak[p - 1, then] if p > 0 else 1.0)
@@ -569,7 +571,7 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
                 for a in range(1, num_actions):
                     if by_cost[a] + by_leak[a] * guess < by_cost[best] + by_leak[best] * guess:
                         best = a
-                # new c and l after each previous action b; none (-1) stands last; kept where the total falls
+                # new c and l after each previous action b; none (-1) stands last; kept if the total falls
                 for b in range(-1, num_previous):
                     weight, others = (first_now, first_uniform) if b < 0 else (now, uniform)
                     c = always_cost + others * all_cost + weight * by_cost[best]
@@ -582,66 +584,66 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
                     if gain > 0:
                         cost[i, then], leak[i, then] = c, left
                         gained = max(gained, gain)
-            if gained <= GAIN * guess:
+            if gained <= LEAST_GAIN * guess:
                 break
         # the best node x to come from, with the rounding of all sums on top
         least = bound[z]
         for i in range(1, size):
-            remainder = 1 - leak[i].max() * UPDATES - ROUNDING
+            remainder = 1 - leak[i].max() * UPDATES - MASS_ROUNDING
             if remainder > 0:
                 least = min(least, (bound[queue[i]] + cost[i].max() * UPDATES) / remainder * (1 + 8 * EPSILON))
         new[z] = least
         for i in range(count):
-            place[pushed[i, 0]] = 0
+            index[pushed[i, 0]] = 0
 
 
 @kernel
-def _around(z, owner, into, steps, place, scratch):
+def _around(z, owner, into, steps, index, scratch):
     """Collect nodes on the way to z, those on short ways from the hub first; returns (size, count of `pushed`).
 
-    queue[:size]: the nodes, as many as the queue holds; place[n]: where n stands, and one more; -1 while it waits. A
+    queue[:size]: the nodes, as many as the queue holds; index[n]: the index of n in it, plus one; -1 while it waits. A
     node of which z is k steps away, and that lies on a way from the hub to z that is s steps longer than the shortest
     one, comes k + DETOUR s-th: its steps to z count, and those lost. A queue of buckets: `turns` has the first node of
-    each of the next TURNS turns, `pushed` are (node, the next of its turn).
+    each of the next MOST_TURNS turns, `pushed` are (node, the next of its turn).
     """
     queue, pushed, turns = scratch
     into_first, into_outcome = into
     turns[:] = -1
     pushed[0, 0], pushed[0, 1], turns[0] = z, -1, 0
-    place[z] = -1
+    index[z] = -1
     size, count, turn, idle = 0, 1, 0, 0
-    while idle <= TURNS and size < len(queue):
-        # the next node of this turn; the search ends after TURNS turns without any
-        at = turns[turn % TURNS]
+    while idle <= MOST_TURNS and size < len(queue):
+        # the next node of this turn; the search ends after MOST_TURNS turns without any
+        at = turns[turn % MOST_TURNS]
         if at < 0:
             turn += 1
             idle += 1
             continue
         idle = 0
-        turns[turn % TURNS] = pushed[at, 1]
+        turns[turn % MOST_TURNS] = pushed[at, 1]
         n = pushed[at, 0]
         queue[size] = n
         size += 1
-        place[n] = size
+        index[n] = size
         # push its predecessors, later by DETOUR turns for each step that they lose
         if into_first[n + 1] - into_first[n] > CROWD:
             continue
         for k in range(into_first[n], into_first[n + 1]):
             x = owner[into_outcome[k]]
             lost = 1 + steps[x] - steps[n]
-            if place[x] == 0 and 0 <= lost < (TURNS - 1) // DETOUR and count < len(pushed):
-                then = (turn + 1 + DETOUR * lost) % TURNS
+            if index[x] == 0 and 0 <= lost < (MOST_TURNS - 1) // DETOUR and count < len(pushed):
+                then = (turn + 1 + DETOUR * lost) % MOST_TURNS
                 pushed[count, 0], pushed[count, 1] = x, turns[then]
                 turns[then] = count
-                place[x] = -1
+                index[x] = -1
                 count += 1
     return size, count
 
 
 def steps_from(hub, first, node):
-    """(N,) int32: the fewest steps in which outcomes lead from the hub to each node, LOST where none do."""
+    """(N,) int32: the fewest steps in which outcomes lead from the hub to each node, NEVER if none do."""
     steps, is_hub = np.empty(len(first) - 1, np.int32), np.zeros(len(first) - 1, np.bool_)
     is_hub[hub] = True
     backward_order(first, node, is_hub, np.empty(len(first) - 1, np.int64), steps)
-    steps[steps < 0] = LOST
+    steps[steps < 0] = NEVER
     return steps

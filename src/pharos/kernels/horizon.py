@@ -1,6 +1,6 @@
 """Backward passes for the effective horizons of deterministic MDPs, and tail bounds of means, for GORP.
 
-next_states (S, A), -1 where the episode ends; rewards (S, A) float64. An episode that has ended is worth 0.
+next_states (S, A), -1 if the episode ends; rewards (S, A) float64. An episode that has ended is worth 0.
 
 Tails bound the probability that each of several means of m samples is the largest, from bounds on their tails. Each
 distribution is cut into 100 parts of equal probability; `low` and `high` enclose the part. For N rows of n means:
@@ -17,7 +17,7 @@ from pharos.kernels.kernel_cache import kernel
 
 
 @kernel(parallel=True)
-def values(next_states, rewards, tie, best, worst, explored, best_now, worst_now, explored_now, optimal, variance):
+def step_values(next_states, rewards, tie, best, worst, explored, best_now, worst_now, explored_now, optimal, variance):
     """One step backwards: the values of optimal, worst and uniform play, and two inputs of the simple bound.
 
     best, worst, explored (S,): of the step after; *_now (S,): of this step. optimal (S,) unsigned: bit a where Q*(s, a)
@@ -64,7 +64,7 @@ def lookahead(next_states, rewards, gamma, after, now):
 
 @interpreted_first()
 @kernel(parallel=True)
-def largest(next_states, after, now):
+def largest_after(next_states, after, now):
     """now (S,) = max over a of after(next state), at least 0."""
     for s in prange(len(next_states)):
         high = 0.0
@@ -96,7 +96,7 @@ def step_along(next_states, rewards, after, optimal, variance, log, near, nodes,
 
     after (S,): Q(s, a) = r(s, a) + after(next state). is_visited (S,) bool, all False before and after. hardest
     (3,): 16 variance log / gap^2 of the node that has the largest, the first among equals, and its gap and variance.
-    Returns how many states `next_nodes` holds; -1 where an action that is not optimal may be taken.
+    Returns how many states `next_nodes` holds; -1 if an action that is not optimal may be taken.
     """
     num_actions = next_states.shape[1]
     count, at, fails = 0, -1, False
@@ -139,7 +139,7 @@ def step_along(next_states, rewards, after, optimal, variance, log, near, nodes,
 # Tails ----------------------------------------------------------------------------------------------------------------
 
 
-PARTS = 100
+MASS_PARTS = 100
 
 
 @kernel
@@ -176,11 +176,11 @@ def bernstein(means, widths, m, lower, upper):
         lower[row] = 0.0
         upper[row] = 0.0
         for a in range(n):
-            for part in range(PARTS):
+            for part in range(MASS_PARTS):
                 # the part of mean a, and the chance of each other mean to be below it
-                high = means[row, a] + _quantile(1 - (part + 1) / PARTS, m, widths[row, a], variances[a])
-                low = means[row, a] - _quantile(part / PARTS, m, widths[row, a], variances[a])
-                least = most = 1 / PARTS
+                high = means[row, a] + _quantile(1 - (part + 1) / MASS_PARTS, m, widths[row, a], variances[a])
+                low = means[row, a] - _quantile(part / MASS_PARTS, m, widths[row, a], variances[a])
+                least = most = 1 / MASS_PARTS
                 for b in range(n):
                     if b != a:
                         most *= _below(means[row, b] - high, m, widths[row, b], variances[b])

@@ -1,8 +1,8 @@
 """Kernels run by Python for little work, which is done long before a kernel is compiled, with the same results.
 
 `interpreted_first` makes a kernel count the entries that its calls read. As long as they are few, and the kernel is not
-compiled, Python runs its text, and that of the functions it calls: the same operations on the same numbers, so the same
-bits. (NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64; few entries do not come that far.)
+compiled, Python runs its text, and the text of the functions it calls: the same operations on the same numbers, so the
+same bits. (NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64; few entries do not come that far.)
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ def in_python(meaning: Callable) -> Callable:
 def interpreted_first(*counted: str) -> Callable:
     """Decorator of a kernel: its calls are interpreted as long as they are small together, then compiled.
 
-    They are small until they have counted COMPILING times `compiling.SMALL` entries, or 1 / LOADING of it if the
+    They are small until they have counted COMPILING times `compiling.SMALL_STATES` entries, or 1 / LOADING of it if the
     compiled kernel is on disk, as loading takes so much less than compiling.
 
     Args:
@@ -62,15 +62,15 @@ def interpreted_first(*counted: str) -> Callable:
     def decorate(kernel: CPUDispatcher) -> CPUDispatcher:
         compiled = kernel._compile_for_args  # asked for the function to call with types that are not compiled yet
         names = kernel.py_func.__code__.co_varnames
-        places = [names.index(name) for name in counted]
+        indices = [names.index(name) for name in counted]
         count = 0
 
         def compiled_or_interpreted(*arguments: object) -> object:
             nonlocal count
-            read = [arguments[i] for i in places] or [each for each in arguments if not isinstance(each, int)]
+            read = [arguments[i] for i in indices] or [each for each in arguments if not isinstance(each, int)]
             count += sum(map(_entries, read))
-            is_small = count < compiling.SMALL // LOADING or (
-                count < COMPILING * compiling.SMALL and not is_on_disk(kernel)
+            is_small = count < compiling.SMALL_STATES // LOADING or (
+                count < COMPILING * compiling.SMALL_STATES and not is_on_disk(kernel)
             )
             return quiet if is_small else compiled(*arguments)
 

@@ -4,8 +4,8 @@ Reading such a file runs its content (it is a pickle, and machine code), so the 
 noticed by a checksum: a damaged file is deleted, and the kernel is compiled again.
 
 The kernels of pharos lie under a digest of the texts of all of them, as one may call another's: whoever has the same
-texts, another checkout or another job on other days, finds them compiled. NUMBA_CACHE_DIR, if it is set, is where they
-lie; else that is the folder `compiled` of the cache. The functions that rules are compiled into have files of their own
+texts, another checkout or another job on other days, finds them compiled. They lie in the folder NUMBA_CACHE_DIR if it
+is set, else in the folder `compiled` of the cache. The functions that rules are compiled into have files of their own
 there (rules/compiler.py).
 """
 
@@ -33,8 +33,8 @@ DIGEST_BYTES = 32
 UNUSED_DAYS = 30
 """Days after which the kernels of other texts, which no process has asked for since, are deleted."""
 
-_HERE = Path(__file__).parent
-_TEXTS = (*sorted(_HERE.glob("*.py")), _HERE.parent / "system" / "arrays.py")
+_KERNELS = Path(__file__).parent
+_TEXTS = (*sorted(_KERNELS.glob("*.py")), _KERNELS.parent / "system" / "arrays.py")
 
 
 class Codegen(Protocol):
@@ -77,7 +77,7 @@ class KernelCache(NullCache):
         return self._is_there
 
     def load_overload(self, sig: object, target_context: TargetContext) -> CompileResult | None:
-        """The compiled kernel of a signature; None where there is none, or a damaged one, which is deleted."""
+        """The compiled kernel of a signature; None if there is none, or a damaged one, which is deleted."""
         target_context.refresh()
         file = self._file(sig, target_context.codegen())
         try:
@@ -131,26 +131,53 @@ def kernel(function: Callable | None = None, /, *, makes_arrays: bool = True, **
     """
     if function is None:
         return partial(kernel, makes_arrays=makes_arrays, **options)
-    dispatcher = numba.njit(nogil=True, _nrt=makes_arrays, **options)(function)
+    compiled = called_by_kernels if function.__name__.startswith("_") else called_by_python
+    dispatcher = compiled(nogil=True, _nrt=makes_arrays, **options)(function)
     dispatcher._cache = cache_in(_folder(), f"{function.__module__.rpartition('.')[2]}.{function.__name__}")
     return dispatcher
 
 
+called_by_python: Any = partial(numba.njit, no_cfunc_wrapper=True)
+"""`numba.njit` of a function that Python calls, and C does not."""
+
+
+def called_by_kernels(function: Callable | None = None, /, **options: object) -> Callable:
+    """Decorator of a function that kernels call and Python does not: `numba.njit` without the ways in from outside, a
+    sixth of compiling.
+
+    Raises:
+        TypeError: Python calls it.
+    """
+    if function is None:
+        return partial(called_by_kernels, **options)
+    dispatcher = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)(function)
+
+    def refuse(*arguments: object) -> None:
+        raise TypeError(f"{function.__name__} is called by kernels alone; expected a call of its text, `.py_func`")
+
+    dispatcher._insert, dispatcher._compile_for_args = lambda *overload: None, refuse  # else its calls end the process
+    return dispatcher
+
+
+inlined = called_by_kernels(forceinline=True)
+"""Decorator of a function that becomes part of the kernels that call it."""
+
+
 @cache
 def _folder() -> Path | None:
-    """The folder of the kernels with the texts of today; those of others are deleted after UNUSED_DAYS."""
+    """The folder of the kernels with the texts of today; folders of other texts are deleted after UNUSED_DAYS."""
     named = os.environ.get("NUMBA_CACHE_DIR")
-    place = Path(named).expanduser() if named else folder_of_rules()
-    if place is None:
+    root = Path(named).expanduser() if named else folder_of_rules()
+    if root is None:
         return None
     digest = hashlib.sha256(b"\0".join(path.read_bytes() for path in _TEXTS)).hexdigest()[:16]
-    folder = place / f"kernels-{digest}"
+    folder = root / f"kernels-{digest}"
     with contextlib.suppress(OSError):  # of a folder that can be read alone
         if folder.is_dir():
             os.utime(folder)
         else:
             folder.mkdir(parents=True, exist_ok=True)
-            for other in place.glob("kernels-*"):
+            for other in root.glob("kernels-*"):
                 if other.stat().st_mtime < time.time() - UNUSED_DAYS * 86400:
                     shutil.rmtree(other, ignore_errors=True)
     return folder

@@ -37,7 +37,7 @@ def subtract_from(y, out):
 
 
 @kernel
-def advance(x, factor, y):
+def add_scaled(x, factor, y):
     """x += factor y, in place; returns the sum of x."""
     total = 0.0
     for i in range(len(x)):
@@ -47,7 +47,7 @@ def advance(x, factor, y):
 
 
 @kernel
-def turn(direction, beta, omega, moved, residual):
+def next_direction(direction, beta, omega, moved, residual):
     """direction = residual + beta (direction - omega moved), in place; returns its sum."""
     total = 0.0
     for i in range(len(direction)):
@@ -65,7 +65,7 @@ def entries_of_factor(first, columns, limit, starts=None, rows=None):
 
     Row i of the matrix has its entries in columns[first[i] : first[i + 1]]; pivots are taken in order. In place of the
     counts of all rows those so far are returned as soon as their sum passes the limit. Unless they are None, rows holds
-    the rows of those of column j from starts[j] on, in order.
+    the rows of the entries of column j from starts[j] on, in order.
 
     Cost: O(entries of the factor) time, 24 bytes a row.
     """
@@ -76,8 +76,8 @@ def entries_of_factor(first, columns, limit, starts=None, rows=None):
     total = 0
     for row in range(size):
         marks[row] = row
-        for place in range(first[row], first[row + 1]):
-            column = columns[place]
+        for entry in range(first[row], first[row + 1]):
+            column = columns[entry]
             # row `row` of the factor: the ways up the tree from the entries left of the diagonal
             while column < row and marks[column] != row:
                 if parent[column] < 0:
@@ -96,7 +96,7 @@ def entries_of_factor(first, columns, limit, starts=None, rows=None):
 # Kernels of rank M ----------------------------------------------------------------------------------------------------
 
 
-ROWS = 256  # sums over so many rows are float32, sums of these float64
+FLOAT32_ROWS = 256  # sums over so many rows are float32, sums of these float64
 
 
 @kernel(fastmath={"reassoc", "contract", "nsz"})
@@ -104,10 +104,10 @@ def project(features, z, out):
     """out (A, M) float64 = (F' z)', z (C, A) float32."""
     part = np.zeros(out.shape, np.float32)
     out[:] = 0.0
-    # float32 sums of ROWS rows, added up as float64
-    for first in range(0, len(features), ROWS):
+    # float32 sums of FLOAT32_ROWS rows, added up as float64
+    for first in range(0, len(features), FLOAT32_ROWS):
         part[:] = 0.0
-        for s in range(first, min(first + ROWS, len(features))):
+        for s in range(first, min(first + FLOAT32_ROWS, len(features))):
             for a in range(z.shape[1]):
                 value = z[s, a]
                 for m in range(features.shape[1]):
@@ -124,9 +124,9 @@ def step(features, diagonal, weights, rate, projected, now, past, out):
     """
     part = np.zeros(out.shape, np.float32)
     out[:] = 0.0
-    for first in range(0, len(features), ROWS):
+    for first in range(0, len(features), FLOAT32_ROWS):
         part[:] = 0.0
-        for s in range(first, min(first + ROWS, len(features))):
+        for s in range(first, min(first + FLOAT32_ROWS, len(features))):
             for a in range(now.shape[1]):
                 # entry (s, a) of K (weights now), and the new term
                 total = np.float32(0.0)

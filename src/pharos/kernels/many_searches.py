@@ -128,7 +128,7 @@ def dense_search_backward(next_states, ends, start, sources, origins, front, com
     """largest[i] = the largest distance to sources[i] of a node that leads there; at most 512 sources, a bit for each.
 
     Every node reads, level by level, what its successors have reached: one cache line for each edge on a level where
-    the successor has new bits; none is written but its own. A node that leads to all sources reads no more.
+    the successor has new bits; it writes its own alone. A node that leads to all sources reads no more.
     origins, front, coming: (N, 8) uint64, active, arriving: (N,) bool; zero before.
     Returns the number of lines read from successors.
     Source: Then et al. (2014), bit-parallel search; Beamer, Asanovic and Patterson (2012), bottom-up steps.
@@ -248,7 +248,7 @@ def lower_along_edges(next_states, ends, start, in_upper, out_upper):
 
 @kernel
 def _successor(next_states, start, v, a, is_end):
-    """The node that v leads to by a: `start`, or -1, where v is an end; node S where a ends the episode."""
+    """The node that v leads to by a: `start`, or -1, if v is an end; node S if a ends the episode."""
     if is_end:
         return start
     u = np.int64(next_states[v, a])

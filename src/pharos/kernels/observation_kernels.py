@@ -30,7 +30,7 @@ def mark_components(states, low, offset, out):
 
 
 @kernel(inline="always")
-def _mixed(word):
+def _mixed_word(word):
     """Mix the bits of a word by the finalizer of SplitMix64 (Steele, Lea and Flood, 2014)."""
     word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -44,25 +44,25 @@ def scramble(states, low, lengths, keys, out):
     num_bits, half = out.shape[1], out.shape[1] // 2
     for n in range(states.shape[0]):
         # the components in binary, the lowest bit of each first
-        place = 0
+        index = 0
         for i in range(states.shape[1]):
             for b in range(lengths[i]):
-                out[n, place] = ((states[n, i] - low[i]) >> b) & 1
-                place += 1
+                out[n, index] = ((states[n, i] - low[i]) >> b) & 1
+                index += 1
         for r in range(len(keys)):
             # a hash of one half and the key of the round
             first, last = (0, half) if r % 2 == 0 else (half, num_bits)
             word = keys[r]
-            for place in range(first, last):
-                word = _mixed(word + step + np.uint64(out[n, place]))
+            for index in range(first, last):
+                word = _mixed_word(word + step + np.uint64(out[n, index]))
             # flips bits of the other half: a new word for every 64 of them
             begin, end = (half, num_bits) if r % 2 == 0 else (0, half)
             mask = word
-            for place in range(begin, end):
-                if (place - begin) % 64 == 0:
+            for index in range(begin, end):
+                if (index - begin) % 64 == 0:
                     word += step
-                    mask = _mixed(word)
-                out[n, place] ^= np.int8(mask & one)
+                    mask = _mixed_word(word)
+                out[n, index] ^= np.int8(mask & one)
                 mask >>= one
 
 

@@ -1,21 +1,21 @@
 """Distributions of states under a policy, moved one step forward.
 
 transitions: see kernels/outcomes.py; live (S,) bool: states in which episodes go on; now, after (S, W) float64:
-the distribution over states, W = 1, or over pairs (state, previously executed action), W = A; that of the first step
+the distribution over states, W = 1, or over pairs (state, previously executed action), W = A; the one of the first step
 has W = 1. policy (S, B, A) probabilities, B = 1 or, for policies that look at the previous action, A; weights: (chosen,
 previous, uniform), with sets behind, see kernels/bellman.py.
 """
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from pharos.kernels.bellman import set_has, set_size
 from pharos.kernels.interpreted import interpreted_first, overload
-from pharos.kernels.kernel_cache import kernel
-from pharos.kernels.outcomes import outcome, outcomes_of, size_of
+from pharos.kernels.kernel_cache import inlined, kernel
+from pharos.kernels.outcomes import outcome, outcome_numbers, size_of
 
 
-@njit(forceinline=True)
+@inlined
 def _mass(now, s):
     """Probability of being in s, whatever the previous action."""
     mass = 0.0
@@ -46,7 +46,7 @@ def _mass_as_first(policy, weights, now, s, a):
     return in_sets
 
 
-@njit(forceinline=True)
+@inlined
 def _execute(policy, weights, now, s, mass, executed):
     """executed[a] = the probability of being in s and executing a.
 
@@ -84,7 +84,7 @@ def push(transitions, live, policy, weights, now, after):
         # split the mass of s by executed actions, then by their outcomes
         _execute(policy, weights, now, s, mass, executed)
         for a in range(num_actions):
-            for i in outcomes_of(transitions, s, a):
+            for i in outcome_numbers(transitions, s, a):
                 t, p = outcome(transitions, s, a, i)
                 if t >= 0:
                     after[t, a if by_action else 0] += p * executed[a]
@@ -120,7 +120,7 @@ def count_visits(transitions, live, policy, weights, gamma, least, waiting, visi
             visits[s, b] += waiting[s, b]
         waiting[s] = 0.0
         for a in range(num_actions):
-            for i in outcomes_of(transitions, s, a):
+            for i in outcome_numbers(transitions, s, a):
                 t, p = outcome(transitions, s, a, i)
                 if t >= 0 and live[t]:
                     waiting[t, a if by_action else 0] += p * (gamma * leaving[a])
@@ -137,7 +137,7 @@ def support(transitions, live, policy, weights, reachable):
     num_actions = size_of(transitions)[1]
     width = reachable.shape[1]
     by_action = width > 1
-    alone = np.zeros_like(reachable)  # a row is 1 at one place while its node is looked at
+    alone = np.zeros_like(reachable)  # a row is 1 at one index while its node is looked at
     nodes = np.flatnonzero(reachable.reshape(-1) > 0.0)
     stack = np.empty(reachable.size, np.int64)
     stack[: len(nodes)] = nodes
@@ -155,7 +155,7 @@ def support(transitions, live, policy, weights, reachable):
             if executed[a] <= 0.0:
                 continue
             c = a if by_action else 0
-            for i in outcomes_of(transitions, s, a):
+            for i in outcome_numbers(transitions, s, a):
                 t, _ = outcome(transitions, s, a, i)
                 if t >= 0 and live[t] and reachable[t, c] == 0.0:
                     reachable[t, c] = 1.0

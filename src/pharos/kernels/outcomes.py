@@ -6,29 +6,29 @@ be written to here, nor returned.
 
 Kernels take `transitions`, one of three things:
 
-- a table (S, A) of next states, -1 where the episode ends: an array, or `PackedIndices`;
+- a table (S, A) of next states, -1 if the episode ends: an array, or `PackedIndices`;
 - several outcomes, as a tuple (successors (N,), offsets, codes, weights, (S, A), each). The outcomes of (s, a), row =
-  s A + a, are successors[row K : (row + 1) K], or successors[offsets[row] : offsets[row + 1]] where there are offsets.
-  Their probabilities are weights[codes[row]], or, without codes, weights at the same places as the successors. Without
+  s A + a, are successors[row K : (row + 1) K], or successors[offsets[row] : offsets[row + 1]] if there are offsets.
+  Their probabilities are weights[codes[row]], or, without codes, weights at the same indices as the successors. Without
   offsets the last ones of a row may have probability 0: they repeat its first successor. each: K, or, so that the
   compiler knows it and unrolls loops (twice as fast), a tuple of K zeros (`each_of`);
 - a pair (`transitions` of the first two kinds, p): with probability p a state stays what it is, else they hold. Staying
   is the last outcome of each row.
 
-`outcomes_of` and `outcome` give them one by one, `expectation` adds up values. Loops over tables cost nothing more:
+`outcome_numbers` and `outcome` give them one by one, `expectation` adds up values. Loops over tables cost nothing more:
 their indices are unsigned, as signed ones would be checked at each read for counting from the end.
 
-State spaces store the possible outcomes, row after row, and their probabilities as codes of a palette. Row s A + a is
-that of action a in state s. Probabilities are compared as their bits, uint64: 0 is an impossible outcome. The palette
-(capacity, K) uint64 has the distinct rows of probabilities, the possible ones in their order, then zeros, numbered in
-the order in which they appear; a table of slots finds them by their hash. K is the most outcomes of a row.
+State spaces store the possible outcomes, row after row, and their probabilities as codes of a palette. Row s A + a
+belongs to action a in state s. Probabilities are compared as their bits, uint64: 0 is an impossible outcome. The
+palette (capacity, K) uint64 has the distinct rows of probabilities, the possible ones in their order, then zeros,
+numbered in the order in which they appear; a table of slots finds them by their hash. K is the most outcomes of a row.
 """
 
 import operator
 
 import numba.extending
 import numpy as np
-from numba import from_dtype, int64, njit, types, uint64
+from numba import from_dtype, int64, types, uint64
 from numba.core import cgutils
 from numba.extending import (
     NativeValue,
@@ -41,7 +41,7 @@ from numba.extending import (
 
 from pharos.kernels.hash_table import mixed, prefetch, slot_of
 from pharos.kernels.interpreted import interpreted_first, overload
-from pharos.kernels.kernel_cache import kernel
+from pharos.kernels.kernel_cache import inlined, kernel
 from pharos.system.arrays import PACKED, PackedIndices
 
 # Indices of 40 bits ---------------------------------------------------------------------------------------------------
@@ -87,7 +87,7 @@ def _getitem(indices, where):
 
 
 @overload_attribute(PackedIndicesType, "shape")
-def _shape(indices):
+def _typed_shape(indices):
     return lambda indices: indices.entries.shape
 
 
@@ -108,7 +108,7 @@ PackedIndices._numba_type_ = property(_type_of)  # type: ignore[attr-defined]
 # Transitions ----------------------------------------------------------------------------------------------------------
 
 
-UNROLLED = 4  # the largest K for which loops over outcomes are unrolled
+UNROLLED_OUTCOMES = 4  # the largest K for which loops over outcomes are unrolled
 UNROLLED_FROM = 100_000
 """States from which sweeps are compiled for each number of actions and outcomes; fewer are swept sooner than that."""
 
@@ -121,16 +121,16 @@ def is_unrolled(num_states):
 
 def each_of(num_outcomes, unrolled):
     """The last entry of `transitions`, for sweeps: a tuple of K zeros if K is small and sweeps are unrolled, else K."""
-    return (0,) * num_outcomes if num_outcomes <= UNROLLED and unrolled else num_outcomes
+    return (0,) * num_outcomes if num_outcomes <= UNROLLED_OUTCOMES and unrolled else num_outcomes
 
 
 def _is_lazy(transitions):
-    """Whether the type is that of a pair (transitions, probability of staying)."""
+    """Whether the type is a pair (transitions, probability of staying)."""
     return isinstance(transitions, types.BaseTuple) and len(transitions) == 2
 
 
 def is_table(transitions):
-    """Whether the type is that of a table of next states."""
+    """Whether the type is a table of next states."""
     return isinstance(transitions, types.Array | PackedIndicesType)
 
 
@@ -147,14 +147,14 @@ def _size_of(transitions):
     return lambda transitions: transitions[4]
 
 
-def outcomes_of(transitions, s, a):
+def outcome_numbers(transitions, s, a):
     """The numbers of the outcomes of (s, a), as a range. Impossible ones among them repeat the state of another."""
 
 
-@overload(outcomes_of)
-def _outcomes_of(transitions, s, a):
+@overload(outcome_numbers)
+def _typed_outcome_numbers(transitions, s, a):
     if _is_lazy(transitions):
-        return lambda transitions, s, a: range(len(outcomes_of(transitions[0], s, a)) + 1)
+        return lambda transitions, s, a: range(len(outcome_numbers(transitions[0], s, a)) + 1)
     if is_table(transitions):
         return lambda transitions, s, a: range(1)
     if isinstance(transitions[5], types.BaseTuple):
@@ -178,7 +178,7 @@ def _outcome(transitions, s, a, k):
     if _is_lazy(transitions):
 
         def moves_or_stays(transitions, s, a, k):
-            if np.int64(k) == len(outcomes_of(transitions[0], s, a)):
+            if np.int64(k) == len(outcome_numbers(transitions[0], s, a)):
                 return np.int64(s), transitions[1]
             t, p = outcome(transitions[0], s, a, k)
             return np.int64(t), (1.0 - transitions[1]) * p
@@ -189,25 +189,25 @@ def _outcome(transitions, s, a, k):
     if isinstance(transitions[2], types.NoneType):
 
         def one_by_one(transitions, s, a, k):
-            place, is_padding = _place(transitions, s * transitions[4][1] + a, k)
-            return transitions[0][place], 0.0 if is_padding else transitions[3][place]
+            index, is_padding = _outcome_index(transitions, s * transitions[4][1] + a, k)
+            return transitions[0][index], 0.0 if is_padding else transitions[3][index]
 
         return one_by_one
 
     def by_palette(transitions, s, a, k):
         row = s * transitions[4][1] + a
-        place, _ = _place(transitions, row, k)
-        return transitions[0][place], transitions[3][uint64(transitions[2][uint64(row)]), uint64(k)]
+        index, _ = _outcome_index(transitions, row, k)
+        return transitions[0][index], transitions[3][uint64(transitions[2][uint64(row)]), uint64(k)]
 
     return by_palette
 
 
-def _place(transitions, row, k):
-    """(place of successor k of a row, whether k is padding, so that it repeats the last one)."""
+def _outcome_index(transitions, row, k):
+    """(index of successor k of a row, whether k is padding, so that it repeats the last one)."""
 
 
-@overload(_place)
-def _place_of(transitions, row, k):
+@overload(_outcome_index)
+def _typed_outcome_index(transitions, row, k):
     if isinstance(transitions[1], types.NoneType):
         if isinstance(transitions[5], types.BaseTuple):
             return lambda transitions, row, k: (uint64(row) * uint64(len(transitions[5])) + uint64(k), False)
@@ -217,8 +217,8 @@ def _place_of(transitions, row, k):
 
     def ragged(transitions, row, k):
         first, after = transitions[1][uint64(row)], transitions[1][uint64(row) + uint64(1)]
-        place = first + k
-        return uint64(min(place, after - 1)), place >= after
+        index = first + k
+        return uint64(min(index, after - 1)), index >= after
 
     return ragged
 
@@ -232,27 +232,29 @@ def _expectation(transitions, v, s, a):
     if _is_lazy(transitions):
 
         def moves_or_stays(transitions, v, s, a):
-            return (1.0 - transitions[1]) * expectation(transitions[0], v, s, a) + transitions[1] * _value(v, s, a)
+            return (1.0 - transitions[1]) * expectation(transitions[0], v, s, a) + transitions[1] * _typed_value(
+                v, s, a
+            )
 
         return moves_or_stays
     if is_table(transitions):
-        return lambda transitions, v, s, a: _value(v, transitions[uint64(s), uint64(a)], uint64(a))
+        return lambda transitions, v, s, a: _typed_value(v, transitions[uint64(s), uint64(a)], uint64(a))
 
     def several(transitions, v, s, a):
         total = 0.0
-        for k in outcomes_of(transitions, s, a):
+        for k in outcome_numbers(transitions, s, a):
             t, p = outcome(transitions, s, a, k)
-            total += p * _value(v, t, a)
+            total += p * _typed_value(v, t, a)
         return total
 
     return several
 
 
-def _value(v, s, a):
-    """v[s], or v[s, a] where v depends on the executed action."""
+def _typed_value(v, s, a):
+    """v[s], or v[s, a] if v depends on the executed action."""
 
 
-@overload(_value, jit_options={"forceinline": True})
+@overload(_typed_value, jit_options={"forceinline": True})
 def _value_of(v, s, a):
     return (lambda v, s, a: v[s]) if v.ndim == 1 else (lambda v, s, a: v[s, a])
 
@@ -284,7 +286,7 @@ def expected(transitions, x, states, out):
     out[:] = 0.0
     for i in range(len(states)):
         for a in range(out.shape[1]):
-            for j in outcomes_of(transitions, states[i], a):
+            for j in outcome_numbers(transitions, states[i], a):
                 t, p = outcome(transitions, states[i], a, j)
                 if p > 0.0:
                     for m in range(x.shape[2]):
@@ -299,7 +301,7 @@ def entries(transitions, states, actions, index, next_states, probabilities):
     """
     n = 0
     for i in range(len(states)):
-        for k in outcomes_of(transitions, states[i], actions[i]):
+        for k in outcome_numbers(transitions, states[i], actions[i]):
             t, p = outcome(transitions, states[i], actions[i], k)
             if p > 0.0:
                 index[n], next_states[n], probabilities[n] = i, t, p
@@ -315,7 +317,7 @@ def push_forward(transitions, mass, out):
     for s in range(mass.shape[0]):
         for a in range(mass.shape[1]):
             if mass[s, a] != 0.0:
-                for i in outcomes_of(transitions, s, a):
+                for i in outcome_numbers(transitions, s, a):
                     t, p = outcome(transitions, s, a, i)
                     if t >= 0:
                         out[t, a if by_action else 0] += p * mass[s, a]
@@ -323,12 +325,12 @@ def push_forward(transitions, mass, out):
 
 @interpreted_first("states")
 @kernel
-def largest(transitions, x, states, sign, out):
+def extreme_outcomes(transitions, x, states, sign, out):
     """out[i, a] = the largest (sign 1) or smallest (-1) of x (S + 1,) over what (states[i], a) may lead to."""
     for i in range(len(states)):
         for a in range(out.shape[1]):
             best = -np.inf
-            for k in outcomes_of(transitions, states[i], a):
+            for k in outcome_numbers(transitions, states[i], a):
                 best = max(best, sign * x[outcome(transitions, states[i], a, k)[0]])
             out[i, a] = sign * best
 
@@ -336,10 +338,10 @@ def largest(transitions, x, states, sign, out):
 @interpreted_first("states")
 @kernel
 def mark_arrivals(transitions, states, out):
-    """out[t, a] = True where executing a in one of `states` may lead to t."""
+    """out[t, a] = True if executing a in one of `states` may lead to t."""
     for s in states:
         for a in range(out.shape[1]):
-            for k in outcomes_of(transitions, s, a):
+            for k in outcome_numbers(transitions, s, a):
                 t, _ = outcome(transitions, s, a, k)
                 if t >= 0:
                     out[t, a] = True
@@ -359,7 +361,7 @@ def _drawn_outcome(transitions, s, a, u):
 
     def several(transitions, s, a, u):
         number, probability, total = 0, 0.0, 0.0
-        for k in outcomes_of(transitions, s, a):
+        for k in outcome_numbers(transitions, s, a):
             p = outcome(transitions, s, a, k)[1]
             if p > 0.0 and total <= u:
                 number, probability = k, p
@@ -373,7 +375,7 @@ def _drawn_outcome(transitions, s, a, u):
 def drawn(transitions, s, a, u):
     """The next state of (s, a), -1 for the end, drawn by u in [0, 1); probabilities need not sum to 1."""
     total = 0.0
-    for k in outcomes_of(transitions, s, a):
+    for k in outcome_numbers(transitions, s, a):
         total += outcome(transitions, s, a, k)[1]
     return np.int64(outcome(transitions, s, a, drawn_outcome(transitions, s, a, u * total)[0])[0])
 
@@ -392,7 +394,7 @@ def have_one_outcome(transitions):
     num_states, num_actions = size_of(transitions)
     for s in range(num_states):
         for a in range(num_actions):
-            for i in outcomes_of(transitions, s, a):
+            for i in outcome_numbers(transitions, s, a):
                 chance = outcome(transitions, s, a, i)[1]
                 if chance != 1.0 and chance != 0.0:  # rows sum to 1 up to a tolerance: a second one may be small
                     return False
@@ -431,7 +433,7 @@ def encode(bits, counts, first_row, first, palette, size, table, codes):
     """codes[r] = the palette's code of row r's probabilities, for the rows from `first_row` on; new ones are entered.
 
     bits (N,): of the probabilities; those of row `first_row` begin at `first`. Returns (row, first, size) of the first
-    row that finds the palette full; row is len(counts) where there is none.
+    row that finds the palette full; row is len(counts) if there is none.
     """
     capacity, num_outcomes = palette.shape
     slots = table.shape[0]
@@ -482,7 +484,7 @@ def enter(palette, size, table):
         table[slot] = code
 
 
-@njit(forceinline=True)
+@inlined
 def _is(palette, code, bits, first, n):
     """Whether the entry of the palette with this code has the probabilities bits[first : first + n]."""
     if n < palette.shape[1] and palette[code, n] != 0:

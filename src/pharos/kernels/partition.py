@@ -1,10 +1,10 @@
 """Partitions of states: equal rows get equal numbers; classes split by the classes that their members lead to.
 
-Exact: hashes only say where to look, and rows are compared entry by entry. `slots` is a hash table of at least twice as
-many entries as rows, -1 where empty, that is empty again after each call.
+Exact: hashes only narrow the search, and rows are compared entry by entry. `slots` is a hash table of at least twice as
+many entries as rows, -1 if empty, that is empty again after each call.
 
 Under transition probabilities classes split by the probabilities of reaching classes, into the coarsest stable
-partition. Rows are those of a sparse matrix, row s A + a of state s and action a; columns from S on are no state. Two
+partition. Rows form a sparse matrix, row s A + a of state s and action a; columns from S on are no state. Two
 rows are equal if they reach every class with the same probability, rounded to 2^-40, so that the order of additions
 does not matter. Members of a class lie side by side in `elements`. Of the groups into which it falls the largest keeps
 its number, and only states that lead to a class with a new number are looked at again, the candidates of the next
@@ -58,7 +58,7 @@ def number_rows(rows, before, slots, numbers):
 def numbered_rows(rows, before=None):
     """((N,) int64, how many): equal rows (N, ...) get equal numbers, in the order in which they appear first.
 
-    before (N,) int64: rows are equal only where these are, too.
+    before (N,) int64: rows are equal only if these are, too.
     """
     rows = np.ascontiguousarray(rows)
     before = np.zeros(len(rows), np.int64) if before is None else before
@@ -87,11 +87,11 @@ def affected_states(next_states, changed, candidates):
 
 
 @kernel
-def split(next_states, classes, sizes, count, candidates, n, slots, used, new, changed):
+def split_classes(next_states, classes, sizes, count, candidates, n, slots, used, new, changed):
     """Split classes by the classes that the candidates lead to; returns the number of classes.
 
-    Members that are no candidates lead where their class led before, and keep its number; so does the first group where
-    all members are candidates. classes (S,), sizes (S,) members of each class; candidates (S,), of which the first n
+    Members that are no candidates lead to what their class led to before, and keep its number; so does the first group
+    if all members are candidates. classes (S,), sizes (S,) members of each class; candidates (S,), of which the first n
     count; used, new (S,) scratch; changed (S,) bool: whose class changed.
     """
     mask = len(slots) - 1
@@ -110,9 +110,9 @@ def split(next_states, classes, sizes, count, candidates, n, slots, used, new, c
             h = mixed(h ^ uint64(classes[t] if t >= 0 else -1))
         slot = np.int64(h) & mask
         while True:
-            place = slots[slot]
+            index = slots[slot]
             # a new signature: its group keeps the number of the class, or gets a new one
-            if place < 0:
+            if index < 0:
                 slots[slot] = i
                 used[i] = slot
                 c = classes[s]
@@ -124,7 +124,7 @@ def split(next_states, classes, sizes, count, candidates, n, slots, used, new, c
                     count += 1
                 break
             # a signature in this slot: s joins its group if all classes agree
-            other = candidates[place]
+            other = candidates[index]
             same = classes[other] == classes[s]
             for a in range(num_actions):
                 if not same:
@@ -133,7 +133,7 @@ def split(next_states, classes, sizes, count, candidates, n, slots, used, new, c
                 same = (classes[t] if t >= 0 else -1) == (classes[u] if u >= 0 else -1)
             if same:
                 used[i] = slot
-                new[i] = new[place]
+                new[i] = new[index]
                 break
             slot = (slot + 1) & mask
     # empty the slots, and renumber the states of new groups
@@ -163,13 +163,13 @@ def predecessors(first, column, num_actions, edges, states):
     """
     size = len(edges) - 1
     edges[:] = 0
-    # how many outcomes lead to each state, and where its predecessors begin
+    # how many outcomes lead to each state, and the beginning of its predecessors
     for k in range(len(column)):
         if column[k] < size:
             edges[column[k] + 1] += 1
     for t in range(size):
         edges[t + 1] += edges[t]
-    # fill; edges[t] moves to where t ends, and is moved back by one place
+    # fill; edges[t] moves to the end of t, and is moved back by one place
     for s in range(size):
         for k in range(first[s * num_actions], first[(s + 1) * num_actions]):
             t = column[k]
@@ -234,7 +234,7 @@ def _have_equal_rows(matrix, num_actions, s, other, classes, mass, keys, mass_of
 def refine(matrix, num_actions, into, classes, layout, slots):
     """Split classes (S,), numbered from 0 without gaps, until nothing splits; returns the number of rounds.
 
-    The last round splits nothing. into: `predecessors`. layout: elements, place, begin, sizes, (S,) each, and slots, a
+    The last round splits nothing. into: `predecessors`. layout: elements, index, begin, sizes, (S,) each, and slots, a
     power of 2 of at least 2 S that are all -1: scratch.
     """
     size, kind = len(classes), classes.dtype
@@ -283,7 +283,7 @@ def _move_to_front(candidates, n, classes, layout, num_candidates, touched):
 
     touched (S,): its first entries are these classes.
     """
-    elements, place, begin, _ = layout
+    elements, index, begin, _ = layout
     num_touched = 0
     for i in range(n):
         s = candidates[i]
@@ -291,10 +291,10 @@ def _move_to_front(candidates, n, classes, layout, num_candidates, touched):
         if num_candidates[c] == 0:
             touched[num_touched] = c
             num_touched += 1
-        front, current = begin[c] + num_candidates[c], place[s]
+        front, current = begin[c] + num_candidates[c], index[s]
         t = elements[front]
         elements[front], elements[current] = s, t
-        place[s], place[t] = front, current
+        index[s], index[t] = front, current
         num_candidates[c] += 1
     return num_touched
 
@@ -303,7 +303,7 @@ def _move_to_front(candidates, n, classes, layout, num_candidates, touched):
 def _group_members(matrix, num_actions, c, k, classes, layout, groups, group_sizes, rows):
     """group[j] of the first k members of class c, the candidates, by equal rows; returns how many groups.
 
-    The others lead where they led before: one of them stands for all, and opens group 0.
+    The others lead to what they led to before: one of them stands for all, and opens group 0.
     """
     elements, _, begin, sizes = layout
     group, member, hashes, slots, used = groups
@@ -341,9 +341,9 @@ def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, num
 
     Group 0 comes last, beside the members that are no candidates.
     """
-    elements, place, begin, sizes = layout
+    elements, index, begin, sizes = layout
     group, ends, _, _, states = groups
-    # where each group begins, and which one is the largest
+    # the beginning of each group, and which one is the largest
     largest, at = 0, begin[c]
     for g in range(num_groups - 1, -1, -1):
         ends[g] = at
@@ -354,7 +354,7 @@ def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, num
     states[:k] = elements[begin[c] : begin[c] + k]
     for j in range(k):
         s = states[j]
-        elements[ends[group[j]]], place[s] = s, ends[group[j]]
+        elements[ends[group[j]]], index[s] = s, ends[group[j]]
         ends[group[j]] += 1
     # new numbers: the largest group keeps c, each other gets the next one
     at = begin[c]
@@ -375,9 +375,9 @@ def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, num
 def _lay_out(classes, layout):
     """Lay the members of each class side by side; returns the number of classes.
 
-    elements[begin[c]:begin[c] + sizes[c]]: the members of class c; s is at place[s].
+    elements[begin[c]:begin[c] + sizes[c]]: the members of class c; s is at index[s].
     """
-    elements, place, begin, sizes = layout
+    elements, index, begin, sizes = layout
     count = 0
     sizes[:] = 0
     for s in range(len(classes)):
@@ -388,8 +388,8 @@ def _lay_out(classes, layout):
         begin[c] = at
         at += sizes[c]
     for s in range(len(classes)):
-        place[s] = begin[classes[s]]
-        elements[place[s]] = s
+        index[s] = begin[classes[s]]
+        elements[index[s]] = s
         begin[classes[s]] += 1
     for c in range(count):
         begin[c] -= sizes[c]

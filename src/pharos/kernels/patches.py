@@ -5,7 +5,7 @@ A patch is a pixel with its eight neighbours. Pictures of worlds have few differ
 p, and the two layers and their gradients are computed once for each group g, not for each picture:
 
     h_g = max(0, patch_g K + k),   z_b = c + sum_p W_p h_g(b, p),   dz_g = sum of dz_b over b in g
-    dW_p = sum_g h_g dz_g,   dh_g = W_p' dz_g where h_g > 0,   dK = sum_g patch_g dh_g
+    dW_p = sum_g h_g dz_g,   dh_g = W_p' dz_g if h_g > 0,   dK = sum_g patch_g dh_g
 
 A patch that is met at several pixels is convolved once. It is the same sum in another order, not an approximation.
 
@@ -19,7 +19,7 @@ from pharos.kernels.kernel_cache import kernel
 
 FILTERS = 16
 COLOURS = 127  # that fit into seven bits, beside what is outside
-RECENT = 1024  # places for patches that have been convolved
+RECENT = 1024  # entries for patches that have been convolved
 SCATTER = 0x9E3779B97F4A7C15
 
 
@@ -34,13 +34,13 @@ def _is_alike(one, pixel, other, at, channels, pixels):
 
 @kernel
 def patch_keys(pictures, shape, keys):
-    """keys (pixels, B) int64: equal where patches are; pictures (B, C pixels), shape (C, H, W).
+    """keys (pixels, B) int64: equal if patches are; pictures (B, C pixels), shape (C, H, W).
 
-    Seven bits for the number of each of nine colours. Where there are more than COLOURS of them all keys differ.
+    Seven bits for the number of each of nine colours. If there are more than COLOURS of them all keys differ.
     """
     channels, height, width = shape
     pixels, count = height * width, 0
-    places = np.empty((COLOURS + 1, 2), np.int64)  # (picture, pixel) of each colour, by its number
+    origin = np.empty((COLOURS + 1, 2), np.int64)  # (picture, pixel) of each colour, by its number
     codes, rows = np.zeros((height + 2, width + 2), np.int64), np.empty((height + 2, width), np.int64)
     for b in range(len(pictures)):
         picture, code = pictures[b], 0
@@ -50,14 +50,14 @@ def patch_keys(pictures, shape, keys):
                 if code == 0 or not _is_alike(picture, pixel, picture, pixel - 1, channels, pixels):
                     code = 1
                     while code <= count and not _is_alike(
-                        picture, pixel, pictures[places[code, 0]], places[code, 1], channels, pixels
+                        picture, pixel, pictures[origin[code, 0]], origin[code, 1], channels, pixels
                     ):
                         code += 1
                     if code > COLOURS:
                         keys[:] = np.arange(keys.size).reshape(keys.shape)
                         return
                     if code > count:
-                        count, places[code, 0], places[code, 1] = code, b, pixel
+                        count, origin[code, 0], origin[code, 1] = code, b, pixel
                 codes[y + 1, x + 1] = code
         for y in range(height + 2):
             for x in range(width):
@@ -72,7 +72,7 @@ def _grouped(keys, members, samples, slots):
     """Put B pictures into groups by their keys (B,) at a pixel; return the number of groups.
 
     members (B,): the group of each picture; samples: a picture of each group.
-    slots: (keys, groups) of a hash table, all -1 before and after; (B,) places of it that are in use.
+    slots: (keys, groups) of a hash table, all -1 before and after; (B,) indices of it that are in use.
     """
     slot_keys, slot_groups, used = slots
     mask, count = uint64(len(slot_keys) - 1), 0
@@ -92,7 +92,7 @@ def _grouped(keys, members, samples, slots):
 
 @kernel(fastmath={"contract"})
 def _convolve(picture, neighbours, kernel, bias, hidden):
-    """hidden (16,) = max(0, patch K + k); neighbours (9 C,): of a pixel in the picture, beyond its end where none."""
+    """hidden (16,) = max(0, patch K + k); neighbours (9 C,): of a pixel in the picture, beyond its end if none."""
     for f in range(FILTERS):
         hidden[f] = bias[f]
     for k in range(len(neighbours)):
@@ -107,7 +107,7 @@ def _convolve(picture, neighbours, kernel, bias, hidden):
 
 @kernel
 def _live(values, at):
-    """Write to `at` where values (n,) are not 0; return how many there are."""
+    """Write to `at` the indices of the values (n,) other than 0; return their number."""
     count = 0
     for k in range(len(values)):
         at[count] = k
@@ -117,7 +117,7 @@ def _live(values, at):
 
 @kernel(fastmath={"contract"})
 def _combine(factors, rows, at, count, out):
-    """out (outputs,) = the sum of factors times rows (n, outputs) over the `count` first places `at`."""
+    """out (outputs,) = the sum of factors times rows (n, outputs) over the `count` first indices `at`."""
     out[:] = 0.0
     blocks = count // 4 * 4
     for k in range(0, blocks, 4):
@@ -141,7 +141,7 @@ def _spread(products, members, total):
 
 
 @kernel
-def _collected(dy, members, dz):
+def _sum_members(dy, members, dz):
     """dz (G, outputs) = the sum of dy (B, outputs) over the members of each group."""
     dz[:] = 0.0
     for b in range(len(members)):
@@ -159,17 +159,17 @@ def _parts(row, offsets, neighbours, pixels, outputs):
 
 
 @kernel
-def forward(parameters, offsets, shape, places, x, y, memory):
+def forward(parameters, offsets, shape, indices, x, y, memory):
     """y (W, B, outputs) = max(0, z) of pictures x, for each row of parameters (W, P).
 
-    offsets: of kernel, its bias, weight and its bias in a row. shape: (C, H, W). places (pixels, 9 C): of neighbours in
-    a picture. x (W, pitch): B pictures of C H W numbers from 0 to 255 each, one after another.
+    offsets: of kernel, its bias, weight and its bias in a row. shape: (C, H, W). indices (pixels, 9 C): of neighbours
+    in a picture. x (W, pitch): B pictures of C H W numbers from 0 to 255 each, one after another.
     memory, written for `backward`: (begins (W, pixels + 1), the first group of each pixel; samples, owners (W, B
     pixels), a picture of each group and the group whose patch is the same; hidden (W, B pixels, 16); members (W,
     pixels, B), the group of each picture, counted from the pixel's first).
     """
     begins, samples, owners, hidden, members = memory
-    number, pixels, outputs, size = y.shape[1], len(places), y.shape[2], shape[0] * len(places)
+    number, pixels, outputs, size = y.shape[1], len(indices), y.shape[2], shape[0] * len(indices)
     keys, products = np.empty((pixels, number), np.int64), np.empty((number, outputs), np.float32)
     room = 2
     while room < 2 * number:
@@ -178,7 +178,7 @@ def forward(parameters, offsets, shape, places, x, y, memory):
     recent_keys, recent, live = np.empty(RECENT, np.int64), np.empty(RECENT, np.int64), np.empty(FILTERS, np.int64)
     for i in range(len(parameters)):
         pictures, total = x[i, : number * size].reshape(number, size), y[i]
-        kernel, of_kernel, weight, bias = _parts(parameters[i], offsets, places.shape[1], pixels, outputs)
+        kernel, of_kernel, weight, bias = _parts(parameters[i], offsets, indices.shape[1], pixels, outputs)
         kernel = kernel * float32(1 / 255)
         patch_keys(pictures, shape, keys)
         total[:], recent[:] = bias, -1
@@ -188,14 +188,14 @@ def forward(parameters, offsets, shape, places, x, y, memory):
             begins[i, p + 1] = end
             for g in range(first, end):
                 key = keys[p, samples[i, g]]
-                place = (uint64(key) * uint64(SCATTER)) >> uint64(54)
-                if recent[place] >= 0 and recent_keys[place] == key:
-                    owners[i, g] = recent[place]
-                    hidden[i, g] = hidden[i, recent[place]]
+                slot = (uint64(key) * uint64(SCATTER)) >> uint64(54)
+                if recent[slot] >= 0 and recent_keys[slot] == key:
+                    owners[i, g] = recent[slot]
+                    hidden[i, g] = hidden[i, recent[slot]]
                 else:
-                    owners[i, g] = recent[place] = g
-                    recent_keys[place] = key
-                    _convolve(pictures[samples[i, g]], places[p], kernel, of_kernel, hidden[i, g])
+                    owners[i, g] = recent[slot] = g
+                    recent_keys[slot] = key
+                    _convolve(pictures[samples[i, g]], indices[p], kernel, of_kernel, hidden[i, g])
             w = weight[p * FILTERS : (p + 1) * FILTERS]
             for g in range(first, end):
                 _combine(hidden[i, g], w, live, _live(hidden[i, g], live), products[g - first])
@@ -208,10 +208,10 @@ def forward(parameters, offsets, shape, places, x, y, memory):
 
 @kernel(fastmath={"reassoc", "contract"})
 def _dots(rows, vector, at, count, out):
-    """out (n,) = rows (n, outputs) times a vector (outputs,) at the `count` first places `at`, elsewhere 0."""
+    """out (n,) = rows (n, outputs) times a vector (outputs,) at the `count` first indices `at`, elsewhere 0."""
     out[:] = 0.0
     for k in range(0, count, 4):
-        # up to three places twice, at the end
+        # up to three indices twice, at the end
         f0, f1, f2, f3 = at[k], at[min(k + 1, count - 1)], at[min(k + 2, count - 1)], at[min(k + 3, count - 1)]
         r0, r1, r2, r3 = rows[f0], rows[f1], rows[f2], rows[f3]
         s0, s1, s2, s3 = float32(0.0), float32(0.0), float32(0.0), float32(0.0)
@@ -235,19 +235,19 @@ def _add_patch(picture, neighbours, dh, of_kernel):
 
 
 @kernel
-def backward(parameters, gradients, offsets, shape, places, x, dy, memory):
+def backward(parameters, gradients, offsets, shape, indices, x, dy, memory):
     """Write the gradients (W, P) of the four parameters; dy (W, B, outputs): of z, before the activation.
 
     Everything else as `forward` has it.
     """
     begins, samples, owners, hidden, members = memory
-    number, pixels, outputs, size = dy.shape[1], len(places), dy.shape[2], shape[0] * len(places)
+    number, pixels, outputs, size = dy.shape[1], len(indices), dy.shape[2], shape[0] * len(indices)
     dz, dh = np.empty((number, outputs), np.float32), np.empty((number * pixels, FILTERS), np.float32)
     live = np.empty(max(number, FILTERS), np.int64)
     for i in range(len(parameters)):
         pictures = x[i, : number * size].reshape(number, size)
-        weight = _parts(parameters[i], offsets, places.shape[1], pixels, outputs)[2]
-        of_kernel, of_its_bias, of_weight, of_bias = _parts(gradients[i], offsets, places.shape[1], pixels, outputs)
+        weight = _parts(parameters[i], offsets, indices.shape[1], pixels, outputs)[2]
+        of_kernel, of_its_bias, of_weight, of_bias = _parts(gradients[i], offsets, indices.shape[1], pixels, outputs)
         of_kernel[:], of_its_bias[:], of_bias[:] = 0.0, 0.0, 0.0
         for b in range(number):
             for j in range(outputs):
@@ -255,7 +255,7 @@ def backward(parameters, gradients, offsets, shape, places, x, dy, memory):
         for p in range(pixels):
             first, end, rows = begins[i, p], begins[i, p + 1], slice(p * FILTERS, (p + 1) * FILTERS)
             dz_of = dz[: end - first]
-            _collected(dy[i], members[i, p], dz_of)
+            _sum_members(dy[i], members[i, p], dz_of)
             h, w, dw = hidden[i, first:end], weight[rows], of_weight[rows]
             for f in range(FILTERS):
                 _combine(h[:, f], dz_of, live, _live(h[:, f], live), dw[f])
@@ -268,7 +268,7 @@ def backward(parameters, gradients, offsets, shape, places, x, dy, memory):
                 if owners[i, g] == g:
                     for f in range(FILTERS):
                         of_its_bias[f] += dh[g, f]
-                    _add_patch(pictures[samples[i, g]], places[p], dh[g], of_kernel)
+                    _add_patch(pictures[samples[i, g]], indices[p], dh[g], of_kernel)
         for k in range(len(of_kernel)):
             for f in range(FILTERS):
                 of_kernel[k, f] *= float32(1 / 255)

@@ -5,18 +5,18 @@ and in rules/interaction.py), of Q-learning (below), of the batched engine (batc
 environments on a table. A stream's whole state is one 64-bit word that can be stored and restored.
 
 Q-learning, compiled: in a table (agents/q_learning.py), and in a kernel from drawn transitions, which is the loop of
-`hardness.sampled_regret`: Q(c, a) of observation c is q[a, c] where the kernel is a matrix K, else F[c] .
+`hardness.sampled_regret`: Q(c, a) of observation c is q[a, c] if the kernel is a matrix K, else F[c] .
 W[a] + q[a, c] for features F and a diagonal.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import float64, njit, types, uint64
+from numba import float64, types, uint64
 from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at, set_has
-from pharos.kernels.kernel_cache import kernel
+from pharos.kernels.kernel_cache import inlined, kernel
 from pharos.kernels.outcomes import drawn, drawn_outcome, is_table, outcome, size_of
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)  # when an environment that has ended is reset
@@ -29,7 +29,7 @@ class Setting(NamedTuple):
         ranges: (2, D) int64, lowest and highest value of each component; (2, 0) on a table.
         scale: (D,) float64, of the vectors that `step_many` writes.
         chance: (chosen, previous, uniform, first_chosen, lazy), weights of the executed action, the fourth that of the
-            chosen one where there is no previous action; and the probability that it has no effect.
+            chosen one if there is no previous action; and the probability that it has no effect.
         limit: steps after which an episode is truncated.
         mode: NEXT_STEP, SAME_STEP or DISABLED.
         first_previous: the previous action on the first step of an episode, -1 for none.
@@ -57,8 +57,8 @@ class EnvironmentBatch(NamedTuple):
         previous, elapsed, ended: (N,) the previous action, steps of the episode so far, whether it is over.
         rewards, terminated, truncated, executed: (N,) of this step; executed is -1 after a reset.
         final: as states; the last state of an episode that was over and reset in the same step.
-        vector: (N, D) float32, the states as vectors; (0, D) where they are not wanted.
-        probabilities: (N,) float64, of the outcomes that were drawn, 1 after a reset; (0,) where the rules have no
+        vector: (N, D) float32, the states as vectors; (0, D) if they are not wanted.
+        probabilities: (N,) float64, of the outcomes that were drawn, 1 after a reset; (0,) if the rules have no
             chance.
     """
 
@@ -77,7 +77,7 @@ class EnvironmentBatch(NamedTuple):
     probabilities: np.ndarray
 
 
-@njit(forceinline=True)
+@inlined
 def uniform_number(rng, i):
     """A uniform number in [0, 1) of stream i: SplitMix64 (Steele, Lea and Flood 2014) on the counter rng[i]."""
     rng[i] += uint64(0x9E3779B97F4A7C15)
@@ -94,35 +94,35 @@ def next_number(rng):
     return uniform_number(rng, 0)
 
 
-@njit(forceinline=True)
+@inlined
 def integer_below(rng, i, n):
     """A uniform integer in [0, n) of stream i."""
     return min(int(uniform_number(rng, i) * n), n - 1)
 
 
-@njit(forceinline=True)
+@inlined
 def normal_by_numbers(u, v):
     """A standard normal number from two uniform ones, u > 0 (Box and Muller 1958)."""
     return np.sqrt(-2.0 * np.log(u)) * np.cos(2.0 * np.pi * v)
 
 
-@njit(forceinline=True)
+@inlined
 def normal_number(rng, i):
     """A standard normal number of stream i."""
     return normal_by_numbers(1.0 - uniform_number(rng, i), uniform_number(rng, i))
 
 
-@njit(forceinline=True)
+@inlined
 def delayed_reward(pending, elapsed, earned, is_last):
-    """Reward paid at a step where rewards come D steps late, and all at once at the end of an episode.
+    """Reward paid at a step if rewards come D steps late, and all at once at the end of an episode.
 
     pending (D,): rewards of the last steps, not paid yet; elapsed: steps of the episode before this one; earned: the
     reward of this step.
     """
-    # a ring: the reward of D steps ago leaves, that of this step comes in
-    place = elapsed % len(pending)
-    total = pending[place]
-    pending[place] = earned
+    # a ring: the reward of D steps ago leaves, the reward of this step comes in
+    slot = elapsed % len(pending)
+    total = pending[slot]
+    pending[slot] = earned
     if is_last:
         for k in range(len(pending)):
             total += pending[k]
@@ -153,11 +153,11 @@ def flip_coins(rng, out):
             out[i, j] = 1.0 if uniform_number(rng, i) < 0.5 else 0.0
 
 
-@njit(forceinline=True)
+@inlined
 def executed_by_number(choice, previous, chance, num_actions, u):
     """The executed action, by one uniform number u in [0, 1): the choice, then the previous action, then a uniform one.
 
-    chance: as in `Setting`; previous: -1 where there is none, and the choice has the weight of the first step.
+    chance: as in `Setting`; previous: -1 if there is none, and the choice has the weight of the first step.
     """
     if previous < 0:
         if u < chance[3]:
@@ -170,7 +170,7 @@ def executed_by_number(choice, previous, chance, num_actions, u):
     return min(int((u - chance[0] - chance[1]) / chance[2] * num_actions), num_actions - 1)
 
 
-@njit(forceinline=True)
+@inlined
 def executed_of_set(choice, previous, chance, is_available, u):
     """`executed_by_number` in a state with some actions only, is_available (A,) bool.
 
@@ -213,7 +213,7 @@ def execute_in_sets(rng, choices, previous, ended, chance, sets, executed):
             executed[i] = executed_of_set(choices[i], previous[i], chance, sets[i], uniform_number(rng, i))
 
 
-@njit(forceinline=True)
+@inlined
 def redrawn_action(choice, previous, chance, num_actions, rng, s):
     """The executed action in state s, by numbers of the stream rng (1,): a uniform action takes a second one.
 
@@ -249,21 +249,21 @@ def _action_of_set(chance, num_actions, rng, s):
     return drawn_of_set
 
 
-@njit(forceinline=True)
+@inlined
 def executed_action(choice, previous, chance, num_actions, rng, i):
-    """The executed action of stream i; nothing is drawn where the choice is always executed."""
+    """The executed action of stream i; nothing is drawn if the choice is always executed."""
     if chance[0] >= 1.0:
         return choice
     return executed_by_number(choice, previous, chance, num_actions, uniform_number(rng, i))
 
 
-@njit(forceinline=True)
+@inlined
 def has_no_effect(chance, rng, i):
-    """Whether the executed action of stream i changes nothing; nothing is drawn where every action has an effect."""
+    """Whether the executed action of stream i changes nothing; nothing is drawn if every action has an effect."""
     return chance[4] > 0.0 and uniform_number(rng, i) < chance[4]
 
 
-@njit(forceinline=True)
+@inlined
 def start_by_number(cumulative, u):
     """The number of a start state, by one uniform number u in [0, 1) and the cumulated probabilities."""
     k = 0
@@ -272,9 +272,9 @@ def start_by_number(cumulative, u):
     return k
 
 
-@njit(forceinline=True)
+@inlined
 def drawn_start(cumulative, rng, i):
-    """The number of a start state; nothing is drawn where there is one."""
+    """The number of a start state; nothing is drawn if there is one."""
     return start_by_number(cumulative, uniform_number(rng, i)) if len(cumulative) > 1 else 0
 
 
@@ -296,20 +296,20 @@ def first_outside(actions, num_actions):
 
 
 @kernel
-def execute_choices(policy, places, numbers, chance, table, palette, states, discount, alive, previous, returns):
+def execute_choices(policy, indices, numbers, chance, table, palette, states, discount, alive, previous, returns):
     """One step of the episodes `alive` (N,): the executed actions become their `previous`, what these pay is added up.
 
-    policy: (M, A), probabilities; places: (N,), rows of the episodes there; numbers: (u, v, w), (N,) each: u chooses,
+    policy: (M, A), probabilities; indices: (N,), rows of the episodes there; numbers: (u, v, w), (N,) each: u chooses,
     v decides between the choice, the previous action and w, a uniform one; chance: (chosen, previous, uniform,
-    first_chosen); table, palette: of rewards; states, previous (A where there is none), returns: of all episodes.
+    first_chosen); table, palette: of rewards; states, previous (A if there is none), returns: of all episodes.
     """
     u, v, w = numbers
     num_actions = policy.shape[1]
     for k in range(len(alive)):
-        i, choice, sum_of = alive[k], 0, policy[places[k], 0]
+        i, choice, sum_of = alive[k], 0, policy[indices[k], 0]
         while sum_of < u[k] and choice < num_actions - 1:
             choice += 1
-            sum_of += policy[places[k], choice]
+            sum_of += policy[indices[k], choice]
         b = previous[i]
         if v[k] < (chance[3] if b == num_actions else chance[0]):
             action = choice
@@ -320,7 +320,7 @@ def execute_choices(policy, places, numbers, chance, table, palette, states, dis
 
 
 def outcome_on_table(transitions, rewards, s, a, rng, i):
-    """(next state, reward, probability) of the outcome of (s, a) that stream i draws; nothing is drawn where there is
+    """(next state, reward, probability) of the outcome of (s, a) that stream i draws; nothing is drawn if there is
     one.
     """
 
@@ -342,7 +342,7 @@ def walk_table(transitions, table_rewards, staying, is_terminal, setting, batch,
     """One step of environments first .. last - 1 on a tabulated state space: `step_many`, with indices for states.
 
     transitions: see kernels/outcomes.py; table_rewards: their rewards, (S, A), or with chance as `transitions`, with
-    rewards in the place of the successors; staying: (S, A), the reward of an action without effect; (0, 0) where all
+    rewards in the place of the successors; staying: (S, A), the reward of an action without effect; (0, 0) if all
     have one.
     """
     _, _, chance, limit, mode, first_previous, starts, cumulative = setting
@@ -384,7 +384,7 @@ def walk_table(transitions, table_rewards, staying, is_terminal, setting, batch,
 
 
 def _next_state(transitions, s, a, word):
-    """A next state of (s, a), -1 for the end; draws a number only where there are several outcomes."""
+    """A next state of (s, a), -1 for the end; draws a number only if there are several outcomes."""
 
 
 @overload(_next_state)
@@ -407,7 +407,7 @@ def q_learning(
     schedule,
     q,
     visits,
-    place,
+    cursor,
     sums,
     word,
     noise,
@@ -419,12 +419,12 @@ def q_learning(
 
     transitions: see kernels/outcomes.py; table, palette: rewards; starts (K,), cumulative (K,): start states and their
     cumulated probabilities;
-    chance: (chosen, previous, uniform, first_chosen), with sets behind where some actions are not available; limit:
+    chance: (chosen, previous, uniform, first_chosen), with sets behind if some actions are not available; limit:
     steps of an episode; q, visits (R, A): values and number
-    of updates, R = S, or S (A + 1) with rows s (A + 1) + b where the agent observes the previous action b (A: none).
+    of updates, R = S, or S (A + 1) with rows s (A + 1) + b if the agent observes the previous action b (A: none).
     schedule: (learning rate, exponent of visits or 0, gamma, first epsilon, last epsilon, steps of exploration,
         exponential?, gamma of returns).
-    place: int64 (state or -1, previous action, steps in the episode, steps in all, episodes); sums: float64 (return of
+    cursor: int64 (state or -1, previous action, steps in the episode, steps in all, episodes); sums: float64 (return of
     this episode, its discount, sum of finished returns); word: uint64 (1,).
     noise: standard deviation of the noise of paid rewards; pending: float64 (steps by which they are late,), what
     is due; noise_word: uint64 (1,). Returns are of earned rewards.
@@ -434,16 +434,16 @@ def q_learning(
     observes_previous = len(q) > num_states
     for _ in range(steps):
         # start an episode
-        if place[0] < 0:
-            place[0] = starts[start_by_number(cumulative, uniform_number(word, 0))]
-            place[1] = num_actions
-            place[2] = 0
+        if cursor[0] < 0:
+            cursor[0] = starts[start_by_number(cumulative, uniform_number(word, 0))]
+            cursor[1] = num_actions
+            cursor[2] = 0
             sums[0] = 0.0
             sums[1] = 1.0
-        s, b = place[0], place[1]
+        s, b = cursor[0], cursor[1]
         row = s * (num_actions + 1) + b if observes_previous else s
         # epsilon of this step: linear or exponential from first to last
-        share = min(1.0, place[3] / exploration) if exploration > 0 else 1.0
+        share = min(1.0, cursor[3] / exploration) if exploration > 0 else 1.0
         if exponential > 0.0:
             epsilon = first_epsilon * (last_epsilon / first_epsilon) ** share
         else:
@@ -480,24 +480,24 @@ def q_learning(
         # the reward that the agent gets, late and noisy
         paid_reward = reward
         if len(pending) > 0:
-            paid_reward = delayed_reward(pending, place[2], reward, ended or place[2] + 1 >= limit)
+            paid_reward = delayed_reward(pending, cursor[2], reward, ended or cursor[2] + 1 >= limit)
         if noise > 0.0:
             paid_reward += noise * normal_number(noise_word, 0)
         # update Q of the chosen action, which may not be the executed one
         visits[row, action] += 1
         alpha = rate if exponent == 0.0 else max(rate, visits[row, action] ** -exponent)
         q[row, action] += alpha * (paid_reward + gamma * value - q[row, action])
-        # returns of earned rewards, and the place of the walk
+        # returns of earned rewards, and the cursor of the walk
         sums[0] += sums[1] * reward
         sums[1] *= measure_gamma
-        place[0] = t
-        place[1] = executed
-        place[2] += 1
-        place[3] += 1
-        if ended or place[2] >= limit:
+        cursor[0] = t
+        cursor[1] = executed
+        cursor[2] += 1
+        cursor[3] += 1
+        if ended or cursor[2] >= limit:
             sums[2] += sums[0]
-            place[4] += 1
-            place[0] = -1
+            cursor[4] += 1
+            cursor[0] = -1
 
 
 @kernel(fastmath={"reassoc", "contract"})
@@ -509,15 +509,15 @@ def _product(x, y):
     return total
 
 
-@njit(forceinline=True)
-def _value(kernel, learned, c, a):
+@inlined
+def _q_value(kernel, learned, c, a):
     """Q(c, a), of the tabular part and the features."""
     _, features, _ = kernel
     q, weights = learned
     return q[a, c] + _product(features[c], weights[a]) if features.shape[1] > 0 else q[a, c]
 
 
-@njit(forceinline=True)
+@inlined
 def _likeness(kernel, c, d):
     """K(c, d), the kernel of two observations."""
     matrix, features, diagonal = kernel
@@ -527,8 +527,8 @@ def _likeness(kernel, c, d):
     return own + _product(features[c], features[d])
 
 
-@njit(forceinline=True)
-def _add(kernel, learned, c, a, step):
+@inlined
+def _gradient_step(kernel, learned, c, a, step):
     """Q(., a) += step K(., c): a gradient step on Q(c, a)."""
     matrix, features, diagonal = kernel
     q, weights = learned
@@ -542,28 +542,29 @@ def _add(kernel, learned, c, a, step):
 
 
 @kernel
-def values(kernel, learned, out):
+def kernel_values(kernel, learned, out):
     """out (C, A) = Q of all observations and actions."""
     for c in range(out.shape[0]):
         for a in range(out.shape[1]):
-            out[c, a] = _value(kernel, learned, c, a)
+            out[c, a] = _q_value(kernel, learned, c, a)
 
 
 @kernel
 def learn(
-    outcomes, terminal, group, starts, cumulative, chance, limit, kernel, learned, target, memory, visits, place, word,
+    outcomes, terminal, group, starts, cumulative, chance, limit, kernel, learned, target, memory, visits, cursor, word,
     noise, schedule, largest_step, steps,
 ):  # fmt: skip
     """`steps` steps of an epsilon-greedy walk, with gradient steps on minibatches of its transitions.
 
     outcomes: (offsets (S A + 1,), states (N,), -1 for the end; rewards (N,); cumulative probabilities of a row (N,)).
     terminal: (S,); group: (S,) the observation of each state; starts, cumulative (K,): of episodes; chance: (chosen,
-    previous, uniform, first_chosen), with the sets of observations (C, A) behind where some actions are not available;
+    previous, uniform, first_chosen), with the sets of observations (C, A) behind if some actions are not available;
     limit: steps of an episode.
     kernel: (K (C, C) or (0, 0), F (C, m), diagonal (C,)); learnt, target: each (q (A, C), weights (A, m)), of which
     target stays as it is. memory: (observations (M,), actions (M,), next observations (M,), -1 for an end, rewards
     (M,)), a ring; visits: (C, A) numbers of choices.
-    place: int64 (state or -1, previous action or -1, steps in the episode, steps in all); word, noise_word: uint64 (1,)
+    cursor: int64 (state or -1, previous action or -1, steps in the episode, steps in all); word, noise_word: uint64
+        (1,)
     noise: (standard deviation of the noise of rewards, its random word); schedule: (gamma, first epsilon, last epsilon,
     steps of exploration, first step of learning, gradient steps in so many steps: two numbers, size of a minibatch).
     largest_step: the largest that does not overshoot; a minibatch takes that, or the largest that it bears itself.
@@ -576,11 +577,11 @@ def learn(
     batch, errors = np.zeros(size, np.int64), np.zeros(size)
     for _ in range(steps):
         # start an episode
-        if place[0] < 0:
-            place[0] = starts[start_by_number(cumulative, uniform_number(word, 0))]
-            place[1] = -1
-            place[2] = 0
-        s, t = place[0], place[3]
+        if cursor[0] < 0:
+            cursor[0] = starts[start_by_number(cumulative, uniform_number(word, 0))]
+            cursor[1] = -1
+            cursor[2] = 0
+        s, t = cursor[0], cursor[3]
         c = group[s]
         # epsilon-greedy action; before learning begins, a uniform one
         share = min(1.0, t / exploration) if exploration > 0 else 1.0
@@ -589,13 +590,13 @@ def learn(
         if uniform_number(word, 0) < epsilon:
             action = action_of_set(chance, num_actions, word, c)
         else:  # greedy, ties at random
-            best, ties = _value(kernel, learned, c, 0), 1
+            best, ties = _q_value(kernel, learned, c, 0), 1
             if not set_has(chance, c, 0):
                 best = -np.inf
             for a in range(1, num_actions):
                 if not set_has(chance, c, a):
                     continue
-                q = _value(kernel, learned, c, a)
+                q = _q_value(kernel, learned, c, a)
                 if q > best:
                     best, ties, action = q, 1, a
                 elif q == best:
@@ -603,7 +604,7 @@ def learn(
                     if uniform_number(word, 0) * ties < 1.0:
                         action = a
         # one step of the MDP: the outcome by its cumulated probability
-        executed = redrawn_action(action, place[1], chance, num_actions, word, c)
+        executed = redrawn_action(action, cursor[1], chance, num_actions, word, c)
         row = s * num_actions + executed
         k, last = offsets[row], offsets[row + 1] - 1
         if k < last:
@@ -619,11 +620,11 @@ def learn(
         if deviation > 0.0:
             rewards[slot] += deviation * normal_number(noise_word, 0)
         visits[c, action] += 1
-        place[0], place[1] = next_state, executed
-        place[2] += 1
-        place[3] += 1
-        if ended or place[2] >= limit:
-            place[0] = -1
+        cursor[0], cursor[1] = next_state, executed
+        cursor[2] += 1
+        cursor[3] += 1
+        if ended or cursor[2] >= limit:
+            cursor[0] = -1
         if t < begin:
             continue
         # gradient steps that fall due between this step and the next
@@ -637,12 +638,12 @@ def learn(
                 y = rewards[j]
                 if next_observations[j] >= 0:
                     d = next_observations[j]
-                    best = _value(kernel, target, d, 0) if set_has(chance, d, 0) else -np.inf
+                    best = _q_value(kernel, target, d, 0) if set_has(chance, d, 0) else -np.inf
                     for a in range(1, num_actions):
                         if set_has(chance, d, a):
-                            best = max(best, _value(kernel, target, d, a))
+                            best = max(best, _q_value(kernel, target, d, a))
                     y += gamma * best
-                errors[i] = y - _value(kernel, learned, observations[j], actions[j])
+                errors[i] = y - _q_value(kernel, learned, observations[j], actions[j])
             # largest step of this minibatch that does not overshoot, by the row sums of its kernel (Gershgorin)
             bound = 0.0
             for i in range(size):
@@ -656,4 +657,4 @@ def learn(
             # move Q along the kernel of each transition
             step = min(largest_step, 1.0 / bound) / size
             for i in range(size):
-                _add(kernel, learned, observations[batch[i]], actions[batch[i]], step * errors[i])
+                _gradient_step(kernel, learned, observations[batch[i]], actions[batch[i]], step * errors[i])

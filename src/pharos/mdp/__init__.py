@@ -32,7 +32,7 @@ if TYPE_CHECKING:
         random_actions,
         sticky_actions,
     )
-    from pharos.mdp.arguments import STEPS, check_horizon, require_mdp, whole_number
+    from pharos.mdp.arguments import STEPS_EXPECTED, check_horizon, require_mdp, whole_number
     from pharos.mdp.bisimulation import Minimization, minimize
     from pharos.mdp.dynamics import (
         BellmanEquation,
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
         runs_of,
         shares_of,
     )
-    from pharos.mdp.expanded import ExpandedMDP, executed_actions, mean_of_actions, nodes_of_outcomes, outcomes_of
+    from pharos.mdp.expanded import ExpandedMDP, executed_actions, mean_of_actions, nodes_of_outcomes, outcome_matrix
     from pharos.mdp.matrices import lacking
     from pharos.mdp.names import Names, SpaceColumns, names_from, names_of
     from pharos.mdp.reachability import (

@@ -1,7 +1,7 @@
 """Selection of the action that is chosen, and chance that decides which one is executed.
 
-Chosen (`Selection`): the best action, the worst one, or that of a policy. The Bellman equations of optimal values,
-worst values and values of a policy differ in nothing else.
+Chosen (`Selection`): the best action, the worst one, or the action of a policy. The Bellman equations of optimal
+values, worst values and values of a policy differ in nothing else.
 
 Executed (`Chance`): sticky, random and lazy actions are added to a world, an MDP in, an MDP out, and nothing is copied:
 an MDP carries three weights, and `Chance` applies them to values (`choice`), to distributions (`executed`), to the
@@ -113,7 +113,7 @@ class PolicyTable:
             policy: (S,) integers, an action for each state; or (S, A) probabilities. Under sticky actions also (S, A +
                 1) integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or
                 a function from an array of state indices to any of these; None: uniform.
-        Rows are divided by their sums in float64: those of a float32 softmax sum to 1 within 1e-7 only, and the
+        Rows are divided by their sums in float64: rows of a float32 softmax sum to 1 within 1e-7 only, and the
         difference would add up over the steps of an episode; `operations` counts the rounding of the division.
         Raises:
             ParameterError: the shape is wrong, or rows are not probabilities that sum to 1 within 1e-6, or have an
@@ -128,7 +128,7 @@ class PolicyTable:
             if table.ndim == 1:
                 return PolicyTable(num_actions, actions=table)
             return PolicyTable(num_actions, np.eye(num_actions)[table])
-        table = _normalized(mdp, table)
+        table = _rows_of_sum_one(mdp, table)
         check_choices(table, mdp.available)
         return PolicyTable(num_actions, table if table.ndim == 3 else table[:, None])
 
@@ -146,7 +146,7 @@ class PolicyTable:
 
     @cached_property
     def later(self) -> np.ndarray:
-        """(S, B, A) probabilities after the first step: B is A, or 1 where the previous action does not matter."""
+        """(S, B, A) probabilities after the first step: B is A, or 1 if the previous action does not matter."""
         return np.ascontiguousarray(self.probabilities[:, :-1] if self.looks_back else self.probabilities)
 
     @cached_property
@@ -209,7 +209,7 @@ def _check_actions(mdp: "TabularMDP", actions: np.ndarray) -> None:
         check_choices(np.eye(num_actions, dtype=bool)[actions], mdp.available)
 
 
-def _normalized(mdp: "TabularMDP", table: np.ndarray) -> np.ndarray:
+def _rows_of_sum_one(mdp: "TabularMDP", table: np.ndarray) -> np.ndarray:
     """Rows divided by their sums, in float64; those that sum to 1 as they are stay so to the bit."""
     num_states, num_actions = mdp.num_states, mdp.num_actions
     shapes = [(num_states, num_actions)] + ([(num_states, num_actions + 1, num_actions)] if mdp.is_sticky else [])
@@ -235,9 +235,9 @@ class Chance:
     """Weights of executing the chosen action, the previously executed one, or a uniform one; they sum to 1.
 
     On the first step there is no previous action: the chosen one is executed with probability `first_chosen`, else a
-    uniform one. (Only where random actions come before sticky ones does this differ from `chosen + previous`.)
+    uniform one. (Only if random actions come before sticky ones, this differs from `chosen + previous`.)
 
-    Where some actions are not available, the uniform action is one of those that are; and a previous one that is not
+    If some actions are not available, the uniform action is one of the available ones; and a previous one that is not
     counts as none: the step is as the first one.
 
     Attributes:
@@ -301,7 +301,7 @@ class Chance:
     def executes_any(self) -> bool:
         """Whether any action can be executed after any other, by some choice.
 
-        False where every step repeats the first.
+        False if every step repeats the first.
         """
         return self.chosen > 0 or self.uniform > 0
 
@@ -319,13 +319,13 @@ class Chance:
 
     @property
     def uniform_for_kernels(self) -> "float | tuple[float, np.ndarray]":
-        """The argument `uniform` of kernels: the weight, with the sets where it depends on them."""
+        """The argument `uniform` of kernels: the weight, with the sets if it depends on them."""
         if self.available is None or not self.is_random:
             return self.uniform
         return float(self.uniform), read_only(self.available)
 
     def at(self, states: States) -> "Chance":
-        """The chance in some states, of which the methods below take rows; the same where all actions are available."""
+        """The chance in some states, of which the methods below take rows; the same if all actions are available."""
         return self if self.available is None else replace(self, available=self.available[states])
 
     def width(self, num_actions: int) -> int:
@@ -341,7 +341,7 @@ class Chance:
 
         Args:
             q: (N, A, ...), the values of executing each action.
-            value: (N, 1, ...), the value of the chosen action; (N, A, ...) where the choice depends on the previous
+            value: (N, 1, ...), the value of the chosen action; (N, A, ...) if the choice depends on the previous
                 action.
         """
         result = self.chosen * value
@@ -362,7 +362,7 @@ class Chance:
         return np.asarray(total / self.available.sum(axis=1).reshape((-1, 1) + (1,) * (q.ndim - 2)))
 
     def shares(self, num_actions: int) -> "float | np.ndarray":
-        """The probability of each action when a uniform one is executed: 1 / A; (N, A) where sets decide it."""
+        """The probability of each action when a uniform one is executed: 1 / A; (N, A) if sets decide it."""
         if self.available is None:
             return 1 / num_actions
         return np.asarray(self.available / self.available.sum(axis=1, keepdims=True))
@@ -370,12 +370,12 @@ class Chance:
     def chosen_values(
         self, q: np.ndarray, previous: np.ndarray | None = None, mean: np.ndarray | None = None
     ) -> np.ndarray:
-        """(N, A): the values of choosing each action, from those of executing it.
+        """(N, A): the values of choosing each action, from the values of executing it.
 
         Args:
             q: (N, A), the values of executing each action.
-            previous: (N,) previously executed actions, A where there is none; it matters under sticky actions alone.
-            mean: (N, 1), the mean of q over actions, where it was added up already.
+            previous: (N,) previously executed actions, A if there is none; it matters under sticky actions alone.
+            mean: (N, 1), the mean of q over actions, if it was added up already.
         """
         mean = self.mean(q) if mean is None or self.available is not None else mean
         later = self.chosen * q + self.uniform * mean if self.is_random else self.chosen * q
@@ -390,7 +390,7 @@ class Chance:
         """(N, A): the mass that executes each action; the adjoint of `choice`.
 
         Args:
-            mass: (N, W), of states, by the previously executed action where that matters.
+            mass: (N, W), of states, by the previously executed action if that matters.
             policy: (N, B, A) probabilities of choosing, B = W or 1.
         """
         if self.available is not None and self.previous:  # what cannot be repeated is as on the first step
@@ -421,7 +421,7 @@ class Chance:
 
         Args:
             policy: (N, A), the probabilities of choosing each action.
-            previous: (N,) previously executed actions, A where there is none; it matters under sticky actions alone.
+            previous: (N,) previously executed actions, A if there is none; it matters under sticky actions alone.
         """
         num_actions = policy.shape[1]
         if self.available is None:
@@ -448,7 +448,7 @@ RANGE = "range"
 class ChanceSetting:
     """Chance added to an environment: of acting, which changes the MDP, and noise and delay of rewards, which do not.
 
-    Values and regret are those of the rewards as they are earned.
+    Values and regret count the rewards as they are earned.
 
     Attributes:
         sticky: probability that the previous action is executed again.
@@ -459,7 +459,7 @@ class ChanceSetting:
         reward_noise: standard deviation of noise in what is paid; 0 on average.
         reward_delay: steps by which rewards are paid late, the last at the end.
         scale_rewards: what is earned is divided by this number before noise and delay; or `range`, by V* - U, the value
-            of optimal less that of uniform play.
+            of optimal less the value of uniform play.
     Raises:
         ParameterError: one of them is out of range.
     """
@@ -505,7 +505,7 @@ class ChanceSetting:
         return ChanceSetting(**{**entry, "reward_delay": whole})  # type: ignore[arg-type]
 
     def to_dict(self) -> dict[str, float]:
-        """`{"sticky": .., "random": ..}`, and the others where they are not 0."""
+        """`{"sticky": .., "random": ..}`, and the others if they are not 0."""
         entry = {name: value for name, value in vars(self).items() if value or name in ("sticky", "random")}
         is_number = self.scale_rewards not in ("", RANGE)
         return {**entry, "scale_rewards": float(self.scale_rewards)} if is_number else entry
@@ -565,8 +565,9 @@ def random_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     """The MDP in which, with probability p, the executed action is uniform over all that are available.
 
     Q(s, a) = (1 - p) q(s, a) + p mean_b q(s, b), where q(s, x) = r(s, x) + gamma V(next(s, x)).
-    Combined with sticky actions: this chance comes before that of `mdp`, so `random_actions(sticky_actions(mdp, p), r)`
-    replaces the choice of the agent, and then the previous action may be executed instead.
+    Combined with sticky actions: this chance comes before the chance of `mdp`. So with
+    `random_actions(sticky_actions(mdp, p), r)` the choice of the agent is replaced first, and then the previous action
+    may be executed instead.
 
     Raises:
         ParameterError: p is not in [0, 1].
@@ -582,7 +583,7 @@ def sticky_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     V(s, b) = (1 - p) max_a q(s, a) + p q(s, b), where b is the previously executed action and q(s, x) the value of
     executing x. On the first step of an episode there is no previous action: the chosen one is executed (as in
     Gymnasium's StickyAction). A previous action b that is not available counts as none: V(s, b) = max_a q(s, a).
-    Combined with random actions: this chance comes before that of `mdp`.
+    Combined with random actions: this chance comes before the chance of `mdp`.
 
     Raises:
         ParameterError: p is not in [0, 1].
@@ -597,15 +598,15 @@ def lazy_actions(mdp: "TabularMDP", p: float, *, staying: "npt.ArrayLike | None"
 
         q(s, a) = (1 - p) [r(s, a) + gamma E V(next)] + p [r(s, a, s) + gamma V(s)]
 
-    Its chance comes after that of sticky and random actions, in whatever order they are added: first it is drawn which
-    action is executed, then whether it has an effect. An action without effect is the previous one of the next step.
-    Colosseum's `p_lazy`; its `p_rand` is `random_actions`.
+    Its chance comes after the chance of sticky and random actions, in whatever order they are added: first it is drawn
+    which action is executed, then whether it has an effect. An action without effect is the previous one of the next
+    step. Colosseum's `p_lazy`; its `p_rand` is `random_actions`.
 
     The mean of both rewards is exact if they are equal; elsewhere the bound of values counts its rounding.
 
     Args:
         p: in [0, 1).
-        staying: (S, A) what staying pays. None: what the rules pay for going from s to s by a, where the MDP is of a
+        staying: (S, A) what staying pays. None: what the rules pay for going from s to s by a, if the MDP is of a
             state space; else r(s, a), as the rewards of a table belong to state and action alone.
     Returns:
         An MDP without ages: a state can be visited twice.

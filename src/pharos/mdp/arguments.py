@@ -1,6 +1,6 @@
 """Checks of arguments: each error names the argument, the value found, and the first entry that is wrong.
 
-`require_mdp` suggests what to write where a function gets something that an MDP can be made of; the others check the
+`require_mdp` suggests what to write if a function gets something that an MDP can be made of; the others check the
 parts of a TabularMDP.
 """
 
@@ -49,8 +49,8 @@ def _remedy(value: object) -> str:
     return "pharos.build(env).mdp(gamma=0.99), or TabularMDP.from_arrays(...)"
 
 
-def as_array(value: object, name: str, dtype: npt.DTypeLike | None = None) -> np.ndarray:
-    """The argument `name` as an array; ParameterError where it is none, such as lists of several lengths."""
+def array_argument(value: object, name: str, dtype: npt.DTypeLike | None = None) -> np.ndarray:
+    """The argument `name` as an array; ParameterError if it is none, such as lists of several lengths."""
     try:
         return np.asarray(value, dtype)
     except (ValueError, TypeError) as error:
@@ -63,7 +63,7 @@ def checked_next_states(next_states: object) -> np.ndarray:
     Raises:
         ParameterError: it is not a table of states; the first wrong entry is named.
     """
-    table = as_array(next_states, "next_states")
+    table = array_argument(next_states, "next_states")
     if table.ndim != 2 or table.size == 0 or table.dtype.kind not in "iu":
         raise ParameterError(
             f"next_states has shape {table.shape} and type {table.dtype}; expected integers of shape (states, actions)"
@@ -77,7 +77,7 @@ def checked_next_states(next_states: object) -> np.ndarray:
     return np.ascontiguousarray(table, np.int32 if len(table) < 2**31 else np.int64)
 
 
-STEPS = "a whole number of steps, at least 1"
+STEPS_EXPECTED = "a whole number of steps, at least 1"
 
 
 def whole_number(
@@ -98,7 +98,7 @@ def check_gamma(gamma: object) -> None:
 def check_horizon(horizon: object) -> None:
     """ParameterError unless it is a number of steps, or None."""
     if horizon is not None:
-        whole_number(horizon, "horizon", f"{STEPS} and below 2^31, or None", most=2**31 - 1)
+        whole_number(horizon, "horizon", f"{STEPS_EXPECTED} and below 2^31, or None", most=2**31 - 1)
 
 
 def terminal_states(terminal: npt.ArrayLike | None, default: np.ndarray, allowed: np.ndarray) -> np.ndarray:

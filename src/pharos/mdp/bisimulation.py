@@ -63,23 +63,23 @@ def minimize(mdp: TabularMDP, observations: npt.ArrayLike | None = None) -> Mini
     """
     rewards = mdp.reward_table
     entries = rewards.table if len(rewards.palette) else rewards.table + 0.0  # -0.0 and 0.0 are one reward
-    classes = _numbered(entries, np.asarray(mdp.terminal).astype(np.int64))
+    classes = _pair_numbers(entries, np.asarray(mdp.terminal).astype(np.int64))
     if mdp.available is not None:
-        classes = _numbered(mdp.available, classes)
+        classes = _pair_numbers(mdp.available, classes)
     if observations is not None:
         observed = np.asarray(observations)
         if observed.ndim == 0 or len(observed) != mdp.num_states:
             count = len(observed) if observed.ndim else "a number"
             raise ParameterError(f"there are {count} observations; expected {mdp.num_states}, one for each state")
         rows = observed.reshape(mdp.num_states, -1)
-        classes = _numbered(rows + 0.0 if observed.dtype.kind == "f" else rows, classes)
+        classes = _pair_numbers(rows + 0.0 if observed.dtype.kind == "f" else rows, classes)
     table = mdp.dynamics.deterministic_table()
     classes, rounds = _refined_general(mdp, classes) if table is None else _refined(table, classes)
     _, representatives = np.unique(classes, return_index=True)
-    return Minimization(_merged(mdp, classes, representatives), classes, representatives, rounds)
+    return Minimization(_quotient(mdp, classes, representatives), classes, representatives, rounds)
 
 
-def _numbered(rows: np.ndarray, before: np.ndarray) -> np.ndarray:
+def _pair_numbers(rows: np.ndarray, before: np.ndarray) -> np.ndarray:
     """(N,) int64: equal pairs (before, row) get equal numbers, in the order in which they appear first."""
     from pharos.kernels import partition
 
@@ -100,10 +100,10 @@ def _refined(table: Indices, classes: np.ndarray) -> tuple[np.ndarray, int]:
     changed = np.zeros(states, np.bool_)
     rounds, n = 0, states
     while n:
-        count = partition.split(table, now, sizes, count, waiting, n, slots, used, new, changed)
+        count = partition.split_classes(table, now, sizes, count, waiting, n, slots, used, new, changed)
         rounds += 1
         n = partition.affected_states(table, changed, waiting)
-    return _numbered(now[:, None], np.zeros(states, np.int64)), rounds
+    return _pair_numbers(now[:, None], np.zeros(states, np.int64)), rounds
 
 
 def _refined_general(mdp: TabularMDP, classes: np.ndarray) -> tuple[np.ndarray, int]:
@@ -117,10 +117,10 @@ def _refined_general(mdp: TabularMDP, classes: np.ndarray) -> tuple[np.ndarray, 
     partition.predecessors(rows[0], rows[1], mdp.num_actions, *into)
     now, layout = classes.astype(small), tuple(np.empty(states, small) for _ in range(4))
     rounds = partition.refine(rows, mdp.num_actions, into, now, layout, partition.slots_for(states))
-    return _numbered(now[:, None], np.zeros(states, np.int64)), int(rounds)
+    return _pair_numbers(now[:, None], np.zeros(states, np.int64)), int(rounds)
 
 
-def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -> TabularMDP:
+def _quotient(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -> TabularMDP:
     count = len(representatives)
     initial = np.zeros(count)
     np.add.at(initial, classes[mdp.start_states], mdp.start_probabilities)

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pharos.mdp.action_sets import filled, sets_of, with_sets
-from pharos.mdp.arguments import as_array, checked_next_states, start_of, terminal_states
+from pharos.mdp.arguments import array_argument, checked_next_states, start_of, terminal_states
 from pharos.mdp.matrices import expected_rewards, transitions_of
 from pharos.mdp.rewards import Rewards, expected_over_outcomes, rewards_of_shape
 from pharos.mdp.row_sums import Residual
@@ -45,7 +45,7 @@ def from_arrays(
             terminal has no available action; the first such entry is named.
     """
     table = checked_next_states(next_states)
-    rewards = as_array(rewards, "rewards")
+    rewards = array_argument(rewards, "rewards")
     sets = sets_of(available, rewards, table.shape)
     if sets is not None:
         table = np.ascontiguousarray(filled(table, sets))
@@ -83,7 +83,7 @@ def from_outcomes(
     Raises:
         ParameterError: as in `from_arrays`, or a probability is not in [0, 1] or a row does not sum to 1.
     """
-    rewards, sets = as_array(rewards, "rewards"), None
+    rewards, sets = array_argument(rewards, "rewards"), None
     shape = np.shape(successors)[:2]
     if len(shape) == 2:
         sets = sets_of(available, rewards, shape)
@@ -153,7 +153,7 @@ def from_matrices(
         ends: whether a row that sums to less than 1 - 1e-6 ends the episode with the rest; or (S, A) probabilities
             of ending, which are then part of the sums of rows.
         available: (S, A) bool, the actions that exist in each state; None: all but those that R (S, A) pays -inf, and
-            those whose row is empty (in a state where not all rows are, and unless `ends` says what that means).
+            those whose row is empty (in a state in which not all rows are, and unless `ends` says what that means).
     Raises:
         ParameterError: shapes do not fit, or a probability or reward is out of range; or a row does not sum to 1:
             the message names the first one, and the likely reason; or a state that is not terminal has no available

@@ -79,7 +79,7 @@ class TopologicalOrder(NamedTuple):
     """An order of states in which each comes before those that it may lead to.
 
     Attributes:
-        states: (S,) all of them; None where it is that of their numbers.
+        states: (S,) all of them; None if they are in the order of their numbers.
         longest: the steps of the longest way through them, or more.
     """
 
@@ -92,7 +92,7 @@ class StronglyConnected(NamedTuple):
 
     Attributes:
         order: (S,) the states, component by component.
-        starts: (G + 1,) where groups of neighbouring components begin in the order.
+        starts: (G + 1,) the indices in the order at which groups of neighbouring components begin.
         has_cycle: (G,) whether a state of a group can be visited again.
         total: how many components there are. largest: the states of the largest one that has a cycle.
     """
@@ -113,7 +113,7 @@ class Dynamics(ABC):
         is_deterministic: whether executing an action has one outcome, everywhere.
         has_ends: whether some execution ends the episode without a next state.
         laziness: probability that nothing happens, as far as `lazy` has added it.
-        workers: threads of a backup, where it has several; None for all processors.
+        workers: threads of a backup, if it has several; None for all processors.
         is_of_many: whether these are some states of an MDP with so many that its sweeps are unrolled.
     """
 
@@ -165,7 +165,7 @@ class Dynamics(ABC):
 
     @abstractmethod
     def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """(N,): a next state of each execution, -1 for the end. Draws nothing where each has one outcome."""
+        """(N,): a next state of each execution, -1 for the end. Draws nothing if each has one outcome."""
 
     @abstractmethod
     def _restricted_to(self, states: np.ndarray) -> "Dynamics": ...
@@ -183,7 +183,7 @@ class Dynamics(ABC):
         """The dynamics of the states [start, stop), numbered as in `Part`, and the outside states they may lead to."""
 
     def deterministic_table(self) -> Indices | None:
-        """(S, A) next states, -1 for the end, where each execution has one outcome; else None."""
+        """(S, A) next states, -1 for the end, if each execution has one outcome; else None."""
         return None
 
     @property
@@ -196,14 +196,14 @@ class Dynamics(ABC):
     def restricted_to(self, states: np.ndarray) -> "Dynamics":
         """The dynamics of these states alone, ascending and renumbered; transitions that leave them are replaced.
 
-        Their sweeps are compiled as those of all states are: who asks for many such parts has a large MDP.
+        Their sweeps are compiled as sweeps of all states are: who asks for many such parts has a large MDP.
         """
         part = self._restricted_to(states)
         part.is_of_many = self.is_unrolled
         return part
 
     def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray, runs: np.ndarray | None = None) -> None:
-        """Set out to T x, out not x itself. Between the rows of the states and the end there may be those of a halo.
+        """Set out to T x, out not x itself. Between the rows of the states and the end there may be the rows of a halo.
 
         runs: the states of some runs (R, 2) alone, see `runs_of`; None: all.
         """
@@ -256,7 +256,7 @@ class Dynamics(ABC):
     def push_forward(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
         """(S, W): the mass (S, A) of executed actions one step later, without what ends; W = A by that action, or 1.
 
-        The adjoint of `expected`: sum(mass * expected(x)) = sum(push_forward(mass) * x) where x is 0 at the end.
+        The adjoint of `expected`: sum(mass * expected(x)) = sum(push_forward(mass) * x) if x is 0 at the end.
         """
         after = np.zeros((self.num_states, width))
         outcomes.push_forward(self.for_kernels, np.ascontiguousarray(mass, np.float64), after)
@@ -273,7 +273,7 @@ class Dynamics(ABC):
         return occupancy.count_visits(self.for_kernels, step.live, step.policy, weights, gamma, least, waiting, visits)
 
     def support(self, step: PolicyStep, reachable: np.ndarray) -> None:
-        """Grow reachable (S, W), 1 where there is mass and else 0, to all that the mass may reach in some steps."""
+        """Grow reachable (S, W), 1 if there is mass and else 0, to all that the mass may reach in some steps."""
         occupancy.support(self.for_kernels, step.live, step.policy, step.chance.for_kernels, reachable)
 
     def entries_of(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -309,7 +309,7 @@ class Dynamics(ABC):
     def _extreme(self, x: np.ndarray, states: States, sign: float) -> np.ndarray:
         rows = np.arange(self.num_states)[states]
         out = np.empty((len(rows), self.num_actions))
-        outcomes.largest(self.for_kernels, np.ascontiguousarray(x, np.float64), rows, sign, out)
+        outcomes.extreme_outcomes(self.for_kernels, np.ascontiguousarray(x, np.float64), rows, sign, out)
         return out
 
     def leads_to(self, state: int) -> np.ndarray:
@@ -355,7 +355,7 @@ class Dynamics(ABC):
         order = np.empty(self.num_states, np.int64)
         bellman.component_order(self.for_kernels, live, number, first, is_cyclic, order)
         largest = int(np.diff(first).max(initial=0, where=is_cyclic))
-        starts, has_cycle = bellman.joined(first, is_cyclic, least)
+        starts, has_cycle = bellman.joined_components(first, is_cyclic, least)
         return StronglyConnected(order, starts, has_cycle, count, largest)
 
     def settle_components(
@@ -448,24 +448,24 @@ def swept(
     """Replace each entry of x by its backup, from the last state of an order to the first; the largest change.
 
     Args:
-        threads: each has a part of the states, where that is possible.
-        part: the places [start, stop) of the order that are swept; None: all.
+        threads: each has a part of the states, if that is possible.
+        part: the range [start, stop) of the order that are swept; None: all.
     """
     rewards, gamma, chance, select = equation
     others = (*rewards.for_kernels, gamma)
     tables = (transitions, *others)
     actions, scratch = bellman.actions_of(num_actions, rewards.is_unrolled), np.empty(num_actions)
-    choice, places = _choice(select), part or (0, rewards.shape[0])
+    choice, bounds = _choice(select), part or (0, rewards.shape[0])
     if choice is None:
         assert isinstance(select, PolicyTable)
         if chance.is_sticky:
             return bellman.sticky_policy_sweep(
-                *tables, chance.for_kernels, select.later, x, actions, scratch, np.empty(num_actions), order, *places
+                *tables, chance.for_kernels, select.later, x, actions, scratch, np.empty(num_actions), order, *bounds
             )
-        return bellman.policy_sweep(*tables, chance.for_kernels, select.later[:, 0], x[:, 0], actions, order, *places)
+        return bellman.policy_sweep(*tables, chance.for_kernels, select.later[:, 0], x[:, 0], actions, order, *bounds)
     if chance.is_sticky:
-        return bellman.sticky_sweep(*tables, chance.for_kernels, choice, x, actions, scratch, order, *places)
-    v, border = x[:, 0], rows_with_room(transitions, *places)
+        return bellman.sticky_sweep(*tables, chance.for_kernels, choice, x, actions, scratch, order, *bounds)
+    v, border = x[:, 0], rows_with_room(transitions, *bounds)
 
     def change_of(low: int, high: int) -> float:
         change = 0.0
@@ -476,7 +476,7 @@ def swept(
             change = float(np.maximum(change, largest))
         return change
 
-    low, high = places
+    low, high = bounds
     cuts = [low + (high - low) * i // threads for i in range(threads + 1)]
     if threads == 1:
         return change_of(*cuts)
@@ -493,7 +493,7 @@ def _choice(select: Selection) -> "float | np.ndarray | None":
 
 
 def _shared(block: Callable[[np.ndarray], None], dynamics: Dynamics, runs: np.ndarray) -> None:
-    """block(part) over the states of runs (R, 2), on all processors where there are enough states to share."""
+    """block(part) over the states of runs (R, 2), on all processors if there are enough states to share."""
     from pharos.system.workers import usable_workers
 
     workers = usable_workers(dynamics.workers) if count_of(runs) >= 1 << 16 else 1
@@ -510,8 +510,8 @@ def as_indices(table: np.ndarray, num_states: int) -> np.ndarray:
     return np.ascontiguousarray(table, np.int32 if num_states < 2**31 else np.int64)
 
 
-def split(blocks: Blocks, shape: tuple[int, ...], start: int, stop: int) -> tuple[Indices, np.ndarray]:
-    """(next states of a range renumbered for its part, int32 where that is enough; its halo).
+def part_with_halo(blocks: Blocks, shape: tuple[int, ...], start: int, stop: int) -> tuple[Indices, np.ndarray]:
+    """(next states of a range renumbered for its part, int32 if that is enough; its halo).
 
     Args:
         blocks: () -> (first row, some rows) of the next states of the states [start, stop), from the first row on;

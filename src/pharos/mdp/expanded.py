@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy  # whose `sparse` is loaded where it is used
+import scipy  # whose `sparse` is loaded on first use
 
 from pharos.mdp.action_sets import stand_ins
 from pharos.mdp.tabular import TabularMDP
@@ -23,10 +23,10 @@ class ExpandedMDP:
     Attributes:
         matrix: (N A, N) CSR, probabilities.
         underlying: (N,) the state of each node; S for the implicit end.
-        previous: (N,) the previously executed action, A for none; -1 where it does not matter.
+        previous: (N,) the previously executed action, A for none; -1 if it does not matter.
         starts: [(node, probability)] of the first step.
         num_actions: A.
-        is_restart: (N,) bool, nodes in which episodes end, where a restart leads to one of several start states: all of
+        is_restart: (N,) bool, nodes in which episodes end, if a restart leads to one of several start states: all of
             them lead to the same nodes with the same probabilities, by every choice.
     """
 
@@ -40,7 +40,7 @@ class ExpandedMDP:
 
     @cached_property
     def table(self) -> np.ndarray | None:
-        """(N, A), the only node that each choice leads to; None where some choice has several outcomes."""
+        """(N, A), the only node that each choice leads to; None if some choice has several outcomes."""
         matrix = self.matrix
         is_single = matrix.nnz == matrix.shape[0] and (np.diff(matrix.indptr) == 1).all() and (matrix.data == 1.0).all()
         return matrix.indices.reshape(-1, self.num_actions).astype(np.int64) if is_single else None
@@ -108,7 +108,7 @@ class ExpandedMDP:
         """Proven, far too large upper bound on the expected time of any target: H / q^H.
 
         A shortest path of at most H edges, each of probability q or more, succeeds with probability q^H or more. H is
-        the length of paths by way of one node, to which all others lead; infinite where there is none.
+        the length of paths by way of one node, to which all others lead; infinite if there is none.
         """
         if not self.is_connected or self._recurrent_class.max() > 0:
             return math.inf
@@ -134,7 +134,9 @@ class ExpandedMDP:
         num_states, num_actions = mdp.num_states, mdp.num_actions
         width = mdp.policy_width  # node s (A + 1) + b, b = A: no previous action
         terminal = np.asarray(mdp.terminal)
-        executed, ends = outcomes_of(mdp, terminal)  # (S A, S + ends): outcome of executing an action in a live state
+        executed, ends = outcome_matrix(
+            mdp, terminal
+        )  # (S A, S + ends): outcome of executing an action in a live state
         # Nodes.
         size = num_states + ends
         nodes = size * width
@@ -157,7 +159,7 @@ class ExpandedMDP:
         weights = scipy.sparse.csr_matrix(
             (weights.data, weights.indices, np.append(0, counts.cumsum())), shape=(counts.size, weights.shape[1])
         )
-        # Transitions of live nodes, and those of terminal states and of the end.
+        # Transitions of live nodes, and transitions of terminal states and of the end.
         matrix = weights @ nodes_of_outcomes(executed, num_actions, width)
         matrix = scipy.sparse.csr_matrix(matrix + _restarts(owner, live, starts, num_actions, nodes, restart))
         matrix.sum_duplicates()
@@ -176,11 +178,11 @@ class ExpandedMDP:
         for node, _ in self.starts:
             is_reached[scipy.sparse.csgraph.breadth_first_order(graph, node, return_predecessors=False)] = True
         nodes = np.flatnonzero(is_reached)
-        place = np.full(size, -1)
-        place[nodes] = np.arange(nodes.size)
+        index = np.full(size, -1)
+        index[nodes] = np.arange(nodes.size)
         rows = (nodes[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
         matrix = scipy.sparse.csr_matrix(self.matrix[rows][:, nodes])
-        starts = [(int(place[node]), p) for node, p in self.starts]
+        starts = [(int(index[node]), p) for node, p in self.starts]
         return ExpandedMDP(
             matrix,
             self.underlying[nodes],
@@ -229,7 +231,7 @@ def nodes_of_outcomes(outcomes: "scipy.sparse.csr_matrix", num_actions: int, wid
     return scipy.sparse.csr_matrix((coo.data, (coo.row, nodes)), shape=(outcomes.shape[0], outcomes.shape[1] * width))
 
 
-def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> "tuple[scipy.sparse.csr_matrix, bool]":
+def outcome_matrix(mdp: TabularMDP, terminal: np.ndarray) -> "tuple[scipy.sparse.csr_matrix, bool]":
     """(S A, S + 1 or S) outcomes of executing actions, rows of terminal states empty; whether the end is among them."""
     matrix = mdp.dynamics.matrix(~terminal)
     ends = bool((matrix.indices == mdp.num_states).any())

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from pharos.errors import ParameterError
 from pharos.mdp.action_sets import filled, sets_of, stand_ins
-from pharos.mdp.arguments import as_array
+from pharos.mdp.arguments import array_argument
 from pharos.mdp.rewards import Rewards, rounding_of_mean
 from pharos.mdp.row_sums import ROUNDED, Residual, normalized_rows, rounding_hint
 
@@ -40,7 +40,7 @@ def transitions_of(
     if not (np.isfinite(matrix.data).all() and (matrix.data >= 0).all()):
         raise ParameterError("P has entries that are negative, NaN or infinite; expected probabilities")
     if not isinstance(ends, bool | np.bool_):
-        shares = as_array(ends, "ends", np.float64)
+        shares = array_argument(ends, "ends", np.float64)
         if shares.shape != (num_states, num_actions) or not ((shares >= 0) & (shares <= 1)).all():
             raise ParameterError(
                 f"ends has shape {shares.shape}; expected True, False or probabilities ({num_states}, {num_actions})"
@@ -68,7 +68,7 @@ def _sets(
 ) -> np.ndarray | None:
     """(S, A) bool, the actions that are available: as given, without those paid -inf and those whose row is empty."""
     rewards = R if isinstance(R, np.ndarray | list | tuple) and not is_list_of_matrices(R) else np.empty(0)
-    sets = sets_of(available, as_array(rewards, "R", np.float64) if len(rewards) else np.empty(0), shape)
+    sets = sets_of(available, array_argument(rewards, "R", np.float64) if len(rewards) else np.empty(0), shape)
     if available is not None or (isinstance(ends, bool | np.bool_) and ends):
         return sets
     has_row = (np.asarray(matrix.sum(axis=1)).ravel() > 0).reshape(shape)
@@ -109,7 +109,7 @@ def by_rows(value: object, name: str, axes: str | None) -> "csr_matrix":
     """(S A, S) CSR float64 with rows s A + a: a copy of an array, a list of matrices, or a sparse matrix.
 
     Args:
-        axes: "SAS", "ASS", or None: a list has one matrix an action, an array is (S, A, S), and where both orders fit
+        axes: "SAS", "ASS", or None: a list has one matrix an action, an array is (S, A, S), and if both orders fit
             it must be said.
     """
     from scipy import sparse
@@ -126,14 +126,14 @@ def by_rows(value: object, name: str, axes: str | None) -> "csr_matrix":
                 f"{name} is a list of {len(value)} matrices of shape {', '.join(map(str, sorted(shapes)))}; expected "
                 f"{expected}, or axes={'SAS' if is_by_action else 'ASS'!r}"
             )
-        parts = [each if sparse.issparse(each) else as_array(each, name, np.float64) for each in value]
+        parts = [each if sparse.issparse(each) else array_argument(each, name, np.float64) for each in value]
         matrix = sparse.vstack([sparse.csr_matrix(part) for part in parts]).tocsr()
     elif sparse.issparse(value):
         matrix = sparse.csr_matrix(value, dtype=np.float64)
         num_states = matrix.shape[1]
         num_actions = matrix.shape[0] // max(num_states, 1)
     else:
-        dense = as_array(value, name, np.float64)
+        dense = array_argument(value, name, np.float64)
         shape = dense.shape
         if axes is None and dense.ndim == 3 and shape[0] == shape[1] == shape[2] > 1:
             raise ParameterError(
@@ -175,7 +175,7 @@ def expected_rewards(
     if sparse.issparse(R) and getattr(R, "shape", None) == shape:
         R = sparse.csr_matrix(R).toarray()
     if not sparse.issparse(R) and not is_list_of_matrices(R):
-        R = as_array(R, "R", np.float64)
+        R = array_argument(R, "R", np.float64)
     if not isinstance(R, np.ndarray) or R.ndim == 3:
         by_transition = by_rows(R, "R", axes)
         if by_transition.shape != matrix.shape:

@@ -1,6 +1,6 @@
 """Names of states and actions, and sets of states by labels and by expressions over variables.
 
-The expressions are those of PRISM's language without functions: comparisons of sums and products of whole numbers and
+The expressions follow PRISM's language without functions: comparisons of sums and products of whole numbers and
 variables, joined by & | ! and parentheses. They are parsed, never executed.
 
 Source: Kwiatkowska, Norman and Parker (2011), "PRISM 4.0"; its manual, section "Expressions", for what binds stronger.
@@ -109,7 +109,7 @@ def names_from(
 ) -> Names:
     """Names from what a user gives; ParameterError if they do not fit (S, A) states and actions."""
     num_states, num_actions = shape
-    masks = {name: _mask(name, each, num_states) for name, each in labels.items()}
+    masks = {name: _label_mask(name, each, num_states) for name, each in labels.items()}
     columns = {name: np.asarray(each) for name, each in variables.items()}
     for name, column in columns.items():
         if column.shape != (num_states,) or column.dtype.kind not in "biu":
@@ -122,7 +122,7 @@ def names_from(
     return Names(masks, columns, None if actions is None else tuple(actions))
 
 
-def _mask(name: str, states: object, num_states: int) -> np.ndarray:
+def _label_mask(name: str, states: object, num_states: int) -> np.ndarray:
     array = np.asarray(states)
     if array.dtype == np.bool_ and array.shape == (num_states,):
         return array
@@ -178,9 +178,9 @@ COMPARISONS = {
     ">": np.greater,
     ">=": np.greater_equal,
 }
-DEEPEST, LONGEST = 40, 10_000
+MOST_PARENTHESES, MOST_CHARACTERS = 40, 10_000
 """Parentheses within each other, and characters, of an expression."""
-LARGEST = 2**62
+LARGEST_NUMBER = 2**62
 """What numbers of an expression stay below, in size: so nothing overflows."""
 
 
@@ -204,13 +204,13 @@ class Parser:
     """Recursive descent over an expression that computes the set of states on the way."""
 
     def __init__(self, text: str, names: Names):
-        self.text, self.names, self.place, self.depth = text, names, 0, 0
+        self.text, self.names, self.index, self.depth = text, names, 0, 0
         self.tokens = self._tokens()
 
     def truth(self) -> np.ndarray:
         """(S,) or () bool; ParameterError if the text is no expression."""
         result = self._either()
-        if self.place < len(self.tokens):
+        if self.index < len(self.tokens):
             raise self._error(f"{self._shown()} after {capped(result.text, 60)!r}", "& or | between two conditions")
         return self._truth(result)
 
@@ -270,8 +270,8 @@ class Parser:
         return Term(-self._numbers(term), term.size, f"-{term.text}") if is_negated else term
 
     def _atom(self) -> Term:
-        kind, word = self.tokens[self.place] if self.place < len(self.tokens) else ("end", "")
-        self.place += 1
+        kind, word = self.tokens[self.index] if self.index < len(self.tokens) else ("end", "")
+        self.index += 1
         if kind == "number":
             return Term(np.array(int(word), np.int64), int(word), word)
         if kind == "label":
@@ -282,14 +282,14 @@ class Parser:
             return self._named(word)
         if word == "(":
             self.depth += 1
-            if self.depth > DEEPEST:
-                raise self._error(f"{self.depth} parentheses within each other", f"at most {DEEPEST}")
+            if self.depth > MOST_PARENTHESES:
+                raise self._error(f"{self.depth} parentheses within each other", f"at most {MOST_PARENTHESES}")
             inner = self._either()
             self.depth -= 1
             if not self._takes(")"):
                 raise self._error(self._shown(), "a closing parenthesis")
             return inner._replace(text=f"({inner.text})")
-        self.place -= 1
+        self.index -= 1
         raise self._error(self._shown(), "a variable, a label, a number or a parenthesis")
 
     def _named(self, word: str) -> Term:
@@ -298,8 +298,8 @@ class Parser:
             if column.dtype == np.bool_:
                 return Term(column, 0, word)
             size = max(abs(int(column.min(initial=0))), abs(int(column.max(initial=0))))
-            if size > LARGEST:
-                raise self._error(f"{word}, whose values are up to {size}", f"at most {LARGEST}")
+            if size > LARGEST_NUMBER:
+                raise self._error(f"{word}, whose values are up to {size}", f"at most {LARGEST_NUMBER}")
             return Term(column.astype(np.int64), size, word)
         if word in self.names.labels:
             return Term(self.names.labels[word], 0, word)
@@ -310,7 +310,7 @@ class Parser:
     # Kinds ----------------------------------------------------------------------------------------------------------
 
     def _truth(self, term: Term) -> np.ndarray:
-        """The truth of a term; a variable that is only 0 or 1 is true where it is 1."""
+        """The truth of a term; a variable that is only 0 or 1 is true if it is 1."""
         if not term.is_number:
             return term.values
         if term.values.ndim and term.size <= 1 and term.values.min(initial=0) >= 0:
@@ -325,38 +325,40 @@ class Parser:
     def _computed(self, operation: np.ufunc, left: Term, right: Term, size: int, sign: str) -> Term:
         text = f"{left.text}{sign}{right.text}"
         a, b = self._numbers(left), self._numbers(right)
-        if size > LARGEST:
-            raise self._error(f"{capped(text, 60)!r}, which may be as large as {size:.3g}", f"at most {LARGEST:.3g}")
+        if size > LARGEST_NUMBER:
+            raise self._error(
+                f"{capped(text, 60)!r}, which may be as large as {size:.3g}", f"at most {LARGEST_NUMBER:.3g}"
+            )
         return Term(operation(a, b), size, text)
 
     # Words ----------------------------------------------------------------------------------------------------------
 
     def _tokens(self) -> list[tuple[str, str]]:
-        text, place, tokens = self.text.rstrip(), 0, []
-        if len(text) > LONGEST:
-            raise ParameterError(f"expression of {len(text):,} characters; expected at most {LONGEST:,}")
-        while place < len(text):
-            match = TOKEN.match(text, place)
+        text, index, tokens = self.text.rstrip(), 0, []
+        if len(text) > MOST_CHARACTERS:
+            raise ParameterError(f"expression of {len(text):,} characters; expected at most {MOST_CHARACTERS:,}")
+        while index < len(text):
+            match = TOKEN.match(text, index)
             if match is None:
                 raise self._error(
-                    f"{text[place:].strip()[0]!r}", "names, whole numbers, = != < <= > >= & | ! + - * and ( )"
+                    f"{text[index:].strip()[0]!r}", "names, whole numbers, = != < <= > >= & | ! + - * and ( )"
                 )
             kind = ("name", "number", "label", "sign")[match.lastindex - 1]  # type: ignore[operator]
             word = match[match.lastindex]  # type: ignore[index]
             if kind == "number" and len(word) > 18:
-                raise self._error(capped(word, 40), f"numbers of at most {LARGEST:.3g}")
+                raise self._error(capped(word, 40), f"numbers of at most {LARGEST_NUMBER:.3g}")
             tokens.append((kind, word))
-            place = match.end()
+            index = match.end()
         return tokens
 
     def _takes(self, sign: str) -> str | None:
-        if self.place < len(self.tokens) and self.tokens[self.place] == ("sign", sign):
-            self.place += 1
+        if self.index < len(self.tokens) and self.tokens[self.index] == ("sign", sign):
+            self.index += 1
             return sign
         return None
 
     def _shown(self) -> str:
-        return repr(self.tokens[self.place][1]) if self.place < len(self.tokens) else "its end"
+        return repr(self.tokens[self.index][1]) if self.index < len(self.tokens) else "its end"
 
     def _error(self, what: str, expected: str) -> ParameterError:
         return ParameterError(f"expression {capped(self.text, 120)!r}: found {what}; expected {expected}")

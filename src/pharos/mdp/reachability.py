@@ -25,7 +25,7 @@ def states_within(mdp: TabularMDP, steps: int | None = None) -> np.ndarray:
 def pairs_within(mdp: TabularMDP, steps: int | None = None) -> np.ndarray:
     """(S, A) bool: pairs (state, previously executed action) that can be reached within `steps` steps of a start.
 
-    Chance decides which actions can be executed after which: where every action is a repetition, that of the first
+    Chance decides which actions can be executed after which: if every action is a repetition, the action of the first
     step is executed always. Start states without a previous action are not among them.
     """
     is_reached = now = np.zeros((mdp.num_states, mdp.num_actions), np.bool_)
@@ -86,7 +86,7 @@ def mdp_within(mdp: TabularMDP, steps: int) -> TabularMDP:
     Transitions of states that take all the steps to reach may be wrong: those that leave the set are replaced.
 
     Returns:
-        This MDP where all of its states are reached; else one without a folder, as its states have other numbers.
+        This MDP if all of its states are reached; else one without a folder, as its states have other numbers.
     Cost: one read of each transition of the reached states, and a copy of them.
     """
     is_reached = states_within(mdp, steps)
@@ -130,8 +130,8 @@ class Part:
     9 % of a range's rows on a Breakout of 2.4 million states, 0.03 % on a Freeway. Ranges are what several processes
     sweep together (solvers/ranked.py).
 
-    Inside a part its own states have the numbers 0 .. n - 1, in order, and those of the halo n .. n + H - 1, ascending;
-    -1 is the end. Arrays of values have n + H + 1 rows, so the compiled sweeps run over parts as they are.
+    Inside a part its own states have the numbers 0 .. n - 1, in order, and states of the halo n .. n + H - 1,
+    ascending; -1 is the end. Arrays of values have n + H + 1 rows, so the compiled sweeps run over parts as they are.
 
     Attributes:
         halo: (H,) int64, ascending: the states outside that these may lead to.
@@ -200,7 +200,7 @@ class EndComponents(NamedTuple):
 
 
 def end_components(mdp: TabularMDP, pairs: np.ndarray | None = None) -> EndComponents:
-    """The maximal end components of an MDP: where play can stay for ever, and come from any node to any other.
+    """The maximal end components of an MDP: sets in which play can stay for ever, and come from any node to any other.
 
     An end component is a set of nodes and at least one choice for each of them, such that no choice leads out of the
     set, whatever chance does, and every node can be reached from every other one. Maximal ones do not overlap, and
@@ -210,8 +210,8 @@ def end_components(mdp: TabularMDP, pairs: np.ndarray | None = None) -> EndCompo
     Args:
         pairs: (S, A) bool, under sticky actions also (S, A, A) with the previously executed action second: the choices
             that may be made; None: all.
-    Cost: a few reads of all transitions, of which only those of nodes in question are looked at again; A + 33 bytes a
-        node. Source: de Alfaro (1997), section 3.3.
+    Cost: a few reads of all transitions, of which only the transitions of nodes in question are looked at again; A + 33
+        bytes a node. Source: de Alfaro (1997), section 3.3.
     """
     width, num_actions = mdp.width, mdp.num_actions
     num_nodes, dtype = mdp.num_states * width, np.int32 if mdp.num_states * width < 2**31 else np.int64
@@ -228,7 +228,7 @@ def end_components(mdp: TabularMDP, pairs: np.ndarray | None = None) -> EndCompo
     component, path, waiting = (np.empty(num_nodes, dtype) for _ in range(3))
     leaves, removed = np.empty(num_actions, np.bool_), 1
     while removed:
-        kernels.number_components(transitions, weights, allowed, count, component, path, waiting)
+        kernels.number_node_components(transitions, weights, allowed, count, component, path, waiting)
         removed, last = 0, 1
         while last:
             last = kernels.remove_leaving(transitions, weights, component, allowed, count, leaves)

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from pharos.environments import Environment
 from pharos.errors import ParameterError, StateSpaceError
 from pharos.kernels import outcomes
-from pharos.mdp.arguments import as_array
+from pharos.mdp.arguments import array_argument
 from pharos.system.arrays import read_only
 from pharos.system.memory import large_zeros
 from pharos.system.workers import usable_workers
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
 
-_BLOCK = 1 << 16
+_REWARD_BLOCK = 1 << 16
 # Entries of a palette that each reward is compared with, before it is searched for.
-_FEW = 4
+_FEW_ENTRIES = 4
 
 
 @dataclass(frozen=True)
 class Rewards:
-    """Rewards of S states and A actions: `palette[table[s, a]]`, or `table[s, a]` where the palette is empty.
+    """Rewards of S states and A actions: `palette[table[s, a]]`, or `table[s, a]` if the palette is empty.
 
     Attributes:
         table: (S, A) uint8 codes, or (S, A) float64 rewards.
@@ -55,11 +55,11 @@ class Rewards:
 
     @staticmethod
     def from_array(rewards: np.ndarray, rounding: float = 0.0) -> "Rewards":
-        """Make rewards of (S, A) numbers; ParameterError where one is NaN or infinite."""
+        """Make rewards of (S, A) numbers; ParameterError if one is NaN or infinite."""
         rewards = np.asarray(rewards, np.float64)
         collector = RewardsCollector((rewards.shape[0], rewards.shape[1]))
-        for start in range(0, len(rewards), _BLOCK):
-            block = rewards[start : start + _BLOCK]
+        for start in range(0, len(rewards), _REWARD_BLOCK):
+            block = rewards[start : start + _REWARD_BLOCK]
             if not np.isfinite(block).all():
                 s, a = map(int, np.argwhere(~np.isfinite(block))[0])
                 raise ParameterError(
@@ -87,7 +87,7 @@ class Rewards:
 
     @property
     def array(self) -> np.ndarray:
-        """(S, A) float64; made anew by each call where the rewards are kept as a palette."""
+        """(S, A) float64; made anew by each call if the rewards are kept as a palette."""
         return self.rows(slice(None))
 
     def rows(self, states: slice | np.ndarray) -> np.ndarray:
@@ -101,12 +101,12 @@ class Rewards:
     def mixed(self, other: "Rewards", p: float) -> "Rewards":
         """(1 - p) times these rewards plus p times others of the same shape.
 
-        A mean is never outside of its two rewards, so it is exact where these are equal. Elsewhere each of its two
+        A mean is never outside of its two rewards, so it is exact if these are equal. Otherwise each of its two
         terms is rounded up to three times (1 - p, the product, the sum), which `rounding` counts.
         """
         collector, largest = RewardsCollector(self.shape), -1.0  # no two rewards that differ
-        for start in range(0, len(self.table), _BLOCK):
-            own, theirs = (each.rows(slice(start, start + _BLOCK)) for each in (self, other))
+        for start in range(0, len(self.table), _REWARD_BLOCK):
+            own, theirs = (each.rows(slice(start, start + _REWARD_BLOCK)) for each in (self, other))
             terms = (1.0 - p) * own, p * theirs
             collector.add(start, np.clip(sum(terms), np.minimum(own, theirs), np.maximum(own, theirs)))
             sizes = np.abs(terms[0]) + np.abs(terms[1])
@@ -116,7 +116,7 @@ class Rewards:
 
     @cached_property
     def unit(self) -> float:
-        """The largest power of two, 1 at most, of which all rewards are whole multiples; 0 where they are rounded, or
+        """The largest power of two, 1 at most, of which all rewards are whole multiples; 0 if they are rounded, or
         more than a palette has."""
         if not len(self.palette) or self.rounding:
             return 0.0
@@ -171,7 +171,7 @@ class RangedRewards(Rewards):
 
 @dataclass
 class RewardsCollector:
-    """Collector of rewards, block by block; they end with a palette where few are distinct."""
+    """Collector of rewards, block by block; they end with a palette if few are distinct."""
 
     shape: tuple[int, int]
     _codes: np.ndarray | None = None
@@ -201,7 +201,7 @@ class RewardsCollector:
         """Enter a block whose rewards are all among the first few of the palette; return whether they are."""
         assert self._codes is not None
         codes, left = np.zeros(block.shape, np.uint8), block.size
-        for code, reward in enumerate(self._palette[:_FEW]):
+        for code, reward in enumerate(self._palette[:_FEW_ENTRIES]):
             equal = block == reward
             left -= int(np.count_nonzero(equal))
             codes += equal.view(np.uint8) * np.uint8(code)
@@ -234,7 +234,7 @@ def rounding_of_mean(outcomes: int, largest: float) -> float:
 
 def rewards_of_shape(rewards: npt.ArrayLike | Rewards, shape: tuple[int, ...]) -> Rewards:
     """Rewards of an array, or those that were made; ParameterError if their shape is not `shape`, or not finite."""
-    array = rewards.array if isinstance(rewards, Rewards) else as_array(rewards, "rewards", np.float64)
+    array = rewards.array if isinstance(rewards, Rewards) else array_argument(rewards, "rewards", np.float64)
     if array.shape != shape:
         raise ParameterError(f"rewards have shape {array.shape}; expected {shape}, one for each state and action")
     return rewards if isinstance(rewards, Rewards) else Rewards.from_array(array)
@@ -248,7 +248,7 @@ def expected_over_outcomes(
     Raises:
         ParameterError: they have neither shape, or one of a possible outcome is not finite.
     """
-    array, shape = as_array(rewards, "rewards", np.float64), probabilities.shape
+    array, shape = array_argument(rewards, "rewards", np.float64), probabilities.shape
     if array.shape == shape[:2]:
         return array, 0.0
     if array.shape != shape:
@@ -276,7 +276,7 @@ def means_of(terms: np.ndarray) -> Rewards:
 # Rewards of stored transitions ----------------------------------------------------------------------------------------
 
 
-_ROWS = 1 << 16
+_RECORDED_ROWS = 1 << 16
 # (first state, rewards (N, A), the largest absolute reward of an outcome that was averaged)
 Blocks = Iterator[tuple[int, np.ndarray, float]]
 
@@ -308,7 +308,7 @@ def rewards_of_space(
             f"the rewards; import the module that registers it, or pass rewards as an (S, A) array"
         )
     env = space.environment if rewards is None else _with_reward(space.environment, rewards)
-    return _collected(space, env, _blocks(space, env, workers))
+    return _rewards_of_blocks(space, env, _blocks(space, env, workers))
 
 
 def ranged_rewards(space: "StateSpace") -> "Rewards":
@@ -317,7 +317,7 @@ def ranged_rewards(space: "StateSpace") -> "Rewards":
     assert env is not None
 
     def compute(start: int, stop: int) -> "Rewards":
-        return _collected(space, env, _blocks(space, env, None, start, stop), start, stop)
+        return _rewards_of_blocks(space, env, _blocks(space, env, None, start, stop), start, stop)
 
     return RangedRewards((space.num_states, space.num_actions), compute)
 
@@ -337,8 +337,8 @@ def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "
     rules, num_actions = rules_of(env).rewards_of(space.num_states), space.num_actions
 
     def blocks() -> Blocks:
-        for start in range(0, space.num_states, _ROWS):
-            stop = min(start + _ROWS, space.num_states)
+        for start in range(0, space.num_states, _RECORDED_ROWS):
+            stop = min(start + _RECORDED_ROWS, space.num_states)
             states, terminal, count = space.packed_states[start:stop], space.terminal[start:stop], stop - start
             own = np.repeat(np.arange(count), num_actions)
             if space.has_chance:
@@ -349,17 +349,17 @@ def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "
                 table = own.reshape(count, num_actions).astype(space.successors.dtype)
                 yield start, rules.block(states, table, terminal, 0, count), 0.0
 
-    return _collected(space, env, blocks())
+    return _rewards_of_blocks(space, env, blocks())
 
 
-def _collected(
+def _rewards_of_blocks(
     space: "StateSpace",
     env: Environment,
     blocks: Blocks,
     first: int = 0,
     last: int | None = None,
 ) -> "Rewards":
-    """Rewards of the states [first, last), from blocks; RuleError where one is not finite."""
+    """Rewards of the states [first, last), from blocks; RuleError if one is not finite."""
     from pharos.rules import refused_reward
 
     stop = space.num_states if last is None else last
@@ -384,8 +384,8 @@ def rewards_of_outcomes(space: "StateSpace") -> np.ndarray:
     assert space.environment is not None
     rules = rules_of(space.environment).rewards_of(space.num_states)
     blocks = [np.empty(0)]
-    for start in range(0, space.num_states, _ROWS):
-        stop = min(start + _ROWS, space.num_states)
+    for start in range(0, space.num_states, _RECORDED_ROWS):
+        stop = min(start + _RECORDED_ROWS, space.num_states)
         which, successors, _ = space.dynamics.entries_of(np.arange(start, stop))
         number = np.arange(len(which)) - np.searchsorted(which, which)  # of each outcome within its row
         rewards = np.zeros(len(which))
@@ -418,7 +418,7 @@ class PaidOutcomes(NamedTuple):
 def paid_outcomes(mdp: "TabularMDP") -> PaidOutcomes:
     """The possible outcomes of all states and executed actions of an MDP, each with its own reward.
 
-    A reward is the outcome's own where the MDP is of an environment whose rewards it has, else the expected one of
+    A reward is the outcome's own if the MDP is of an environment whose rewards it has, else the expected one of
     state and action. Cost: some 50 bytes an outcome; for MDPs that fit.
     """
     num_states, num_actions = mdp.num_states, mdp.num_actions
@@ -443,7 +443,7 @@ def paid_outcomes(mdp: "TabularMDP") -> PaidOutcomes:
 
 
 def _outcomes_of_environment(mdp: "TabularMDP") -> PaidOutcomes | None:
-    """Outcomes with rewards by the rules, where the MDP has chance and is of an environment; else None."""
+    """Outcomes with rewards by the rules, if the MDP has chance and is of an environment; else None."""
     space = mdp.space
     if space is None or space.environment is None or mdp.dynamics.is_deterministic:
         return None
@@ -463,14 +463,14 @@ def _outcomes_of_environment(mdp: "TabularMDP") -> PaidOutcomes | None:
 
 
 def _joined(outcomes: PaidOutcomes) -> PaidOutcomes:
-    """The outcomes with those of a row that have the same next state and reward joined, in the place of the first."""
+    """Outcomes of a row that have the same next state and reward are joined, in the place of the first."""
     which, states, rewards, probabilities = outcomes
     order = np.lexsort((rewards, states, which))
     key = np.stack([which, states, rewards])[:, order]
     begins = np.flatnonzero(np.append(True, (key[:, 1:] != key[:, :-1]).any(axis=0)))
     first = np.minimum.reduceat(order, begins)
-    place = np.argsort(first)
-    first, sums = first[place], np.add.reduceat(probabilities[order], begins)[place]
+    by_first = np.argsort(first)
+    first, sums = first[by_first], np.add.reduceat(probabilities[order], begins)[by_first]
     return PaidOutcomes(which[first], states[first], rewards[first], sums)
 
 
@@ -482,12 +482,12 @@ def _blocks(
 
     rules = rules_of(env).rewards_of(space.num_states)
     end = space.num_states if last is None else last
-    starts = range(first, end, _ROWS)
+    starts = range(first, end, _RECORDED_ROWS)
     states, terminal = space.packed_states, space.terminal
     successors, dynamics = None if space.has_chance else space.successors, space.dynamics
 
     def block(start: int) -> tuple[np.ndarray, float]:
-        stop, largest = min(start + _ROWS, end), np.zeros(1)
+        stop, largest = min(start + _RECORDED_ROWS, end), np.zeros(1)
         if successors is not None:
             return rules.block(states, successors, terminal, start, stop), 0.0
         outcomes = dynamics.entries_of(np.arange(start, stop))

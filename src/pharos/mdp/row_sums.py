@@ -15,7 +15,7 @@ and rewards r' that is as near as the sums say:
 where d is the largest |sum - 1| of a row and e the same times the largest reward of an outcome of that row (0 if
 rewards were given for states and actions). The rows as they were given are such P', if what they lack ends the episode.
 With V' = T' V', |V' - V| <= |T' V' - T' V| + |T' V - T V| <= gamma |V' - V| + gamma d |V| + e in the maximum norm,
-hence |V' - V| <= (gamma d |V| + e) / (1 - gamma). With a horizon, or where no state is visited twice, the step from one
+hence |V' - V| <= (gamma d |V| + e) / (1 - gamma). With a horizon, or if no state is visited twice, the step from one
 backup to the next is the same, and the sum has as many terms as there are steps.
 """
 
@@ -91,6 +91,6 @@ def normalized_rows(
 
 
 def rounding_hint(total: float) -> str:
-    """The likely reason where a sum is nearly 1, for the end of a message; else empty."""
+    """The likely reason if a sum is nearly 1, for the end of a message; else empty."""
     is_near = abs(total - 1) <= 1e-2
     return ": were they rounded, or computed in float32? divide each row by its sum" if is_near else ""

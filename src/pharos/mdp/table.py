@@ -18,8 +18,8 @@ import numpy.typing as npt
 from pharos.errors import ParameterError
 from pharos.kernels import outcomes as kernels
 from pharos.mdp.actions import States
-from pharos.mdp.arguments import as_array
-from pharos.mdp.dynamics import Dynamics, Outcomes, TopologicalOrder, as_indices, split
+from pharos.mdp.arguments import array_argument
+from pharos.mdp.dynamics import Dynamics, Outcomes, TopologicalOrder, as_indices, part_with_halo
 from pharos.mdp.row_sums import ROUNDED, normalized_rows, rounding_hint
 from pharos.system.arrays import (
     Indices,
@@ -27,11 +27,11 @@ from pharos.system.arrays import (
     OutcomeRows,
     PackedIndices,
     WrongOutcomes,
-    blocks_of,
     holds_end,
+    index_blocks,
+    index_rows,
     read_only,
     rounding_of_sums,
-    rows_of,
 )
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Table(Dynamics):
         if isinstance(self.next_states, PackedIndices) and isinstance(states, slice) and states == slice(None):
             rows = self.next_states
             out = np.empty((*rows.shape, *x.shape[2:]), x.dtype)
-            for first, table in blocks_of(rows):  # no more of them is unpacked at a time
+            for first, table in index_blocks(rows):  # no more of them is unpacked at a time
                 out[first : first + len(table)] = self._expected(x, table)
             return out
         return self._expected(x, self.next_states[states])
@@ -93,12 +93,12 @@ class Table(Dynamics):
         return self.next_states[states, actions]
 
     def part(self, start: int, stop: int) -> tuple["Table", np.ndarray]:
-        rows = rows_of(self.next_states, start, stop)
-        local, halo = split(partial(blocks_of, rows), rows.shape, start, stop)
+        rows = index_rows(self.next_states, start, stop)
+        local, halo = part_with_halo(partial(index_blocks, rows), rows.shape, start, stop)
         return Table(local), halo
 
     def _restricted_to(self, states: np.ndarray) -> "Table":
-        # transitions that leave them lead back to where they came from
+        # transitions that leave them lead back to their own state
         number = np.full(self.num_states, -1, np.int64)
         number[states] = np.arange(len(states))
         table = np.asarray(self.next_states[states])
@@ -125,7 +125,8 @@ class Lazy(Dynamics):
     Under sticky actions the action that had no effect counts as executed.
 
     Attributes:
-        tables: the dynamics without laziness; where they are lazy already, their own tables, and p is that of both.
+        tables: the dynamics without laziness; if they are lazy already, their own tables, and p is the probability of
+            both.
         laziness: p, in (0, 1).
         roundings: of p and of the mean. Joining two p is off by at most 4 units, which move as much weight from one
             value to another.
@@ -215,7 +216,7 @@ class Lazy(Dynamics):
 # The share of a dense table that may be padding before successors are kept one row after another.
 MOST_PADDING = 0.3
 # Vectors of probabilities that codes of one and of two bytes tell apart.
-FEW, MANY = 1 << 8, 1 << 16
+ONE_BYTE_CODES, MOST_CODES = 1 << 8, 1 << 16
 
 
 def checked_outcomes(
@@ -227,7 +228,7 @@ def checked_outcomes(
         ParameterError: a shape or type is wrong, an index is outside, or a row holds no probabilities; the first such
             entry is named.
     """
-    table, chances = as_array(successors, "successors"), as_array(probabilities, "probabilities")
+    table, chances = array_argument(successors, "successors"), array_argument(probabilities, "probabilities")
     if table.ndim != 3 or table.size == 0 or table.dtype.kind not in "iu":
         raise ParameterError(
             f"successors have shape {table.shape} and type {table.dtype}; expected integers of shape "
@@ -265,7 +266,11 @@ def checked_outcomes(
 
 
 def compact_outcomes(
-    successors: np.ndarray, probabilities: np.ndarray, *, most_padding: float = MOST_PADDING, most_vectors: int = MANY
+    successors: np.ndarray,
+    probabilities: np.ndarray,
+    *,
+    most_padding: float = MOST_PADDING,
+    most_vectors: int = MOST_CODES,
 ) -> dict[str, Any]:
     """Arguments of an `OutcomeTable`, from (S, A, K) arrays: the possible outcomes alone, in their order."""
     num_states, num_actions, _ = successors.shape
@@ -296,7 +301,7 @@ def compact_outcomes(
 def _palette(vectors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray | None]:
     """(codes (N,), the distinct ones (P, K) in the order in which they appear) of vectors (N, K).
 
-    None where they are more than `most`.
+    None if they are more than `most`.
     """
     from pharos.kernels import partition
 
@@ -306,11 +311,11 @@ def _palette(vectors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray | N
         return numbers, None
     palette = np.empty((count, vectors.shape[1]))
     palette[numbers] = vectors
-    return numbers.astype(np.uint8 if count <= FEW else np.uint16), palette
+    return numbers.astype(np.uint8 if count <= ONE_BYTE_CODES else np.uint16), palette
 
 
 # Executions whose outcomes NumPy lists sooner than a kernel is compiled.
-_FEW = 1 << 14
+_FEW_EXECUTIONS = 1 << 14
 # Outcomes, at most, that are copied for kernels.
 _COPIED = 1 << 20
 
@@ -329,7 +334,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
     def from_arrays(successors: npt.ArrayLike, probabilities: npt.ArrayLike) -> "OutcomeTable":
         """Make a table of (S, A, K) successors, -1 for the end, and probabilities, without impossible outcomes.
 
-        Up to 65,536 distinct vectors of probabilities become a palette. Rows are kept one after another where more than
+        Up to 65,536 distinct vectors of probabilities become a palette. Rows are kept one after another if more than
         30 % of (S, A, K) would be padding.
 
         Raises:
@@ -339,7 +344,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
         return OutcomeTable(**compact_outcomes(*checked_outcomes(successors, probabilities)[:2]))
 
     def check(self) -> None:
-        """ParameterError where the arrays, whoever wrote them, are not what the attributes say. Cost: O(S A K)."""
+        """ParameterError if the arrays, whoever wrote them, are not what the attributes say. Cost: O(S A K)."""
         pairs, size = (self.num_states, self.num_actions), self.successors.shape
         fitting = {
             "successors": ("iu", size if len(size) == 1 else (*pairs, *size[2:3])),
@@ -401,7 +406,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
     def mass(self) -> float:  # type: ignore[override]
         if self.is_deterministic:
             return 1.0
-        if self.palette is not None:  # the sign of a sum by fsum is that of the exact one
+        if self.palette is not None:  # the sign of a sum by fsum is the sign of the exact sum
             beyond = max(math.fsum([*vector, -1.0]) for vector in np.asarray(self.palette).tolist())
             return 1.0 if beyond <= 0 else math.nextafter(1.0 + beyond, 2.0)
         sums = self.expected(np.ones(self.num_states + 1))
@@ -440,7 +445,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
     def entries(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         states, actions = np.asarray(states, np.int64), np.asarray(actions, np.int64)
         rows = states * self.num_actions + actions
-        if len(rows) < _FEW:
+        if len(rows) < _FEW_EXECUTIONS:
             return self.possible(rows)
         size = int((self.begins(rows + 1) - self.begins(rows)).sum())
         columns = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size)
@@ -457,12 +462,12 @@ class OutcomeTable(OutcomeRows, Dynamics):
 
     def part(self, start: int, stop: int) -> tuple["OutcomeTable", np.ndarray]:
         first, last = self.begins(np.array([start, stop]) * self.num_actions).tolist()
-        entries = rows_of(self.flat, first, last)
-        local, halo = split(partial(blocks_of, entries), entries.shape, start, stop)
+        entries = index_rows(self.flat, first, last)
+        local, halo = part_with_halo(partial(index_blocks, entries), entries.shape, start, stop)
         return self._of_states(slice(start, stop), slice(first, last), local), halo
 
     def _restricted_to(self, states: np.ndarray) -> "OutcomeTable":
-        # transitions that leave them lead back to where they came from
+        # transitions that leave them lead back to their own state
         number = np.full(self.num_states + 1, -2, np.int64)
         number[states], number[-1] = np.arange(len(states)), -1
         return self._renumbered(states, number)
@@ -481,14 +486,14 @@ class OutcomeTable(OutcomeRows, Dynamics):
     # Parts of it ------------------------------------------------------------------------------------------------------
 
     def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
-        """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for where it came from."""
-        which, places = self.places(self._rows(np.asarray(states)))
-        next_states = number[self.flat[places]]
+        """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for the state of the row."""
+        which, entries = self.entry_indices(self._rows(np.asarray(states)))
+        next_states = number[self.flat[entries]]
         next_states = np.where(next_states == -2, which // self.num_actions, next_states)
-        return self._of_states(states, places, as_indices(next_states, len(states)))
+        return self._of_states(states, entries, as_indices(next_states, len(states)))
 
-    def _of_states(self, states: States, places: States, successors: Indices) -> "OutcomeTable":
-        """The rows of some states, with other successors (N,); places (N,) of their entries, all and in order."""
+    def _of_states(self, states: States, entries: States, successors: Indices) -> "OutcomeTable":
+        """Rows of some states, with other successors (N,); entries (N,): indices of all their outcomes, in order."""
         arrays: dict[str, Any] = {"successors": successors.reshape(-1, *self.successors.shape[1:])}
         if self.offsets is not None:
             rows = self._rows(np.arange(self.num_states)[states])
@@ -496,7 +501,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
         if self.probabilities is None:
             arrays.update(codes=np.array(np.asarray(self.codes)[states]), palette=self.palette)
         else:
-            probabilities = np.array(self.probabilities.reshape(-1)[places])
+            probabilities = np.array(self.probabilities.reshape(-1)[entries])
             arrays["probabilities"] = probabilities.reshape(arrays["successors"].shape)
         return OutcomeTable(num_actions=self.num_actions, **arrays)
 
@@ -510,7 +515,7 @@ class Matrices(OutcomeTable):
 
     Attributes:
         transitions: (S A, S) CSR float64, row s A + a; 1 minus the sum of a row is the probability that the episode
-            ends, where it exceeds 4 (n + 2) units of 2^-53 for rows of n entries: less may be rounding.
+            ends, if it exceeds 4 (n + 2) units of 2^-53 for rows of n entries: less may be rounding.
     """
 
     def __init__(self, transitions: "csr_matrix", num_actions: int):
@@ -521,11 +526,11 @@ class Matrices(OutcomeTable):
         counts = np.diff(transitions.indptr)
         lacks = 1 - np.asarray(transitions.sum(axis=1)).ravel()
         ending = np.flatnonzero(lacks > rounding_of_sums(int(counts.max(initial=0))))
-        places, offsets = transitions.indptr[ending + 1], transitions.indptr
+        indices, offsets = transitions.indptr[ending + 1], transitions.indptr
         successors, probabilities = transitions.indices, transitions.data
         if len(ending):
-            successors = np.insert(successors, places, -1)
-            probabilities = np.insert(probabilities, places, lacks[ending])
+            successors = np.insert(successors, indices, -1)
+            probabilities = np.insert(probabilities, indices, lacks[ending])
             offsets = offsets + np.searchsorted(ending, np.arange(len(offsets)))
         super().__init__(successors, num_actions, offsets=offsets, probabilities=probabilities)
 

@@ -54,11 +54,12 @@ class TabularMDP:
         folder: of the state space, or of an imported table; None: in no folder.
         space: the state space that the states are of, if there is one.
         is_numbered: whether states have the numbers that they were given with; not after some were merged.
-        age: (S,) integers that each transition out of a state that is not terminal makes larger; None where they are
+        age: (S,) integers that each transition out of a state that is not terminal makes larger; None if they are
             not known. Solvers take the states in this order then, once.
         available: (S, A) bool, the actions that exist in each state, one or more, all in terminal states; None: all
-            everywhere. Transitions and rewards of the others are those of the first available action.
-        names: of states and actions: labels, variables, names of actions; None: those of the space, if there is one.
+            everywhere. Transitions and rewards of the others are the same as for the first available action.
+        names: of states and actions: labels, variables, names of actions; None: the names of the space, if there is
+            one.
         residual: what the sums of rows that were given leave open, see mdp/row_sums.py; error bounds of values count
             it.
     """
@@ -125,7 +126,7 @@ class TabularMDP:
     def next_states(self) -> Indices | None:
         """(S, A) int32, int64 or `PackedIndices`, the next state of each action; -1: the episode ends.
 
-        None where transitions are not stored so.
+        None if transitions are not stored so.
         """
         return getattr(self.dynamics, "next_states", None)
 
@@ -135,7 +136,7 @@ class TabularMDP:
 
         1 minus the sum of a row is the probability that the episode ends.
 
-        None where transitions are not stored so.
+        None if transitions are not stored so.
         """
         return getattr(self.dynamics, "transitions", None)
 
@@ -146,7 +147,7 @@ class TabularMDP:
 
     @property
     def initial(self) -> int | np.ndarray:
-        """The start state, or (S,) probabilities where there are several."""
+        """The start state, or (S,) probabilities if there are several."""
         if len(self.start_states) == 1:
             return int(self.start_states[0])
         distribution = np.zeros(self.num_states)
@@ -184,7 +185,7 @@ class TabularMDP:
         return "pairs (state, previously executed action)" if self.is_sticky else "states"
 
     def acting(self, x: np.ndarray, states: States) -> np.ndarray:
-        """Values (N, A, ...) of executing actions in some states, those of unavailable actions as what they act as.
+        """Values (N, A, ...) of executing actions in some states, unavailable actions as what they act as.
 
         Only under sticky actions they may differ, as the action is part of what comes next.
         """
@@ -222,7 +223,7 @@ class TabularMDP:
         return replace(self, horizon=horizon)
 
     def with_rewards(self, rewards: npt.ArrayLike) -> "TabularMDP":
-        """The same MDP with other rewards, (S, A); those of terminal states must be 0."""
+        """The same MDP with other rewards, (S, A); rewards of terminal states must be 0."""
         if self.available is not None and np.shape(rewards) == self.available.shape:
             rewards = filled(np.asarray(rewards, np.float64), self.available)
         table = rewards_of_shape(rewards, self.reward_table.shape)

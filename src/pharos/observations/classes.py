@@ -12,7 +12,7 @@ from pharos.observations.observation import Observation
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
-BLOCK = 4096
+CLASS_BLOCK = 4096
 MOST_HISTORIES = 1_000_000
 
 AliasingCallback = Callable[[int, str], None]
@@ -36,7 +36,7 @@ def observation_classes(
 ) -> np.ndarray:
     """Number the different observations of a state space.
 
-    Observations count as equal where their digests of 128 bits are: of 10^9 different ones two are taken for one with a
+    Observations count as equal if their digests of 128 bits are: of 10^9 different ones two are taken for one with a
     probability below 10^-20.
 
     Returns:
@@ -54,7 +54,7 @@ def observation_classes(
     def observations_of(block: slice) -> np.ndarray:
         return observation(space.states(block))
 
-    return _numbered(observations_of, space.num_states, observation.name, progress)
+    return _class_numbers(observations_of, space.num_states, observation.name, progress)
 
 
 def history_aliasing(
@@ -67,7 +67,7 @@ def history_aliasing(
     """Count the states that an observation of k frames does not tell apart, over all histories that play can have.
 
     A history is what the last k states of an episode can be; at its start the first state stands k times. A state
-    shares an observation where some history that ends in it gives the same frames as one that ends in another state.
+    shares an observation if some history that ends in it gives the same frames as one that ends in another state.
     `num_observations` are the different stacks of frames.
 
     Raises:
@@ -81,7 +81,7 @@ def history_aliasing(
         states = space.states(part.ravel())
         return observation.of_histories(states.reshape(*part.shape, -1))
 
-    classes = _numbered(observations_of, len(histories), observation.name, progress)
+    classes = _class_numbers(observations_of, len(histories), observation.name, progress)
     ends, terminal = histories[:, -1], np.asarray(space.terminal)
 
     def sharing(among: np.ndarray) -> int:
@@ -117,17 +117,17 @@ def _histories(space: "StateSpace", length: int, max_histories: int) -> np.ndarr
     return np.array(sorted(visited), np.int64)
 
 
-def _numbered(
+def _class_numbers(
     observations_of: Callable[[slice], np.ndarray], count: int, name: str, progress: AliasingCallback | None
 ) -> np.ndarray:
     """(count,) int64, the numbers of different observations, which `observations_of` gives for blocks of rows."""
     import xxhash
 
     digests = np.empty(count, "V16")
-    for start in range(0, count, BLOCK):
+    for start in range(0, count, CLASS_BLOCK):
         if progress is not None:
             progress(start, name)
-        observations = observations_of(slice(start, min(start + BLOCK, count)))
+        observations = observations_of(slice(start, min(start + CLASS_BLOCK, count)))
         rows = np.ascontiguousarray(observations).reshape(len(observations), -1).view(np.uint8)
         digests[start : start + len(rows)] = [xxhash.xxh3_128_digest(row.data) for row in rows]
     halves = digests.view(np.uint64).reshape(-1, 2)

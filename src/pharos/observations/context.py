@@ -6,12 +6,12 @@ from pharos.errors import ParameterError
 from pharos.observations.observation import Observation
 from pharos.observations.vector import Vector
 
-Seen = np.ndarray | dict[str, np.ndarray]  # one observation or a batch of them; a dict where there are several parts
+Seen = np.ndarray | dict[str, np.ndarray]  # one observation or a batch of them; a dict if there are several parts
 NO_ACTION = -1  # the previous action on the first step of an episode
 
 
 class ObservationInContext:
-    """Input of an agent: an observation of the state, with the previous action and the remaining time where wanted.
+    """Input of an agent: an observation of the state, with the previous action and the remaining time if wanted.
 
     Without either, the observation itself. A `vector` is extended: one entry for each action (1 for the previous one,
     all 0 on the first step), then the remaining time. Any other observation becomes a Dict of "observation",
@@ -26,10 +26,10 @@ class ObservationInContext:
         names: of the entries of a vector; None for others.
         has_more: whether frames or coins are wanted.
         is_alone: whether neither the previous action nor the remaining time is wanted.
-        vector: the observation, where it is one; is_vector: whether it is.
+        vector: the observation, if it is one; is_vector: whether it is.
         is_plain: whether nothing at all is: a function of the state.
     Raises:
-        ParameterError: the remaining time is wanted where there is no time limit.
+        ParameterError: the remaining time is wanted although there is no time limit.
     """
 
     def __init__(self, observation: Observation, *, previous_action: bool, remaining_time: bool, limit: int | None):

@@ -1,6 +1,6 @@
 """Simple images, one small plane for each kind of thing, and complex images, sprites on a ground like an Atari screen.
 
-Both come from the rules' `draw`, compiled where possible, over blocks of states; `render` gives them beside the
+Both come from the rules' `draw`, compiled if possible, over blocks of states; `render` gives them beside the
 pictures for people. Several frames in one image: the last k pictures of an episode, as agents of Atari games see them.
 
 Source: Mnih et al. (2015), "Human-level control through deep reinforcement learning", methods.
@@ -39,12 +39,12 @@ def num_values(layer: Layer) -> int:
 
 
 class Drawing:
-    """Runs a drawing kernel of the rules on batches of states; a twin in Python where Numba cannot compile it.
+    """Runs a drawing kernel of the rules on batches of states; a twin in Python if Numba cannot compile it.
 
     Attributes:
         env: the environment; rows, columns: of its grid. `block` frames are worth a thread's while.
-        motion: whether the planes of `draw_motion` follow those of `draw`; not where the class defines none.
-        layers: those of all planes.
+        motion: whether the planes of `draw_motion` follow those of `draw`; not if the class defines none.
+        layers: of all planes.
     Raises:
         ParameterError: the environment declares no grid, no layers or no draw(), or motion is no truth.
     """
@@ -116,8 +116,8 @@ MOST = 16
 class Frames(Observation):
     """An image of one state, or of the last k states of an episode, the oldest first, along the channels.
 
-    At the start of an episode the first frame stands k times. As a function of one state it is what an agent sees where
-    an episode starts in that state; elsewhere it depends on the k - 1 states before, see `of_histories`.
+    At the start of an episode the first frame stands k times. As a function of one state it is what an agent sees if
+    an episode starts in that state; otherwise it depends on the k - 1 states before, see `of_histories`.
 
     Attributes:
         frames: k.
@@ -125,7 +125,7 @@ class Frames(Observation):
     """
 
     def _stack(self, frames: object, channels: int) -> None:
-        """Set `space` to k stacked frames, where it was the space of one; `channels` is the axis of its channels.
+        """Set `space` to k stacked frames, if it was the space of one; `channels` is the axis of its channels.
 
         Raises:
             ParameterError: k is no integer from 1 to MOST.
@@ -157,20 +157,20 @@ DARKEST = 128  # of the shades of things on a plane of their own
 
 
 class SimpleImage(Frames):
-    """One plane for each layer of the environment, channel first: (L, rows k, columns k) uint8, 0 where nothing is.
+    """One plane for each layer of the environment, channel first: (L, rows k, columns k) uint8, 0 if a cell is empty.
 
     A layer with one kind of thing shows it as 255; one with several (such as cars of several colours) in even shades
-    from 255 down to 128. Shows where things are, not where they go: directions and timers that `draw` leaves out cannot
-    be seen without `motion`.
+    from 255 down to 128. Shows the positions of things, not their motion: directions and timers that `draw` leaves out
+    cannot be seen without `motion`.
 
     Args:
         motion: planes for the M motion layers follow, such as the cell that a ball comes from: with them no two states
-            of the classes of pharos look alike. Where a class declares none, `draw` shows all that there is.
+            of the classes of pharos look alike. If a class declares none, `draw` shows all that there is.
         frames: k, the last k pictures of the episode, the oldest first: (k L, rows, columns). See `Frames`.
         hide: names of layers that the agent does not see: their planes stay, and are always 0.
         grey: one plane (1, rows k, columns k) for all things, each in a shade of its own, later layers over earlier
             ones.
-        scale: k, pixels on each side of a cell. None: 1, or more where there are more planes than rows or columns,
+        scale: k, pixels on each side of a cell. None: 1, or more if there are more planes than rows or columns,
             because Stable-Baselines3 takes the smallest dimension for the channels.
     Attributes:
         shades: (L, 256) uint8, the shade of every value on the plane of every layer.
@@ -253,7 +253,7 @@ def _paint(planes: np.ndarray, shades: np.ndarray, covering: bool, out: np.ndarr
         target[shade > 0] = shade[shade > 0]
 
 
-LARGEST = 1024  # pixels on a side
+MOST_PIXELS = 1024  # pixels on a side
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601, as in Pillow and OpenCV
 
 
@@ -306,12 +306,12 @@ class ComplexImage(Frames):
         ground_of(scenery.ground)(ground, scenery.cell, scenery.margin)
         picture = _scaled(ground, height, width)
         layers = self._drawing.layers
-        sprite, place, color, keep = _sprite_tables(layers, scenery, np.diff(top), np.diff(left))
+        sprite, offset, color, keep = _sprite_tables(layers, scenery, np.diff(top), np.diff(left))
         hidden = hidden_names(hide, f"complex_image of {env.name}", layers)
         sprite[[name in hidden for name in layers]] = -1
         if grey:
             picture, color = (values @ np.array(LUMINANCE)[:, None] for values in (picture, color))
-        self._tables = (_bytes(picture), top, left, sprite, place, _bytes(color), keep)
+        self._tables = (_bytes(picture), top, left, sprite, offset, _bytes(color), keep)
         channels = picture.shape[2]
         shape = (channels, height, width) if channels_first else (height, width, channels)
         self.space = Box(0, 255, shape, np.uint8)
@@ -325,13 +325,13 @@ class ComplexImage(Frames):
     def _checked_size(self, size: object) -> tuple[int, int]:
         try:
             height, width = size if isinstance(size, Iterable) else ()
-            valid = all(int(n) == n and 1 <= n <= LARGEST for n in (height, width))
+            valid = all(int(n) == n and 1 <= n <= MOST_PIXELS for n in (height, width))
         except (TypeError, ValueError):
             valid = False
         if not valid:
             raise ParameterError(
                 f"complex_image of {self.env}: size is {size!r}; "
-                f"expected 'natural' or (height, width) of 1 to {LARGEST} pixels"
+                f"expected 'natural' or (height, width) of 1 to {MOST_PIXELS} pixels"
             )
         return int(height), int(width)
 
@@ -342,7 +342,7 @@ def _natural_size(scenery: Scenery, rows: int, columns: int) -> tuple[int, int]:
 
 
 def _edges(before: int, cell: int, number: int, natural: int, size: int) -> np.ndarray:
-    """(number + 1,) where each cell begins, in pixels of the picture."""
+    """(number + 1,) the beginning of each cell, in pixels of the picture."""
     return np.rint((before + cell * np.arange(number + 1)) * size / natural).astype(np.int64)
 
 
@@ -384,7 +384,7 @@ def _area_weights(old: int, new: int) -> np.ndarray:
 def _sprite_tables(
     layers: Mapping[str, Layer], scenery: Scenery, heights: np.ndarray, widths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """sprite, place, color and keep, as `draw_complex` takes them; color still (P, 3) float64."""
+    """sprite, offset, color and keep, as `draw_complex` takes them; color still (P, 3) float64."""
     rows = len(heights)
     sprite = np.full((len(layers), rows, 256), -1, np.int64)
     images: list[np.ndarray] = []
@@ -399,18 +399,18 @@ def _sprite_tables(
             sprite[number, row, 1:] = first + count - 1
             sprite[number, row, 1 : 1 + count] = first + np.arange(count)
         images += [_sprite_image(name, look, value, scenery) for look in looks for value in range(1, count + 1)]
-    place = np.zeros((max(1, len(images)), heights.max() + 1, widths.max() + 1), np.int64)
+    offset = np.zeros((max(1, len(images)), heights.max() + 1, widths.max() + 1), np.int64)
     pixels: list[np.ndarray] = []
     used = 0
     for i, image in enumerate(images):
         for height in np.unique(heights):
             for width in np.unique(widths):
-                place[i, height, width] = used
+                offset[i, height, width] = used
                 pixels.append(_scaled(image, int(height), int(width)).reshape(-1, 4))
                 used += int(height * width)
     table = np.concatenate([np.zeros((1, 4)) if not pixels else np.empty((0, 4)), *pixels])
     keep = 256 - np.rint(table[:, 3] * 256).astype(np.uint16)
-    return sprite, place, table[:, :3], keep
+    return sprite, offset, table[:, :3], keep
 
 
 def _sprite_image(name: str, layer: Layer, value: int, scenery: Scenery) -> np.ndarray:
@@ -425,7 +425,7 @@ def _sprite_image(name: str, layer: Layer, value: int, scenery: Scenery) -> np.n
     return image
 
 
-def _compose(planes, picture, top, left, sprite, place, color, keep, out) -> None:
+def _compose(planes, picture, top, left, sprite, offset, color, keep, out) -> None:
     """Python twin of the kernel for one state: the part of `interaction.draw_complex` after drawing."""
     out[:] = picture
     for layer, plane in enumerate(planes):
@@ -434,7 +434,7 @@ def _compose(planes, picture, top, left, sprite, place, color, keep, out) -> Non
             if number < 0:
                 continue
             height, width = top[row + 1] - top[row], left[column + 1] - left[column]
-            pixels = slice(place[number, height, width], place[number, height, width] + height * width)
+            pixels = slice(offset[number, height, width], offset[number, height, width] + height * width)
             target = out[top[row] : top[row + 1], left[column] : left[column + 1]]
             stays = keep[pixels].reshape(height, width, 1).astype(np.int64)
             target[:] = color[pixels].reshape(height, width, -1) + (target * stays >> 8)

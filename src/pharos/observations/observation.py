@@ -2,7 +2,7 @@
 
 Observations of the user's own, named as `module:name` or `file.py:name` like environments and agents.
 
-The name is that of an entry that the module registers, of a pair (function, Gymnasium space), or of a subclass of
+The name is the key of an entry that the module registers, of a pair (function, Gymnasium space), or of a subclass of
 `Observation`, which is called with the environment and the options.
 """
 
@@ -40,7 +40,7 @@ class Observation:
         env: the environment.
         space: Gymnasium space of one observation.
         names: of the entries of a one-dimensional observation; None for others.
-        frames: k, where the last k states are seen; else 1.
+        frames: k, if the last k states are seen; else 1.
         irrelevant: how many entries of noise follow a vector.
         is_flat: whether a compiled step may draw it: a pixel is a cell, and each layer has a plane of its own.
         shades: (L, 256) uint8, of an image: the shade of every value on the plane of every layer.
@@ -60,7 +60,7 @@ class Observation:
         raise NotImplementedError
 
     def one(self, state: np.ndarray) -> np.ndarray:
-        """The observation of one state (D,): a fresh array, or an integer where the space is Discrete."""
+        """The observation of one state (D,): a fresh array, or an integer if the space is Discrete."""
         return self(state[None])[0]
 
     def frame(self, states: np.ndarray) -> np.ndarray:
@@ -85,10 +85,10 @@ class FunctionObservation(Observation):
     """A user's function(env, states) with its Gymnasium space, checked at every call.
 
     The function gets the environment and states (N, D) int64, and returns an array (N, *space.shape). Its numbers are
-    converted to the space's dtype where that keeps their kind (float64 to float32, integers to floats).
+    converted to the space's dtype if that keeps their kind (float64 to float32, integers to floats).
 
     Raises:
-        ParameterError: the result has another shape, or a dtype that does not fit; for the start states also where a
+        ParameterError: the result has another shape, or a dtype that does not fit; for the start states also if a
             value lies outside the space.
     """
 
@@ -144,7 +144,7 @@ _BUILT_IN = {
 _registered: dict[str, tuple[Function, object]] = {}
 
 # Options that change what an agent is told, not how
-TELLING = ("motion", "hide", "seen_first", "frames", "irrelevant")
+INFORMATION_OPTIONS = ("motion", "hide", "seen_first", "frames", "irrelevant")
 
 
 def names() -> list[str]:
@@ -159,7 +159,7 @@ def title(name: str, options: Mapping[str, Any], *, whole: bool = False) -> str:
     Args:
         whole: with all options.
     """
-    shown = (*TELLING, *sorted(set(options) - set(TELLING))) if whole else TELLING
+    shown = (*INFORMATION_OPTIONS, *sorted(set(options) - set(INFORMATION_OPTIONS))) if whole else INFORMATION_OPTIONS
     words = (f"{option}={_words(options[option])}" for option in shown if options.get(option))
     return f"{name}({', '.join(words)})".removesuffix("()")
 
@@ -263,7 +263,7 @@ class OwnObservation:
     Attributes:
         name: under which results speak of it.
         make: (env, **options) -> Observation.
-        source: where it comes from; None where no other process can import it.
+        source: its origin; None if no other process can import it.
     """
 
     name: str
@@ -282,8 +282,8 @@ def imported(path: str, folder: str | Path | None = None) -> OwnObservation:
     Raises:
         ParameterError: no such module, file or name, or it is no observation.
     """
-    source = sources.find(path, folder)
-    return _observation(source, sources.load(source))
+    source = sources.find_source(path, folder)
+    return _observation(source, sources.load_source(source))
 
 
 def observation_of(source: Source, *, trust: bool = False, strict: bool = False) -> OwnObservation:

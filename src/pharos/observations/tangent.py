@@ -25,7 +25,7 @@ from pharos.system import sources
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
-SAMPLE = 4096  # states whose observations the digest is of
+DIGEST_STATES = 4096  # states whose observations the digest is of
 
 
 def network_inputs(observation: Observation, states: np.ndarray) -> np.ndarray:
@@ -77,7 +77,7 @@ def ntk(
         states: (N, D) states; None: all reachable ones, in the order of the state space.
         others: (M, D) states y; None: the same as `states`.
     Returns:
-        (N, M) float32; symmetric where `others` is None. Sums are float64.
+        (N, M) float32; symmetric if `others` is None. Sums are float64.
     Raises:
         ParameterError: the network has no closed form, does not fit the observation, or the kernel does not fit into
             memory. UnknownName: no such environment or observation.
@@ -123,7 +123,7 @@ def representation(
         network, initialisation: as for `ntk`. Or a network of one's own, a function of the shape of an input that
             returns a torch.nn.Module, or its name, "file.py:function" or "module:function": its kernel is the mean over
             20 random ones, see `empirical_ntk`; initialisation is the function's.
-        landmarks: of the approximation of the kernel, at least 2; None: where there are more than 4,096 different
+        landmarks: of the approximation of the kernel, at least 2; None: if there are more than 4,096 different
             observations; 0: never.
     Raises:
         ParameterError: the environment's class is not known, the network has no closed form or does not fit the
@@ -165,14 +165,14 @@ def representation(
             },
             **named,
             "landmarks": landmarks,
-            "digest": _digest(inputs, space.num_states),
+            "digest": _inputs_digest(inputs, space.num_states),
         },
     )
 
 
-def _digest(inputs: Callable[[np.ndarray], np.ndarray], num_states: int) -> str:
-    """Digest of the network's input in up to SAMPLE states all over the space."""
+def _inputs_digest(inputs: Callable[[np.ndarray], np.ndarray], num_states: int) -> str:
+    """Digest of the network's input in up to DIGEST_STATES states all over the space."""
     import xxhash
 
-    states = np.unique(np.linspace(0, num_states - 1, min(SAMPLE, num_states)).astype(np.int64))
+    states = np.unique(np.linspace(0, num_states - 1, min(DIGEST_STATES, num_states)).astype(np.int64))
     return xxhash.xxh3_128_hexdigest(np.ascontiguousarray(inputs(states)).data)

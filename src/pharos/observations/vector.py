@@ -55,15 +55,15 @@ class Vector(Observation):
         self.names = components.names
         self.low = components.low
         self.scale = np.where(components.size > 1, 1 / np.maximum(components.size - 1, 1), 0.0)
-        whose = f"vector of {env.name}"
+        source = f"vector of {env.name}"
         if isinstance(hide, int):
             if not -len(components.names) <= hide < 0:
-                raise ParameterError(f"{whose}: hide is {hide}; expected a name, or -1 to -{len(components.names)}")
+                raise ParameterError(f"{source}: hide is {hide}; expected a name, or -1 to -{len(components.names)}")
             hide = [components.names[hide]]
-        for name in hidden_names(hide, whose, components.variables, components.names):
+        for name in hidden_names(hide, source, components.variables, components.names):
             self.scale[components.variables.get(name) or components.names.index(name)] = 0.0
         few = f"0 to {MOST_IRRELEVANT} entries, so that a policy can be asked about all their values in a state"
-        self.irrelevant = whole_number(irrelevant, f"{whose}: irrelevant", few, least=0, most=MOST_IRRELEVANT)
+        self.irrelevant = whole_number(irrelevant, f"{source}: irrelevant", few, least=0, most=MOST_IRRELEVANT)
         self.names = (*components.names, *(f"irrelevant[{i}]" for i in range(self.irrelevant)))
         self.space = Box(0.0, 1.0, (len(self.names),), np.float32)
 
@@ -108,14 +108,16 @@ class OneHot(Observation):
         self._low = components.low
         self._offset = np.cumsum(components.size) - components.size
         self._first = np.zeros(length, bool)  # entries that start states alone show
-        whose = f"one_hot of {env.name}"
-        for name in hidden_names(seen_first, whose, components.variables, components.names, "seen_first"):
+        source = f"one_hot of {env.name}"
+        for name in hidden_names(seen_first, source, components.variables, components.names, "seen_first"):
             columns = components.variables.get(name) or components.names.index(name)
             for i in np.arange(len(components))[columns].ravel():
                 self._first[self._offset[i] : self._offset[i] + components.size[i]] = True
         starts = env.initial_states() if self._first.any() else []
         if len(starts) > MOST_STARTS:
-            raise ParameterError(f"{whose}: seen_first with {len(starts)} start states; expected at most {MOST_STARTS}")
+            raise ParameterError(
+                f"{source}: seen_first with {len(starts)} start states; expected at most {MOST_STARTS}"
+            )
         self._starts = np.array([state for state, _ in starts], np.int64)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
@@ -162,7 +164,7 @@ class Number(Observation):
     Toy text has the numbers of Gymnasium: row x columns + column in frozen_lake and cliff_walking; ((row x size +
     column) x (L + 1) + passenger) x L + destination in taxi with L landmarks, 500 numbers on 5 x 5 cells, which do not
     say whether a fickle passenger may still change his mind. An imported world has the number in its folder, which is
-    that of the table, matrix or file; 0 for the end of an episode.
+    the number in the table, matrix or file; 0 for the end of an episode.
 
     Raises:
         ParameterError: the source does not number its states.
@@ -191,9 +193,9 @@ class Number(Observation):
 
 
 SPARE = 8  # bits beyond those that write the state
-ROUNDS = 6
+HASH_ROUNDS = 6
 MOST_BITS = 1 << 16
-SEED = "an integer of at least 0"
+SEED_EXPECTED = "an integer of at least 0"
 FRACTION = 40  # bits of the number that decides whether a state is in the share of `mixed`
 
 
@@ -222,13 +224,13 @@ class Hash(Observation):
         expected = f"an integer from {enough}, which write the state, to {MOST_BITS}"
         count = needed + SPARE if bits is None else bits
         count = whole_number(count, f"hash of {env.name}: bits", expected, enough, MOST_BITS)
-        whole_number(seed, f"hash of {env.name}: seed", SEED, least=0)
+        whole_number(seed, f"hash of {env.name}: seed", SEED_EXPECTED, least=0)
         self.name = "hash"
         self.env = env
         self.names = tuple(f"bit {i}" for i in range(count))
         self.space = MultiBinary(count)
         self._low, self._lengths = components.low, lengths
-        self._keys = np.random.SeedSequence(seed).generate_state(ROUNDS, np.uint64)
+        self._keys = np.random.SeedSequence(seed).generate_state(HASH_ROUNDS, np.uint64)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         from pharos.kernels.observation_kernels import scramble
@@ -242,10 +244,10 @@ class Mixed(Observation):
     """`one_hot` with a share of the states given random words instead: (sum of the sizes of the ranges,) float32.
 
     One-hot codes of neighbours are alike, words are not, so the share says how much of a representation is lost while
-    the size of the input and the length of every code, sqrt(D) for D components, stay. A state is in the share where a
+    the size of the input and the length of every code, sqrt(D) for D components, stay. A state is in the share if a
     random number of its own in [0, 1) is below it: a larger share has the same states, and more. A word has L entries
-    of +-sqrt(D / L), the signs being those of `hash` with L bits and the same seed. Complete: words differ from each
-    other, and a one-hot code has entries that no word has.
+    of +-sqrt(D / L), the signs being the signs of `hash` with L bits and the same seed. Complete: words differ from
+    each other, and a one-hot code has entries that no word has.
 
     Args:
         share: of the states, from 0 (one_hot) to 1 (words only).
@@ -260,7 +262,7 @@ class Mixed(Observation):
 
         if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 1:
             raise ParameterError(f"mixed of {env.name}: share is {share!r}; expected a number from 0 to 1")
-        whole_number(seed, f"mixed of {env.name}: seed", SEED, least=0)
+        whole_number(seed, f"mixed of {env.name}: seed", SEED_EXPECTED, least=0)
         components = env.components
         if not (components.size > 1).any():
             raise ParameterError(f"mixed of {env.name}: no component has two values; expected states that differ")

@@ -8,7 +8,7 @@ from pharos.plots.instances import growth, hardness_plane, policies, states_by_d
 from pharos.plots.regret import predictions, regret
 from pharos.plots.style import (
     DIAGONAL,
-    agent_name,
+    agent_label,
     color_among,
     label_edges,
     legend_below,

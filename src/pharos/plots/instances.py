@@ -20,7 +20,7 @@ from pharos.drawing import NIGHT, enlarged, image, save_gif
 from pharos.errors import ParameterError, UnknownName
 from pharos.interaction import GymEnv
 from pharos.observations import render as render_state
-from pharos.plots.style import COLORS, INK, plain_log, single, styled
+from pharos.plots.style import INK_COLOR, LINE_COLORS, plain_log, single, styled
 from pharos.policies import PolicyAnswers, PolicyLike, TabularAgent
 from pharos.system.wording import pluralize
 
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
     from pharos.training import Task
 
 
-ARROWS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
+ARROW_VECTORS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
 
 
-CELLS = ("row", "column")
+ROW_AND_COLUMN = ("row", "column")
 MOST_LETTERS = 40  # a side: beyond it, letters in cells are too small to read
 
 
@@ -48,7 +48,7 @@ def value_map(
     space: "StateSpace",
     solution: "Solution",
     *,
-    over: tuple[str, str] = CELLS,
+    over: tuple[str, str] = ROW_AND_COLUMN,
     fix: Mapping[str, int] | None = None,
     rest: Literal["start"] | None = None,
     title: str = "",
@@ -56,10 +56,10 @@ def value_map(
 ) -> "Figure":
     """Draw V over the cells of a grid, or over two other variables, with the actions that the policy may take.
 
-    Over row and column, arrows are those of all optimal actions for an optimal solution; for a given policy as long as
-    their probability. Over other variables, letters say which actions the policy may take. A dot stands where every
-    action is as good. Terminal states are grey and outside of the colours' range; the number is the reward of getting
-    there. A frame marks where episodes start.
+    Over row and column, arrows show all optimal actions of an optimal solution; the arrows of a given policy are as
+    long as their probability. Over other variables, letters say which actions the policy may take. A dot means that
+    every action is as good. Terminal states are grey and outside of the colours' range; the number is the reward of
+    getting there. A frame marks where episodes start.
 
     Args:
         space: of any environment.
@@ -68,7 +68,7 @@ def value_map(
         fix: name -> value of every other variable, such as {"passenger": 4}: the slice to draw. What has one value in
             it need not be named.
         rest: "start": variables that `fix` does not name are as in the first start state.
-        axes: where to draw; None for a new figure.
+        axes: matplotlib axes to draw on; None for a new figure.
     Raises:
         ParameterError: states lack these variables, others are not fixed, or values belong to pairs.
     """
@@ -76,48 +76,50 @@ def value_map(
         raise ParameterError(
             "values under sticky actions belong to pairs (state, previous action); expected one a state"
         )
-    shown, place = _cells(space, over, fix or {}, rest)
+    shown, cells = _cells(space, over, fix or {}, rest)
     from matplotlib.patches import Rectangle
 
     assert space.environment is not None
     # Values as an image over the two variables
-    first, size = _extent(space, over, place)
-    place = place - first
+    first, size = _extent(space, over, cells)
+    cells = cells - first
     mdp = solution.mdp
     terminal = np.asarray(mdp.terminal)
     values = np.full(size, np.nan)
-    values[place[:, 0], place[:, 1]] = np.where(terminal[shown], np.nan, solution.v[shown])
+    values[cells[:, 0], cells[:, 1]] = np.where(terminal[shown], np.nan, solution.v[shown])
     drawn, axis = single(axes, (max(3.2, 0.62 * min(size[1], 30) + 1.2), max(2.8, 0.62 * min(size[0], 24) + 0.6)))
     axis.set_facecolor("#c9ccd1")
     image = axis.imshow(values, cmap="cividis")
     drawn.colorbar(image, ax=axis, shrink=0.8, label="value").outline.set_visible(False)
     # The actions of the policy in each cell
     lengths, letters = _lengths(solution), _letters(space.environment.actions)
-    draws_actions = over == CELLS or max(size) <= MOST_LETTERS
+    draws_actions = over == ROW_AND_COLUMN or max(size) <= MOST_LETTERS
     low, high = _range_of(values)
-    for s, (row, column) in zip(shown, place, strict=True):
+    for s, (row, column) in zip(shown, cells, strict=True):
         value = values[row, column]
         dark = np.isnan(value) or (high > low and (value - low) / (high - low) > 0.5)
         color = "#101216" if dark else "#f4f5f7"
         if terminal[s]:
             if draws_actions:
-                axis.text(column, row, _reward_on_entering(mdp, s), ha="center", va="center", color=INK, fontsize=9)
+                axis.text(
+                    column, row, _reward_on_entering(mdp, s), ha="center", va="center", color=INK_COLOR, fontsize=9
+                )
         elif not draws_actions:
             continue
         elif np.isnan(value) or lengths[s].min() == lengths[s].max():
             axis.plot(column, row, "o", color=color, markersize=3)
-        elif over == CELLS:
+        elif over == ROW_AND_COLUMN:
             _draw_arrows(axis, (column, row), space.environment.actions, lengths[s], color, letters)
         else:
             text = "".join(letters[int(action)] for action in np.flatnonzero(lengths[s] > 0.02))
             axis.text(column, row, text, ha="center", va="center", color=color, fontsize=7)
     # Frames around start states
-    for row, column in place[np.isin(shown, mdp.start_states)]:
+    for row, column in cells[np.isin(shown, mdp.start_states)]:
         axis.add_patch(
             Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="#D55E00", linewidth=1.6)
         )
     axis.set(xticks=[], yticks=[], title=textwrap.fill(title, max(24, int(9 * drawn.get_figwidth()))))
-    if over != CELLS:
+    if over != ROW_AND_COLUMN:
         key = "   ".join(f"{letter} {name}" for letter, name in zip(letters, space.environment.actions, strict=True))
         axis.set(ylabel=over[0], xlabel=f"{over[1]}\n{key}" if draws_actions and len(letters) <= 12 else over[1])
         axis.set_yticks(*_ticks(size[0], first[0]))
@@ -135,12 +137,12 @@ def _draw_arrows(
     each action that leads nowhere."""
     column, row = cell
     indices = [int(action) for action in np.flatnonzero(lengths > 0.02)]
-    if still := "".join(letters[action] for action in indices if actions[action] not in ARROWS):
+    if still := "".join(letters[action] for action in indices if actions[action] not in ARROW_VECTORS):
         axis.text(column, row, still, ha="center", va="center", color=color, fontsize=8)
     for action in indices:
-        if actions[action] not in ARROWS:
+        if actions[action] not in ARROW_VECTORS:
             continue
-        x, y = ARROWS[actions[action]]
+        x, y = ARROW_VECTORS[actions[action]]
         head: dict[str, object] = {"arrowstyle": "->", "color": color, "lw": 1.3, "shrinkA": 0, "shrinkB": 0}
         length = 0.1 + 0.26 * lengths[action]
         back = length if len(indices) == 1 else 0.0
@@ -159,18 +161,18 @@ def _letters(actions: Sequence[str]) -> list[str]:
 
 def _ticks(count: int, first: int) -> tuple[list[int], list[str]]:
     """(positions, labels) of ticks: at most a dozen values of a variable."""
-    places = list(range(0, count, -(-count // 12)))
-    return places, [str(first + place) for place in places]
+    indices = list(range(0, count, -(-count // 12)))
+    return indices, [str(first + index) for index in indices]
 
 
-def _extent(space: "StateSpace", over: tuple[str, str], place: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
+def _extent(space: "StateSpace", over: tuple[str, str], cells: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
     """(the values in the first row and column, the number of rows and columns)."""
     assert space.environment is not None
-    if over == CELLS:
+    if over == ROW_AND_COLUMN:
         components = space.environment.components
-        which = [components.names.index(name) for name in CELLS]
+        which = [components.names.index(name) for name in ROW_AND_COLUMN]
         return components.low[which], tuple(components.size[which].tolist())
-    low, high = place.min(axis=0), place.max(axis=0)
+    low, high = cells.min(axis=0), cells.max(axis=0)
     return low, (int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1)
 
 
@@ -179,7 +181,7 @@ def _cells(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N,) the states of the slice, (N, 2) their values of the two variables."""
     names, environment = space.component_names, space.manifest["environment"]
-    if over == CELLS and not set(CELLS) <= set(names):
+    if over == ROW_AND_COLUMN and not set(ROW_AND_COLUMN) <= set(names):
         raise ParameterError(
             f"{environment}: a state has {', '.join(names[:4])}; expected row and column alone, or others beside them "
             f"to fix: say which two to draw over, such as --over {','.join(names[:2])} (over=(...) in Python)"
@@ -209,7 +211,7 @@ def _cells(
     free = [name for name in others if name not in fix and np.ptp(states[shown, names.index(name)])]
     if free:
         slices = " ".join(f"--fix {name}={start[name]}" for name in free[:4])
-        expected = "row and column alone" if over == CELLS else f"{' and '.join(over)} alone"
+        expected = "row and column alone" if over == ROW_AND_COLUMN else f"{' and '.join(over)} alone"
         raise ParameterError(
             f"{environment}: a state has {', '.join(names[:6])}; expected {expected}: "
             f"fix the others, such as {slices} (fix={{...}} in Python), or --fix start (rest='start')"
@@ -242,7 +244,7 @@ def _reward_on_entering(mdp: "TabularMDP", terminal: int) -> str:
 # Planes of hardness ---------------------------------------------------------------------------------------------------
 
 
-MARKERS = "os^Dv<>P*X"
+PLOT_MARKERS = "os^Dv<>P*X"
 
 
 @styled
@@ -259,7 +261,7 @@ def hardness_plane(
         reports: name of an instance, such as "breakout/12x8x1", to its report. One colour for each class before the
             slash.
         visitation, estimation: names of measures in the reports.
-        axes: where to draw; None for a new figure.
+        axes: matplotlib axes to draw on; None for a new figure.
     Raises:
         ParameterError: no reports, or a report lacks a measure or has no finite value for it.
     """
@@ -272,13 +274,17 @@ def hardness_plane(
         number = classes.index(name.split("/")[0])
         low, high = _range(name, report, visitation)
         gaps = _range(name, report, estimation)[1]
-        color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
+        color, marker = LINE_COLORS[number % len(LINE_COLORS)], PLOT_MARKERS[number % len(PLOT_MARKERS)]
         axis.plot([low, high], [gaps, gaps], color=color, linewidth=2)
         axis.plot((low * high) ** 0.5, gaps, marker, color=color, markersize=6, markeredgecolor="white")
         points[name] = ((low * high) ** 0.5, gaps)
     for number, cls in enumerate(classes):
         axis.plot(
-            [], [], MARKERS[number % len(MARKERS)], color=COLORS[number % len(COLORS)], label=cls.replace("_", " ")
+            [],
+            [],
+            PLOT_MARKERS[number % len(PLOT_MARKERS)],
+            color=LINE_COLORS[number % len(LINE_COLORS)],
+            label=cls.replace("_", " "),
         )
     axis.set(xscale="log", yscale="log", xlabel=visitation.replace("_", " "), ylabel=estimation.replace("_", " "))
     axis.margins(0.18)
@@ -308,8 +314,8 @@ def _label(axis: Any, points: Mapping[str, tuple[float, float]]) -> None:
                 edge = x + 6 if right else x - 6 - width
                 boxes[right, dy] = (edge, y + dy, edge + width, y + dy + height)
         cost = {
-            place: sum(_overlap(box, other) for other in obstacles) + 2 * abs(place[1] + 3)
-            for place, box in boxes.items()
+            offset: sum(_overlap(box, other) for other in obstacles) + 2 * abs(offset[1] + 3)
+            for offset, box in boxes.items()
         }
         right, dy = min(cost, key=cost.__getitem__)
         obstacles.append(boxes[right, dy])
@@ -367,7 +373,7 @@ def growth(spaces: Mapping[str, "StateSpace"], *, axes: "Axes | None" = None) ->
 
     Args:
         spaces: label -> state space.
-        axes: where to draw; None for a new figure.
+        axes: matplotlib axes to draw on; None for a new figure.
     Raises:
         ParameterError: no space is given.
     """
@@ -375,7 +381,7 @@ def growth(spaces: Mapping[str, "StateSpace"], *, axes: "Axes | None" = None) ->
         raise ParameterError("no state spaces to draw; give at least one")
     drawn, axis = single(axes, (5.6, 3.6))
     for number, (label, space) in enumerate(spaces.items()):
-        within, color = states_by_depth(space).cumsum(), COLORS[number % len(COLORS)]
+        within, color = states_by_depth(space).cumsum(), LINE_COLORS[number % len(LINE_COLORS)]
         distance = np.arange(1, len(within) + 1)
         axis.plot(distance, within, color=color, label=f"{label}: {pluralize(space.num_states, 'state')}")
         axis.plot(distance[-1:], within[-1:], "o", color=color, markersize=5)
@@ -405,9 +411,9 @@ def policies(
 ) -> Path:
     """Write an episode of each agent, side by side, with the return so far below.
 
-    All start in the same state and meet the same chance as far as they act alike. For the best policy give that of a
-    discounted solution: with many undiscounted steps to go, a policy that waits is as good as one that goes straight
-    to the goal.
+    All start in the same state and meet the same chance as far as they act alike. For the best policy give the
+    policy of a discounted solution: with many undiscounted steps left, a policy that waits is as good as one that goes
+    straight to the goal.
 
     Args:
         task: environment, chance, and what the agents see.

@@ -17,9 +17,9 @@ from pharos.environments import class_called, instance_name
 from pharos.errors import ParameterError
 from pharos.observations import title
 from pharos.plots.style import (
-    COLORS,
-    GRID,
-    INK,
+    GRID_COLOR,
+    INK_COLOR,
+    LINE_COLORS,
     legend_below,
     panels,
     single,
@@ -42,9 +42,9 @@ if TYPE_CHECKING:
 IMPORTED = "imported"
 # Columns that are drawn: normalised and not, of the policy so far; and summed
 EPISODE_COLUMNS = ("normalized_regret", "expected_regret", "cumulative_realised_regret")
-AVERAGE_COLUMNS = ("normalized_average_regret", "average_regret", "cumulative_average_regret")
+AVERAGE_REGRET_COLUMNS = ("normalized_average_regret", "average_regret", "cumulative_average_regret")
 # Two labels up to this long stand beside each other
-WIDE = 60
+MOST_LABEL_LETTERS = 60
 
 
 @styled
@@ -58,7 +58,7 @@ def regret(
     """Draw the regret of runs over their steps; runs that differ in the seed alone are one line with an interval.
 
     Left, the normalised expected regret of the policy learnt so far: 0 is optimal, 1 is playing at random (in units of
-    return where playing at random is optimal in one of the tasks). Right, the cumulative realised regret of all
+    return if playing at random is optimal in one of the tasks). Right, the cumulative realised regret of all
     episodes played, exploration included; a dotted line is what playing at random would have cost in as many episodes.
     If all runs measure the average reward of a step in the long run, both are of the average regret of the policies
     learnt: left a step, right summed over the steps.
@@ -76,11 +76,11 @@ def regret(
     left, right = axes if axes is not None else panels(2, 4.6, 3.5)[1]
     curves = [curve for runs in groups.values() for _, curve in runs]
     average = all("average_regret" in curve for curve in curves)
-    normalized, column, summed = AVERAGE_COLUMNS if average else EPISODE_COLUMNS
+    normalized, column, summed = AVERAGE_REGRET_COLUMNS if average else EPISODE_COLUMNS
     relative = not any(np.isnan(curve[normalized]).any() for curve in curves)
     column = normalized if relative else column
     for number, (label, runs) in enumerate(groups.items()):
-        color = COLORS[number % len(COLORS)]
+        color = LINE_COLORS[number % len(LINE_COLORS)]
         _line(left, *_aligned(runs, column), color, label, confidence, resamples)
         steps, losses = _aligned(runs, summed)
         _line(right, steps, losses, color, label, confidence, resamples)
@@ -88,7 +88,7 @@ def regret(
         random = ((steps if average else _aligned(runs, "episodes")[1]) * spread).mean(axis=0)
         right.plot(steps, random, ":", color=color, linewidth=1.2)
     if relative:
-        left.axhline(1, color=INK, linewidth=0.8, linestyle=":")
+        left.axhline(1, color=INK_COLOR, linewidth=0.8, linestyle=":")
     is_infinite = any(np.isinf(curve[column]).any() for curve in curves)  # a total reward of a policy without end
     title_left = "policy learnt so far" + " (gaps: infinite)" * is_infinite
     left.set(title=title_left, xlabel="steps", ylabel=in_words(column), xlim=right.get_xlim())
@@ -97,9 +97,11 @@ def regret(
     for axis in (left, right):
         axis.xaxis.set_major_formatter(thousands)
     right.yaxis.set_major_formatter(thousands)
-    right.plot([], [], ":", color=INK, linewidth=1.2, label="at random")
+    right.plot([], [], ":", color=INK_COLOR, linewidth=1.2, label="at random")
     if axes is None:
-        legend_below(left.figure, [right], 2 if max(map(len, right.get_legend_handles_labels()[1])) <= WIDE else 1)
+        legend_below(
+            left.figure, [right], 2 if max(map(len, right.get_legend_handles_labels()[1])) <= MOST_LABEL_LETTERS else 1
+        )
     else:
         right.legend(loc="best")
     return left.figure
@@ -117,7 +119,7 @@ def _groups(folders: Sequence[str | os.PathLike]) -> dict[str, list[tuple[dict[s
 
 
 def _spread(result: dict[str, Any], average: bool) -> float:
-    """Regret of playing at random, of an episode or of a step in the long run; NaN where it is infinite."""
+    """Regret of playing at random, of an episode or of a step in the long run; NaN if it is infinite."""
     if average:
         return (sum(result["optimal_gain_at_start"].values()) - sum(result["uniform_gain_at_start"].values())) / 2
     uniform = result["value_uniform"]
@@ -131,11 +133,11 @@ def _with_averages(curve: Any, result: dict[str, Any]) -> Any:
     lost = (curve["average_regret_lower"] + curve["average_regret_upper"]) / 2
     total = np.concatenate([[0.0], np.cumsum(np.diff(curve["step"]) * lost.to_numpy()[:-1])])
     columns = (lost / regret_scale(_spread(result, True), 0.0, GAIN_TOLERANCE), lost, total)
-    return curve.assign(**dict(zip(AVERAGE_COLUMNS, columns, strict=True)))
+    return curve.assign(**dict(zip(AVERAGE_REGRET_COLUMNS, columns, strict=True)))
 
 
 def _labels(configs: list[dict[str, Any]]) -> list[str]:
-    """The label of each group of runs; where two are alike, with discount and horizon, or a number."""
+    """The label of each group of runs; if two are alike, with discount and horizon, or a number."""
     plain_labels = [_label(config, configs) for config in configs]
     labels: list[str] = []
     for config, label in zip(configs, plain_labels, strict=True):
@@ -216,16 +218,18 @@ def predictions(prediction: "Prediction", *, axes: "Axes | None" = None) -> "Fig
     """Draw a bar for each observation and network, from 0 (optimal) towards 1 (uniform play), with its interval.
 
     Args:
-        axes: where to draw; None for a new figure.
+        axes: matplotlib axes to draw on; None for a new figure.
     """
     cells = prediction.cells
     drawn, axis = single(axes, (6.4, 1.1 + 0.42 * len(cells)))
     rows = range(len(cells))
     same_network = len({cell.network for cell in cells}) == 1
-    axis.barh(rows, [cell.value for cell in cells], color=COLORS[0], height=0.55)
+    axis.barh(rows, [cell.value for cell in cells], color=LINE_COLORS[0], height=0.55)
     ends = [[cell.value - cell.low for cell in cells], [cell.high - cell.value for cell in cells]]
-    axis.errorbar([cell.value for cell in cells], rows, xerr=ends, fmt="none", ecolor=INK, capsize=3, linewidth=1.2)
-    axis.axvline(1.0, color=INK, linewidth=1, linestyle=(0, (4, 3)))
+    axis.errorbar(
+        [cell.value for cell in cells], rows, xerr=ends, fmt="none", ecolor=INK_COLOR, capsize=3, linewidth=1.2
+    )
+    axis.axvline(1.0, color=INK_COLOR, linewidth=1, linestyle=(0, (4, 3)))
     right = max(1.15, *(cell.high + 0.05 for cell in cells))
     axis.set(
         yticks=list(rows),
@@ -236,6 +240,6 @@ def predictions(prediction: "Prediction", *, axes: "Axes | None" = None) -> "Fig
         title=f"{prediction.environment}, {prediction.chance}",
     )
     axis.grid(axis="y", visible=False)
-    axis.grid(axis="x", color=GRID)
+    axis.grid(axis="x", color=GRID_COLOR)
     axis.invert_yaxis()
     return drawn

@@ -1,4 +1,4 @@
-"""Style of all figures, those of studies too: colours, panels, legends, files."""
+"""Style of all figures, also in studies: colours, panels, legends, files."""
 
 import functools
 import io
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 T = TypeVar("T")
 
-# Okabe and Ito's colours, which people tell apart whatever their sight; those of classes stand in their `look`
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+# Okabe and Ito's colours, which people distinguish whatever their sight; the colours of classes are in their `look`
+LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MORE_COLORS = ("#CC79A7", "#E69F00", "#F0E442", "#999999")
 OBSERVATION_COLORS = {TABULAR_OBSERVATION: "#009E73", "vector": "#0072B2", "simple_image": "#D55E00"}
-INK, GRID, DIAGONAL = "#23262d", "#e3e5e8", "#888888"
+INK_COLOR, GRID_COLOR, DIAGONAL = "#23262d", "#e3e5e8", "#888888"
 DPI, PAGE_DPI = 160, 120
 DATES: dict[str, Any] = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 
 def style(dark: bool = False) -> dict[Any, Any]:
     """Matplotlib settings of a figure on light or dark ground."""
-    ink, ground, grid = ("#d8dbe2", "#1b1e24", "#3a3f4a") if dark else (INK, "#ffffff", GRID)
+    ink, ground, grid = ("#d8dbe2", "#1b1e24", "#3a3f4a") if dark else (INK_COLOR, "#ffffff", GRID_COLOR)
     return {
         "figure.facecolor": ground, "axes.facecolor": ground, "savefig.facecolor": ground,
         "text.color": ink, "axes.labelcolor": ink, "axes.edgecolor": ink, "xtick.color": ink, "ytick.color": ink,
@@ -95,7 +95,7 @@ def label_edges(axes: Sequence[Any], below: str, beside: str) -> None:
         axis.set(xlabel=below if i + columns >= len(axes) else "", ylabel="" if i % columns else beside)
 
 
-def agent_name(agent: str) -> str:
+def agent_label(agent: str) -> str:
     """`DQN`; of an algorithm from a module or a file, the name of its class."""
     return agent_called(agent).title
 
@@ -134,8 +134,8 @@ def save(figure: "Figure", path: str | os.PathLike, *, follow: bool = True) -> P
     return path
 
 
-def save_for_page(draw: Callable[[], "Figure | None"], place: Path) -> dict[str, bytes] | None:
-    """Draw a figure into place.png and place.pdf; return its PNG for light and for dark pages, None without a figure.
+def save_for_page(draw: Callable[[], "Figure | None"], path: Path) -> dict[str, bytes] | None:
+    """Draw a figure into FILE.png and FILE.pdf; return its PNG for light and for dark pages, None without a figure.
 
     Args:
         draw: called under the style of either page.
@@ -149,9 +149,9 @@ def save_for_page(draw: Callable[[], "Figure | None"], place: Path) -> dict[str,
                 return None
             images[theme] = file_of(figure, "png", PAGE_DPI)
             if theme == "light":
-                place.parent.mkdir(parents=True, exist_ok=True)
-                replace_file(place.with_suffix(".png"), images[theme])
-                replace_file(place.with_suffix(".pdf"), file_of(figure, "pdf"))
+                path.parent.mkdir(parents=True, exist_ok=True)
+                replace_file(path.with_suffix(".png"), images[theme])
+                replace_file(path.with_suffix(".pdf"), file_of(figure, "pdf"))
     return images
 
 
@@ -173,7 +173,7 @@ def thousands(value: float, _: object = None) -> str:
 
 
 def plain_log(side: "Axis") -> None:
-    """Ticks of a logarithmic axis as numbers, with 2 and 5 between powers of ten where there are few of these."""
+    """Ticks of a logarithmic axis as numbers, with 2 and 5 between powers of ten if there are few of these."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     low, high = side.get_view_interval()

@@ -52,7 +52,7 @@ class DeepPolicy:
     Args:
         deterministic: the most probable action of a distribution, instead of the distribution.
         masked: whether the model was trained under action masks (MaskablePPO), which come with the observations then.
-        imposed: whether masks may be those of the batched engine, of whose networks the model itself knows nothing.
+        imposed: whether masks may be the masks of the batched engine, of whose networks the model itself knows nothing.
     Raises:
         ParameterError: the policy has a memory, so that its probabilities do not belong to observations; it needs masks
             and there are none, or takes none; or the VecNormalize that it was trained behind is missing.
@@ -77,7 +77,7 @@ class DeepPolicy:
 
         policy = self.model.policy
         policy.set_training_mode(False)
-        batch = _as_policy_sees(_normalized(self.model, observations), policy.observation_space)
+        batch = _as_policy_sees(_as_normalizer_gives(self.model, observations), policy.observation_space)
         with torch.no_grad():
             tensor, _ = policy.obs_to_tensor(batch)
             q_net: Callable[..., torch.Tensor] | None = getattr(policy, "q_net", None)
@@ -109,7 +109,7 @@ def restricted(logits: np.ndarray, masks: np.ndarray) -> np.ndarray:
 class RecurrentDeepPolicy:
     """The policy of a model with an LSTM, of sb3-contrib: a `RecurrentPolicy`, the distribution itself.
 
-    Its state is that of the actor: hidden and cell states, (n, layers, size) float32 each.
+    Its state is the actor's: hidden and cell states, (n, layers, size) float32 each.
     """
 
     def __init__(self, model: RecurrentModel):
@@ -130,7 +130,7 @@ class RecurrentDeepPolicy:
         policy = self.model.policy
         policy.set_training_mode(False)
         with torch.no_grad():
-            batch = _as_policy_sees(_normalized(self.model, observations), policy.observation_space)
+            batch = _as_policy_sees(_as_normalizer_gives(self.model, observations), policy.observation_space)
             tensor, _ = policy.obs_to_tensor(batch)
             hidden, cell = (torch.from_numpy(part.swapaxes(0, 1).copy()) for part in state)
             begins = torch.from_numpy(starts.astype(np.float32))
@@ -211,7 +211,7 @@ def _normalizer(model: object) -> "VecNormalize | None":
     return None if of is None else of()
 
 
-def _normalized(model: object, observations: Observations) -> Observations:
+def _as_normalizer_gives(model: object, observations: Observations) -> Observations:
     """Observations as the VecNormalize of a model gives them, whose statistics stay as they are."""
     normalizer = _normalizer(model)
     if normalizer is None or not normalizer.norm_obs:
@@ -229,7 +229,7 @@ def memory_error(policy: object) -> ParameterError:
 
 
 def _as_policy_sees(observations: Observations, space: "Space") -> Observations:
-    """Images moved to channel first where Stable-Baselines3 has done so with those of the environment."""
+    """Images moved to channel first if Stable-Baselines3 has done so with the environment's."""
     if isinstance(observations, dict):
         from gymnasium.spaces import Dict
 
@@ -245,7 +245,7 @@ def _channel_first(observations: np.ndarray, space: "Space") -> np.ndarray:
 
 
 def check_observation(policy: object, space: "Space", name: object) -> None:
-    """ParameterError where a model was trained on observations of another kind or size, or with other numbers."""
+    """ParameterError if a model was trained on observations of another kind or size, or with other numbers."""
     model, name = getattr(policy, "model", policy), getattr(name, "name", name)
     normalizer = _normalizer(model)
     own = model if normalizer is None or not normalizer.norm_obs else normalizer.venv

@@ -41,7 +41,7 @@ class TabularAgent(Protocol):
     """Chooses actions from the index of the state."""
 
     def policy_table(self) -> np.ndarray:
-        """(S,) actions, (S, A) probabilities, or (S, A + 1, A) where previous actions are seen."""
+        """(S,) actions, (S, A) probabilities, or (S, A + 1, A) if previous actions are seen."""
 
 
 Arrays: TypeAlias = Any
@@ -60,7 +60,7 @@ class RecurrentPolicy(Protocol):
         """The state of n episodes that begin."""
 
     def __call__(self, observations: Arrays, state: Arrays, starts: np.ndarray) -> tuple[np.ndarray, Arrays]:
-        """((N, A) probabilities or (N,) actions, the next state); starts: (N,) bool, where an episode begins."""
+        """((N, A) probabilities or (N,) actions, the next state); starts: (N,) bool, whether an episode begins."""
 
 
 PolicyLike = np.ndarray | TabularAgent | Policy | RecurrentPolicy | SB3Model | Callable[[Any], Any]
@@ -74,7 +74,7 @@ def policy_function(policy: PolicyLike, *, masked: bool = False) -> Callable[...
     Args:
         masked: whether the function takes (N, A) masks as well.
     Raises:
-        ParameterError: it is none, has a memory, or takes masks where there are none, or the other way round.
+        ParameterError: it is none, has a memory, or takes masks although there are none, or the other way round.
     """
     if isinstance(policy, RecurrentPolicy) and not isinstance(policy, Policy | SB3Model):
         raise memory_error(policy)
@@ -104,9 +104,9 @@ def masks_for(policy: PolicyLike, mdp: TabularMDP, masks: "MasksLike | None") ->
 
 
 # Observations in one query of a policy.
-BATCH = 4096
+QUERY_BATCH = 4096
 SINGLE, HALF = 1.1e-4, 1e-2  # by which a sum of probabilities may miss 1, of 32 bits and of 16
-SOME = 1024  # rows that stand for all where these are too many for an exact value
+SOME = 1024  # rows that stand for all if these are too many for an exact value
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +188,7 @@ class ReachableRows(NamedTuple):
 
 
 class QueriedPolicy:
-    """Answers of a policy so far, by row: a state s, or s (A + 1) + b where the previous action b matters (A: none).
+    """Answers of a policy so far, by row: a state s, or s (A + 1) + b if the previous action b matters (A: none).
 
     Attributes:
         by_pairs: whether rows are pairs of state and previous action.
@@ -200,7 +200,7 @@ class QueriedPolicy:
         self.width = 1 if by_state else mdp.num_actions + 1 if sees_previous_action else mdp.policy_width
         self.by_pairs = self.width > 1
         # index + 1 of each row, 0: not queried; pages of zeros take no memory until they are written
-        self._place = np.zeros(mdp.num_states * self.width, np.int32)
+        self._index = np.zeros(mdp.num_states * self.width, np.int32)
         # number of filled entries of the next two arrays, which double when they are full
         self._count = 0
         self._rows, self._answers = np.empty(64, np.int64), np.empty((64, mdp.num_actions))
@@ -216,32 +216,32 @@ class QueriedPolicy:
         return self._answers[: self._count]
 
     def index(self, rows: np.ndarray) -> np.ndarray:
-        """(N,) place of each row in `rows` and `probabilities`; -1 for rows that were not queried."""
-        return self._place[rows] - 1
+        """(N,) index of each row in `rows` and `probabilities`; -1 for rows that were not queried."""
+        return self._index[rows] - 1
 
     def query(self, rows: np.ndarray) -> np.ndarray:
         """(N, A) probabilities of distinct or repeated rows; only new ones are queried."""
-        places = self.places(rows)  # before `probabilities`, which it appends to
-        return self.probabilities[places]
+        indices = self.index_after_query(rows)  # before `probabilities`, which it appends to
+        return self.probabilities[indices]
 
-    def places(self, rows: np.ndarray) -> np.ndarray:
-        """(N,) place of each row in `rows` and `probabilities`; new ones are queried."""
-        places = self.index(rows)
-        if (is_new := places < 0).any():
+    def index_after_query(self, rows: np.ndarray) -> np.ndarray:
+        """(N,) index of each row in `rows` and `probabilities`; new ones are queried."""
+        indices = self.index(rows)
+        if (is_new := indices < 0).any():
             unknown = np.unique(rows[is_new])
             count = self._count + unknown.size
             if count > len(self._rows):
                 more = max(count, 2 * len(self._rows)) - len(self._rows)
                 self._rows = np.concatenate([self._rows, np.empty(more, np.int64)])
                 self._answers = np.concatenate([self._answers, np.empty((more, self.num_actions))])
-            for start in range(0, unknown.size, BATCH):
-                block = unknown[start : start + BATCH]
-                place = slice(self._count + start, self._count + start + len(block))
-                self._rows[place], self._answers[place] = block, self._query(block)
-            self._place[unknown] = np.arange(self._count, count) + 1
+            for start in range(0, unknown.size, QUERY_BATCH):
+                block = unknown[start : start + QUERY_BATCH]
+                part = slice(self._count + start, self._count + start + len(block))
+                self._rows[part], self._answers[part] = block, self._query(block)
+            self._index[unknown] = np.arange(self._count, count) + 1
             self._count = count
-            places = self.index(rows)
-        return places
+            indices = self.index(rows)
+        return indices
 
     def _query(self, rows: np.ndarray) -> np.ndarray:
         """(N, A) probabilities in rows that are new."""
@@ -295,8 +295,8 @@ class QueriedPolicy:
     def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
         """Query the policy in all rows of `reach` at once; True.
 
-        False where there are more rows, and the policy reaches all of these (every action has a positive probability,
-        as seen in SOME of them). None where an action has probability 0, so that it may reach less. Then nothing is
+        False if there are more rows, and the policy reaches all of these (every action has a positive probability,
+        as seen in SOME of them). None if an action has probability 0, so that it may reach less. Then nothing is
         stored.
         """
         chance = self.mdp.chance
@@ -306,12 +306,12 @@ class QueriedPolicy:
         rows, is_whole = reach()
         if not is_whole:
             return False if always or (self._query(rows[:: len(rows) // SOME + 1]) > 0).all() else None
-        blocks = [self._query(rows[start : start + BATCH]) for start in range(0, len(rows), BATCH)]
+        blocks = [self._query(rows[start : start + QUERY_BATCH]) for start in range(0, len(rows), QUERY_BATCH)]
         probabilities = np.concatenate(blocks)
         if not always and not (probabilities > 0).all():
             return None
         self._rows, self._answers, self._count = rows.copy(), probabilities, len(rows)
-        self._place[rows] = np.arange(1, self._count + 1)
+        self._index[rows] = np.arange(1, self._count + 1)
         return True
 
     def _arrivals(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -319,8 +319,8 @@ class QueriedPolicy:
         return states * self.width + (actions if self.by_pairs else 0)
 
     def reached_states(self) -> np.ndarray:
-        """(N,) the state that each state of `reached_mdp` behaves as: that of a row, or each once under sticky actions,
-        where the MDP tells previous actions apart itself."""
+        """(N,) the state that each state of `reached_mdp` behaves as: the state of a row, or each once under sticky
+        actions, if the MDP tells previous actions apart itself."""
         states = self.rows // self.width
         return np.unique(states) if self.mdp.is_sticky else states
 
@@ -332,12 +332,12 @@ class QueriedPolicy:
             return self._mdp_on(
                 states, starts, lambda next_states, executed, _: self.index(self._arrivals(next_states, executed))
             ), self.probabilities
-        place = np.full(mdp.num_states, -1, np.int64)
-        place[states] = np.arange(states.size)
+        index = np.full(mdp.num_states, -1, np.int64)
+        index[states] = np.arange(states.size)
         policy = np.zeros((states.size, self.width, mdp.num_actions))
         policy[:, :, 0] = 1.0  # arbitrary, in pairs that are not reached
-        policy[place[self.rows // self.width], self.rows % self.width] = self.probabilities
-        return self._mdp_on(states, place[mdp.start_states], lambda next_states, *_: place[next_states]), policy
+        policy[index[self.rows // self.width], self.rows % self.width] = self.probabilities
+        return self._mdp_on(states, index[mdp.start_states], lambda next_states, *_: index[next_states]), policy
 
     def _mdp_on(
         self, states: np.ndarray, starts: np.ndarray, number: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -496,7 +496,7 @@ class PolicyAnswers(QueriedPolicy):
         return self.ask(rows) if self.observer.previous_action else self.by_state.query(rows // self.width)
 
     def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
-        """Query the policy as `QueriedPolicy` does. Where that is None, one of vectors under chance has answered in all
+        """Query the policy as `QueriedPolicy` does. If that is None, one of vectors under chance has answered in all
         states of `reach` nevertheless, in blocks: level by level it would be asked about few at a time."""
         is_whole = super().query_all(reach)
         has_chance = self.by_pairs or self.mdp.dynamics.has_chance
@@ -522,7 +522,7 @@ class PolicyAnswers(QueriedPolicy):
         return total / 2**irrelevant
 
     def answer(self, observations: Observations, count: int = 1, states: np.ndarray | None = None) -> np.ndarray:
-        """(N, A) probabilities for a batch of `count` observations, of these states (N,) where masks need them."""
+        """(N, A) probabilities for a batch of `count` observations, of these states (N,) if masks need them."""
         if self.masks is None:
             return self.checked(self.policy(observations), count)
         assert states is not None

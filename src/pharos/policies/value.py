@@ -1,9 +1,9 @@
 """Value of a policy, which is queried and evaluated in the states that it reaches.
 
-`evaluate_policy` gives the values of all states, `policy_value` that of the start; `table_values` and `walk_values`
-give the latter of many policies at once, to the same bits. A deterministic policy in a deterministic game of a million
-states reaches some hundred of them; under chance it may reach many, and beyond a limit the value is estimated from
-simulated episodes instead, and the answer says so.
+`evaluate_policy` gives the values of all states, `policy_value` the value of the start; `table_values` and
+`walk_values` give the latter of many policies at once, to the same bits. A deterministic policy in a deterministic game
+of a million states reaches some hundred of them; under chance it may reach many, and beyond a limit the value is
+estimated from simulated episodes instead, and the answer says so.
 
 `estimate`: the value from simulated episodes, with an interval that holds it almost surely. `QueriedHistories`:
 policies that see the last k frames, or remember, are queried in the histories that they reach.
@@ -40,17 +40,17 @@ from pharos.policies.policy import (
     masks_for,
 )
 from pharos.solvers import Solution
-from pharos.system.arrays import as_array
+from pharos.system.arrays import as_index_array
 
 # Histories whose frames are drawn at once
-BATCH = 512
+HISTORY_BATCH = 512
 
 
 class QueriedHistories(PolicyAnswers):
     """Answers of a policy that sees k frames; a row is the number of a history, the last k states of an episode.
 
     The histories that a policy reaches, with what is executed in them, are an MDP again: a history leads to the one
-    without its first state and with the next state behind. So the value of the policy is exact where they are few.
+    without its first state and with the next state behind. So the value of the policy is exact if they are few.
     """
 
     def __init__(self, policy: PolicyLike, mdp: TabularMDP, observer: Observer, **options: Unpack[AnswerOptions]):
@@ -64,7 +64,7 @@ class QueriedHistories(PolicyAnswers):
         self.by_pairs, self.width = False, 1
         self._histories: list[tuple[int, ...]] = []
         self._number: dict[tuple[int, ...], int] = {}
-        self._place = np.zeros(64, np.int32)
+        self._index = np.zeros(64, np.int32)
 
     def first_rows(self, states: np.ndarray) -> np.ndarray:
         return self._numbers([(int(s),) * self.observer.frames for s in states])
@@ -113,16 +113,16 @@ class QueriedHistories(PolicyAnswers):
         return super().index(rows)
 
     def _make_room(self) -> None:
-        """Grow `_place` to an entry for each numbered history."""
-        if len(self._place) < len(self._histories):
-            more = np.zeros(2 * len(self._histories) - len(self._place), np.int32)
-            self._place = np.concatenate([self._place, more])
+        """Grow `_index` to an entry for each numbered history."""
+        if len(self._index) < len(self._histories):
+            more = np.zeros(2 * len(self._histories) - len(self._index), np.int32)
+            self._index = np.concatenate([self._index, more])
 
     def _query(self, rows: np.ndarray) -> np.ndarray:
         answers = []
         context: Any = self.observer.observe
-        for start in range(0, len(rows), BATCH):
-            histories = np.array([self._histories[row] for row in rows[start : start + BATCH]], np.int64)
+        for start in range(0, len(rows), HISTORY_BATCH):
+            histories = np.array([self._histories[row] for row in rows[start : start + HISTORY_BATCH]], np.int64)
             count, frames = histories.shape
             states = self.observer.space.states(histories.ravel()).reshape(count, frames, -1)
             observations = context.observation.of_histories(states)
@@ -141,8 +141,8 @@ class QueriedHistories(PolicyAnswers):
 class QueriedMemories(QueriedHistories):
     """Answers of a policy with a memory; a row is the number of (memory, previous action if it is seen, state).
 
-    A memory is what the policy has kept of the observations before. It has one number where the observations before
-    were the same, and where what is kept is the same to the last bit: a policy that keeps nothing is queried once about
+    A memory is what the policy has kept of the observations before. It has one number if the observations before
+    were the same, and if what is kept is the same to the last bit: a policy that keeps nothing is queried once about
     each state and once more at the start, one that counts steps once about each state and step.
 
     Raises:
@@ -160,7 +160,7 @@ class QueriedMemories(QueriedHistories):
         self.recurrent, self.observer, self.deterministic = policy, observer, deterministic
         check_observation(policy, observer.observe.space, observer.observation)
         self._name_rows()
-        # bytes of each memory but the first, which is that of the start; `_layout` gives their dtypes and shapes
+        # bytes of each memory but the first, which belongs to the start; `_layout` gives their dtypes and shapes
         self._kept: list[bytes] = [b""]
         self._memory: dict[bytes, int] = {}
         self._layout: tuple[Arrays, list[tuple[np.dtype, tuple[int, ...]]]] | None = None
@@ -251,7 +251,7 @@ def _packed(tree: Arrays, count: int) -> list[bytes]:
     return [row.tobytes() for row in joined]
 
 
-def answers_of(
+def policy_answers(
     policy: PolicyLike, mdp: TabularMDP, observer: Observer, **options: Unpack[AnswerOptions]
 ) -> PolicyAnswers:
     """Answers of a policy that sees observations: of the state alone, of the last frames, or with a memory."""
@@ -282,12 +282,12 @@ class Evaluation:
     Attributes:
         value: expected return of an episode, in the setting of the task.
         exact: whether the value is computed, not estimated.
-        error_bound: proven bound on the error of an exact value, which is that of the probabilities that the policy
-            answers: a network rounds its own to 32 bits, which moves values by more. For an estimate, half the width of
-            an interval that holds the value with a probability of at least 99 % (empirical Bernstein bound).
+        error_bound: proven bound on the error of an exact value, for the probabilities that the policy
+            returned. (A network computes them in float32, which moves values by more.) For an estimate, half the width
+            of an interval that holds the value with a probability of at least 99 % (empirical Bernstein bound).
         states: number of states (or pairs of state and previous action) in which the policy was asked.
-        episodes: simulated episodes behind an estimate; 0 where the value is exact.
-        gain: average reward a step in the long run, within proven bounds; None where nobody asked for it.
+        episodes: simulated episodes behind an estimate; 0 if the value is exact.
+        gain: average reward a step in the long run, within proven bounds; None unless it was asked for.
     """
 
     value: float
@@ -311,16 +311,16 @@ def policy_value(
     seed: int = 0,
     reach: Callable[[int, int], ReachableRows] | None = None,
 ) -> Evaluation:
-    """Return the value of a policy from the start: exact where it reaches few states, else estimated with a bound.
+    """Return the value of a policy from the start: exact if it reaches few states, else estimated with a bound.
 
     A total reward (gamma 1, no horizon) is -inf if the policy may go on for ever and pays on average; NaN if it goes on
     for ever and pays nothing on average, though something each time, so that its sum has no limit.
 
     Args:
         observer: gives what the policy sees; called for policies over observations alone.
-        return_range: gives the lowest and the highest return of an episode; called where the value is estimated.
+        return_range: gives the lowest and the highest return of an episode; called if the value is estimated.
         deterministic, masks, max_states, episodes, seed: as for `training.evaluate_agent`.
-        reach: (rows at most, steps) -> the rows that every policy of positive probabilities reaches, where more than
+        reach: (rows at most, steps) -> the rows that every policy of positive probabilities reaches, if more than
             one policy is evaluated: such policies are queried in all of them at once. Changes no value.
     Raises:
         ParameterError: it reaches more than `max_states`, and the total reward of an episode has no limits.
@@ -351,7 +351,7 @@ def policy_value(
 
 
 def endless_value(mdp: TabularMDP, policy: np.ndarray | str) -> float:
-    """The total reward of a policy that goes on for ever where something is paid, in an MDP whose optimum is finite.
+    """The total reward of a policy that goes on for ever while something is paid, in an MDP whose optimum is finite.
 
     Returns:
         -inf if it pays on average; else NaN, as the sums of positive and of negative rewards are both infinite.
@@ -368,7 +368,7 @@ def _answers(
 ) -> QueriedPolicy:
     """Answers of a table, or of a policy that sees observations."""
     if not isinstance(policy, np.ndarray):
-        return answers_of(policy, mdp, observer(), **options)
+        return policy_answers(policy, mdp, observer(), **options)
     if options.get("masks") is not None:
         raise ParameterError("masks given for a policy that is a table; expected a model trained under masks")
     return TableAnswers(_table_of(policy, options.get("deterministic", False)), mdp)
@@ -420,7 +420,7 @@ def evaluate_policy(
         ParameterError: the policy has the wrong shape, or its rows are not probabilities; or it sees observations, and
             the MDP was not made from a state space (the observation "number" is of any table); or a model was trained
             on other observations, behind a VecNormalize that is not with it, or under masks that are not given.
-        DivergenceError: gamma is 1, there is no horizon, and the policy goes on for ever where something is paid.
+        DivergenceError: gamma is 1, there is no horizon, and the policy goes on for ever while something is paid.
     Source: Puterman (1994), section 6.1.
     """
     if isinstance(policy, TabularAgent):
@@ -445,7 +445,7 @@ class AverageRegret(NamedTuple):
     """Loss of a policy a step in the long run, from the start; each number within proven bounds.
 
     Attributes:
-        regret: the optimal gain less that of the policy. gain, optimal: of the policy, and of the best one.
+        regret: the optimal gain less the gain of the policy. gain, optimal: of the policy, and of the best one.
     """
 
     regret: solvers.GainInterval
@@ -483,7 +483,7 @@ def average_regret(
     Raises:
         ParameterError: the policy has the wrong shape, or its rows are not probabilities; or as `evaluate_policy`.
         PrecisionError: floats, within limits of time, prove no bound within the tolerance.
-    Cost: that of `average_reward`, twice.
+    Cost: twice the cost of `average_reward`.
     Source: Auer, Jaksch and Ortner (2009), "Near-optimal regret bounds for reinforcement learning".
     """
     best = solvers.average_reward(mdp, tolerance=tolerance).gain_at_start if optimal is None else optimal
@@ -561,9 +561,9 @@ def _solution_of_reached(
 
     Raises:
         ParameterError: the MDP was not made from a state space of an environment, the policy is none for its
-            observations, or it sees the previous action where actions are not sticky, so that values do not belong to
-            states.
-        DivergenceError: gamma is 1, there is no horizon, and the policy goes on for ever where something is paid.
+            observations, or it sees the previous action although actions are not sticky, so that values do not belong
+            to states.
+        DivergenceError: gamma is 1, there is no horizon, and the policy goes on for ever while something is paid.
     """
     if previous_action and not mdp.is_sticky:
         raise ParameterError(
@@ -655,7 +655,7 @@ def table_values(mdp: TabularMDP, policies: Sequence[np.ndarray]) -> list[Evalua
 
     Args:
         policies: (S,) actions each, evaluated in all states; or (S, A) probabilities, evaluated in states they reach.
-    Cost: one backward induction for all, in some groups where they are large.
+    Cost: one backward induction for all, in some groups if they are large.
     """
     size, evaluations = max(1, MOST_TOGETHER // _rows(mdp)), []
     for first in range(0, len(policies), size):
@@ -675,7 +675,7 @@ def table_values(mdp: TabularMDP, policies: Sequence[np.ndarray]) -> list[Evalua
 
 
 def _rows(mdp: TabularMDP) -> int:
-    """Number of pairs of a state and, where that matters, a previous action."""
+    """Number of pairs of a state and, if that matters, a previous action."""
     return mdp.num_states * mdp.policy_width
 
 
@@ -720,7 +720,7 @@ def walk_values(
     Cost: the longest episode times a call of `act`.
     """
     worlds = {
-        id(mdp): (as_array(mdp.dynamics.deterministic_table()), np.asarray(mdp.terminal), mdp.reward_table)
+        id(mdp): (as_index_array(mdp.dynamics.deterministic_table()), np.asarray(mdp.terminal), mdp.reward_table)
         for mdp in mdps
     }
     indices = {key: np.array([i for i, mdp in enumerate(mdps) if id(mdp) == key]) for key in worlds}
@@ -780,7 +780,7 @@ def estimate(
     previous, rows = np.full(episodes, mdp.num_actions), answers.first_rows(states)
     returns, alive = np.zeros(episodes), np.arange(episodes)
     for step in range(steps):
-        places = answers.places(rows)
+        indices = answers.index_after_query(rows)
         numbers = rng.random(alive.size), rng.random(alive.size), rng.integers(mdp.num_actions, size=alive.size)
         if mdp.available is not None and not mdp.chance.is_none:
             sets = mdp.available[states[alive]]
@@ -789,7 +789,7 @@ def estimate(
             can_be = sets[np.arange(alive.size), np.minimum(before, mdp.num_actions - 1)]
             previous[alive] = np.where(can_be, before, mdp.num_actions)
         execute_choices(
-            answers.probabilities, places, numbers, chance, *rewards, states, mdp.gamma**step, alive, previous, returns
+            answers.probabilities, indices, numbers, chance, *rewards, states, mdp.gamma**step, alive, previous, returns
         )
         executed = previous[alive]
         next_states = mdp.dynamics.sample(states[alive], executed, rng)

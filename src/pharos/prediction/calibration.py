@@ -53,7 +53,7 @@ class OrderCounts:
 
 @dataclass(frozen=True, eq=False)
 class Published:
-    """Published cells of one agent: the regret that was predicted, and that of the runs.
+    """Published cells of one agent: the regret that was predicted, and the regret of the runs.
 
     Attributes:
         classes: (N,) names of the classes of environments, which weigh alike.

@@ -33,7 +33,7 @@ def predicted(config: Mapping[str, Any], *, primary: bool = False) -> dict[str, 
         config: of a run of a study that was read already, so that code which it names is trusted.
         primary: the idealised learner alone, with its table; `estimated_error` is then its own.
     Returns:
-        Numbers, NaN where there is none and `notes` says why; `network`, `estimated_error`, `curve`, `adam_curve`.
+        Numbers, NaN if there is none and `notes` says why; `network`, `estimated_error`, `curve`, `adam_curve`.
     """
     from pharos.hardness import report
 
@@ -123,9 +123,9 @@ class PrimaryRegret:
     Attributes:
         network: its name.
         value: normalised regret of the learnt policies, a mean over training: 0 optimal, 1 uniform play.
-        deviation: standard deviation of one walk of the idealised learner; NaN where nothing is drawn.
+        deviation: standard deviation of one walk of the idealised learner; NaN if nothing is drawn.
         tabular: of the same learner with a table of the states in the place of the network.
-        note: what is random in it, and what half of the landmarks change where they stand for the kernel.
+        note: what is random in it, and what half of the landmarks change if they stand for the kernel.
     """
 
     network: str

@@ -16,7 +16,7 @@ class Pairs:
 
     Attributes:
         first, second: (M,) rows of the cells.
-        sign: (M,) 1 where the outcome of the first is the larger one, else -1.
+        sign: (M,) 1 if the outcome of the first is the larger one, else -1.
     """
 
     first: np.ndarray
@@ -34,18 +34,18 @@ class Pairs:
         return Pairs(first, second, np.sign(y[first] - y[second]))
 
     def only(self, mask: np.ndarray) -> "Pairs":
-        """The pairs where the mask (M,) is true."""
+        """The pairs for which the mask (M,) is true."""
         return Pairs(self.first[mask], self.second[mask], self.sign[mask])
 
     def right(self, x: np.ndarray) -> np.ndarray:
-        """(M,) 1 where x (N,) orders the pair as the outcome does, 1/2 where it says that both are alike, else 0.
+        """(M,) 1 if x (N,) orders the pair as the outcome does, 1/2 if it says that both are alike, else 0.
 
         Alike is what differs by at most TIE_TOLERANCE of the spread of x.
         """
         return self._right(x, x)
 
     def _right(self, values: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """(..., M) of values (..., N) of x in other places; NaN where one of a pair is."""
+        """(..., M) of values (..., N) of x at other indices; NaN if one of a pair is."""
         difference = values[..., self.first] - values[..., self.second]
         is_rounding = np.abs(difference) <= TIE_TOLERANCE * (x.max(initial=-np.inf) - x.min(initial=np.inf))
         return 0.5 + 0.5 * np.where(is_rounding, 0.0, np.sign(difference)) * self.sign
@@ -64,7 +64,7 @@ class Pairs:
         Args:
             y, noise: (N,) of cells: the mean over seeds, and the variance over seeds / seeds; NaN of a single seed.
         Returns:
-            NaN where no pair has two seeds in both of its cells.
+            NaN if no pair has two seeds in both of its cells.
         """
         from scipy.special import ndtr
 
@@ -101,9 +101,9 @@ class Pairs:
         permutations: int,
         seed: int,
     ) -> np.ndarray:
-        """(R,) agreement where observations change names, in all MDPs of a class alike, but in each class otherwise.
+        """(R,) agreement if observations change names, in all MDPs of a class alike, but in each class otherwise.
 
-        So a class whose instances all prefer the same observation counts once. NaN where no pair is left.
+        So a class whose instances all prefer the same observation counts once. NaN if no pair is left.
 
         Args:
             x, classes, mdps, observations: (N,) of cells; classes and MDPs are numbers from 0.

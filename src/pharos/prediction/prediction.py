@@ -139,7 +139,7 @@ class Prediction:
         cells: one for each observation and network, in the order in which they were asked for.
         half_width: half of the interval that held LEVEL of the published cells; coverage: the share that such intervals
             held of classes left out; published_cells, published_classes: numbers of both.
-        warnings: where the instance lies outside of what was tested.
+        warnings: ways in which the instance lies outside of what was tested.
         hyperparameters: of the agent.
     """
 
@@ -224,7 +224,7 @@ def predict(
             returns a torch.nn.Module; several: each with each observation. None: the agent's own.
         steps: of training.
         landmarks: as for `representation`.
-        common: with the hyperparameters of the published cells, in the place of those of the class.
+        common: use the hyperparameters of the published cells, in place of the class's.
         pilot: train one seed of the real agent for this share of the steps (0.1, 0.25 or 0.5), too. Values and
             intervals are then of the pilot and the idealised learner together.
         progress: called with what is being done.
@@ -380,7 +380,7 @@ def _warnings(calibration: Published, states: int, steps: int, spread: float, ch
 
 
 def _other_hyperparameters(agent: str, settings: Mapping[str, Any]) -> Iterable[str]:
-    """A line if hyperparameters are not those of the published cells."""
+    """A line if hyperparameters differ from the published cells."""
     other = [name for name, value in COMMON[agent].items() if settings.get(name) != value]
     if other:
         yield (

@@ -1,6 +1,6 @@
 """The compiled engine: rules run by Numba, inside the kernels that search, step and draw.
 
-Each class compiles its kernels in its constructor, by calling them with no work to do, and raises Numba's error where
+Each class compiles its kernels in its constructor, by calling them with no work to do, and raises Numba's error if
 that fails.
 """
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pharos.rules.interaction import InteractionKernels
 
 Rows = np.ndarray | tuple[np.ndarray, np.ndarray]  # terminal, or (terminal, probabilities)
-COUNTED = np.empty(0, np.int64)
+NO_RANKS = np.empty(0, np.int64)
 """No ranks of outcomes: those of a state and action are all its possible ones, in their order."""
 
 explored: set[type[Environment]] = set()
@@ -31,7 +31,7 @@ explored: set[type[Environment]] = set()
 _SUSPECTS = 16  # states of which a kernel cannot say in which one a rule failed
 
 
-# Makers of kernels are imported where they are called: a script that steps does not load those that search.
+# Makers of kernels are imported by the functions that call them: a script that steps loads no kernels that search.
 @cache
 def exploration_kernels(
     cls: type[Environment], names: tuple[str, ...], num_words: int, num_actions: int, outcomes: int = 1
@@ -47,7 +47,8 @@ def exploration_kernels(
 def interaction_kernels(
     cls: type[Environment], names: tuple[str, ...], num_actions: int, outcomes: int = 1, motion: bool = False
 ) -> "InteractionKernels":
-    """The kernels of `interaction.py`; with motion they draw the planes of `draw_motion` behind those of `draw`."""
+    """The kernels of `interaction.py`; with motion they draw the planes of `draw_motion` behind the planes of
+    `draw`."""
     from pharos.rules.interaction import interaction
 
     layers = len(cls.layers) if motion else 0
@@ -108,7 +109,7 @@ class CompiledExpansion(_Compiled):
         self._check(states, stop, progress, failure)
 
     def _check(self, states, stop: int | None, progress, failure: Exception | None) -> None:
-        """Raise a RuleError where a rule failed or left the ranges in a state before `stop`; None: in any of them."""
+        """Raise a RuleError if a rule failed or left the ranges in a state before `stop`; None: in any of them."""
         from pharos.kernels.hash_table import COUNT, FAULT, FIRST  # which stepping does without
 
         if failure or progress[FAULT]:
@@ -152,7 +153,7 @@ class CompiledRewards(_Compiled):
             self._rewards_of(states, np.empty((1, env.num_actions), np.int32), terminal, 0, 0)
         else:
             nothing = np.empty(0, np.int64)
-            self._expected_rewards_of(states, (nothing, nothing, np.empty(0)), terminal, 0, 0, COUNTED, None)
+            self._expected_rewards_of(states, (nothing, nothing, np.empty(0)), terminal, 0, 0, NO_RANKS, None)
 
     def threads(self, workers: int) -> int:
         return workers
@@ -160,7 +161,7 @@ class CompiledRewards(_Compiled):
     def block(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
         return self._rewards_or_error("block", self._rewards_of, states, successors, terminal, start, stop)
 
-    def expected_block(self, states, outcomes, terminal, start, stop, ranks=COUNTED, largest=None) -> np.ndarray:
+    def expected_block(self, states, outcomes, terminal, start, stop, ranks=NO_RANKS, largest=None) -> np.ndarray:
         return self._rewards_or_error(
             "expected_block", self._expected_rewards_of, states, outcomes, terminal, start, stop, ranks, largest
         )
@@ -242,7 +243,7 @@ class CompiledStepping:
         self._mark_available(self.parameters, states, out)
 
     def step_and_draw_one(self, *arguments: object) -> Function | None:
-        """The kernel that steps and draws, compiled for these arguments; None where `draw` does not compile."""
+        """The kernel that steps and draws, compiled for these arguments; None if `draw` does not compile."""
         try:
             self._step_and_draw_one(self.parameters, *arguments)
         except Exception:  # Numba raises its own errors, and others from inside of it
@@ -254,7 +255,7 @@ class CompiledDrawing:
     """A kernel that draws states, with the parameters of one environment; see `rules.Rules.drawing`.
 
     Args:
-        kernel: its name in interaction.py. arguments: those of the first call, for no states.
+        kernel: its name in interaction.py. arguments: of the first call, for no states.
     """
 
     is_compiled, motion = True, False
@@ -270,7 +271,7 @@ class CompiledDrawing:
 
 
 class CompiledMotion(CompiledDrawing):
-    """A kernel that draws states with the planes of `draw_motion` behind those of `draw`."""
+    """A kernel that draws states with the planes of `draw_motion` behind the planes of `draw`."""
 
     motion = True
 
@@ -282,5 +283,5 @@ def signature_of(env: Environment) -> tuple:
 
 
 def _class_of(env: Environment) -> type:
-    """The class of `env`, which type checkers take for a key of `cache` where they do not know its `__hash__`."""
+    """The class of `env`, which type checkers take for a key of `cache` even if they do not know its `__hash__`."""
     return type(env)

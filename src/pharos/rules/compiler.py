@@ -28,7 +28,7 @@ import numpy as np
 from numba.extending import overload
 
 from pharos.environments import Environment
-from pharos.kernels.kernel_cache import cache_in, folder_of_rules
+from pharos.kernels.kernel_cache import cache_in, called_by_kernels, called_by_python, folder_of_rules, inlined
 
 Function = Callable[..., Any]
 """A function that Numba compiles, or has compiled."""
@@ -37,17 +37,17 @@ CompiledRules = dict[str, Function]
 Constructor = Callable[..., tuple[object, ...]]
 """The class of `self` in compiled rules, a named tuple."""
 RULES = ("transition", "is_terminal", "reward", "draw")
-_COLOURS = re.compile("\x1b\\[[0-9;]*m")  # Numba writes them where colorama is installed
-_HERE = Path(__file__).parent
-_KERNELS = _HERE.parent / "kernels"
+_COLOURS = re.compile("\x1b\\[[0-9;]*m")  # Numba writes them if colorama is installed
+_RULES_FOLDER = Path(__file__).parent
+_KERNELS = _RULES_FOLDER.parent / "kernels"
 _MACHINERY = (
-    *(_HERE / name for name in ("compiler.py", "exploration.py", "interaction.py", "packed_view.py")),
+    *(_RULES_FOLDER / name for name in ("compiler.py", "exploration.py", "interaction.py", "packed_view.py")),
     *(_KERNELS / name for name in ("hash_table.py", "stepping.py")),
 )
 
 
 def rules_of_class(cls: type[Environment]) -> tuple[str, ...]:
-    """Names of the rules of a class: those of every class, and the optional ones that it defines."""
+    """Names of the rules of a class: the rules of every class, and the optional ones that it defines."""
     optional = {
         "probability": cls.takes_outcomes(),
         "age": cls.age is not Environment.age,
@@ -139,15 +139,15 @@ class Compiler:
 
     def inlined(self, function: Function) -> Function:
         """Compile a function that becomes part of its callers."""
-        return numba.njit(forceinline=True)(self._named(function))
+        return inlined(self._named(function))
 
     def function(self, function: Function) -> Function:
         """Compile a function that kernels call."""
-        return numba.njit(nogil=True)(self._named(function))
+        return called_by_kernels(self._named(function), nogil=True)
 
     def kernel(self, function: Function) -> Function:
         """Compile a function that Python calls; the compiled form is kept on disk."""
-        kernel: Any = numba.njit(nogil=True)(self._named(function))
+        kernel = called_by_python(nogil=True)(self._named(function))
         kernel._cache = cache_in(folder_of_rules(), f"{self.name}.{function.__name__}")
         return kernel
 
@@ -210,7 +210,7 @@ class _RuleCompiler:
         )
         clone.__kwdefaults__ = function.__kwdefaults__
         clone.__qualname__, clone.__module__ = function.__qualname__, __name__
-        self._done[function] = numba.njit(forceinline=True)(clone)
+        self._done[function] = inlined(clone)
         return self._done[function]
 
     def _compiled_among(self, values: Mapping[str, object]) -> CompiledRules:
@@ -346,7 +346,7 @@ def function_text(function: object, numbers: dict[object, int]) -> str:
 
 
 def value_text(value: object, names: set[str], numbers: dict[object, int]) -> str:
-    """A text of a value; of a module or a class, by those of its attributes that are among `names`."""
+    """A text of a value; of a module or a class, by its attributes that are among `names`."""
     value = plain_function(value)
     home = getattr(value, "__module__", None) or ""
     if isinstance(value, types.ModuleType):

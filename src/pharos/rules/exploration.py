@@ -3,7 +3,7 @@
 Each maker is an ordinary function that returns compiled ones (see `compiler.Compiler`). The variables that the inner
 functions take from it are constants for Numba: the rules; `Parameters`, the class of `self` in rules; W words a state;
 A actions of at most K outcomes, 1 without chance.
-`layout` is a tuple of one table (D, 4): where component i of a state sits (layout.py).
+`layout` is a tuple of one table (D, 4): the position of component i in a packed state (layout.py).
 
 A state has A K branches, branch a K + k for outcome k of action a. With chance or an age the expansion is another one
 (`expand_branches_function`), and the search the same with A K in place of A: an impossible branch is taken to lead to
@@ -21,7 +21,7 @@ from pharos.rules.compiler import CompiledRules, Compiler, Constructor, Function
 from pharos.rules.packed_view import fault, get_word, packed_view, read_only_view, set_word
 from pharos.system.arrays import SUM_TOLERANCE
 
-BATCH = 16  # states expanded before their successors are looked up: enough look-ups to hide the memory's latency
+LOOKUP_BATCH = 16  # states expanded before their successors are looked up: enough look-ups to hide the memory's latency
 
 
 class ExpansionKernels(NamedTuple):
@@ -164,28 +164,30 @@ def explore_kernel(
         states (capacity, W) uint64: the states of the search, in the order of discovery: progress[COUNT] of them.
         successors (rows, A), terminal (rows,) uint8: row i belongs to state base + i.
         table (slots,): index of a state, or -1; its place follows from the hash of the state.
-        While one batch is looked up, the next one is expanded already where it is known: memory has that long to
+        While one batch is looked up, the next one is expanded already if it is known: memory has that long to
         answer.
         """
-        keys = np.empty((2, BATCH * A, W), np.uint64)
-        slots = np.empty((2, BATCH * A), np.int64)
+        keys = np.empty((2, LOOKUP_BATCH * A, W), np.uint64)
+        slots = np.empty((2, LOOKUP_BATCH * A), np.int64)
         capacity = table.shape[0]
         first, count = progress[FIRST], progress[COUNT]
         level_end, depth = progress[LEVEL_END], progress[DEPTH]
         waiting, buffer = 0, 0  # states [first, first + waiting) are expanded, in the other buffer
         while True:
-            # size of the next batch; 0 at the end, and where its successors might not fit
+            # size of the next batch; 0 at the end, or if its successors might not fit
             n = 0
-            if count + 2 * BATCH * A <= room:
-                n = max(0, min(BATCH, count - first - waiting, last - first - waiting))
+            if count + 2 * LOOKUP_BATCH * A <= room:
+                n = max(0, min(LOOKUP_BATCH, count - first - waiting, last - first - waiting))
             if n == 0 and waiting == 0:
                 break
             # expand the next batch into one buffer
             if n > 0:
                 progress[COUNT] = count
                 begin = first + waiting
-                batch, places = keys[buffer], slots[buffer]
-                expand(parameters, layout, states, begin, n, batch, places, terminal, begin - base, table, progress)
+                batch, slots_of_batch = keys[buffer], slots[buffer]
+                expand(
+                    parameters, layout, states, begin, n, batch, slots_of_batch, terminal, begin - base, table, progress
+                )
                 if progress[FAULT]:
                     return
             buffer = 1 - buffer
@@ -229,27 +231,27 @@ def expand_and_find_kernel(
 
     @compiler.kernel
     def expand_and_find(parameters, layout, states, start, stop, base, keys, indices, terminal, table, progress):
-        """Successors of states [start, stop), and the indices of those that the table has.
+        """Successors of states [start, stop), and the indices of the successors that the table has.
 
-        keys ((rows * A), W) gets the successors' words; indices (rows * A,) their indices, or -1 - slot where the table
-        has none; row i belongs to state base + i. The table is only read; another thread may insert meanwhile: what it
-        inserts is found or not found, and the one that numbers the states searches on from the slot.
+        keys ((rows * A), W) gets the successors' words; indices (rows * A,) their indices, or -1 - slot if the table
+        has none; row i belongs to state base + i. The table is only read. Another thread may insert meanwhile: a state
+        that it inserts is found or not, and the thread that numbers the states searches on from the slot.
         """
-        slots = np.empty((2, BATCH * A), np.int64)
+        slots = np.empty((2, LOOKUP_BATCH * A), np.int64)
         capacity = table.shape[0]
         waiting, buffer = 0, 0
-        for batch in range(start, stop + BATCH, BATCH):
+        for batch in range(start, stop + LOOKUP_BATCH, LOOKUP_BATCH):
             # expand the next batch into one buffer
-            n = max(0, min(BATCH, stop - batch))
+            n = max(0, min(LOOKUP_BATCH, stop - batch))
             if n > 0:
                 part = keys[(batch - base) * A : (batch - base + n) * A]
-                places, row = slots[buffer], batch - base
-                expand(parameters, layout, states, batch, n, part, places, terminal, row, table, progress)
+                slots_of_batch, row = slots[buffer], batch - base
+                expand(parameters, layout, states, batch, n, part, slots_of_batch, terminal, row, table, progress)
                 if progress[FAULT]:
                     return
             buffer = 1 - buffer
             # look up the successors of the batch before it
-            before = batch - BATCH
+            before = batch - LOOKUP_BATCH
             first = (before - base) * A
             for j in range(waiting * A):
                 slot = slots[buffer, j]
@@ -338,7 +340,7 @@ def expand_branches_function(
 
     @compiler.function
     def expand(parameters, layout, states, first, n, keys, slots, rows, row, table, progress):
-        """Successors of states [first, first + n): packed words to keys, slots from which to search to slots, -1 where
+        """Successors of states [first, first + n): packed words to keys, slots from which to search to slots, -1 if
         a branch leads to the state itself: it is terminal, or the branch is impossible.
 
         keys (n * A * K, W), slots (n * A * K,). rows is (terminal, probabilities): terminal[row + i] gets whether state
@@ -360,7 +362,7 @@ def expand_branches_function(
             for a in range(A):
                 total = 0.0
                 for k in range(K):
-                    # a branch: its probability, and, where that is positive, its successor
+                    # a branch: its probability, and, if that is positive, its successor
                     slots[j] = -1
                     p = 1.0 if k == 0 else 0.0
                     if not ended:
@@ -395,7 +397,7 @@ def expected_rewards_kernel(
 ) -> Function:
     """Kernel of the expected rewards of stored transitions, with chance.
 
-    K: 1 where rewards do not depend on the outcome, which is not looked for then.
+    K: 1 if rewards do not depend on the outcome, which is not looked for then.
     """
     reward, probability = rules["reward"], rules["probability"]
     load = words.load
@@ -405,10 +407,10 @@ def expected_rewards_kernel(
     def rewards_of(parameters, layout, states, which, successors, probabilities, ranks, terminal, start, out, largest):
         """out[i, a] = expected reward of action a in state start + i; 0 in terminal states; out (n, A), zeros.
 
-        which (N,), ascending: i A + a of each outcome; successors, probabilities (N,): where it leads, how likely it
-        is. ranks (N,): which one of the possible outcomes, -1 for none; without entries: they are counted. Rewards that
-        are all the same are their own expectation, to the last bit. largest (1,): raised to the largest absolute reward
-        that is averaged.
+        which (N,), ascending: i A + a of each outcome; successors, probabilities (N,): its next state and its
+        probability. ranks (N,): which one of the possible outcomes, -1 for none; without entries: they are counted.
+        Rewards that are all the same are their own expectation, to the last bit. largest (1,): raised to the largest
+        absolute reward that is averaged.
         """
         self = Parameters(*parameters)
         state = read_only_view(WORDS, *layout)

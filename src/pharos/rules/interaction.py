@@ -38,7 +38,7 @@ def interaction(
 ) -> InteractionKernels:
     """The kernels of a class of environments with A actions of at most K outcomes.
 
-    L: how many layers `draw` has, where the planes of `draw_motion` are to follow; else 0.
+    L: how many layers `draw` has, if the planes of `draw_motion` are to follow; else 0.
     """
     chance = ("probability",) * (K > 1)
     step, drawing = compiler.calling("transition", "is_terminal", "reward", *chance), compiler.calling("draw")
@@ -148,7 +148,7 @@ def step_one_kernel(compiler: Compiler, Parameters: Constructor, advances: Advan
 
     @compiler.kernel
     def step_one(parameters, ranges, scale, state, branch, next_state, vector):
-        """One step: `advance`, and vector[i] = (next_state[i] - low[i]) * scale[i] where `vector` has room (0 entries:
+        """One step: `advance`, and vector[i] = (next_state[i] - low[i]) * scale[i] if `vector` has room (0 entries:
         not wanted).
         """
         self = Parameters(*parameters)
@@ -231,7 +231,7 @@ def step_many_kernel(
 
     @compiler.kernel
     def step_many(parameters, setting, batch, first, last):
-        """One step of environments first .. last - 1; return -1, or i * D + c where component c of environment i left
+        """One step of environments first .. last - 1; return -1, or i * D + c if component c of environment i left
         its range.
 
         An environment that has `ended` is reset instead (the mode DISABLED never comes here with one); in the mode
@@ -257,7 +257,7 @@ def step_many_kernel(
                         probabilities[i] = chance[4]
                 else:
                     branch = action
-                    if K > 1:  # nothing is drawn where an action has one outcome
+                    if K > 1:  # nothing is drawn if an action has one outcome
                         outcome, p = drawn_outcome(self, states[i], action, uniform_number(rng, i))
                         probabilities[i] = p * (1.0 - chance[4])
                         branch = action * K + outcome
@@ -366,7 +366,7 @@ def draw_complex_kernel(compiler: Compiler, rules: CompiledRules, Parameters: Co
 
         picture (height, width, C) uint8: the ground; top (rows + 1,), left (columns + 1,): edges of the cells in
         pixels. sprite (L, rows, 256): number of the sprite of a value of a layer in a row, -1 for none; place (sprites,
-        heights, widths): where its pixels for a cell of this height and width begin in color (P, C) uint8,
+        heights, widths): index of its first pixel, for a cell of this height and width, in color (P, C) uint8,
         premultiplied, and keep (P,) uint16: how much of the ground stays, of 256.
         """
         self = Parameters(*parameters)

@@ -1,4 +1,4 @@
-"""The interpreted engine: rules called in Python, where Numba cannot compile them, and to name a failing state."""
+"""The interpreted engine: rules called in Python, if Numba cannot compile them, and to name a failing state."""
 
 import multiprocessing
 import numbers
@@ -14,8 +14,8 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import RuleError
-from pharos.kernels.hash_table import COUNT, FIRST, find, insert_missing, pack_rows, slots_of, unpack_rows
-from pharos.rules.layout import Layout, unpack
+from pharos.kernels.hash_table import COUNT, FIRST, find_states, insert_missing, pack_rows, slots_of, unpack_rows
+from pharos.rules.layout import Layout, unpack_states
 from pharos.system.arrays import SUM_TOLERANCE
 from pharos.system.workers import without_interrupts
 
@@ -24,7 +24,7 @@ class Branches(NamedTuple):
     """Next states of N states by B branches each: A actions, or, with chance, outcome k of action a as branch a K + k.
 
     Attributes:
-        next_states: (N B, D) int64, or uint8 where it suffices; terminal states and impossible outcomes lead to the
+        next_states: (N B, D) int64, or uint8 if it suffices; terminal states and impossible outcomes lead to the
             state itself.
         terminal: (N,) bool.
         probabilities: (N, B) float64; None without chance.
@@ -54,7 +54,7 @@ def interpreted_successors(env: Environment, rows: list[list[int]]) -> tuple[np.
     Args:
         rows: N states, D integers each.
     Returns:
-        (N * A, D) int64, or uint8 where it suffices: row i * A + a the successor of state i by action a, terminal
+        (N * A, D) int64, or uint8 if it suffices: row i * A + a the successor of state i by action a, terminal
         states leading to themselves; and (N,) bool, which states are terminal.
     Raises:
         RuleError: a rule raised an exception or left the declared ranges; names the state and the action.
@@ -83,7 +83,7 @@ def interpreted_successors(env: Environment, rows: list[list[int]]) -> tuple[np.
             "" if len(out) % len(actions) == 0 else f" by action {env.actions[(len(out) - 1) % len(actions)]!r}"
         )
         raise RuleError(f"{env}: in state {state}{action_name} a rule raises {error!r}") from error
-    # successors out of range, or all where some are no states: the first bad one is named
+    # successors out of range, or all if some are no states: the first bad one is named
     next_states = _array(out)
     components = env.components
     if next_states.shape == (len(out), len(components)):
@@ -100,7 +100,7 @@ def interpreted_successors(env: Environment, rows: list[list[int]]) -> tuple[np.
 def _small_successors(env: Environment, rows: list[list[int]]) -> tuple[np.ndarray, np.ndarray] | None:
     """`interpreted_successors` for integers from 0 to 255, the usual case: no lists, successors become bytes.
 
-    None where a rule raises, an integer is another or a range is left: rules are pure, so that the caller can call them
+    None if a rule raises, an integer is another or a range is left: rules are pure, so that the caller can call them
     again.
     """
     transition, is_terminal, actions = _transition(env), env.is_terminal, range(env.num_actions)
@@ -137,7 +137,7 @@ def _transition(env: Environment) -> Callable[..., None]:
 
 
 def _array(out: list[list[int]]) -> np.ndarray:
-    """The successors as an array; an empty one where they are no integers of one length."""
+    """The successors as an array; an empty one if they are no integers of one length."""
     try:
         return np.array(out, np.int64)
     except (ValueError, TypeError, OverflowError):
@@ -145,7 +145,7 @@ def _array(out: list[list[int]]) -> np.ndarray:
 
 
 def check_successor(env: Environment, state: tuple[int, ...], action: int, out: list[int], which: str = "") -> None:
-    """Raise a RuleError where `out` is no state; `which`: the outcome, in words."""
+    """Raise a RuleError if `out` is no state; `which`: the outcome, in words."""
     components = env.components
     where = f"{env}: {which}action {env.actions[action]!r} in state {state}"
     if len(out) != len(components):
@@ -182,7 +182,7 @@ def _outcomes(env: Environment, rows: list[list[int]]) -> Branches:
 
 
 def outcome_probabilities(env: Environment, state: tuple[int, ...], action: int) -> list[float]:
-    """The probabilities of the K outcomes of an action; RuleError where they are no distribution."""
+    """The probabilities of the K outcomes of an action; RuleError if they are no distribution."""
     probabilities = []
     for outcome in range(env.outcomes):
         where = f"{env}: probability of outcome {outcome} of action {env.actions[action]!r} in state {state}"
@@ -205,7 +205,7 @@ def outcome_probabilities(env: Environment, state: tuple[int, ...], action: int)
 
 
 def _outcome(env: Environment, state: tuple[int, ...], action: int, outcome: int) -> list[int]:
-    """The next state by an outcome; RuleError where that is no state, or not older than `state`."""
+    """The next state by an outcome; RuleError if that is no state, or not older than `state`."""
     which = f"outcome {outcome} of " if env.takes_outcomes() else ""
     out = list(state)
     try:
@@ -228,9 +228,9 @@ def _outcome(env: Environment, state: tuple[int, ...], action: int, outcome: int
     return out
 
 
-BLOCK = 4096  # states whose successors are Python objects at a time
+EXPANDED_AT_ONCE = 4096  # states whose successors are Python objects at a time
 _MOST_FILES = 1 << 16
-_SHARE = 64  # states that are worth sending to another process
+_WORTH_SENDING = 64  # states that are worth sending to another process
 
 
 class InterpretedExpansion:
@@ -248,7 +248,7 @@ class InterpretedExpansion:
 
     def explore(self, states, successors, terminal, probabilities, table, base, last, room, progress) -> None:
         first, count = int(progress[FIRST]), int(progress[COUNT])
-        stop = min(last, count, first + min(BLOCK, (room - count) // self.branches))
+        stop = min(last, count, first + min(EXPANDED_AT_ONCE, (room - count) // self.branches))
         rows = slice(first - base, stop - base)
         keys = np.empty(((stop - first) * self.branches, self.layout.num_words), np.uint64)
         indices = np.empty(len(keys), np.int64)
@@ -256,12 +256,12 @@ class InterpretedExpansion:
         insert_missing(table, states, keys, indices, successors[rows], progress)
 
     def expand_and_find(self, states, start, stop, base, keys, indices, terminal, probabilities, table) -> None:
-        for first in range(start, stop, BLOCK):
-            last = min(first + BLOCK, stop)
+        for first in range(start, stop, EXPANDED_AT_ONCE):
+            last = min(first + EXPANDED_AT_ONCE, stop)
             rows = slice(first - base, last - base)
             part = slice(rows.start * self.branches, rows.stop * self.branches)
             self._expand(states[first:last], keys[part], terminal[rows], probabilities[rows])
-            find(table, states, keys[part], indices[part])
+            find_states(table, states, keys[part], indices[part])
         size = (stop - base) * self.branches
         missing = np.flatnonzero(indices[:size] < 0)
         slots = np.empty(len(missing), np.int64)
@@ -298,11 +298,11 @@ class InterpretedRewards:
 
     def block(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
         out = np.zeros((stop - start, self.env.num_actions))
-        rows = list(map(tuple, unpack(self.layout, states[start:stop]).tolist()))
+        rows = list(map(tuple, unpack_states(self.layout, states[start:stop]).tolist()))
         live = np.flatnonzero(~np.asarray(terminal[start:stop])).tolist()
         with np.errstate(all="ignore"):  # what is not finite is reported
             for a in range(self.env.num_actions):
-                next_states = list(map(tuple, unpack(self.layout, states[successors[start:stop, a]]).tolist()))
+                next_states = list(map(tuple, unpack_states(self.layout, states[successors[start:stop, a]]).tolist()))
                 for i in live:
                     out[i, a] = self._reward(rows[i], a, next_states[i])
         return out
@@ -311,9 +311,9 @@ class InterpretedRewards:
         num_actions = self.env.num_actions
         out = np.zeros((stop - start) * num_actions)
         rewards: list[list[float]] = [[] for _ in out]
-        rows = list(map(tuple, unpack(self.layout, states[start:stop]).tolist()))
+        rows = list(map(tuple, unpack_states(self.layout, states[start:stop]).tolist()))
         which, successors, probabilities = outcomes
-        next_states = list(map(tuple, unpack(self.layout, states[successors]).tolist()))
+        next_states = list(map(tuple, unpack_states(self.layout, states[successors]).tolist()))
         ended = np.asarray(terminal[start:stop]).tolist()
         with np.errstate(all="ignore"):  # what is not finite is reported
             for j, (pair, probability) in enumerate(zip(which.tolist(), probabilities.tolist(), strict=True)):
@@ -331,7 +331,8 @@ class InterpretedRewards:
         return out.reshape(-1, num_actions)
 
     def _reward(self, state: tuple[int, ...], action: int, next_state: tuple[int, ...], rank: int = 0) -> float:
-        """The reward of the possible outcome with this rank among those of (state, action); -1: without effect."""
+        """The reward of the possible outcome with this rank among the outcomes of (state, action); -1: without
+        effect."""
         env = self.env
         try:
             if rank >= 0 and env.has_chance and env.pays_by_outcome():
@@ -350,7 +351,7 @@ class InterpretedAges:
 
     def block(self, states, start: int, stop: int) -> np.ndarray:
         return np.array(
-            [self.env.age(tuple(row)) for row in unpack(self.layout, states[start:stop]).tolist()], np.int64
+            [self.env.age(tuple(row)) for row in unpack_states(self.layout, states[start:stop]).tolist()], np.int64
         )
 
 
@@ -362,9 +363,9 @@ def refused_reward(env: Environment, state: tuple[int, ...], action: int, why: s
 def blame(env: Environment, layout: Layout, suspects: np.ndarray, failure: BaseException | None) -> NoReturn:
     """Raise the error of compiled rules that failed or left the declared ranges in one of some packed states.
 
-    It names the first state where they fail interpreted.
+    It names the first state in which they fail interpreted.
     """
-    rows = unpack(layout, suspects).tolist()
+    rows = unpack_states(layout, suspects).tolist()
     if failure and not rows:  # they were not run yet: it is Numba's, of compiling them
         raise failure
     interpreted_branches(env, rows)
@@ -378,7 +379,7 @@ def blame(env: Environment, layout: Layout, suspects: np.ndarray, failure: BaseE
 class Interpreters:
     """Processes that call the rules, each in a part of the states: Python runs on one processor at a time.
 
-    They are forked, so that rules of any kind come along, those typed at a prompt too; where the system cannot do that,
+    They are forked, so that rules of any kind come along, even rules typed at a prompt. If the system cannot do that,
     or with one worker, there are none. They end with this process, however it ends.
     """
 
@@ -399,8 +400,8 @@ class Interpreters:
             self._connections.append(ours)
 
     def branches(self, states: np.ndarray) -> Branches:
-        """`interpreted_branches` of states (N, D) int64, shared between the processes where they are many."""
-        shares = min(len(self._connections) + 1, len(states) // _SHARE)
+        """`interpreted_branches` of states (N, D) int64, shared between the processes if they are many."""
+        shares = min(len(self._connections) + 1, len(states) // _WORTH_SENDING)
         if shares < 2:
             return interpreted_branches(self.env, states.tolist())
         parts = np.array_split(states, shares)
@@ -432,7 +433,7 @@ def _send(connection: Connection, states: np.ndarray) -> bool:
 
 
 def _received(connection: Connection, rows: int, env: Environment) -> Branches | None:
-    """The branches that another process sends; None where it was killed, or where a rule fails.
+    """The branches that another process sends; None if it was killed, or if a rule fails.
 
     This process then calls the rules itself, and raises the error.
     """

@@ -1,8 +1,8 @@
-"""Layout of states in 64-bit words: the place of each component; integer vectors <-> packed states.
+"""Layout of states in 64-bit words: the position of each component; integer vectors <-> packed states.
 
 Component i with `size[i]` values takes ceil(log2(size[i])) bits and holds value - low[i]. Components follow one another
 in the order of declaration; one that would straddle two words starts the next word. The rule is part of the file
-format. `kernels.hash_table` has compiled twins of `pack` and `unpack` for a few states at a time; this file loads no
+format. `kernels.hash_table` has compiled twins of both functions for a few states at a time; this file loads no
 Numba.
 """
 
@@ -62,7 +62,7 @@ def layout_of(components: Components) -> Layout:
     )
 
 
-def pack(layout: Layout, states: np.ndarray) -> np.ndarray:
+def pack_states(layout: Layout, states: np.ndarray) -> np.ndarray:
     """Packed states (N, W) uint64 of integers (N, D) within their ranges."""
     offsets = (np.asarray(states, np.int64) - layout.low).astype(np.uint64)
     packed = np.zeros((len(offsets), layout.num_words), np.uint64)
@@ -71,7 +71,7 @@ def pack(layout: Layout, states: np.ndarray) -> np.ndarray:
     return packed
 
 
-def unpack(layout: Layout, packed: np.ndarray) -> np.ndarray:
+def unpack_states(layout: Layout, packed: np.ndarray) -> np.ndarray:
     """Integers (N, D) int64 of packed states (N, W) uint64."""
     packed = np.asarray(packed)
     if len(packed) <= AT_ONCE * len(layout.word):

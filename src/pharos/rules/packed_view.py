@@ -1,6 +1,6 @@
 """Packed states that rules read and write as if they were arrays of integers.
 
-A state of D small integers is stored in a few 64-bit words (rules/layout.py says where each component sits).
+A state of D small integers is stored in a few 64-bit words (rules/layout.py has the position of each component).
 Unpacking 29 components, running a rule and packing them again costs three times the rule itself. So compiled rules get
 a view instead: `state[i]` is a shift and a mask of a word on the stack, which LLVM keeps in a register when there is
 one word.
@@ -18,7 +18,7 @@ from numba import int64, types
 from numba.core import cgutils
 from numba.extending import models, overload, register_model
 
-intrinsic: Any = numba.extending.intrinsic  # whose types would hide those of the functions that it makes
+intrinsic: Any = numba.extending.intrinsic  # whose types would hide the types of the functions that it makes
 
 _WORD = ir.IntType(64)
 _REGISTER_WORDS = 8  # views on more words than this are in memory
@@ -26,7 +26,7 @@ _OFFSET, _MASK, _LOW, _SIZE = range(4)  # columns of the layout's table
 
 
 class PackedView(types.Type):
-    """Numba type of the view on `num_words` words: where they are, the layout's table, and the fault.
+    """Numba type of the view on `num_words` words: their address, the layout's table, and the fault.
 
     Words that are only read are an array on the stack. Words that are written one after the other are a vector, kept in
     a register: through memory each write would wait for the one before it.
@@ -146,7 +146,7 @@ def clear_fault(typing_context, view):
 
 
 def _checked_component(builder, view, index):
-    """The component `index` as in Python (negative from the end); component 0 and a fault where there is none."""
+    """The component `index` as in Python (negative from the end); component 0 and a fault if there is none."""
     checked = cgutils.alloca_once_value(builder, index)
     with builder.if_then(builder.icmp_unsigned(">=", index, view.length), likely=False):
         wrapped = builder.add(index, view.length)
@@ -164,11 +164,11 @@ def _note_fault(builder, view, component):
 
 def _column(builder, view, index, column):
     """One entry of the layout's row of a component."""
-    place = builder.add(builder.shl(index, ir.Constant(_WORD, 2)), ir.Constant(_WORD, column))
-    return builder.load(builder.gep(view.fields, [place]))
+    address = builder.add(builder.shl(index, ir.Constant(_WORD, 2)), ir.Constant(_WORD, column))
+    return builder.load(builder.gep(view.fields, [address]))
 
 
-def _place(builder, view, view_type, index):
+def _word_and_shift(builder, view, view_type, index):
     """The word of a component and its shift there."""
     offset = _column(builder, view, index, _OFFSET)
     if view_type.num_words == 1:
@@ -181,7 +181,7 @@ def _get_component(typing_context, view, index):
     def codegen(context, builder, sig, args):
         view = _view(context, builder, sig, args)
         index = _checked_component(builder, view, args[1])
-        word, shift = _place(builder, view, sig.args[0], index)
+        word, shift = _word_and_shift(builder, view, sig.args[0], index)
         field = builder.and_(_load_word(builder, view, sig.args[0], word), _column(builder, view, index, _MASK))
         return builder.add(_column(builder, view, index, _LOW), builder.lshr(field, shift))
 
@@ -193,7 +193,7 @@ def _set_component(typing_context, view, index, value):
     def codegen(context, builder, sig, args):
         view = _view(context, builder, sig, args)
         index = _checked_component(builder, view, args[1])
-        word, shift = _place(builder, view, sig.args[0], index)
+        word, shift = _word_and_shift(builder, view, sig.args[0], index)
         mask = _column(builder, view, index, _MASK)
         offset = builder.sub(args[2], _column(builder, view, index, _LOW))
         # a value out of range becomes the lowest one, and a fault
@@ -204,12 +204,12 @@ def _set_component(typing_context, view, index, value):
             builder.store(ir.Constant(_WORD, 0), harmless)
         # replace the bits of the component in its word
         field = builder.shl(builder.load(harmless), shift)
-        place = view.words
+        address = view.words
         if sig.args[0].in_register:
             field, mask = (_in_lane(builder, sig.args[0].num_words, word, bits) for bits in (field, mask))
         else:
-            place = builder.gep(view.words, [ir.Constant(_WORD, 0), word])
-        builder.store(builder.or_(builder.and_(builder.load(place), builder.not_(mask)), field), place)
+            address = builder.gep(view.words, [ir.Constant(_WORD, 0), word])
+        builder.store(builder.or_(builder.and_(builder.load(address), builder.not_(mask)), field), address)
         return context.get_dummy_value()
 
     return types.void(view, types.int64, types.int64), codegen

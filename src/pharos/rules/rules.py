@@ -6,8 +6,8 @@ Two engines run them, the first that can:
     interpreted  in Python, state by state; while building, in as many processes as there are workers (interpreted.py,
                  stepping.py)
 
-Where Numba cannot compile a rule, this file gives one warning for each class of environments and use, and takes the
-other engine. Whatever the engine, a rule that fails is a RuleError that names the state and the action.
+If Numba cannot compile a rule, this file gives one warning for each class of environments and use, and takes the
+other engine. In both engines, a rule that fails is a RuleError that names the state and the action.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ import numpy as np
 from pharos.environments import Environment
 from pharos.kernels.stepping import EnvironmentBatch, Setting
 from pharos.rules.compiled import (
-    COUNTED,
+    NO_RANKS,
     CompiledAges,
     CompiledDrawing,
     CompiledExpansion,
@@ -45,8 +45,8 @@ class Expansion(Protocol):
     """Successors of packed states, looked up in a table of states (kernels/hash_table.py).
 
     See exploration.py for the arrays. A state has B branches: one for each of A actions, or, with chance, branch a K +
-    k for outcome k of action a, of which impossible ones lead to the state itself. `probabilities` (rows, B) gets those
-    of the branches; it has no rows without chance.
+    k for outcome k of action a, of which impossible ones lead to the state itself. `probabilities` (rows, B) gets the
+    probabilities of the branches; it has no rows without chance.
 
     Raises:
         RuleError: a rule failed, or left the declared ranges.
@@ -109,14 +109,14 @@ class TransitionRewards(Protocol):
         terminal: np.ndarray,
         start: int,
         stop: int,
-        ranks: np.ndarray = COUNTED,
+        ranks: np.ndarray = NO_RANKS,
         largest: np.ndarray | None = None,
     ) -> np.ndarray:
         """Expected rewards (stop - start, A) of states [start, stop), with chance.
 
         Args:
             outcomes: three arrays: which (N,) int64, ascending, (s - start) A + a of each outcome; successors
-                (N,) int64, where it leads; probabilities (N,).
+                (N,) int64, its next state; probabilities (N,).
             ranks: (N,) int64, which one of the possible outcomes of its state and action each is, -1 for an action
                 without effect; no entries: they are all, in their order.
             largest: (1,) float64, raised to the largest absolute reward that was averaged with a different one.
@@ -164,7 +164,7 @@ class Stepping(Protocol):
     def step_many(
         self, parameters: tuple[object, ...], setting: Setting, batch: EnvironmentBatch, first: int, last: int, /
     ) -> int:
-        """One step of many environments; returns -1, or i D + c where component c of environment i left its range."""
+        """One step of many environments; returns -1, or i D + c if component c of environment i left its range."""
 
     def is_terminal_one(self, parameters: tuple[object, ...], state: np.ndarray, /) -> bool:
         """Whether a state is terminal."""
@@ -173,16 +173,16 @@ class Stepping(Protocol):
         """out[n, a] = whether action a is available in states[n], (N, D); all are in terminal states."""
 
     def step_and_draw_one(self, *arguments: object) -> Callable[..., tuple[float, int]] | None:
-        """The function that steps and draws, for these arguments after the parameters; None where there is none."""
+        """The function that steps and draws, for these arguments after the parameters; None if there is none."""
 
 
 class Rules:
     """The rules of one environment, each use by the fastest engine that can; nothing is compiled before it is used.
 
     Attributes:
-        env: the environment. layout: where its components sit in packed states.
+        env: the environment. layout: of its components in packed states.
         exploration: for building state spaces.
-        rewards: for the rewards of built ones. ages: for their ages, where the class has some.
+        rewards: for the rewards of built ones. ages: for their ages, if the class has some.
         stepping: for interaction.
     """
 
@@ -216,14 +216,14 @@ class Rules:
         """Whether compiled exploration is loaded sooner than many states are interpreted: it is on disk."""
         try:
             return is_kept(self.env, self.layout)
-        except Exception:  # the warning comes where it is compiled
+        except Exception:  # the warning comes when it is compiled
             return False
 
     def rewards_of(self, num_states: int) -> TransitionRewards:
         """Rewards of the transitions of `num_states` states in all; few are interpreted."""
         from pharos.rules.interpreted import InterpretedRewards
 
-        is_small = num_states * self.env.num_actions * self.env.outcomes < compiling.SMALL // 4
+        is_small = num_states * self.env.num_actions * self.env.outcomes < compiling.SMALL_STATES // 4
         return InterpretedRewards(self.env, self.layout) if is_small else self.rewards
 
     @cached_property
@@ -245,11 +245,11 @@ class Rules:
         return InterpretedAges(self.env, self.layout)
 
     def available(self, states: np.ndarray) -> np.ndarray | None:
-        """(N, A) bool, the actions that exist in each of the states (N, D); None where all do everywhere."""
+        """(N, A) bool, the actions that exist in each of the states (N, D); None if every action exists everywhere."""
         if not self.env.has_sets:
             return None
         out = np.empty((len(states), self.env.num_actions), np.bool_)
-        is_small = out.size < compiling.SMALL // 4
+        is_small = out.size < compiling.SMALL_STATES // 4
         if is_small and "stepping" not in vars(self):
             from pharos.rules.stepping import InterpretedStepping
 
@@ -270,20 +270,20 @@ class Rules:
     def drawing(
         self, kernel: str, interpreted: Callable[..., None], *arguments: object, motion: bool = False
     ) -> Callable[..., None]:
-        """A function that draws states, compiled where Numba can.
+        """A function that draws states, compiled if Numba can.
 
         Args:
             kernel: its name in interaction.py.
-            interpreted: the function that draws where Numba cannot compile it.
+            interpreted: the function that draws if Numba cannot compile it.
             arguments: of a first call, for no states, which compiles it.
-            motion: whether the planes of `draw_motion` follow those of `draw`.
+            motion: whether the planes of `draw_motion` follow the planes of `draw`.
         """
         engine = CompiledMotion if motion else CompiledDrawing
         compiled = compiled_or_none(engine, self.env, kernel, *arguments)
         return interpreted if compiled is None else compiled
 
     def reason_not_compiled(self) -> str:
-        """The reason why Numba does not compile exploration and rewards; "" where it does. Does not warn."""
+        """The reason why Numba does not compile exploration and rewards; "" if it does. Does not warn."""
         return "".join(_reason(engine, self.env, self.layout)[1] for engine in (CompiledExpansion, CompiledRewards))
 
 
@@ -305,7 +305,7 @@ _warned: set[tuple[type, object]] = set()
 
 
 def compiled_or_none(engine: Callable[..., Engine], env: Environment, *arguments: object) -> Engine | None:
-    """The compiled engine; None, after one warning for each class, where Numba cannot compile it."""
+    """The compiled engine; None, after one warning for each class, if Numba cannot compile it."""
     compiled, reason = _reason(engine, env, *arguments)
     if reason and (type(env), engine) not in _warned:
         _warned.add((type(env), engine))

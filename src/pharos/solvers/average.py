@@ -5,13 +5,13 @@ p(m | n, a) h(m):
 
 1. End components first: whoever goes on for ever does so in one of them. Inside, every node can reach every other one,
    so that all have the same best gain g. For any h whatever, g <= max T_a h(n) - h(n) over all nodes and choices, and a
-   policy a has at least min T_a h(n) - h(n) over all nodes: the bounds are those of one backup, its rounding included.
-2. A good h is that of the best policy. Damped sweeps h + (T h - h) / 2 - constant, which converge where a chain is
+   policy a has at least min T_a h(n) - h(n) over all nodes: the bounds come from one backup, its rounding included.
+2. A good h is the bias of the best policy. Damped sweeps h + (T h - h) / 2 - constant, which converge if a chain is
    periodic, too; then policy iteration from there. A policy is solved for by what it earns, and the steps it takes,
    until it comes back to one node. A policy with several recurrent classes is led to the best one first: in an end
    component it can be.
 3. Components become one node each, which may stop and be paid its gain. Then the gain of a node is a total reward
-   (`goals.py`): the mean of the gains of where it ends up, 0 where an episode ends.
+   (`goals.py`): the mean of the gains of the components in which it ends up, 0 if the episode ends.
 
 A policy makes a Markov chain, whose recurrent classes are its end components, and with one choice a node the same three
 steps hold. Its bias is what it earns beyond its gain, h = lim sum over t of E r_t - g: in a recurrent class h is known
@@ -36,8 +36,8 @@ from pharos.kernels.hitting import UNIT
 from pharos.mdp import BEST, WORST, PolicyTable, Selection, TabularMDP, end_components, require_mdp, stand_ins
 from pharos.solvers.chains import Chain
 from pharos.solvers.goals import (
-    ELIMINATED,
-    MARGIN,
+    BOUND_MARGIN,
+    MOST_UNSWEPT_NODES,
     Choices,
     GoalProblem,
     WrittenOut,
@@ -52,13 +52,13 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 # Sweeps before policies are improved, and in all; the damping, which makes chains aperiodic.
-FIRST_SWEEPS, MOST_SWEEPS, DAMPING = 32, 100_000, 0.5
+FIRST_SWEEPS, MOST_GAIN_SWEEPS, DAMPING = 32, 100_000, 0.5
 # Outcomes that all sweeps of one component may read, some ten seconds.
 MOST_READ = 3e9
 # Damped steps after which the likeliest node of a class is the one to come back to.
 HOMING = 32
 # Improvements of a policy, at most.
-MOST_IMPROVEMENTS = 200
+MOST_GAIN_IMPROVEMENTS = 200
 POLICIES = ("optimal", "worst")
 """Names of the policies that are found."""
 
@@ -85,7 +85,7 @@ class AverageReward:
             (S,) actions; or (S, A) probabilities, under sticky actions (S, A + 1) actions or (S, A + 1, A).
         tolerance: half of the widest interval of a gain, at most.
 
-    Under sticky actions the numbers of a state are those of an episode that starts there, without a previous action.
+    Under sticky actions the numbers of a state belong to an episode that starts in it, without a previous action.
     """
 
     mdp: TabularMDP
@@ -112,13 +112,13 @@ class AverageReward:
     def bias(self) -> StateBounds:
         """Surplus of `policy` over its gain: `lower` and `upper` (S,), proven.
 
-        h(s) = sum over t of E r_t - g(s), summed in the mean (Cesaro) where the chain is periodic. So the stationary
+        h(s) = sum over t of E r_t - g(s), summed in the mean (Cesaro) if the chain is periodic. So the stationary
         mean of h is 0 in each recurrent class, and h is 0 at the end. Of two states of one class the difference says
         how much more is earned from the one than from the other, in all.
 
         Raises:
             PrecisionError: the equations are too large, or floats do not prove a bound.
-        Cost: linear equations of the policy's chain, up to 20,000 nodes, or more where elimination fills little in.
+        Cost: linear equations of the policy's chain, up to 20,000 nodes, or more if elimination fills little in.
         Source: Puterman (2005), section 8.2.
         """
         return _bias(self.mdp, PolicyTable.of(self.mdp, self.policy))
@@ -133,8 +133,8 @@ def average_reward(
 ) -> AverageReward:
     """The long-run average reward a step, and the bias, of the best or another policy, with proven bounds.
 
-    g(s) = lim 1/T sum over t < T of E r_t. Discount and horizon of the MDP do not count: play goes on for ever. Where
-    an episode ends nothing more is paid, so that the gain is 0 there.
+    g(s) = lim 1/T sum over t < T of E r_t. Discount and horizon of the MDP do not count: play goes on for ever. If an
+    episode ends, nothing more is paid, so the gain is 0.
 
     Args:
         policy: None or "optimal"; "uniform"; "worst"; or a policy as `evaluate_policy` takes it.
@@ -145,7 +145,7 @@ def average_reward(
         ParameterError: the policy has the wrong shape. UnknownName: no such policy.
         PrecisionError: floats, within limits of time, prove no bound within the tolerance.
     Cost: nodes and outcomes are written out, 12 bytes an outcome; sweeps, and linear equations of some policies of each
-        end component; of components of more than 20,000 nodes where elimination fills little in, else sweeps alone.
+        end component; of components of more than 20,000 nodes if elimination fills little in, else sweeps alone.
     Source: Puterman (2005), chapters 8 and 9; Ashok et al. (2017).
     """
     mdp = mdp.with_horizon(None)
@@ -158,7 +158,7 @@ def average_reward(
     v, error, choices = _ends(nodes, component, inside, stops, room, staying, tolerance / 4)
     gain = _of_states(mdp, select, v - error, v + error)
     if not (gain.upper - gain.lower).max(initial=0.0) <= 2 * tolerance and not any(mdp.residual):
-        raise _imprecise(mdp, tolerance)
+        raise _precision_error(mdp, tolerance)
     if isinstance(select, PolicyTable):
         return AverageReward(mdp, select.kind, gain, select.table, tolerance)
     return AverageReward(mdp, select.kind, gain, _policy_table(mdp, nodes.sign, v, choices), tolerance)
@@ -174,7 +174,7 @@ def _selection(mdp: TabularMDP, policy: TablePolicy | str | None) -> Selection:
     return PolicyTable.of(mdp, policy.policy_table() if isinstance(policy, TableAgent) else policy)
 
 
-def _imprecise(mdp: TabularMDP, tolerance: float) -> PrecisionError:
+def _precision_error(mdp: TabularMDP, tolerance: float) -> PrecisionError:
     return PrecisionError(
         f"{mdp}: 64-bit floats, within limits of time, prove no average reward to a tolerance of {tolerance:g}; raise "
         "the tolerance, or discount (gamma < 1)"
@@ -205,7 +205,7 @@ def _gains(
     least, most = np.full(total, np.inf), np.full(total, -np.inf)
     np.minimum.at(least, labels, rewards)
     np.maximum.at(most, labels, rewards)
-    # where all choices pay the same, or a node stays for ever alone, there is nothing to solve
+    # if all choices pay the same, or a node stays for ever alone, there is nothing to solve
     size = np.bincount(component[component >= 0], minlength=total)
     alone = np.flatnonzero(size[labels] == 1)
     at = alone[rewards[alone] == most[labels[alone]]][::-1]
@@ -217,10 +217,10 @@ def _gains(
         choices = _inner(nodes, rows[order[ends[k] : ends[k + 1]]])
         mean = MeanPayoff(choices)
         mean.solve(tolerance)
-        gains[k], error[k] = (mean.upper + mean.lower) / 2, (mean.upper - mean.lower) / 2 * MARGIN
+        gains[k], error[k] = (mean.upper + mean.lower) / 2, (mean.upper - mean.lower) / 2 * BOUND_MARGIN
         error[k] += 2 * UNIT * abs(gains[k])
         if not error[k] <= tolerance and not any(nodes.mdp.residual):
-            raise _imprecise(nodes.mdp, 2 * tolerance)
+            raise _precision_error(nodes.mdp, 2 * tolerance)
         origin = choices.origin[mean.policy]
         staying[origin // per_node] = origin % per_node
     return gains, error, staying
@@ -264,19 +264,19 @@ class MeanPayoff:
         self.policy = choices.rows[:-1].copy()
 
     def solve(self, tolerance: float) -> None:
-        """Sweep, improve policies, and sweep on where that fails, until the bounds are as near as the tolerance."""
+        """Sweep, improve policies, and sweep on if that fails, until the bounds are as near as the tolerance."""
         sweeps = Sweeps(self.choices)
         sweeps.go_on(FIRST_SWEEPS, tolerance)
         if self._is_met(sweeps.h, tolerance) or self._improve(tolerance) or self._in_rational_numbers():
             return
         is_settled = False
-        most = min(MOST_SWEEPS, MOST_READ / (self.choices.matrix.nnz + len(self.choices.owner)))
+        most = min(MOST_GAIN_SWEEPS, MOST_READ / (self.choices.matrix.nnz + len(self.choices.owner)))
         while not (self._is_met(sweeps.h, tolerance) or is_settled or sweeps.count >= most):
             is_settled = sweeps.go_on(sweeps.count, tolerance)
         self._bound(sweeps.h)
 
     def _is_met(self, h: np.ndarray, tolerance: float) -> bool:
-        """Whether the bounds are near enough, those of h (M + 1,) included."""
+        """Whether the bounds are near enough, also the ones that h (M + 1,) gives."""
         self._bound(h)
         return self.upper - self.lower <= 2 * tolerance * (1 - 2.0**-20)
 
@@ -295,7 +295,7 @@ class MeanPayoff:
     def _improve(self, tolerance: float) -> bool:
         """Policy iteration from the policy so far; whether the bounds are near enough."""
         policy, choices = self.policy, self.choices
-        for _ in range(MOST_IMPROVEMENTS):
+        for _ in range(MOST_GAIN_IMPROVEMENTS):
             policy, class_of = self._towards_one_class(policy)
             h = _solved(choices, policy, class_of, np.ones(len(policy), np.bool_))[0]
             if not np.isfinite(h).all():
@@ -311,7 +311,7 @@ class MeanPayoff:
         return False
 
     def _in_rational_numbers(self) -> bool:
-        """The same in rational numbers, where floats do not hold h; whether there was room for them."""
+        """The same in rational numbers, if floats do not hold h; whether there was room for them."""
         from pharos.solvers.rational import best_mean, fractions_of
 
         small = self.choices.num_nodes <= DENSE and not self.choices.deviation
@@ -319,7 +319,7 @@ class MeanPayoff:
         if rows is None:
             return False
         policy = self.policy
-        for _ in range(MOST_IMPROVEMENTS):
+        for _ in range(MOST_GAIN_IMPROVEMENTS):
             policy, class_of = self._towards_one_class(policy)
             result = best_mean(self.choices, rows, policy, class_of)
             if result is None:
@@ -406,7 +406,7 @@ class Sums:
         self.chain = Chain(matrix, float)
 
     def until(self, b: np.ndarray) -> np.ndarray:
-        """(M + 1,) x of b (M,), as floats have it; NaN where it cannot be solved for."""
+        """(M + 1,) x of b (M,), as floats have it; NaN if it cannot be solved for."""
         x = np.zeros(self.num_nodes + 1)
         x[self.nodes] = self.chain.solve(b[self.nodes])[:-1]
         return x
@@ -425,11 +425,11 @@ class Sums:
         if not ((off + more + rounding <= 0).all() and (w >= 0).all()):
             v, w = self._rational(b, error)
         x, room = np.zeros(self.num_nodes + 1), np.zeros(self.num_nodes + 1)
-        x[self.nodes], room[self.nodes] = v[:-1], w[:-1] * MARGIN
+        x[self.nodes], room[self.nodes] = v[:-1], w[:-1] * BOUND_MARGIN
         return x, room
 
     def _rational(self, b: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same of the nodes that it solves for, where floats are too short."""
+        """The same of the nodes that it solves for, if floats are too short."""
         from pharos.solvers.rational import exact_sums, fractions_of
 
         rows, sums = fractions_of(self.choices), None
@@ -461,11 +461,11 @@ def _homes(matrix: "csr_matrix", class_of: np.ndarray) -> np.ndarray:
 def _solved(
     choices: Choices, policy: np.ndarray, class_of: np.ndarray, inside: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((M + 1,) h, 0 at the home of each class; (K,) mean rewards) of a policy; NaN where it is not solved for.
+    """((M + 1,) h, 0 at the home of each class; (K,) mean rewards) of a policy; NaN if it is not solved for.
 
     Args:
         class_of: (M,) the recurrent class of each node, -1: none.
-        inside: (M,) bool: the nodes to solve for: those of the classes; others, too, if there is one class.
+        inside: (M,) bool: the nodes to solve for: the nodes of the classes; others, too, if there is one class.
     """
     home = _homes(choices.matrix[policy], class_of)
     inside = inside.copy()
@@ -479,7 +479,7 @@ def _solved(
     return x - of_nodes * steps, gains
 
 
-# Where play ends up ---------------------------------------------------------------------------------------------------
+# Components in which play ends ----------------------------------------------------------------------------------------
 
 
 def _ends(
@@ -491,7 +491,7 @@ def _ends(
     staying: np.ndarray,
     tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """((N,) gains, (N,) error of each, (N,) choices) where the components are paid `stops` (K,), each within `room`."""
+    """((N,) gains, (N,) error of each, (N,) choices) if the components are paid `stops` (K,), each within `room`."""
     count, live = len(nodes.live), nodes.live
     may_end = bool((nodes.matrix.indices == count).any())
     amounts = np.unique(np.append(stops, 0.0) if may_end or not len(stops) else stops)
@@ -500,12 +500,12 @@ def _ends(
         return v, error, staying
     nothing = np.zeros(len(nodes.rewards))
     problem = GoalProblem.collapsed(nodes, component, inside, stops, nothing, nothing, staying)
-    if problem.choices.num_nodes > ELIMINATED:
+    if problem.choices.num_nodes > MOST_UNSWEPT_NODES:
         v, error, choices = _swept_ends(problem, tolerance)
     else:
         goals = problem.solve(tolerance)
         v, error, choices = goals.v, goals.error, goals.policy
-    return v, np.where(live, (error + room) * MARGIN, 0.0), choices
+    return v, np.where(live, (error + room) * BOUND_MARGIN, 0.0), choices
 
 
 def _swept_ends(problem: GoalProblem, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -518,7 +518,7 @@ def _swept_ends(problem: GoalProblem, tolerance: float) -> tuple[np.ndarray, np.
     largest = float(np.abs(choices.rewards).max(initial=0.0))
     step = (choices.terms + 24) * UNIT * largest + choices.deviation * 2 * largest
     lower, upper = (np.append(np.full(choices.num_nodes, each), 0.0) for each in (-largest, largest))
-    for sweep in range(int(min(MOST_SWEEPS, MOST_READ / (2 * choices.matrix.nnz)))):
+    for sweep in range(int(min(MOST_GAIN_SWEEPS, MOST_READ / (2 * choices.matrix.nnz)))):
         for bound, side in ((lower, -1.0), (upper, 1.0)):
             values = (choices.rewards + choices.matrix @ bound) / leaving
             moved = np.maximum.reduceat(values, choices.rows[:-1]) + side * step
@@ -526,9 +526,9 @@ def _swept_ends(problem: GoalProblem, tolerance: float) -> tuple[np.ndarray, np.
         if sweep % 8 == 7 and (upper - lower).max() <= 2 * tolerance:
             break
     else:
-        raise _imprecise(problem.mdp, tolerance)
+        raise _precision_error(problem.mdp, tolerance)
     best = best_rows(choices, (choices.rewards + choices.matrix @ lower) / leaving)
-    middle, half = (upper + lower) / 2, (upper - lower) / 2 * MARGIN
+    middle, half = (upper + lower) / 2, (upper - lower) / 2 * BOUND_MARGIN
     of_nodes = problem.node_of[:-2]
     return problem.sign * middle[of_nodes], half[of_nodes], problem.unfolded(choices.origin[best])
 
@@ -546,7 +546,7 @@ def _first_values(mdp: TabularMDP, x: np.ndarray, rewards: np.ndarray | float = 
 def _of_states(
     mdp: TabularMDP, select: Selection, lower: np.ndarray, upper: np.ndarray, rewards: np.ndarray | float = 0.0
 ) -> StateBounds:
-    """StateBounds of the states, without a previous action, from those of the nodes (N,)."""
+    """StateBounds of the states, without a previous action, from the bounds of the nodes (N,)."""
     if mdp.is_sticky:
         first, bounds = mdp.chance.first, []
         for x, side in ((lower, -1.0), (upper, 1.0)):
@@ -586,7 +586,7 @@ def _bias(mdp: TabularMDP, select: PolicyTable) -> StateBounds:
     low, high = np.full(len(home), np.inf), np.full(len(home), -np.inf)
     np.minimum.at(low, class_of[is_recurrent], (total - slack - choices.error)[is_recurrent])
     np.maximum.at(high, class_of[is_recurrent], (total + slack + choices.error)[is_recurrent])
-    gains, room = (low + high) / 2, (high - low) / 2 * MARGIN + 2 * UNIT * np.abs(low)
+    gains, room = (low + high) / 2, (high - low) / 2 * BOUND_MARGIN + 2 * UNIT * np.abs(low)
     g, g_error = np.zeros(len(members) + 1), np.zeros(len(members) + 1)
     g[:-1][is_recurrent], g_error[:-1][is_recurrent] = gains[class_of[is_recurrent]], room[class_of[is_recurrent]]
     # h of the classes, and its stationary mean: of one round from the home of each
@@ -601,7 +601,7 @@ def _bias(mdp: TabularMDP, select: PolicyTable) -> StateBounds:
     length, length_error = 1 + again @ steps, again @ steps_error + unit * (1 + again @ steps)
     mean = again @ round_of / length
     mean_error = again @ round_error + unit * (again @ np.abs(round_of)) + np.abs(mean) * length_error
-    mean_error = mean_error / (length - length_error) * MARGIN + 4 * UNIT * np.abs(mean)
+    mean_error = mean_error / (length - length_error) * BOUND_MARGIN + 4 * UNIT * np.abs(mean)
     h[:-1][is_recurrent] -= mean[class_of[is_recurrent]]
     h_error[:-1][is_recurrent] += (mean_error + 4 * UNIT * np.abs(mean))[class_of[is_recurrent]] + unit * np.abs(
         h[:-1][is_recurrent]

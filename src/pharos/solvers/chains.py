@@ -1,7 +1,7 @@
 """Markov chains of proper policies: linear equations by elimination without subtraction, component by component.
 
-A policy's chain has small strongly connected components even where those of the MDP are large: it is eliminated from
-the components that lead to no other one up, each in the order of minimum degree. See kernels/elimination.py.
+A policy's chain has small strongly connected components even if the components of the MDP are large: it is eliminated
+from the components that lead to no other one up, each in the order of minimum degree. See kernels/elimination.py.
 """
 
 import math
@@ -52,7 +52,7 @@ class Chain:
     """Linear equations x(n) sum_m p(n, m) = b(n) + sum_m p(n, m) x(m) of M nodes, 0 at the end, node M.
 
     Elimination keeps the relative accuracy of what is not negative: floats give x to some 1e-13 of itself, pairs of
-    floats to some 1e-29, even where a loop is left once in 1e300 steps.
+    floats to some 1e-29, even if a loop is left once in 1e300 steps.
 
     Attributes:
         dtype: of x: float, or complex, which is pairs of floats. unit: the relative rounding of such a number.
@@ -76,8 +76,8 @@ class Chain:
         inner = (inner + inner.T).tocsr()
         order = np.lexsort((_place_of_least_degree(inner), component))
         self._order = order
-        place = np.empty(size + 1, np.int64)
-        place[np.append(order, size)] = np.arange(size + 1)
+        index = np.empty(size + 1, np.int64)
+        index[np.append(order, size)] = np.arange(size + 1)
         inner = inner[order][:, order]
         entries = linear_algebra.entries_of_factor(inner.indptr, inner.indices, MOST_FILLED)
         self._is_eliminated = bool(entries.sum() <= MOST_FILLED and (1.0 * entries) @ entries <= MOST_MULTIPLICATIONS)
@@ -88,7 +88,7 @@ class Chain:
         linear_algebra.entries_of_factor(inner.indptr, inner.indices, MOST_FILLED, up_first, up_node)
         below = sparse.csr_matrix((up_node, up_node, up_first), shape=(size, size)).tocsc()
         ordered, numbers = matrix[order], component[order]
-        rows = (ordered.indptr, place[ordered.indices], ordered.data)
+        rows = (ordered.indptr, index[ordered.indices], ordered.data)
         blocks = np.searchsorted(numbers, numbers), np.searchsorted(numbers, numbers, side="right")
         factor = up_first, up_node, below.indptr, below.indices, *np.zeros((2, len(up_node)), dtype)
         leaving, self._pivot, work = np.zeros((3, size), dtype)
@@ -96,7 +96,7 @@ class Chain:
         elimination.factorize(*self._parts, leaving, self._pivot, work)
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """(M + 1,) x of b (M,), 0 at the end; infinite or NaN where numbers are too small, or it is too large."""
+        """(M + 1,) x of b (M,), 0 at the end; infinite or NaN if numbers are too small, or it is too large."""
         with np.errstate(all="ignore"):
             x, least, own = self._solved(right), math.inf, np.arange(len(right))
             for _ in range(0 if np.iscomplexobj(x) else REFINEMENTS):
@@ -118,7 +118,7 @@ class Chain:
         return x
 
     def _iterated(self, right: np.ndarray) -> np.ndarray:
-        """(M,) x, as BiCGSTAB has it: where any state soon leads anywhere, it converges within some tens of steps."""
+        """(M,) x, as BiCGSTAB has it: if any state soon leads anywhere, it converges within some tens of steps."""
         from scipy import sparse
 
         leaving = np.asarray(self._matrix.sum(axis=1)).ravel()
@@ -126,14 +126,14 @@ class Chain:
 
 
 def _place_of_least_degree(pattern: "csr_matrix") -> np.ndarray:
-    """(M,) the place of each node in an order of minimum degree, of a symmetric pattern; or another, if all is lost."""
+    """(M,) the index of each node in an order of minimum degree, of a symmetric pattern; or another, if all is lost."""
     from scipy import sparse
     from scipy.sparse import csgraph, linalg
 
-    places = np.zeros(pattern.shape[0], np.int64)
+    indices = np.zeros(pattern.shape[0], np.int64)
     joined = np.flatnonzero(np.diff(pattern.indptr))
     if not len(joined):
-        return places
+        return indices
     part = pattern[joined][:, joined]
     order = csgraph.reverse_cuthill_mckee(part, symmetric_mode=True)
     banded = part[order][:, order]
@@ -142,7 +142,7 @@ def _place_of_least_degree(pattern: "csr_matrix") -> np.ndarray:
         # SciPy has the order from a factor alone
         part = part + sparse.diags(np.asarray(part.sum(axis=1)).ravel() + 1.0)
         options = {"SymmetricMode": True}
-        places[joined] = linalg.splu(part.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).perm_c
+        indices[joined] = linalg.splu(part.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).perm_c
     else:
-        places[joined[order]] = np.arange(len(joined))
-    return places
+        indices[joined[order]] = np.arange(len(joined))
+    return indices

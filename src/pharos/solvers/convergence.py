@@ -25,7 +25,7 @@ _ENDLESS, _LOOK = 10_000, 64
 def shrinking(change: float, before: float, sweeps: int, gamma: float) -> float:
     """The factor, at most gamma, by which a sweep shrinks the largest change.
 
-    It is that of the last half of the sweeps: changes often shrink by much more than gamma in each.
+    It is the mean over the last half of the sweeps: changes often shrink by much more than gamma in each.
 
     Args:
         change: by the last of `sweeps` sweeps. before: by the one after half of them.
@@ -61,7 +61,7 @@ class Convergence:
         self.sweeps, self.in_vain, self.least = 0, 0, math.inf
         self.bound = backup.rounding(0.0) / (1 - backup.factor) if backup.factor < 1 else math.inf
         if not self.bound <= tolerance:
-            raise imprecise(mdp, self.bound, tolerance, self.is_single)
+            raise precision_error(mdp, self.bound, tolerance, self.is_single)
         self._bounds: list[float] = []
 
     def is_met(self, bound: float) -> bool:
@@ -74,7 +74,7 @@ class Convergence:
         return bound <= self.tolerance
 
     def is_endless(self) -> bool:
-        """Whether 10,000 further sweeps would not suffice: near gamma = 1 on cycles, or where rounding moves values.
+        """Whether 10,000 further sweeps would not suffice: near gamma = 1 on cycles, or if rounding moves values.
 
         To be called after every sweep.
         """
@@ -93,9 +93,9 @@ class Convergence:
     def check(self, is_moving: bool, patience: float) -> None:
         """PrecisionError unless sweeps move values by more than rounding does, and have gained within `patience`."""
         if not math.isfinite(self.bound):
-            raise imprecise(self.mdp, self.bound, self.tolerance, self.is_single)
+            raise precision_error(self.mdp, self.bound, self.tolerance, self.is_single)
         if not is_moving or self.in_vain > patience:
-            raise imprecise(self.mdp, min(self.least, self.bound), self.tolerance, self.is_single)
+            raise precision_error(self.mdp, min(self.least, self.bound), self.tolerance, self.is_single)
 
 
 def operations(mdp: TabularMDP, sweeps: float) -> float:
@@ -103,8 +103,8 @@ def operations(mdp: TabularMDP, sweeps: float) -> float:
     return sweeps * (CALL + 4.0 * mdp.num_states * mdp.width * mdp.num_actions)
 
 
-def imprecise(mdp: TabularMDP, bound: float, tolerance: float, is_single: bool = False) -> PrecisionError:
-    """PrecisionError that 64-bit floats, or 32-bit ones where values are stored so, do not reach the tolerance."""
+def precision_error(mdp: TabularMDP, bound: float, tolerance: float, is_single: bool = False) -> PrecisionError:
+    """PrecisionError that 64-bit floats, or 32-bit ones if values are stored so, do not reach the tolerance."""
     bits, end, advice = (32, "3.4e38", "use float64, ") if is_single else (64, "1.8e308", "")
     if not math.isfinite(bound):
         return PrecisionError(

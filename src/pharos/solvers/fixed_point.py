@@ -2,8 +2,8 @@
 
 Sweeps go in place and in reverse order of discovery: breadth-first search numbers a state before those that it leads
 to, so a sweep from the last state to the first carries values back along whole paths. 20 to 40 sweeps solve games that
-take a thousand plain ones. Where no state can be visited twice, and gamma is 1 or the states have an age, one pass is
-enough. Where sweeps are slow, because gamma is near 1, solving strongly connected components one after another or
+take a thousand plain ones. If no state can be visited twice, and gamma is 1 or the states have an age, one pass is
+enough. If sweeps are slow, because gamma is near 1, solving strongly connected components one after another or
 policy iteration gives a better x to go on from.
 
 The bound. Let T be the backup, a contraction with factor rho, x* its fixed point, and let one sweep in place change
@@ -19,14 +19,14 @@ Values of 32 bits. Backups are computed in 64 bits, and what is stored is the ne
 backup it is off by at most s = 2^-24 |v| + 2^-150. That is one more rounding of a new entry, so e becomes e + s; and d,
 which sweeps tell of the backups before they are stored, becomes d + s: D <= (rho (d + s) + e + s) / (1 - rho).
 
-Values component by component: where play cannot come back to a state, the states that it leads to are solved first.
+Values component by component: if play cannot come back to a state, the states that it leads to are solved first.
 
 A strongly connected component needs the values of those that it leads to, and no others. Sweeps over all states
 go on over those that are long settled, and a component settles only after those behind it; one after another, from the
 last to the first, each is swept until it is settled, and states without a cycle once.
 
-Its result is a better x to go on sweeping from, like that of policy_iteration.py: the bound of `fixed_point` comes
-from the next sweep over all states, and nothing has to be proven of components.
+Its result is a better x to go on sweeping from, like the result of policy_iteration.py: the bound of `fixed_point`
+comes from the next sweep over all states, and nothing has to be proven of components.
 Source: Dai, Mausam, Weld and Goldsmith (2011), "Topological value iteration algorithms".
 """
 
@@ -39,7 +39,15 @@ from numpy.typing import DTypeLike
 
 from pharos.errors import PrecisionError
 from pharos.mdp import BellmanEquation, Part, PolicyTable, Selection, TabularMDP
-from pharos.solvers.convergence import SETTLED, SETTLING, Convergence, imprecise, operations, shrinking, sweeps_left
+from pharos.solvers.convergence import (
+    SETTLED,
+    SETTLING,
+    Convergence,
+    operations,
+    precision_error,
+    shrinking,
+    sweeps_left,
+)
 from pharos.solvers.policy_iteration import PolicyIteration
 from pharos.system.memory import SHARE_OF_VALUES, available_memory, large_zeros
 
@@ -49,9 +57,9 @@ Numbers = TypeVar("Numbers", float, np.ndarray)
 # Half a unit in the last place of 32 bits, for numbers from 1 to 2, and for the smallest ones.
 _UNIT32, _LEAST32 = 2.0**-24, 2.0**-150
 # Entries of x that are looked at in one go.
-_BLOCK = 1 << 20
+_LARGEST_BLOCK = 1 << 20
 # Rounding of the computation of a bound itself, and products of rounding errors.
-MARGIN = 1 + 2.0**-40
+ROUNDING_MARGIN = 1 + 2.0**-40
 
 
 class FixedPoint(NamedTuple):
@@ -69,7 +77,7 @@ class FixedPoint(NamedTuple):
 
 
 class Backup(Generic[M]):
-    """The Bellman backup T of an MDP under a selection of actions: the best, the worst, or those of a policy.
+    """The Bellman backup T of an MDP under a selection of actions: the best, the worst, or the actions of a policy.
 
     Attributes:
         dtype: that values are stored in; backups are computed in 64 bits.
@@ -96,7 +104,7 @@ class Backup(Generic[M]):
         self._exact_to = 2.0**53 * mdp.reward_table.unit if is_sum and is_pure and mdp.reward_table.unit else -1.0
 
     def factor_of(self, mass: float) -> float:
-        """Contraction factor, where the probabilities of choosing sum to at most `mass`."""
+        """Contraction factor, if the probabilities of choosing sum to at most `mass`."""
         chance, dynamics = self.mdp.chance, self.mdp.dynamics
         executed = chance.chosen * mass + chance.previous + chance.uniform
         is_exact = mass == 1.0 and dynamics.mass == 1.0 and chance.is_none
@@ -108,7 +116,7 @@ class Backup(Generic[M]):
         return SETTLING + math.ceil(1 / (1 - self.factor))
 
     def zeros(self) -> np.ndarray:
-        """(S + 1, W); mapped from a file where memory has little room for it."""
+        """(S + 1, W); mapped from a file if memory has little room for it."""
         return large_zeros((self.mdp.num_states + 1, self.mdp.width), self.dtype, share=SHARE_OF_VALUES)
 
     def __call__(self, x: np.ndarray, out: np.ndarray) -> np.ndarray:
@@ -118,9 +126,9 @@ class Backup(Generic[M]):
         return out
 
     def sweep(self, x: np.ndarray, part: tuple[int, int] | None = None) -> float:
-        """Set x to T x in place, from the last state to the first where possible; return the largest change.
+        """Set x to T x in place, from the last state to the first if possible; return the largest change.
 
-        part: the range of states [start, stop) alone, where transitions are in arrays.
+        part: the range of states [start, stop) alone, if transitions are in arrays.
         """
         options = {} if part is None else {"part": part}
         with np.errstate(over="ignore", invalid="ignore"):  # the bound of values beyond floats is infinite
@@ -135,14 +143,14 @@ class Backup(Generic[M]):
     def rounding_of(self, rewards: Numbers, largest: Numbers) -> Numbers:
         """A bound on the rounding error of a backup in 64 bits of rewards up to `rewards`, entries up to `largest`.
 
-        Rewards that are means have errors of their own, which any choice between them passes on once. 0 where whole
+        Rewards that are means have errors of their own, which any choice between them passes on once. 0 if whole
         numbers are added up, and 53 bits hold them.
         """
         bound = self.operations * (_UNIT * (rewards + largest) + 2.0**-1074) + self.rounding_of_rewards
         return bound * np.logical_not(rewards + largest <= self._exact_to)
 
     def stored(self, largest: float) -> float:
-        """A bound on the error of storing a backup, where the result is at most `largest`: 0 in 64 bits."""
+        """A bound on the error of storing a backup, if the result is at most `largest`: 0 in 64 bits."""
         return _UNIT32 * (1 + 4 * _UNIT32) * largest + 2 * _LEAST32 if self.is_single else 0.0
 
     def size(self, largest: float) -> float:
@@ -150,8 +158,8 @@ class Backup(Generic[M]):
         return largest * (1 + 4 * _UNIT32) + 4 * _LEAST32 if self.is_single else largest
 
     def changed(self, change: float, largest: float) -> float:
-        """A bound on the change of stored entries of at most `largest`; `change` is that of a sweep, which compares
-        backups before they are stored, and which some dynamics compute in 32 bits.
+        """A bound on the change of stored entries of at most `largest`; `change` is the change of a sweep, which
+        compares backups before they are stored, and which some dynamics compute in 32 bits.
         """
         if not self.is_single:
             return change
@@ -160,7 +168,7 @@ class Backup(Generic[M]):
 
     def bound(self, change: float, rounding: float) -> float:
         """The largest error of values that a sweep has changed by at most `change`: (rho d + e) / (1 - rho)."""
-        return (self.factor * change + rounding) / (1 - self.factor) * MARGIN
+        return (self.factor * change + rounding) / (1 - self.factor) * ROUNDING_MARGIN
 
 
 def fixed_point(
@@ -172,7 +180,7 @@ def fixed_point(
     """Sweep until the proven bound is at most the tolerance; at gamma = 1 no state may be visited twice.
 
     Args:
-        x: (S + 1, W) of the backup's dtype, where to sweep, from any finite values; None: from zeros.
+        x: (S + 1, W) of the backup's dtype, to sweep in, from any finite values; None: from zeros.
     Raises:
         PrecisionError: floats cannot reach the tolerance.
     """
@@ -187,13 +195,13 @@ def fixed_point(
     components, better = ComponentSolver(mdp, select), PolicyIteration(mdp, select, convergence.tick)
     while True:
         change = backup.sweep(x)
-        largest += change  # at most that: the entries are read where it matters, which costs a third of a sweep
+        largest += change  # at most that: the entries are read if it matters, which costs a third of a sweep
         if better.is_exact or not rho * change > max(backup.rounding(largest + change), tolerance * (1 - rho)):
             largest = largest_of(x)
         rounding = backup.rounding(largest + change)
         if convergence.is_met(backup.bound(change, rounding)):
             return FixedPoint(x, convergence.bound, convergence.sweeps)
-        # x is exact up to rounding, also where values are infinite; or sweeps move rounding errors about
+        # x is exact up to rounding, also if values are infinite; or sweeps move rounding errors about
         convergence.check(rho * change > rounding, SETTLING if better.is_exact else math.inf)
         if components.is_worth_it(convergence.sweeps, change, tolerance) and components.improve(x, tolerance):
             largest = largest_of(x)
@@ -203,7 +211,7 @@ def fixed_point(
 
 
 def _in_single(backup: Backup[TabularMDP], convergence: Convergence, x: np.ndarray) -> FixedPoint:
-    """Fixed point in values of 32 bits, by sweeps alone; where these would not end, in 64 bits, rounded to 32 bits at
+    """Fixed point in values of 32 bits, by sweeps alone; if these would not end, in 64 bits, rounded to 32 bits at
     last: near gamma = 1 rounding to 32 bits adds up over 1 / (1 - gamma) sweeps."""
     tolerance = convergence.tolerance
     while True:
@@ -217,9 +225,9 @@ def _in_single(backup: Backup[TabularMDP], convergence: Convergence, x: np.ndarr
             result = fixed_point(double, tolerance, convergence.progress)
             with np.errstate(over="ignore"):
                 x[:] = result.x
-            bound = (result.bound + backup.stored(largest_of(result.x))) * MARGIN
+            bound = (result.bound + backup.stored(largest_of(result.x))) * ROUNDING_MARGIN
             if not bound <= tolerance:
-                raise imprecise(backup.mdp, bound, tolerance, is_single=True)
+                raise precision_error(backup.mdp, bound, tolerance, is_single=True)
             return FixedPoint(x, bound, convergence.sweeps + result.sweeps)
         convergence.check(shift != 0.0, backup.patience)
 
@@ -227,7 +235,7 @@ def _in_single(backup: Backup[TabularMDP], convergence: Convergence, x: np.ndarr
 def backward_induction(
     mdp: TabularMDP, select: Selection, horizon: int, keep_all: bool = False
 ) -> tuple[FixedPoint, np.ndarray, np.ndarray | None]:
-    """(values with `horizon` steps to go, x with one step less, all steps (T + 1, S + 1, W) where they are kept).
+    """(values with `horizon` steps to go, x with one step less, all steps (T + 1, S + 1, W) if they are kept).
 
     Raises:
         PrecisionError: values are too large for 64-bit floats.
@@ -261,8 +269,8 @@ def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np
             residual = np.abs(reward + mdp.gamma * x[successor, 0] - x[:-1, 0]).max(initial=0.0)
         bound = (float(residual) + rounding) / (1 - mdp.gamma)
     if not math.isfinite(bound):
-        raise imprecise(mdp, bound, 0.0)
-    return bound * MARGIN
+        raise precision_error(mdp, bound, 0.0)
+    return bound * ROUNDING_MARGIN
 
 
 def within_residual(mdp: TabularMDP, bound: float, x: np.ndarray) -> float:
@@ -274,15 +282,15 @@ def within_residual(mdp: TabularMDP, bound: float, x: np.ndarray) -> float:
         return bound
     order = None if mdp.gamma < 1 else mdp.order()
     steps = 1 / (1 - mdp.gamma) if order is None else order.longest + 1
-    return (bound + steps * mdp.residual.deviation(mdp.gamma, largest_of(x) + bound)) * MARGIN
+    return (bound + steps * mdp.residual.deviation(mdp.gamma, largest_of(x) + bound)) * ROUNDING_MARGIN
 
 
 def largest_of(x: np.ndarray) -> float:
-    """max |x|; NaN where an entry is NaN."""
+    """max |x|; NaN if an entry is NaN."""
     flat = x.reshape(-1)  # one long row: faster
     largest = 0.0
-    for start in range(0, flat.size, _BLOCK):  # each is read once, which counts where x is in a file
-        block = flat[start : start + _BLOCK]
+    for start in range(0, flat.size, _LARGEST_BLOCK):  # each is read once, which counts if x is in a file
+        block = flat[start : start + _LARGEST_BLOCK]
         largest = float(np.maximum(largest, np.maximum(block.max(), -block.min())))
     return largest
 
@@ -290,9 +298,9 @@ def largest_of(x: np.ndarray) -> float:
 def _in_one_pass(
     backup: Backup[TabularMDP], tolerance: float, progress: Callable[[int, float], None] | None, x: np.ndarray | None
 ) -> FixedPoint:
-    """Fixed point where no state can be visited again: each is backed up once, after all states that it leads to.
+    """Fixed point if no state can be visited again: each is backed up once, after all states that it leads to.
 
-    Rounding adds up along the way: that of a state n steps before the end is at most e (1 + rho + ... + rho^n).
+    Rounding adds up along the way: the rounding of a state n steps before the end is at most e (1 + rho + ... + rho^n).
     """
     mdp, rho = backup.mdp, backup.factor
     order = mdp.order()
@@ -301,11 +309,11 @@ def _in_one_pass(
     with np.errstate(over="ignore", invalid="ignore"):
         mdp.dynamics.sweep_once(backup.equation, x, order)
         series = min(backups, 1 / (1 - rho)) if rho < 1 else backups * np.float64(rho) ** order.longest
-        bound = float(backup.rounding(backup.size(largest_of(x))) * series * MARGIN)
+        bound = float(backup.rounding(backup.size(largest_of(x))) * series * ROUNDING_MARGIN)
     if progress is not None:
         progress(1, bound)
     if not bound <= tolerance:
-        raise imprecise(mdp, bound, tolerance, backup.is_single)
+        raise precision_error(mdp, bound, tolerance, backup.is_single)
     return FixedPoint(x, bound, 1)
 
 
@@ -318,28 +326,28 @@ def bound_of_steps(mdp: TabularMDP, horizon: int, bound: float, largest: float) 
     Raises:
         PrecisionError: values are too large for 64-bit floats.
     """
-    if not math.isfinite(bound * MARGIN + largest):
+    if not math.isfinite(bound * ROUNDING_MARGIN + largest):
         raise PrecisionError(
             f"{mdp}: the values of {horizon} steps pass 1.8e308, the largest 64-bit float; use smaller rewards"
         )
-    return bound * MARGIN
+    return bound * ROUNDING_MARGIN
 
 
 # Components -----------------------------------------------------------------------------------------------------------
 
 
 # Sweeps before the attempt, and how many must be left: finding components takes as long as some tens of them.
-FIRST_ATTEMPT, LEFT = 32, 100
+SWEEPS_BEFORE, LEAST_SWEEPS_LEFT = 32, 100
 # Operations that must be left: fewer take less time than compiling.
 WORTH = 5e8
 # States under sticky actions that are swept in one call, at least.
-LEAST = 512
+LEAST_PART = 512
 # Sweeps over all states that an attempt may cost, at most: near gamma = 1 the number of sweeps left has no limit.
 MOST = 4096
 # Bytes of a state that an attempt takes, at most.
-BYTES = 48
+STATE_BYTES = 48
 # The share of the change that the tolerance allows which a component may have left.
-SHARE = 0.25
+COMPONENT_SHARE = 0.25
 
 
 class ComponentSolver:
@@ -357,10 +365,10 @@ class ComponentSolver:
             return False
         before, self._change = self._change, change
         gamma = self.mdp.gamma
-        if sweeps < FIRST_ATTEMPT or gamma == 0.0 or not self._is_known:
+        if sweeps < SWEEPS_BEFORE or gamma == 0.0 or not self._is_known:
             return False
         self._left = sweeps_left(change, shrinking(change, before, sweeps, gamma), tolerance, gamma)
-        return self._left > LEFT and operations(self.mdp, self._left) > WORTH and self._fits
+        return self._left > LEAST_SWEEPS_LEFT and operations(self.mdp, self._left) > WORTH and self._fits
 
     def improve(self, x: np.ndarray, tolerance: float) -> bool:
         """Settle the components of x (S + 1, W) one after another; return whether that was tried.
@@ -369,10 +377,10 @@ class ComponentSolver:
         component is swept once.
         """
         mdp, self._is_tried = self.mdp, True
-        components = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST if mdp.is_sticky else 1)
+        components = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST_PART if mdp.is_sticky else 1)
         if components.largest > mdp.num_states // 2:
             return False
-        target = SHARE * tolerance * (1 - mdp.gamma)
+        target = COMPONENT_SHARE * tolerance * (1 - mdp.gamma)
         with np.errstate(over="ignore", invalid="ignore"):
             most = min(0.5 * self._left, MOST) * mdp.num_states
             mdp.dynamics.settle_components(self.equation, x, components, target, SETTLED, most)
@@ -388,5 +396,5 @@ class ComponentSolver:
     @property
     def _fits(self) -> bool:
         """Whether memory has room for what an attempt takes, and for the transitions, which are read out of order."""
-        each = BYTES + 4 * self.mdp.num_actions
+        each = STATE_BYTES + 4 * self.mdp.num_actions
         return each * self.mdp.num_states <= available_memory()

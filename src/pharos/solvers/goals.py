@@ -6,11 +6,11 @@ over policies whose expected sums of positive and of negative rewards are not bo
 1. End components that pay nothing are collapsed: a policy may stay there for ever, so that each becomes one node with
    the choices that leave it, and one more that stops and pays 0. No other way of staying for ever has a finite value:
    whoever stays in a component that pays is paid infinitely often. So policies that end almost surely, *proper* ones,
-   are all that counts; where there is none, there is no finite value.
-2. Policy iteration from a proper policy, where actions are replaced by those that are better beyond rounding alone. If
-   the new policy is not proper, it stays in a component with a positive mean reward, which can be repeated before the
-   end as often as one likes: the value is infinite. With T_a v(n) = r(n, a) + sum_m p(m | n, a) v(m), the mean reward
-   is that of the residuals T_a v - v, none of which is negative.
+   are all that counts; if there is none, there is no finite value.
+2. Policy iteration from a proper policy, in which actions are replaced by those that are better beyond rounding alone.
+   If the new policy is not proper, it stays in a component with a positive mean reward, which can be repeated before
+   the end as often as one likes: the value is infinite. With T_a v(n) = r(n, a) + sum_m p(m | n, a) v(m), the mean
+   reward is the mean of the residuals T_a v - v, none of which is negative.
 3. Bounds. For any u with u >= T_a u everywhere and u = 0 at the end, u >= V: along each proper policy of finite value
    u plus what was paid does not rise on average. For any l with l <= T_pi l under a proper policy pi, l <= V of pi.
    Both hold for v + w and v - w, if w is what a policy collects that is paid more than the residuals of v and their
@@ -21,8 +21,8 @@ with v itself, rows that floats do not sum to 1 are taken as divided by their su
 probability 1 - 1e-12 loses no digit.
 
 A policy's equations are solved by elimination without subtraction (`chains.py`), in floats, then in pairs of them: no
-digit is lost where a loop is left once in 10^12 steps, and a bound is proven wherever rounding of one step, times the
-steps, is less than the tolerance. Where that is too much, or where actions are as good as each other, and to mix them
+digit is lost if a loop is left once in 10^12 steps, and a bound is proven wherever rounding of one step, times the
+steps, is less than the tolerance. If that is too much, or if actions are as good as each other, and to mix them
 would never end, policy iteration is repeated in rational numbers (`rational.py`).
 
 Source: Bertsekas and Tsitsiklis (1991), "An analysis of stochastic shortest path problems"; Haddad and Monmege (2018),
@@ -50,7 +50,7 @@ from pharos.mdp import (
     stand_ins,
 )
 from pharos.solvers.chains import Chain, mean_changes
-from pharos.solvers.policy_iteration import BLOCK
+from pharos.solvers.policy_iteration import GREEDY_BLOCK
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -62,29 +62,29 @@ MOST_IMPROVEMENTS = 1000
 # Improvements after which sweeps look further ahead, and how many.
 SWEPT, SWEEPS = 50, 100
 # Solutions of the same policy's equations, each with the rounding of the one before.
-SETTLED = 4
+SETTLING_SOLUTIONS = 4
 # Tolerances within which values may be for every MDP within the residual of one.
 WIDER = 1e6
 # Units of a number in its last place that may be rounding.
 NOISE = 64
 # More than what sums of numbers too small for a float lose.
-SMALLEST = 2.0**-1000
+UNDERFLOW_SLACK = 2.0**-1000
 # Nodes of the largest MDP that is not swept first.
-ELIMINATED = 20_000
+MOST_UNSWEPT_NODES = 20_000
 # Sweeps of paths before their steps are looked at for a cycle.
-LOOK = 8
+LOOK_AHEAD = 8
 # More than the rounding of the computation of a bound itself.
-MARGIN = 1 + 2.0**-30
+BOUND_MARGIN = 1 + 2.0**-30
 
 
 class Choices(NamedTuple):
-    """Choices of nodes, written out: those of node n are the rows rows[n] to rows[n + 1].
+    """Choices of nodes, written out: the choices of node n are the rows rows[n] to rows[n + 1].
 
     Attributes:
         matrix: (R, M + 1) CSR of the outcomes that leave the node; node M is the end.
         rows: (M + 1,). owner: (R,) the node of each row.
         rewards: (R,), to be maximised. error: (R,) bound on the error of each, of one that is 0 exactly none.
-        origin: (R,) node of the MDP times its choices, plus the choice; -1: to stop where nothing is paid.
+        origin: (R,) node of the MDP times its choices, plus the choice; -1: to stop if nothing is paid.
         terms: the most outcomes of a row, and the numbers that a probability was computed from.
         deviation: how far the probabilities of a row may be from its own, in sum; bounds hold for all of them.
     """
@@ -106,7 +106,7 @@ class Choices(NamedTuple):
         """((R,) T_a v - v, by how much each may be off) of v (M + 1,), floats or pairs of them."""
         rewards = self.rewards if rewards is None else rewards
         total, size, off = mean_changes(self.matrix, self.owner, v)
-        slack = (self.terms + 24) * UNIT * (np.abs(rewards) + size) + off + SMALLEST
+        slack = (self.terms + 24) * UNIT * (np.abs(rewards) + size) + off + UNDERFLOW_SLACK
         if self.deviation:
             slack += self.deviation * 2 * float(np.abs(v).max(initial=0.0))
         return rewards + total, slack
@@ -118,7 +118,7 @@ class Goals:
 
     Attributes:
         v: (N,) of the nodes of the MDP. error: (N,) each is within this of the true one.
-        policy: (N,) a choice for each node, of a policy that ends almost surely where it does not stay for nothing.
+        policy: (N,) a choice for each node, of a policy that ends almost surely if it does not stay for nothing.
         improvements: of the policy, or sweeps. is_exact: whether values of actions, which follow from v, are exact.
     """
 
@@ -162,7 +162,7 @@ def _goals(
 ) -> Goals:
     if mdp.is_deterministic and not isinstance(select, PolicyTable):
         return longest_paths(mdp, select)
-    if mdp.num_states * mdp.width > ELIMINATED and not any(mdp.residual):
+    if mdp.num_states * mdp.width > MOST_UNSWEPT_NODES and not any(mdp.residual):
         goals = swept_goals(mdp, select, tolerance, progress)
         if goals is not None:
             return goals
@@ -259,7 +259,7 @@ class GoalProblem:
     def of(mdp: TabularMDP, select: Selection, arrived: np.ndarray | None = None) -> "GoalProblem":
         """
         arrived: (S + 1,) bool, the terminal states, and last the end, in which play has arrived. The other ones, and to
-            stay for ever where nothing is paid, then have no value. None: everything counts as arrived.
+            stay for ever if nothing is paid, then have no value. None: everything counts as arrived.
         """
         nodes = WrittenOut.of(mdp, select, arrived)
         size = nodes.size
@@ -330,7 +330,7 @@ class GoalProblem:
     def solve_in(
         self, inside: np.ndarray, tolerance: float, progress: Callable[[int, float], None] | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """((N,) values, (N,) error of each, (N,) choices) where `inside` (M + 1,) bool holds, at the end 0, else
+        """((N,) values, (N,) error of each, (N,) choices) if `inside` (M + 1,) bool holds, at the end 0, else
         infinite.
 
         From the nodes inside, the end among them, some policy surely ends without leaving them; choices that may leave
@@ -360,7 +360,7 @@ class GoalProblem:
         return v[self.node_of[:-2]], error[self.node_of[:-2]], self.unfolded(origin)
 
     def solve(self, tolerance: float, progress: Callable[[int, float], None] | None = None) -> Goals:
-        """Policy iteration, then bounds; in rational numbers where floats cannot tell, or are too short."""
+        """Policy iteration, then bounds; in rational numbers if floats cannot tell, or are too short."""
         choices = self._without_idle(self.choices)
         sure, policy = self.proper(choices)
         if not sure[:-1].all():
@@ -420,7 +420,7 @@ class GoalProblem:
         )
 
     def unfolded(self, origin: np.ndarray) -> np.ndarray:
-        """(N,) choices of the nodes, from those of the collapsed nodes (M,); -1 is to stop."""
+        """(N,) choices of the nodes, from the choices of the collapsed nodes (M,); -1 is to stop."""
         nodes = len(self.node_of) - 2
         policy = np.zeros(nodes, np.int64)
         matrix, inside = self.matrix, self.inside
@@ -532,7 +532,7 @@ def _values(
     infinite: Infinite,
     progress: Callable[[int, float], None] | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """((M,) values, (M,) error of each, (M,) rows, improvements), from a proper policy: by floats, where they can tell
+    """((M,) values, (M,) error of each, (M,) rows, improvements), from a proper policy: by floats, if they can tell
     and are long enough, else by rational numbers."""
     from pharos.solvers.rational import rational_values
 
@@ -596,7 +596,7 @@ def _errors(
     above = None if below is None else _room(choices, policy, chain, total + slack, slack, tolerance)
     if below is None or above is None:
         raise Undecided(policy)
-    return np.maximum(below, above) * MARGIN
+    return np.maximum(below, above) * BOUND_MARGIN
 
 
 def _room(
@@ -605,9 +605,9 @@ def _room(
     """(M,) w <= tolerance with w(n) >= off + sum_m p(m) w(m) for all choices (R,), rounding included; None if unproven.
 
     w is what a policy collects that is paid so much, and its slack more, improved from a proper one (M,) whose chain is
-    given. Each row is paid its own rounding, not that of another choice of its node.
+    given. Each row is paid its own rounding, not the rounding of another choice of its node.
     """
-    least = NOISE * chain.unit * tolerance + SMALLEST  # more than rounding of w takes away
+    least = NOISE * chain.unit * tolerance + UNDERFLOW_SLACK  # more than rounding of w takes away
     extra, zeros, settled = np.zeros(len(off)), np.zeros(len(off)), 0
     for improvements in range(MOST_IMPROVEMENTS):
         payment = off + slack + 2 * extra + least
@@ -624,7 +624,7 @@ def _room(
         extra = np.maximum(extra, rounding)
         if np.array_equal(changed, rows):
             settled += 1
-            if settled > SETTLED:
+            if settled > SETTLING_SOLUTIONS:
                 return None
             continue
         if not _is_proper(choices, changed):
@@ -686,11 +686,11 @@ def _pays(choices: Choices, policy: np.ndarray, nodes: np.ndarray) -> bool:
 
 
 # Whole numbers that 64 bits hold, and those that floats hold.
-WHOLE, EXACT = 2**62, 2**53
+WHOLE, FLOAT_INTEGERS = 2**62, 2**53
 
 
 def longest_paths(mdp: TabularMDP, select: Selection) -> Goals:
-    """Total rewards where every choice has one outcome: longest paths to the end, or to a cycle that pays nothing.
+    """Total rewards if every choice has one outcome: longest paths to the end, or to a cycle that pays nothing.
 
     Rewards are whole multiples of a power of 2, so that all sums are of whole numbers, and no tie is left to rounding.
     Paths become longer step by step; once the steps of their states form a cycle, it pays: the value is infinite.
@@ -714,7 +714,7 @@ def longest_paths(mdp: TabularMDP, select: Selection) -> Goals:
     sweeps = 0
     while lengthen(table, whole, terminal, v, is_reached, action):
         sweeps += 1
-        if sweeps & (sweeps - 1) == 0 and sweeps > LOOK:
+        if sweeps & (sweeps - 1) == 0 and sweeps > LOOK_AHEAD:
             state = int(bellman.cycle_of(table, action, mark))
             if state >= 0:
                 pairs = [(state, int(action[state]))]
@@ -727,7 +727,7 @@ def longest_paths(mdp: TabularMDP, select: Selection) -> Goals:
     action[stays] = free.pairs[stays].argmax(axis=1)
     largest = max(int(np.abs(v).max()), 1) + max(map(abs, numbers))
     values = sign * np.ldexp(v[:-1].astype(np.float64), -shift)
-    is_exact = largest < EXACT
+    is_exact = largest < FLOAT_INTEGERS
     return Goals(values, np.zeros(len(values)) if is_exact else 2 * UNIT * np.abs(values), action, sweeps, is_exact)
 
 
@@ -741,7 +741,7 @@ FIRST_BOUNDS, ATTEMPT, MOST_SWEEPS, PART = 32, 64, 100_000, 0.25
 def swept_goals(
     mdp: TabularMDP, select: Selection, tolerance: float, progress: Callable[[int, float], None] | None
 ) -> Goals | None:
-    """Total rewards by sweeps, where no component pays nothing and to stay in one always costs; None: elsewhere.
+    """Total rewards by sweeps, if no component pays nothing and to stay in one always costs; else None.
 
     There T has one fixed point V. Values that a sweep lowers everywhere are no less than V, and those that it raises
     everywhere no more, as long as each backup is rounded up, or down: it pays its rounding more, or less. So values
@@ -773,7 +773,7 @@ def swept_goals(
             attempt = sweeps + max(8, sweeps // 16)
             continue
         largest = largest_of(x) + tolerance
-        step = (backup.rounding(largest) + (backup.operations + 16) * UNIT * largest) * MARGIN
+        step = (backup.rounding(largest) + (backup.operations + 16) * UNIT * largest) * BOUND_MARGIN
         bounds = []
         for side in (1.0, -1.0):
             settled = _monotone(mdp, select, x, over, side, PART * tolerance, step)
@@ -781,11 +781,11 @@ def swept_goals(
             bounds.append(settled[0])
         upper, lower = bounds
         if upper is not None and lower is not None:
-            v, error = (upper + lower) / 2, float((upper - lower).max()) / 2 * MARGIN
+            v, error = (upper + lower) / 2, float((upper - lower).max()) / 2 * BOUND_MARGIN
             if progress is not None:
                 progress(sweeps, error)
             nodes = mdp.num_states * mdp.width
-            # where staying in a component costs, the policy that attains the bound does not
+            # if staying in a component costs, the policy that attains the bound does not
             policy = _greedy(mdp, select, upper if select.kind == "worst" else lower)
             return Goals(v[:-1].reshape(nodes), np.full(nodes, error), policy, sweeps)
         changes += [changes[-1]] * (sweeps + 1 - len(changes))
@@ -824,8 +824,8 @@ def _greedy(mdp: TabularMDP, select: Selection, x: np.ndarray) -> np.ndarray:
     if isinstance(select, PolicyTable):
         return np.zeros(mdp.num_states * mdp.width, np.int64)
     actions = np.empty(mdp.num_states, np.int64)
-    for start in range(0, mdp.num_states, BLOCK):
-        states = slice(start, min(start + BLOCK, mdp.num_states))
+    for start in range(0, mdp.num_states, GREEDY_BLOCK):
+        states = slice(start, min(start + GREEDY_BLOCK, mdp.num_states))
         actions[states] = select.policy(mdp.reward_table.rows(states) + mdp.dynamics.expected(x, states)).table
     return np.repeat(actions, mdp.width)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from pharos.errors import ParameterError
-from pharos.mdp import STEPS, whole_number
+from pharos.mdp import STEPS_EXPECTED, whole_number
 
 if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
@@ -26,15 +26,15 @@ class Solving:
             S, A): row t has t steps to go.
         progress: called after each sweep with its number and the bound so far, and as often while equations are solved.
         values: a file (.npy) that holds the values while they are computed, in place of memory, and afterwards; what
-            it holds already is where the sweeps begin, so that a solve that was killed goes on. Large ones that memory
-            has room for are swept there, and copied to the file every ten minutes and in the end, whatever ends it.
-            None: memory, or where that has little room a file without a name.
+            it holds already is what the sweeps begin with, so that a solve that was killed goes on. Large ones that
+            memory has room for are swept there, and copied to the file every ten minutes and in the end, whatever ends
+            it. None: memory, or, if that has little room, a file without a name.
         processes: 1; or "mpi": those that `mpiexec` has started, all of which make this call, and sweep a range of the
             states each; the first gets the Solution, the others None. Values depend on it within the tolerance; those
             of a horizon do not.
-        checkpoint: a folder for the values so far, once a minute, so that the same call goes on where one was killed,
+        checkpoint: a folder for the values so far, once a minute, so that the same call goes on after one was killed,
             with any number of processes.
-        threads: threads of a sweep. Beyond one, last digits may differ, within the error. They share the states where
+        threads: threads of a sweep. Beyond one, last digits may differ, within the error. They share the states if
             no action is sticky and transitions are in arrays.
         dtype: type of the stored values: float64; or float32, half the memory, and a bound that counts it. So a
             tolerance below 1.2e-7 max |V| / (1 - gamma) is out of reach. For one process, and no horizon.
@@ -58,7 +58,7 @@ class Solving:
         if not (isinstance(tolerance, int | float | np.floating) and np.isfinite(tolerance) and tolerance > 0):
             raise ParameterError(f"tolerance is {tolerance!r}; expected a positive number, in units of return")
         if self.horizon is not None:
-            object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", STEPS))
+            object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", STEPS_EXPECTED))
         object.__setattr__(self, "dtype", _dtype_name(self.dtype))
         whole_number(self.threads, "threads")
         if self.dtype == "float32" and (self.horizon is not None or self.is_distributed):

@@ -1,4 +1,4 @@
-"""Policy iteration: values of the greedy policy by linear algebra, where sweeps would take too long.
+"""Policy iteration: values of the greedy policy by linear algebra, if sweeps would take too long.
 
 Its result is only a better x to go on sweeping from: the bound of `fixed_point` comes from the next sweep alone.
 Three ways, depending on the operator: a deterministic policy without chance has a functional graph, one pass over it
@@ -7,9 +7,9 @@ of the policy, so that nothing is stored but some vectors. Source: Howard (1960)
 Gargiani et al. (2024), "Inexact policy iteration methods for large-scale Markov decision processes".
 
 Sparse linear systems (1 - gamma P) x = r of a policy, within limits of time and memory: two families of MDPs are slow
-by sweeps near gamma = 1, and each is quick by one of two methods. Where states lead to near ones (rings, grids,
+by sweeps near gamma = 1, and each is quick by one of two methods. If states lead to near ones (rings, grids,
 corridors, games of many screens), elimination in the order of Cuthill and McKee fills little in; how much is counted
-beforehand. Where any state soon leads anywhere, BiCGSTAB converges within some tens of steps. MDPs with neither
+beforehand. If any state soon leads anywhere, BiCGSTAB converges within some tens of steps. MDPs with neither
 property are not solved here. Source: Cuthill and McKee (1969); Liu (1990), elimination trees; van der Vorst (1992),
 BiCGSTAB.
 """
@@ -39,19 +39,19 @@ if TYPE_CHECKING:
 
 
 # Unknowns of the largest dense system, and of the largest that is eliminated whatever it fills in.
-DENSE, ELIMINATED = 400, 3000
+DENSE, MOST_ELIMINATED = 400, 3000
 # Steps of BiCGSTAB; by how much each call shrinks the residual; calls, each for the residual of the one before.
-MOST_STEPS, SHRINKAGE, CALLS = 500, 1e-8, 4
+MOST_BICGSTAB_STEPS, SHRINKAGE, CALLS = 500, 1e-8, 4
 # Entries of one factor, and multiplications: 250 MB and some seconds at most.
-MOST_FILLED, MOST_MULTIPLICATIONS = 10_000_000, 5e9
+MOST_ATTEMPT_FILLED, MOST_ATTEMPT_MULTIPLICATIONS = 10_000_000, 5e9
 
 
 def solution_of_system(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The x of system x = right, from a guess; NaN where the system is singular to the last bit, or takes too long."""
+    """The x of system x = right, from a guess; NaN if the system is singular to the last bit, or takes too long."""
     try:
         if len(right) <= DENSE:
             return np.linalg.solve(system.toarray(), right)
-        if len(right) <= ELIMINATED:
+        if len(right) <= MOST_ELIMINATED:
             return _eliminated(system, right)
         return _large(system, right, x)
     except (np.linalg.LinAlgError, RuntimeError):
@@ -65,14 +65,15 @@ def _eliminated(system: "csr_matrix", right: np.ndarray) -> np.ndarray:
 
 
 def _large(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The x of system x = right, by elimination where it fills little in, else by BiCGSTAB from a guess."""
+    """The x of system x = right, by elimination if it fills little in, else by BiCGSTAB from a guess."""
     from scipy.sparse import csgraph, linalg
 
     order = csgraph.reverse_cuthill_mckee(system)
     ordered = system[order][:, order]
     if not fills_little(ordered):
         return iterated(system, right, x)
-    # in each row the diagonal outweighs the rest, so pivots are on the diagonal, and the pattern is that of the count
+    # in each row the diagonal outweighs the rest, so pivots are on the diagonal, and the pattern is the one that was
+    # counted
     options = {"SymmetricMode": True}
     factors = linalg.splu(ordered.tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
     solved = np.empty(len(right))
@@ -85,7 +86,7 @@ def iterated(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarr
     """The x of system x = right, by BiCGSTAB, repeated on the residual as far as rounding allows; NaN if divergent."""
     residual = right - system @ x
     for call in range(CALLS):
-        step, left, _ = bicgstab(lambda y: system @ y, residual, SHRINKAGE, MOST_STEPS)
+        step, left, _ = bicgstab(lambda y: system @ y, residual, SHRINKAGE, MOST_BICGSTAB_STEPS)
         if call == 0 and not left <= SHRINKAGE:
             return np.full(len(right), np.nan)
         after = right - system @ (x + step)
@@ -98,7 +99,8 @@ def iterated(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarr
 def bicgstab(
     times: Callable[[np.ndarray], np.ndarray], right: np.ndarray, shrinkage: float, steps: int
 ) -> tuple[np.ndarray, float, int]:
-    """(x, norm of its residual divided by that of `right`, applications of the operator) of `times(x) = right`, from 0.
+    """(x, norm of its residual divided by the norm of `right`, applications of the operator) of `times(x) = right`,
+    from 0.
 
     Args:
         times: the image of a vector (n,), a new array, or one that the next call may overwrite.
@@ -119,24 +121,26 @@ def bicgstab(
     with np.errstate(all="ignore"):  # a breakdown is NaN, and does not converge
         while norm > enough and step < steps:
             step += 1
-            # Search direction, preconditioned: where episodes do not end, constant vectors shrink to 1 - gamma, which
+            # Search direction, preconditioned: if episodes do not end, constant vectors shrink to 1 - gamma, which
             # slows all methods.
             linear_algebra.shift(direction, np.float64(total) / size / constant, towards)
             moved[:] = times(towards)
             alpha = np.float64(rho) / linear_algebra.products(right, moved)[0]
-            total = linear_algebra.advance(residual, -alpha, moved)
+            total = linear_algebra.add_scaled(residual, -alpha, moved)
             # Stabilisation: the step along the residual that makes the new residual smallest.
             linear_algebra.shift(residual, np.float64(total) / size / constant, onwards)
             stabilised = times(onwards)
             across, own = linear_algebra.products(residual, stabilised)
             omega = np.float64(across) / own
-            linear_algebra.advance(x, alpha, towards)
-            linear_algebra.advance(x, omega, onwards)
-            linear_algebra.advance(residual, -omega, stabilised)
+            linear_algebra.add_scaled(x, alpha, towards)
+            linear_algebra.add_scaled(x, omega, onwards)
+            linear_algebra.add_scaled(residual, -omega, stabilised)
             # Next direction.
             before = rho
             rho, norm = linear_algebra.products(right, residual)
-            total = linear_algebra.turn(direction, (rho / np.float64(before)) * (alpha / omega), omega, moved, residual)
+            total = linear_algebra.next_direction(
+                direction, (rho / np.float64(before)) * (alpha / omega), omega, moved, residual
+            )
             if not norm < 1e8 * best:
                 break
             best = min(best, norm)
@@ -149,28 +153,28 @@ def fills_little(matrix: "csr_matrix") -> bool:
     from pharos.kernels import linear_algebra
 
     both = (abs(matrix) + abs(matrix).T).tocsr()
-    entries = linear_algebra.entries_of_factor(both.indptr, both.indices, MOST_FILLED).astype(float)
-    return bool(entries.sum() <= MOST_FILLED and entries @ entries <= MOST_MULTIPLICATIONS)
+    entries = linear_algebra.entries_of_factor(both.indptr, both.indices, MOST_ATTEMPT_FILLED).astype(float)
+    return bool(entries.sum() <= MOST_ATTEMPT_FILLED and entries @ entries <= MOST_ATTEMPT_MULTIPLICATIONS)
 
 
 # Policy iteration -----------------------------------------------------------------------------------------------------
 
 
-# Sweeps before the first attempt, and before that of the inexact way, which gains less: most games are solved by then.
-# Later attempts come after twice as many sweeps each, four times where they failed.
+# Sweeps before the first attempt, and before the attempt in the inexact way, which gains less: most games are solved by
+# then. Later attempts come after twice as many sweeps each, four times if they failed.
 FIRST_ATTEMPT, FIRST_INEXACT = 64, 256
 # Nodes times actions of the largest linear system that is solved directly, and nodes of the largest that is tried so
 # at once. (Nodes are states, or pairs with a previous action.)
 MOST_ENTRIES, DIRECTLY = 2_000_000, 3000
 # States whose greedy actions are worked out in one go.
-BLOCK = 1 << 16
+GREEDY_BLOCK = 1 << 16
 # Improvements of one attempt.
-MOST_IMPROVEMENTS = 60
+MOST_ATTEMPT_IMPROVEMENTS = 60
 # Inexact: improvements of one attempt, sweeps after each, by how much each shrinks the residual of its policy, and in
 # how many steps at most.
-MOST_INEXACT, SWEEPS_AFTER, FORCING, STEPS = 500, 20, 0.1, 100
+MOST_INEXACT, SWEEPS_AFTER, FORCING, MOST_OPERATOR_STEPS = 500, 20, 0.1, 100
 # Bytes of a node that an attempt takes, at most, and bytes that there always are.
-BYTES, SMALL = 80, 1 << 28
+NODE_BYTES, LEAST_BYTES = 80, 1 << 28
 # Operations of policy iteration by sparse systems, for each node.
 SPARSE = 50_000.0
 
@@ -213,11 +217,11 @@ class PolicyIteration:
     @property
     def _fits(self) -> bool:
         """Whether memory has room for what an attempt takes, some ten vectors of values."""
-        return BYTES * self.nodes <= max(SMALL, available_memory())
+        return NODE_BYTES * self.nodes <= max(LEAST_BYTES, available_memory())
 
     @property
     def is_direct(self) -> bool:
-        """Whether linear systems are solved directly: where they are small, or the inexact way has failed twice."""
+        """Whether linear systems are solved directly: if they are small, or the inexact way has failed twice."""
         most = MOST_ENTRIES if self._failures > 1 else DIRECTLY
         return self.nodes <= most and self.nodes * self.mdp.num_actions <= MOST_ENTRIES
 
@@ -243,7 +247,7 @@ class PolicyIteration:
 
     def _improve_exactly(self, x: np.ndarray) -> None:
         policy = self._greedy(x)
-        for _ in range(MOST_IMPROVEMENTS):
+        for _ in range(MOST_ATTEMPT_IMPROVEMENTS):
             self.tick()
             before = x.copy()
             self._evaluate(x, policy)
@@ -322,17 +326,17 @@ class PolicyIteration:
             linear_algebra.subtract_from(y, image)
             return image
 
-        step, _, applications = bicgstab(times, right, FORCING, STEPS)
+        step, _, applications = bicgstab(times, right, FORCING, MOST_OPERATOR_STEPS)
         x[:-1] += step.reshape(x[:-1].shape)
         return applications + 2.0
 
     def _greedy(self, x: np.ndarray) -> PolicyTable:
-        """The policy of the best (or worst) actions by x; where a policy is given, that one."""
+        """The policy of the best (or worst) actions by x; if a policy is given, that one."""
         if isinstance(self.select, PolicyTable):
             return self.select
         mdp, actions = self.mdp, np.empty(self.mdp.num_states, np.int64)
-        for start in range(0, mdp.num_states, BLOCK):
-            states = slice(start, min(start + BLOCK, mdp.num_states))
+        for start in range(0, mdp.num_states, GREEDY_BLOCK):
+            states = slice(start, min(start + GREEDY_BLOCK, mdp.num_states))
             q = mdp.reward_table.rows(states) + mdp.gamma * mdp.acting(mdp.dynamics.expected(x, states), states)
             sets = None if mdp.available is None else mdp.available[states]
             actions[states] = available_choices(self.select.policy(q).table, sets)
@@ -355,13 +359,13 @@ def chain(mdp: TabularMDP, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def chain_values(gamma: float, successor: np.ndarray, reward: np.ndarray) -> tuple[np.ndarray, int]:
-    """((S,) values on a functional graph, in O(S); where gamma is 1 a state on a cycle of infinite value, else -1)."""
+    """((S,) values on a functional graph, in O(S); if gamma is 1 a state on a cycle of infinite value, else -1)."""
     v = np.empty(len(successor))
-    return v, int(bellman.chain_values(successor, reward, gamma, v, np.empty(len(successor), np.int64)))
+    return v, int(bellman.solve_chain(successor, reward, gamma, v, np.empty(len(successor), np.int64)))
 
 
 def linear_values(mdp: TabularMDP, policy: PolicyTable, guess: np.ndarray) -> np.ndarray:
-    """(S, W): the values of a policy, as the solution of (1 - gamma P) x = r; NaN where it is not found."""
+    """(S, W): the values of a policy, as the solution of (1 - gamma P) x = r; NaN if it is not found."""
     from scipy import sparse
 
     states, actions, width = mdp.num_states, mdp.num_actions, mdp.width

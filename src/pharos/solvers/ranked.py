@@ -47,8 +47,8 @@ from pharos.system.workers import usable_workers
 # Values so far --------------------------------------------------------------------------------------------------------
 
 
-SECONDS = 60.0
-_SHARE = 20  # of the time of solving, at most one part in so many is spent on writing
+WRITE_SECONDS = 60.0
+_WRITING_SHARE = 20  # of the time of solving, at most one part in so many is spent on writing
 _HEADER = 5  # float64: sweeps, two numbers, rows, columns
 _DIGEST = 32  # characters of a digest; two follow, of the header and of the values
 
@@ -63,7 +63,7 @@ class SolverCheckpoint:
         numbers: those that `keep` was given beside the values.
     """
 
-    def __init__(self, folder: Path | None, question: str, seconds: float = SECONDS):
+    def __init__(self, folder: Path | None, question: str, seconds: float = WRITE_SECONDS):
         """
         folder: None to keep nothing. question: the setting of the solve, but for the MDP and the selection of actions.
         """
@@ -73,7 +73,7 @@ class SolverCheckpoint:
         self.numbers = (0.0, 0.0)
 
     def start(self, backup: "RankedBackup") -> int:
-        """Set the values to those of the file, where there is one. Returns the sweeps that they took."""
+        """Set the values to the file's, if there is one. Returns the sweeps that they took."""
         if self._folder is None:
             return 0
         name = storage.digest_of_json([self._question, backup.mdp.num_states, backup.mdp.width, backup.fingerprint()])
@@ -111,7 +111,7 @@ class SolverCheckpoint:
                     stacklevel=2,
                 )
         now = time.monotonic()
-        self._next = now + max(self._seconds, _SHARE * (now - began))
+        self._next = now + max(self._seconds, _WRITING_SHARE * (now - began))
 
     def finish(self, backup: "RankedBackup") -> None:
         """Remove the file, as the question is answered."""
@@ -120,7 +120,7 @@ class SolverCheckpoint:
                 self._path.unlink(missing_ok=True)
 
     def _read(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray | None]:
-        """(header, values) of the file; zeros and None where there is none, or not a whole one."""
+        """(header, values) of the file; zeros and None if there is none, or not a whole one."""
         nothing = np.zeros(_HEADER), None
         assert self._path is not None
         try:
@@ -143,19 +143,19 @@ class SolverCheckpoint:
 # Sweeps of ranks ------------------------------------------------------------------------------------------------------
 
 
-_ROWS = 1 << 20  # of values that a rank sends to the first in one exchange
-_BLOCK = 1 << 16  # states whose fingerprint is taken in one go
+_EXCHANGED_ROWS = 1 << 20  # of values that a rank sends to the first in one exchange
+_FINGERPRINT_BLOCK = 1 << 16  # states whose fingerprint is taken in one go
 _GAP = 64  # states between two runs of those that others read, from which on they are two
-_LOOKS = 8  # how often in a sweep of a large range messages are looked after
-_MIX = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # of splitmix64
+_MESSAGE_CHECKS = 8  # how often in a sweep of a large range messages are looked after
+_SPLITMIX = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # of splitmix64
 
 
 class RankedBackup:
     """One rank's part of the Bellman backup T of an MDP under a selection of actions.
 
     Attributes:
-        part: the states of this rank. backup: T on them; its factor and its rounding are those of the whole MDP.
-        x: (n + H + 1, W) values, see mdp/reachability.py. previous: those before the last sweep of a horizon.
+        part: the states of this rank. backup: T on them; its factor and its rounding belong to the whole MDP.
+        x: (n + H + 1, W) values, see mdp/reachability.py. previous: the values before the last sweep of a horizon.
         first: (R, 2) runs of its states that sweeps of a horizon begin with: those that others read, short gaps filled.
     """
 
@@ -171,7 +171,7 @@ class RankedBackup:
         vars(backup).update(zip(names, numbers.tolist(), strict=True))
         self._halo = Halo(rank, self.part.halo, self.cuts)
         self.first = runs_of(self._halo.is_boundary(len(self.part)), _GAP)
-        pieces = min(_LOOKS, 1 + (len(self.part) >> 16)) if rank.needs_progress else 1
+        pieces = min(_MESSAGE_CHECKS, 1 + (len(self.part) >> 16)) if rank.needs_progress else 1
         self._rest = shares_of(runs_between(self.first, len(self.part)), pieces)
         self._high = shares_of(np.array([[self._halo.low, len(self.part)]]), pieces)[::-1]
         self.x = self.part.zeros()
@@ -221,14 +221,14 @@ class RankedBackup:
         is_first = self.rank.rank == 0
         whole = np.zeros((self.mdp.num_states + 1 if is_first else 0, x.shape[1]))
         own = x[: len(self.part)]
-        for first in range(0, int(np.diff(self.cuts).max()), _ROWS):
-            for start, rows in zip(self.cuts, self.rank.gather(own[first : first + _ROWS]), strict=False):
+        for first in range(0, int(np.diff(self.cuts).max()), _EXCHANGED_ROWS):
+            for start, rows in zip(self.cuts, self.rank.gather(own[first : first + _EXCHANGED_ROWS]), strict=False):
                 if is_first:
                     whole[start + first : start + first + len(rows)] = rows
         return whole if is_first else None
 
     def scatter(self, whole: np.ndarray | None) -> None:
-        """Set the values of all ranks, halos included, to those of the first rank, (S + 1, W)."""
+        """Set the values of all ranks, halos included, to the values of the first rank, (S + 1, W)."""
         self.rank.scatter_rows(whole, self.cuts, self.x)
         self._halo.receive(self.x)
         self._halo.send(self.x)
@@ -239,33 +239,33 @@ class RankedBackup:
         part, equation = self.part, self.backup.equation
         x = self.part.zeros()
         numbers = np.concatenate([np.arange(part.start, part.stop), part.halo])
-        x[:-1] = (_mixed(numbers)[:, None] >> np.uint64(12)) * 2.0**-52
+        x[:-1] = (_mixed_numbers(numbers)[:, None] >> np.uint64(12)) * 2.0**-52
         total = 0
-        for start in range(0, len(part), _BLOCK):
-            states = slice(start, min(start + _BLOCK, len(part)))
+        for start in range(0, len(part), _FINGERPRINT_BLOCK):
+            states = slice(start, min(start + _FINGERPRINT_BLOCK, len(part)))
             q = equation.rewards.rows(states) + equation.gamma * part.dynamics.expected(x, states)
             for kind, values in enumerate((q, equation.value(q, states))):
                 bits = np.ascontiguousarray(values).view(np.uint64).reshape(len(values), -1)
-                place = (part.start + np.arange(states.start, states.stop, dtype=np.uint64)[:, None]) * np.uint64(
+                position = (part.start + np.arange(states.start, states.stop, dtype=np.uint64)[:, None]) * np.uint64(
                     2 * bits.shape[1]
                 )
-                place = place + np.uint64(2) * np.arange(bits.shape[1], dtype=np.uint64) + np.uint64(kind)
-                total += int(np.add.reduce(_mixed(bits ^ _mixed(place)), axis=None, dtype=np.uint64))
+                position = position + np.uint64(2) * np.arange(bits.shape[1], dtype=np.uint64) + np.uint64(kind)
+                total += int(np.add.reduce(_mixed_numbers(bits ^ _mixed_numbers(position)), axis=None, dtype=np.uint64))
         totals = self.rank.allgather(np.array([total % 2**64], np.uint64))
         return f"{sum(int(each[0]) for each in totals) % 2**64:016x}"
 
 
 def _larger(one: float, other: float) -> float:
-    """The larger of two numbers; NaN where one is NaN."""
+    """The larger of two numbers; NaN if one is NaN."""
     return float(np.maximum(one, other))
 
 
-def _mixed(numbers: np.ndarray) -> np.ndarray:
+def _mixed_numbers(numbers: np.ndarray) -> np.ndarray:
     """Whole numbers as uint64, mixed by splitmix64."""
     with np.errstate(over="ignore"):
-        z = numbers.astype(np.uint64) + np.uint64(_MIX[0])
-        z = (z ^ (z >> np.uint64(30))) * np.uint64(_MIX[1])
-        z = (z ^ (z >> np.uint64(27))) * np.uint64(_MIX[2])
+        z = numbers.astype(np.uint64) + np.uint64(_SPLITMIX[0])
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(_SPLITMIX[1])
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(_SPLITMIX[2])
     return z ^ (z >> np.uint64(31))
 
 
@@ -334,7 +334,7 @@ def shared_solution(
     mdp: TabularMDP,
     select: Selection,
     solving: Solving,
-    checkpoint_seconds: float = SECONDS,
+    checkpoint_seconds: float = WRITE_SECONDS,
 ) -> Solution:
     """Solution of an MDP under a selection of actions, by several processes; under MPI the others get None.
 

@@ -1,6 +1,6 @@
-"""Total and average rewards in rational numbers, where floats are too short to tell or to hold a value.
+"""Total and average rewards in rational numbers, if floats are too short to tell or to hold a value.
 
-The numbers are those of the floats, rows divided by their exact sums. Policy iteration keeps an action unless another
+The numbers are the floats, rows divided by their exact sums. Policy iteration keeps an action unless another
 one is better, and begins with a policy that ends almost surely. So a policy that does not, later on, stays in a
 component in which no residual is negative and one is positive: the value is infinite. There is no other way to fail.
 """
@@ -34,14 +34,14 @@ def rational_values(
     count, entries_left = choices.num_nodes, MOST_ENTRIES
     written = fractions_of(choices)
     if written is None:
-        raise _too_many(count)
+        raise _too_many_nodes(count)
     rows = [_divided(*row) for row in written]
     policy, improvements = policy.copy(), 0
     while True:
         v, entries = eliminated([rows[i] for i in policy], count, entries_left)
         entries_left -= entries
         if entries_left < 0:
-            raise _too_many(count)
+            raise _too_many_nodes(count)
         if v is None:
             raise infinite(choices, policy[_stuck(choices, policy)])
         v.append(Fraction(0))
@@ -59,14 +59,14 @@ def rational_values(
 
 
 def fractions_of(choices: "Choices") -> list[Row] | None:
-    """The rows as rational numbers, those of floats; None if they are too many."""
+    """The rows as rational numbers, equal to the floats; None if they are too many."""
     matrix = choices.matrix
     if matrix.nnz > MOST_ENTRIES:
         return None
     rows = []
     for i in range(matrix.shape[0]):
-        places = range(matrix.indptr[i], matrix.indptr[i + 1])
-        row = {int(matrix.indices[k]): Fraction(float(matrix.data[k])) for k in places}
+        entries = range(matrix.indptr[i], matrix.indptr[i + 1])
+        row = {int(matrix.indices[k]): Fraction(float(matrix.data[k])) for k in entries}
         rows.append((Fraction(float(choices.rewards[i])), row))
     return rows
 
@@ -113,7 +113,7 @@ def best_mean(
     return gain, better
 
 
-def _too_many(count: int) -> PrecisionError:
+def _too_many_nodes(count: int) -> PrecisionError:
     return PrecisionError(
         f"64-bit floats cannot tell the total reward of {count} nodes within the tolerance, or whether it is finite, "
         "and they are too many for rational numbers; raise the tolerance, lower gamma, or give a horizon"
@@ -123,7 +123,7 @@ def _too_many(count: int) -> PrecisionError:
 def eliminated(rows: list[Row], count: int, most: int) -> tuple[list[Fraction] | None, int]:
     """(x = r + P x by elimination without subtraction of probabilities; entries that it filled in).
 
-    x is None where some nodes never end, and where it would fill in more entries than `most`.
+    x is None if some nodes never end, or if it would fill in more entries than `most`.
     Source: Grassmann, Taksar and Heyman (1985).
     """
     rewards = [row[0] for row in rows]

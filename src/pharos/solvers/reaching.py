@@ -1,7 +1,7 @@
 """Probabilities of reaching a target, and the cost of getting there, of the best and of the worst policy.
 
-A probability is a total reward: a step pays the probability that it enters the target, where play ends. A cost *that
-must arrive* counts policies that reach the target surely; where none does, the least one is infinite, and where one may
+A probability is a total reward: a step pays the probability that it enters the target, at which play ends. A cost *that
+must arrive* counts policies that reach the target surely; if none does, the least one is infinite, and if one may
 miss it, the largest one is. `goals.py` solves all four.
 """
 
@@ -58,7 +58,7 @@ class Bounds(StateBounds):
     Attributes:
         lower, upper: (S,) float64, proven; both infinite if the number is.
         policy: (S,) actions that attain it, or (S, A + 1) under sticky actions, by the previous action; meaningless
-            where the number is infinite.
+            if the number is infinite.
     """
 
     policy: np.ndarray
@@ -74,7 +74,7 @@ class Reachability:
         costs: (S, A) >= 0 of executed actions; None: the rewards, as they are or negated.
         tolerance: the largest error of a number.
 
-    Under sticky actions the numbers of a state are those of an episode that starts there, without a previous action.
+    Under sticky actions the numbers of a state belong to an episode that starts in it, without a previous action.
     """
 
     mdp: TabularMDP
@@ -95,7 +95,7 @@ class Reachability:
 
     @cached_property
     def least_cost(self) -> Bounds:
-        """The least expected cost of reaching the target, over policies that surely do; infinite where none does.
+        """The least expected cost of reaching the target, over policies that surely do; infinite if none does.
 
         Raises:
             ParameterError: costs are needed, as rewards have both signs.
@@ -108,7 +108,7 @@ class Reachability:
 
     @cached_property
     def largest_cost(self) -> Bounds:
-        """The largest expected cost of reaching the target, over all policies; infinite where one may miss it.
+        """The largest expected cost of reaching the target, over all policies; infinite if one may miss it.
 
         Raises:
             ParameterError: costs are needed, as rewards have both signs.
@@ -226,7 +226,7 @@ def reach(
     Returns:
         A `Reachability` with `maximum`, `minimum`, `least_cost` and `largest_cost`, each with (S,) arrays `lower` and
         `upper`. Costs are those *that must arrive*, as `Rmin=? [F target]` and `Rmax=? [F target]` of PRISM and Storm:
-        infinite where they cannot, or need not.
+        infinite if they cannot, or need not.
     Raises:
         ParameterError: the target is no states and no expression, or costs are negative. UnknownName: it names a label
             or a variable that is not there.
@@ -235,7 +235,7 @@ def reach(
     Source: Baier and Katoen (2008), chapter 10; Haddad and Monmege (2018).
     """
     with_end = isinstance(target, str) and target == TERMINAL
-    mask = _mask(mdp, target)
+    mask = _target_mask(mdp, target)
     if costs is not None:
         costs = np.asarray(costs, np.float64)
         if costs.shape != mdp.rewards.shape or not (np.isfinite(costs) & (costs >= 0)).all():
@@ -244,7 +244,7 @@ def reach(
     return Reachability(replace(mdp, gamma=1.0, horizon=None), mask, with_end, costs, tolerance)
 
 
-def _mask(mdp: TabularMDP, target: ArrayLike | str) -> np.ndarray:
+def _target_mask(mdp: TabularMDP, target: ArrayLike | str) -> np.ndarray:
     if isinstance(target, str):
         if target == TERMINAL:
             return np.array(mdp.terminal)

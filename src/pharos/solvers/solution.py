@@ -9,7 +9,7 @@ import numpy as np
 from pharos.mdp import Selection, TabularMDP, available_choices
 
 # States whose greedy actions are worked out in one go.
-_BLOCK = 1 << 20
+_GREEDY_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,17 +19,17 @@ class Solution:
     Attributes:
         mdp: what was solved.
         error_bound: every entry of `v` and `q` is within this of the true value (proven; in units of return). If the
-            probabilities of the MDP were rounded, also of those of each MDP within its `residual`; that part may exceed
-            the tolerance.
+            probabilities of the MDP were rounded, also of the true value of each MDP within its `residual`; that part
+            may exceed the tolerance.
         sweeps, seconds: cost of the solve; compiling is not among the seconds.
         horizon: number of steps to go of the values; or None.
-        select: which action is chosen: the best one, the worst one, or that of a policy.
-        x: (S + 1, W) float64, or float32 where it was asked for: values of (state, previously executed action), W = A
+        select: which action is chosen: the best one, the worst one, or the action of a policy.
+        x: (S + 1, W) float64, or float32 if it was asked for: values of (state, previously executed action), W = A
             under sticky actions, else 1; row S, the end, is 0.
         next_x: the values of next states: x, or with a horizon those with one step less to go.
         proper: of total rewards, the policy: (S,) actions, or (S, A + 1) if it must look at the previous action; greedy
             ones may go round in a circle, as every state of it has the same value.
-        all_steps: with a horizon, where they were kept: (T + 1, S), or (T + 1, S, A), row t with t steps to go.
+        all_steps: with a horizon, if they were kept: (T + 1, S), or (T + 1, S, A), row t with t steps to go.
 
     Under sticky actions values belong to pairs: `v` is (S, A), the value of (state, previously executed action), and
     `q` is (S, A), the value of executing an action. Otherwise `v` is (S,), and `q` (S, A) is the value of choosing an
@@ -87,8 +87,8 @@ class Solution:
     def policy(self) -> np.ndarray:
         """The policy: for "optimal" and "worst" (S,) greedy actions, the first among equals; else the one given.
 
-        Of total rewards (gamma 1, no horizon) it ends almost surely, unless it stays where nothing is paid; under
-        sticky actions that may take (S, A + 1) actions, by the previous action.
+        Of total rewards (gamma 1, no horizon) it ends almost surely, unless it stays in a component in which nothing is
+        paid; under sticky actions that may take (S, A + 1) actions, by the previous action.
         """
         if self.proper is not None:
             return self.proper
@@ -96,8 +96,8 @@ class Solution:
         if policy_table is not None:
             return policy_table
         actions = np.empty(self.mdp.num_states, np.int64)
-        for start in range(0, self.mdp.num_states, _BLOCK):
-            block = slice(start, min(start + _BLOCK, self.mdp.num_states))
+        for start in range(0, self.mdp.num_states, _GREEDY_BLOCK):
+            block = slice(start, min(start + _GREEDY_BLOCK, self.mdp.num_states))
             greedy = self.select.policy(self.q_of(block)).table
             sets = None if self.mdp.available is None else self.mdp.available[block]
             actions[block] = available_choices(greedy, sets)

@@ -1,6 +1,6 @@
 """Optimal values, worst values and values of uniform play.
 
-Values of a given policy: on its functional graph where everything is deterministic, else by iteration.
+Values of a given policy: on its functional graph if everything is deterministic, else by iteration.
 """
 
 import contextlib
@@ -24,9 +24,9 @@ from pharos.mdp import (
     require_mdp,
     uniform_choice,
 )
-from pharos.solvers.convergence import imprecise
+from pharos.solvers.convergence import precision_error
 from pharos.solvers.fixed_point import (
-    MARGIN,
+    ROUNDING_MARGIN,
     Backup,
     backward_induction,
     chain_bound,
@@ -42,7 +42,7 @@ from pharos.system.memory import kept_array
 from pharos.system.records import takes
 
 # Rows of values in a file that are read in one go.
-_ROWS = 1 << 22
+_FILE_ROWS = 1 << 22
 # Between two copies of values to their file.
 _SECONDS = 600.0
 
@@ -82,10 +82,10 @@ def value_iteration(mdp: TabularMDP, tolerance: float | Solving = 1e-6, **option
         ParameterError: options that do not go together, see `Solving`; or several processes, and gamma = 1 without a
             horizon. RankFailed: another rank failed.
     Cost: O(S A) a sweep, 0.5 to 2 ns for each state and action on game graphs; memory 8 bytes a state (8 A under sticky
-        actions). Where gamma is so near 1 that sweeps would be many: strongly connected components one after another
-        where none has half of the states (48 bytes a state); policy iteration, on the graph of the policy where nothing
+        actions). If gamma is so near 1 that sweeps would be many: strongly connected components one after another
+        if none has half of the states (48 bytes a state); policy iteration, on the graph of the policy if nothing
         is left to chance (56 bytes a state then); by a Krylov method whose operator is a sweep else (10 vectors
-        of values); and by elimination where that fails and nodes (states, under sticky actions pairs with the previous
+        of values); and by elimination if that fails and nodes (states, under sticky actions pairs with the previous
         action) times actions are up to 2 million (up to 500 MB then), or nodes are up to 3000.
     Source: Bellman (1957); in place: Puterman (1994), section 6.3.3; the sticky equation: the pharos paper, appendix A.
     """
@@ -104,7 +104,7 @@ def worst_value(mdp: TabularMDP, tolerance: float | Solving = 1e-6, **options: U
 def uniform_value(mdp: TabularMDP, tolerance: float | Solving = 1e-6, **options: Unpack[SolvingOptions]) -> Solution:
     """The values of the uniformly random policy: every action is replaced by a uniform one, so nothing is chosen.
 
-    The options are those of `value_iteration`.
+    The options are the same as for `value_iteration`.
     """
     return _solution(random_actions(mdp, 1.0), BEST, Solving.of(mdp, tolerance, options))
 
@@ -145,9 +145,9 @@ def _until_the_end(mdp: TabularMDP, select: Selection, solving: Solving, watch: 
     x[:-1] = goals.v.reshape(mdp.num_states, mdp.width)
     largest = float(np.abs(goals.v).max(initial=0.0))
     rounding = 0.0 if goals.is_exact and not backup.is_single else backup.rounding(largest)
-    bound = (float(goals.error.max(initial=0.0)) + rounding) * MARGIN
+    bound = (float(goals.error.max(initial=0.0)) + rounding) * ROUNDING_MARGIN
     if not bound <= solving.tolerance and not any(mdp.residual):
-        raise imprecise(mdp, bound, solving.tolerance, backup.is_single)
+        raise precision_error(mdp, bound, solving.tolerance, backup.is_single)
     if solving.values is not None:
         mapped = _kept_values(solving.values, x.shape, solving.dtype)
         mapped[:] = x
@@ -167,8 +167,8 @@ def _kept_values(path: str | os.PathLike, shape: tuple[int, int], dtype: DTypeLi
         the file cannot be made.
     """
     x = kept_array(path, shape, dtype)
-    for start in range(0, len(x), _ROWS):
-        block = x[start : start + _ROWS]
+    for start in range(0, len(x), _FILE_ROWS):
+        block = x[start : start + _FILE_ROWS]
         if not np.isfinite(block).all():
             block[~np.isfinite(block)] = 0.0
     x[-1] = 0.0
@@ -182,9 +182,9 @@ def _in_memory(
     """(values to sweep, progress callback of the sweeps).
 
     Large values that memory has room for are swept there, as pages of a file that change are written again and again,
-    and copied to their file every ten minutes, where that costs little, and in the end, whatever ends it.
+    and copied to their file every ten minutes, if that costs little, and in the end, whatever ends it.
     """
-    if mapped is None or mapped.nbytes <= memory.SMALL or not memory.fits(mapped.nbytes, memory.SHARE_OF_VALUES):
+    if mapped is None or mapped.nbytes <= memory.SMALL_BYTES or not memory.fits(mapped.nbytes, memory.SHARE_OF_VALUES):
         yield mapped, progress
         return
     x, due = np.array(mapped), time.monotonic() + _SECONDS
@@ -231,7 +231,7 @@ def evaluate_policy(
         in O(S), exactly up to rounding, whatever the tolerance.
     Raises:
         ParameterError: the policy has the wrong shape, or its rows are not probabilities.
-        DivergenceError: gamma is 1, there is no horizon, and the policy goes on for ever where something is paid.
+        DivergenceError: gamma is 1, there is no horizon, and the policy goes on for ever while something is paid.
         PrecisionError: 64-bit floats cannot reach the tolerance, or hold the values.
     Source: Puterman (1994), section 6.1.
     """
@@ -281,12 +281,12 @@ def evaluate_parts(
     starts = mdp.start_states[np.argsort(part[mdp.start_states], kind="stable")].reshape(len(begins), -1)
     solution = Solution(mdp, 0.0, 0, 0.0, mdp.horizon, select, x, before)
     values = [solution.value_from(states, start_probabilities) for states in starts]
-    return list(zip(values, (bounds * MARGIN).tolist(), strict=True))
+    return list(zip(values, (bounds * ROUNDING_MARGIN).tolist(), strict=True))
 
 
 @require_mdp
 def uniform_policy(mdp: TabularMDP) -> np.ndarray:
-    """(S, A) probabilities, all 1 / A; where some actions are not available, 1 over the number of those that are."""
+    """(S, A) probabilities, all 1 / A; if some actions are not available, 1 over the number of available ones."""
     return uniform_choice(mdp)
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceLocked, StateSpaceMismatch
-from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, Plan, lock, read_manifest
+from pharos.state_space.manifest import ARRAYS, MANIFEST, PART_NAMES, Plan, lock_build, read_manifest
 from pharos.state_space.progress import BuildCallback, reporter
 from pharos.state_space.store import StateSpace, load
 from pharos.state_space.stored import SHARDS, check_files
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from pharos.ranks import Rank
     from pharos.state_space.search import Options
 
-OUR_FILES = (*ARRAYS, *PARTS.values(), SHARDS, MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
-CHECKPOINT_SECONDS = 15.0
+OUR_FILES = (*ARRAYS, *PART_NAMES.values(), SHARDS, MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
+BUILD_CHECKPOINT_SECONDS = 15.0
 Hold = Callable[[Path], contextlib.AbstractContextManager[object]]  # of a folder, for one builder
 
 
@@ -41,14 +41,14 @@ def build(
     workers: int | None = None,
     processes: int | str = 1,
     progress: BuildCallback | bool | None = None,
-    checkpoint_seconds: float = CHECKPOINT_SECONDS,
+    checkpoint_seconds: float = BUILD_CHECKPOINT_SECONDS,
     wait: bool | None = None,
 ) -> StateSpace:
     """Enumerate the states of `env` that can be reached from its start states, and their transitions.
 
     Args:
         env: the environment, or its name, such as "frozen_lake/4x4".
-        folder: where to write; None for the user's cache, keyed by environment, parameters and rules. A folder that
+        folder: to write to; None for the user's cache, keyed by environment, parameters and rules. A folder that
             holds the finished state space is loaded; one that holds part of it is resumed, with the same result.
         max_states: StateSpaceTooLarge when there are more.
 
@@ -56,13 +56,13 @@ def build(
         memory: bytes that states and table may take; None for as much as there is. Beyond them the table is on disk, in
             a file without a name in `folder` of 23 to 46 bytes a state (11 to 23 more for each further word), which is
             gone in the end.
-        workers: threads, or processes where rules are interpreted; None for all processors.
+        workers: threads, or processes if rules are interpreted; None for all processors.
         processes: 1; or "mpi": those that `mpiexec` has started, all of which make this call with a folder that all of
-            them see, and share the work and the table of states, which has to fit in memory then (`memory` is that of
+            them see, and share the work and the table of states, which has to fit in memory then (`memory` is for
             each).
         progress: None for a bar on a terminal; False for silence; or a function that gets a BuildProgress now and then.
         checkpoint_seconds: at most this much work is lost when the process is killed.
-        wait: where another process is building in the folder, wait for it, with a warning; None: in the user's cache,
+        wait: if another process is building in the folder, wait for it, with a warning; None: in the user's cache,
             which nobody has named.
     Returns:
         The StateSpace, whose files are in `folder`.
@@ -94,7 +94,7 @@ def build(
     path = Path(folder) if folder is not None else folder_of(plan)
     options = Options(max_states, memory, workers, checkpoint_seconds)
     with rank_of_build(plan, memory) if processes == "mpi" else contextlib.nullcontext() as rank:
-        hold = _waiting if (folder is None if wait is None else wait) else lock
+        hold = _waiting if (folder is None if wait is None else wait) else lock_build
         was_there = (rank is None or rank.rank == 0) and _build(plan, path, rank, options, progress, hold)
     return load(path, verify=was_there, environment=env)
 
@@ -110,11 +110,11 @@ def _build(
     """Complete the state space in the folder; returns whether it was complete before."""
     from pharos.state_space.journal import remove_parts
     from pharos.state_space.ranked_table import RankedSearch
-    from pharos.state_space.search import Search, check_size, journal_of
+    from pharos.state_space.search import Search, check_max_states, journal_of
 
     manifest = _manifest_of(plan, path)
     if manifest is not None and manifest["complete"]:
-        check_size(plan.env, manifest["num_states"], 0, options.max_states)
+        check_max_states(plan.env, manifest["num_states"], 0, options.max_states)
         if plan.env.has_chance:
             remove_parts(path)
         return True
@@ -152,7 +152,7 @@ def folder_of(plan: Plan) -> Path:
 
 
 def _manifest_of(plan: Plan, path: Path) -> dict[str, Any] | None:
-    """The manifest of a folder for this state space; None where there is none yet."""
+    """The manifest of a folder for this state space; None if there is none yet."""
     manifest = read_manifest(path)
     if manifest is None:
         if path.is_dir() and any(not _is_ours(item.name) for item in path.iterdir()):

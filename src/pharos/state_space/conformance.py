@@ -24,7 +24,7 @@ import numpy as np
 from pharos.drawing import ground_of, shape_of
 from pharos.environments import Environment, Layer, State, classes, start_distribution
 from pharos.errors import ParameterError, RuleError, UnknownName
-from pharos.rules import mentioned_names, mutable_attributes, pack, unpack
+from pharos.rules import mentioned_names, mutable_attributes, pack_states, unpack_states
 from pharos.state_space.guarded_rules import SUM_TOLERANCE, InterpretedCheck
 
 if TYPE_CHECKING:
@@ -65,8 +65,8 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
     Rules, on the states nearest to the start and on states far from it: values are integers in their declared ranges,
     the same question has the same answer, nothing but `out` and the planes is written to, rewards are finite, drawings
     stay inside their planes, the probabilities of the outcomes of an action sum to 1, ages increase, and compiled rules
-    agree with interpreted ones. Where all states fit into `max_states`,
-    the state space is built, too, and compared: the same states in the same order, terminal states absorbing.
+    agree with interpreted ones. If all states fit into `max_states`, the state space is built, too, and compared: the
+    same states in the same order, terminal states absorbing.
 
     Args:
         max_states: how many states are looked at; half of them nearest to the start, half by depth-first search.
@@ -89,7 +89,7 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
     states, complete = _some_states(env, check, max_states, seed)
     if not check.transitions:
         notes.append("every start state is terminal: episodes end before they begin")
-    _check_again(check, states, seed)
+    _check_no_memory(check, states, seed)
     if env.layers:
         for state in states:
             check.drawing(state)
@@ -120,7 +120,7 @@ def _some_states(env: Environment, check: InterpretedCheck, max_states: int, see
     """(expanded states in the order of discovery, whether these are all reachable ones)."""
     starts, _ = start_distribution(env)
     states = dict.fromkeys(starts)
-    # breadth-first: the states nearest to the start, all of them where they are few
+    # breadth-first: the states nearest to the start, all of them if they are few
     queue = deque(starts)
     while queue and len(states) <= max_states:
         for successor in check.expand(queue.popleft()):
@@ -161,7 +161,7 @@ def _has_choice(check: InterpretedCheck, states: list[State], gamma: float = 0.9
     return bool((np.ptp(q.reshape(-1, num_actions), axis=1) > 1e-9 * np.abs(q).max()).any())
 
 
-def _check_again(check: InterpretedCheck, states: list[State], seed: int) -> None:
+def _check_no_memory(check: InterpretedCheck, states: list[State], seed: int) -> None:
     """Call the rules again in some states, in random order: they must have no memory."""
     for state in random.Random(seed).sample(states, min(len(states), 200)):
         check.repeat(state)
@@ -222,7 +222,7 @@ def _names_in(value: object) -> tuple[str, ...]:
 
 
 def _check_compiled(env: Environment, check: InterpretedCheck, states: list[State], notes: list[str]) -> bool:
-    """Compare compiled rules with interpreted ones on `states`; False, and a note, where Numba cannot compile them."""
+    """Compare compiled rules with interpreted ones on `states`; False, and a note, if Numba cannot compile them."""
     from pharos.rules import CompiledExpansion, not_compiled, rules_of
 
     rules = rules_of(env)
@@ -231,7 +231,7 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
         notes.append(not_compiled(reason))
         return False
     num_states, branches = len(states), env.num_actions * env.outcomes
-    packed = pack(layout, np.array(states, np.int64))
+    packed = pack_states(layout, np.array(states, np.int64))
     keys = np.zeros((num_states * branches, layout.num_words), np.uint64)
     terminal = np.zeros(num_states, np.uint8)
     probabilities = np.ones((num_states, branches))
@@ -256,7 +256,7 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
                 f"{check.terminal[states[i]]} interpreted; expected the same"
             )
     # probability and next state of each branch
-    next_states = unpack(layout, keys)
+    next_states = unpack_states(layout, keys)
     for j in range(len(keys)):
         i, branch = divmod(j, branches)
         if not terminal[i]:
@@ -273,7 +273,7 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
 def _check_compiled_branch(
     check: InterpretedCheck, branch: tuple[State, int, int], probability: float, successor: State
 ) -> None:
-    """Raise a RuleError where an outcome of an action in a state differs between compiled and interpreted rules."""
+    """Raise a RuleError if an outcome of an action in a state differs between compiled and interpreted rules."""
     if probability != check.probabilities.get(branch, 0.0):
         raise RuleError(
             f"{check.where('probability', *branch)} is {probability} compiled, "
@@ -287,7 +287,7 @@ def _check_compiled_branch(
 
 
 def _check_compiled_sets(check: InterpretedCheck, rules: "Rules", states: list[State]) -> None:
-    """Raise a RuleError where the actions that are available in a state differ."""
+    """Raise a RuleError if the actions that are available in a state differ."""
     sets = np.empty((len(states), check.env.num_actions), np.bool_)
     rules.stepping.mark_available(np.array(states, np.int64), sets)
     for state, compiled in zip(states, sets.tolist(), strict=True):
@@ -299,7 +299,7 @@ def _check_compiled_sets(check: InterpretedCheck, rules: "Rules", states: list[S
 
 
 def _check_compiled_rewards(check: InterpretedCheck, rules: "Rules", states: list[State], every: np.ndarray) -> None:
-    """Raise a RuleError where a reward differs between compiled and interpreted rules.
+    """Raise a RuleError if a reward differs between compiled and interpreted rules.
 
     Args:
         every: the states, packed, and then the successors of each one by all branches.
@@ -328,7 +328,7 @@ def _check_compiled_rewards(check: InterpretedCheck, rules: "Rules", states: lis
 
 
 def _check_compiled_drawings(check: InterpretedCheck, states: list[State], notes: list[str]) -> None:
-    """Raise a RuleError where a drawing differs between compiled and interpreted rules."""
+    """Raise a RuleError if a drawing differs between compiled and interpreted rules."""
     from pharos.rules import CompiledDrawing, CompiledMotion, reason_of
 
     planes = np.zeros((len(states), *check.drawings[states[0]].shape), np.uint8)
@@ -380,11 +380,12 @@ def _check_built(env: Environment, check: InterpretedCheck, states: list[State])
                     target[index[check.transitions[branch]]] += check.probabilities[branch]
             if bool(terminal[i]) != ends or (abs(row - target) > SUM_TOLERANCE).any():
                 raise RuleError(
-                    f"{check.where('transition', state, a)}: built, it leads to {_text(row)}; expected {_text(target)}"
+                    f"{check.where('transition', state, a)}: built, it leads to {_row_text(row)}; "
+                    f"expected {_row_text(target)}"
                 )
 
 
-def _text(row: np.ndarray) -> str:
+def _row_text(row: np.ndarray) -> str:
     """Text of a distribution over states."""
     return ", ".join(f"state {i} ({row[i]:.6g})" for i in np.flatnonzero(row))
 
@@ -396,16 +397,16 @@ SPRITE_LETTERS = set(".#123456789")
 
 
 def check_declarations(env: Environment) -> None:
-    """Raise a RuleError where an attribute, the parameters, the variables or the start states break the contract."""
+    """Raise a RuleError if an attribute, the parameters, the variables or the start states break the contract."""
     cls = type(env)
-    whose = cls.__name__
+    source = cls.__name__
     # attributes of the class
     parameters = getattr(cls, "__dataclass_params__", None)
     if parameters is None or not parameters.frozen or "__dataclass_params__" not in vars(cls):
-        raise RuleError(f"{whose} is no frozen dataclass; decorate it with @dataclass(frozen=True, kw_only=True)")
+        raise RuleError(f"{source} is no frozen dataclass; decorate it with @dataclass(frozen=True, kw_only=True)")
     name = getattr(env, "name", None)
     if not isinstance(name, str) or not name:
-        raise RuleError(f"{whose}.name is {name!r}; expected the name that users type, a text")
+        raise RuleError(f"{source}.name is {name!r}; expected the name that users type, a text")
     actions = getattr(env, "actions", None)
     if (
         not isinstance(actions, tuple)
@@ -413,7 +414,7 @@ def check_declarations(env: Environment) -> None:
         or not all(isinstance(action, str) and action for action in actions)
         or len(set(actions)) < len(actions)
     ):
-        raise RuleError(f"{whose}.actions is {actions!r}; expected a tuple of different names, at least one")
+        raise RuleError(f"{source}.actions is {actions!r}; expected a tuple of different names, at least one")
     for attribute in ("version", "max_episode_steps"):
         value = getattr(env, attribute)
         if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
@@ -444,7 +445,7 @@ def check_declarations(env: Environment) -> None:
     except ParameterError as error:
         raise RuleError(str(error)) from error
     except Exception as error:  # of code of the user's own
-        raise RuleError(f"{env}: variables() or initial_state() fails: {_told(error)}") from error
+        raise RuleError(f"{env}: variables() or initial_state() fails: {_message_of(error)}") from error
     if len(env.variables()) != len(components.variables):
         raise RuleError(f"{env}: variables() declares {len(env.variables())} names; expected the same at every call")
     if starts[0] != again_starts[0] or (starts[1] != again_starts[1]).any():
@@ -452,27 +453,27 @@ def check_declarations(env: Environment) -> None:
 
 
 def check_layers(env: Environment, notes: list[str]) -> None:
-    """Raise a RuleError where a layer or the grid breaks the contract; a note where there are no layers."""
-    whose = type(env).__name__
+    """Raise a RuleError if a layer or the grid breaks the contract; a note if there are no layers."""
+    source = type(env).__name__
     if not isinstance(env.layers, dict) or not all(isinstance(name, str) for name in env.layers):
-        raise RuleError(f"{whose}.layers is {env.layers!r}; expected a dict of name -> Layer")
+        raise RuleError(f"{source}.layers is {env.layers!r}; expected a dict of name -> Layer")
     if not env.layers:
         notes.append("it declares no layers: it cannot be drawn, and has no image observations")
         return
     for name, layer in env.layers.items():
-        _check_layer(f"{whose}.layers[{name!r}]", name, layer)
+        _check_layer(f"{source}.layers[{name!r}]", name, layer)
     motion = env.motion_layers
     names = set(motion) if isinstance(motion, dict) else set()
     if bool(names) != env.has_motion or names & set(env.layers):
         raise RuleError(
-            f"{whose}.motion_layers is {motion!r}; expected a dict of name -> Layer, with other names than layers, "
+            f"{source}.motion_layers is {motion!r}; expected a dict of name -> Layer, with other names than layers, "
             f"where the class defines draw_motion, and {{}} elsewhere"
         )
     for name, layer in motion.items():
-        _check_layer(f"{whose}.motion_layers[{name!r}]", name, layer)
-    for place, look in (("look", env.look), ("look.scenery", env.look.scenery)):
+        _check_layer(f"{source}.motion_layers[{name!r}]", name, layer)
+    for attribute, look in (("look", env.look), ("look.scenery", env.look.scenery)):
         if look is not None:
-            with _named(f"{whose}.{place}.ground"):
+            with _named(f"{source}.{attribute}.ground"):
                 ground_of(look.ground)
     try:
         rows, columns = env.grid()
@@ -480,20 +481,20 @@ def check_layers(env: Environment, notes: list[str]) -> None:
     except (TypeError, ValueError, NotImplementedError):
         fits = False
     except Exception as error:  # of code of the user's own
-        raise RuleError(f"{env}: grid() fails: {_told(error)}") from error
+        raise RuleError(f"{env}: grid() fails: {_message_of(error)}") from error
     if not fits:
         raise RuleError(
             f"{env}: it has layers but grid() does not give (rows, columns); expected two integers, at least 1"
         )
 
 
-def _told(error: Exception) -> str:
+def _message_of(error: Exception) -> str:
     """An error of the user's code in a line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def _check_layer(where: str, name: object, layer: object) -> None:
-    """Raise a RuleError where a layer, called `where` in messages, breaks the contract."""
+    """Raise a RuleError if a layer, called `where` in messages, breaks the contract."""
     if not isinstance(name, str) or not isinstance(layer, Layer):
         raise RuleError(f"{where} is {layer!r}; expected a Layer")
     glyphs = layer.glyph if isinstance(layer.glyph, tuple) else (layer.glyph,)
@@ -514,21 +515,21 @@ def _check_layer(where: str, name: object, layer: object) -> None:
 
 
 @contextlib.contextmanager
-def _named(whose: str) -> Iterator[None]:
-    """Context in which an unknown name, such as that of a shape, is a RuleError of `whose`."""
+def _named(source: str) -> Iterator[None]:
+    """Context in which an unknown name, such as the name of a shape, is a RuleError of `source`."""
     try:
         yield
     except UnknownName as error:
-        raise RuleError(f"{whose}: {error}") from None
+        raise RuleError(f"{source}: {error}") from None
 
 
-def _check_sprites(whose: str, sprite: Sequence[Any], num_values: int) -> None:
-    """Raise a RuleError where the sprites of a layer are no pixels, or too few or many for its values."""
+def _check_sprites(source: str, sprite: Sequence[Any], num_values: int) -> None:
+    """Raise a RuleError if the sprites of a layer are no pixels, or too few or many for its values."""
     sprites = sprite if sprite and isinstance(sprite[0], tuple) else (sprite,)
     for rows in sprites:
         if not rows or len(set(map(len, rows))) != 1 or not rows[0] or set("".join(rows)) - SPRITE_LETTERS:
-            raise RuleError(f"{whose} has {rows!r}; expected rows of equal length of the letters . # 1-9")
+            raise RuleError(f"{source} has {rows!r}; expected rows of equal length of the letters . # 1-9")
     if len(sprites) not in (1, num_values):
         raise RuleError(
-            f"{whose} has {len(sprites)} sprites for {num_values} values; expected one for all, or one for each"
+            f"{source} has {len(sprites)} sprites for {num_values} values; expected one for all, or one for each"
         )

@@ -4,9 +4,9 @@ Data first, then the manifest that describes it: whatever kills the process, the
 command goes on from there.
 
 Chance. During the build, possible outcomes are appended one after another, with a code for each state and action. The
-code's vector in the palette has the number of outcomes and their probabilities. Where there are more vectors than
+code's vector in the palette has the number of outcomes and their probabilities. If there are more vectors than
 codes, the probabilities are spelled out, once and for all. `OutcomeParts` makes the files of the finished build from
-these: rows are padded to equal length where little of that would be padding, and codes take one byte where that
+these: rows are padded to equal length if little of that would be padding, and codes take one byte if that
 suffices.
 """
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from pharos.errors import DiskFull
 from pharos.kernels import outcomes as kernels
-from pharos.rules import pack
+from pharos.rules import pack_states
 from pharos.state_space.manifest import (
     ARRAYS,
     CODES,
@@ -33,7 +33,7 @@ from pharos.state_space.manifest import (
     MOST_CODES,
     OFFSETS,
     PALETTE,
-    PARTS,
+    PART_NAMES,
     PROBABILITIES,
     STATES,
     SUCCESSORS,
@@ -49,7 +49,7 @@ from pharos.state_space.stored import check_outcome_rules, check_rules, states_t
 from pharos.state_space.table import BranchBlock
 from pharos.system.arrays import OutcomesOfState, as_stored, dtype_of, from_stored
 
-BLOCK_BYTES = 1 << 22  # of a file that are copied at a time
+COPIED_BYTES = 1 << 22  # of a file that are copied at a time
 
 
 @dataclass
@@ -116,12 +116,12 @@ class Journal:
         """Open the files, at the start states or at the last checkpoint; returns the position of the search."""
         arrays = manifest["arrays"] if manifest else {}
         names = self._names(arrays)
-        for name in {*ARRAYS, *PARTS.values()} - set(names):
+        for name in {*ARRAYS, *PART_NAMES.values()} - set(names):
             (self.path / name).unlink(missing_ok=True)  # left by a process that was killed while it replaced some files
         for name in names:
             self._files[name] = GrowingFile(self.path / name, arrays.get(name))
         if manifest is None:
-            states = pack(self.plan.layout, np.array(self.plan.starts[0], np.int64))
+            states = pack_states(self.plan.layout, np.array(self.plan.starts[0], np.int64))
             position = Position(count=len(states), level_end=len(states))
             self._files[STATES].append(states)
         else:
@@ -194,7 +194,7 @@ class Journal:
         narrow, self._indices = self._successors_name, SUCCESSORS40
         old = self._files[narrow]
         self._files[self._successors_name] = GrowingFile(self.path / self._successors_name)
-        for _, entries in blocks_of(old, np.dtype("<i4")):
+        for _, entries in number_blocks(old, np.dtype("<i4")):
             self._append_successors(entries)
         self._written = self._entries(position)
         self.commit(complete=False)
@@ -217,7 +217,7 @@ class Journal:
         """Commit the written data: data first, then the manifest that describes it.
 
         Args:
-            written: entries of the manifest; None for those of the thread that writes.
+            written: entries of the manifest; None for the entries of the thread that writes.
         """
         written = written or self._written
         if written is None:
@@ -257,7 +257,7 @@ class Journal:
         return {**position.to_dict(), "arrays": arrays}
 
     def _check_rules(self, position: Position) -> None:
-        """Raise StateSpaceMismatch where the stored transitions are those of other rules."""
+        """Raise StateSpaceMismatch if the stored transitions come from other rules."""
         if position.first == 0:
             return
         shape = (position.first, self.plan.env.num_actions)
@@ -267,14 +267,14 @@ class Journal:
         check_rules(self.path, self.plan.env, self.plan.layout, self.stored_states(position.count), successors, bits)
 
 
-def blocks_of(file: GrowingFile, dtype: np.dtype, entries: int | None = None) -> Iterator[tuple[int, np.ndarray]]:
+def number_blocks(file: GrowingFile, dtype: np.dtype, entries: int | None = None) -> Iterator[tuple[int, np.ndarray]]:
     """Blocks of the numbers in a file: pairs (index of the first one, array), in order.
 
     Args:
-        entries: of a block, at most; None for BLOCK_BYTES.
+        entries: of a block, at most; None for COPIED_BYTES.
     """
     size = file.bytes // dtype.itemsize
-    block_size = entries or max(1, BLOCK_BYTES // dtype.itemsize)
+    block_size = entries or max(1, COPIED_BYTES // dtype.itemsize)
     for first in range(0, size, block_size):
         shape = (min(block_size, size - first),)
         yield first, np.memmap(file.path, dtype, "r", offset=first * dtype.itemsize, shape=shape)
@@ -292,7 +292,7 @@ ENTRIES = 1 << 18  # of rows of K, as many as are copied at a time
 class JournalRows(NamedTuple):
     """Rows of outcomes: number of the first row, number of its first outcome; then R rows of N outcomes in all.
 
-    counts (R,); codes (R,), None where probabilities are spelled out; successors (N,).
+    counts (R,); codes (R,), None if probabilities are spelled out; successors (N,).
     """
 
     row: int
@@ -307,9 +307,9 @@ class OutcomeParts:
     """The outcomes in the files of an unfinished build.
 
     Attributes:
-        folder: where they are. rows: how many, A for each state. most_declared: the most outcomes that a row may have.
+        folder: that holds them. rows: how many, A for each state. most_declared: the most outcomes that a row may have.
         indices: the file of the finished build that its successors will be in, of INDEX_TYPES.
-        palette: (P, K) uint64, bits of the vectors; None where probabilities are spelled out.
+        palette: (P, K) uint64, bits of the vectors; None if probabilities are spelled out.
     """
 
     folder: Path
@@ -332,9 +332,9 @@ class OutcomeParts:
             rows = min(step, self.rows - row)
             codes = None
             if self.palette is None:
-                counts = np.diff(np.fromfile(self.folder / PARTS[OFFSETS], "<i8", rows + 1, offset=8 * row))
+                counts = np.diff(np.fromfile(self.folder / PART_NAMES[OFFSETS], "<i8", rows + 1, offset=8 * row))
             else:
-                codes = np.fromfile(self.folder / PARTS[CODES], "<u2", rows, offset=2 * row)
+                codes = np.fromfile(self.folder / PART_NAMES[CODES], "<u2", rows, offset=2 * row)
                 counts = sizes[codes]
             yield row, first, codes, counts
             first += int(counts.sum())
@@ -342,8 +342,8 @@ class OutcomeParts:
     def _part(self, row: int, first: int, codes: np.ndarray | None, counts: np.ndarray) -> JournalRows:
         entries = int(counts.sum())
         dtype = dtype_of(INDEX_TYPES[self.indices])
-        place = first * dtype.itemsize
-        stored = np.fromfile(self.folder / PARTS[self.indices], dtype, entries, offset=place)
+        first_byte = first * dtype.itemsize
+        stored = np.fromfile(self.folder / PART_NAMES[self.indices], dtype, entries, offset=first_byte)
         successors = np.asarray(from_stored(stored))
         return JournalRows(row, first, counts, codes, successors)
 
@@ -351,7 +351,7 @@ class OutcomeParts:
         """Bits (N,) uint64 of the probabilities of the outcomes of some rows."""
         if self.palette is None:
             entries = len(part.successors)
-            return np.fromfile(self.folder / PARTS[PROBABILITIES], "<u8", entries, offset=8 * part.first)
+            return np.fromfile(self.folder / PART_NAMES[PROBABILITIES], "<u8", entries, offset=8 * part.first)
         assert part.codes is not None
         vectors = self.palette[part.codes]
         return vectors[vectors != 0]
@@ -370,7 +370,7 @@ class OutcomeParts:
         """
         most = self.most()
         successors, index_type = self.indices, INDEX_TYPES[self.indices]
-        num_entries = written[PARTS[successors]]["bytes"] // dtype_of(index_type).itemsize
+        num_entries = written[PART_NAMES[successors]]["bytes"] // dtype_of(index_type).itemsize
         # form of the rows: padded to K, or with offsets; palette and codes, or probabilities
         is_dense = MOST_PADDING[1] * (self.rows * most - num_entries) <= MOST_PADDING[0] * self.rows * most
         dtypes = {successors: index_type}
@@ -383,7 +383,7 @@ class OutcomeParts:
         # files of the build that have this form already are linked, the others written anew
         stay = {successors, OFFSETS, PROBABILITIES} if not is_dense else set()
         stay |= {CODES} if dtypes.get(CODES) == "<u2" else set()
-        stay &= {name for name in dtypes if PARTS[name] in written}
+        stay &= {name for name in dtypes if PART_NAMES[name] in written}
         files: dict[str, GrowingFile] = {}
         try:
             for name in dtypes.keys() - stay:
@@ -395,9 +395,9 @@ class OutcomeParts:
             for file in files.values():
                 file.close()
         for name in stay:
-            _link(self.folder / PARTS[name], self.folder / name)
+            _link(self.folder / PART_NAMES[name], self.folder / name)
         return {
-            name: {"dtype": dtype, **files[name].entry()} if name in files else written[PARTS[name]]
+            name: {"dtype": dtype, **files[name].entry()} if name in files else written[PART_NAMES[name]]
             for name, dtype in dtypes.items()
         }, most
 
@@ -426,10 +426,10 @@ class OutcomeParts:
             for state in states[
                 (states >= row // self.num_actions) & (states < (row + len(counts)) // self.num_actions)
             ]:
-                place = int(state) * self.num_actions - row
-                rows = slice(place, place + self.num_actions)
-                first_outcome = first + int(counts[:place].sum())
-                part = self._part(row + place, first_outcome, None if codes is None else codes[rows], counts[rows])
+                index = int(state) * self.num_actions - row
+                rows = slice(index, index + self.num_actions)
+                first_outcome = first + int(counts[:index].sum())
+                part = self._part(row + index, first_outcome, None if codes is None else codes[rows], counts[rows])
                 ends = np.cumsum(part.counts)[:-1]
                 probabilities = np.split(self.bits(part).view(np.float64), ends)
                 outcomes[int(state)] = list(zip(np.split(part.successors, ends), probabilities, strict=True))
@@ -444,7 +444,7 @@ def _padded(values: np.ndarray, counts: np.ndarray, most: int, *, fill_with_firs
 
 
 def _link(source: Path, target: Path) -> None:
-    """Give a file another name; copy it where the file system has no hard links."""
+    """Give a file another name; copy it if the file system has no hard links."""
     if target.is_symlink():
         target.unlink()
     try:
@@ -465,7 +465,7 @@ class OutcomeJournal(Journal):
     """The files of one build with chance; see `Journal`.
 
     Attributes:
-        palette: (capacity, K) uint64, the bits of the vectors found; None where probabilities are spelled out.
+        palette: (capacity, K) uint64, the bits of the vectors found; None if probabilities are spelled out.
     """
 
     def __init__(self, path: Path, plan: Plan):
@@ -477,25 +477,25 @@ class OutcomeJournal(Journal):
         self._failure: BaseException | None = None
 
     def _names(self, arrays: dict[str, Any]) -> tuple[str, ...]:
-        self._indices = successors_name(arrays, PARTS)
-        if PARTS[PROBABILITIES] in arrays:
+        self._indices = successors_name(arrays, PART_NAMES)
+        if PART_NAMES[PROBABILITIES] in arrays:
             self.palette = None
         return tuple(self._dtypes())
 
     @property
     def _successors_name(self) -> str:
-        return PARTS[self._indices]
+        return PART_NAMES[self._indices]
 
     def _dtypes(self) -> dict[str, str]:
         dtypes = {STATES: "<u8", self._successors_name: INDEX_TYPES[self._indices]}
         if self.palette is None:
-            return {**dtypes, PARTS[OFFSETS]: "<i8", PARTS[PROBABILITIES]: "<f8", TERMINAL: "|u1"}
-        return {**dtypes, PARTS[CODES]: "<u2", PARTS[PALETTE]: "<f8", TERMINAL: "|u1"}
+            return {**dtypes, PART_NAMES[OFFSETS]: "<i8", PART_NAMES[PROBABILITIES]: "<f8", TERMINAL: "|u1"}
+        return {**dtypes, PART_NAMES[CODES]: "<u2", PART_NAMES[PALETTE]: "<f8", TERMINAL: "|u1"}
 
     def _check_rules(self, position: Position) -> None:
-        """Load the palette of the build; StateSpaceMismatch where stored outcomes are those of other rules."""
+        """Load the palette of the build; StateSpaceMismatch if stored outcomes come from other rules."""
         if self.palette is not None:
-            vectors = np.fromfile(self.path / PARTS[PALETTE], "<u8").reshape(-1, self._most)
+            vectors = np.fromfile(self.path / PART_NAMES[PALETTE], "<u8").reshape(-1, self._most)
             self._vectors = len(vectors)
             self.palette = np.zeros((max(len(self.palette), self._vectors), self._most), np.uint64)
             self.palette[: self._vectors] = vectors
@@ -537,19 +537,19 @@ class OutcomeJournal(Journal):
         files = self._files
         files[STATES].append(states)
         if codes is None:
-            before = files[PARTS[PROBABILITIES]].bytes // 8
-            files[PARTS[OFFSETS]].append(before + np.cumsum(counts))
-            files[PARTS[PROBABILITIES]].append(probability_bits[:size])
+            before = files[PART_NAMES[PROBABILITIES]].bytes // 8
+            files[PART_NAMES[OFFSETS]].append(before + np.cumsum(counts))
+            files[PART_NAMES[PROBABILITIES]].append(probability_bits[:size])
         else:
             assert self.palette is not None
-            files[PARTS[CODES]].append(codes)
-            files[PARTS[PALETTE]].append(self.palette[num_vectors : self._vectors])
+            files[PART_NAMES[CODES]].append(codes)
+            files[PART_NAMES[PALETTE]].append(self.palette[num_vectors : self._vectors])
         self._append_successors(successors[:size])
         files[TERMINAL].append(np.packbits(block.terminal, bitorder="little"))
         self._written = self._entries(at)
 
     def _encoded(self, bits: np.ndarray, counts: np.ndarray) -> np.ndarray | None:
-        """Codes (rows,) uint16 of the rows' probabilities in the palette; None where there are more vectors than codes.
+        """Codes (rows,) uint16 of the rows' probabilities in the palette; None if there are more vectors than codes.
 
         bits: of the probabilities of all outcomes; counts (rows,): outcomes of each row.
         """
@@ -577,8 +577,10 @@ class OutcomeJournal(Journal):
         self._vectors = num_vectors
         parts = self._parts(self._written["num_expanded"])
         for name in (OFFSETS, PROBABILITIES):
-            self._files[PARTS[name]] = GrowingFile(self.path / PARTS[name])  # closed with the others, come what may
-        offsets, probabilities = (self._files[PARTS[name]] for name in (OFFSETS, PROBABILITIES))
+            self._files[PART_NAMES[name]] = GrowingFile(
+                self.path / PART_NAMES[name]
+            )  # closed with the others, come what may
+        offsets, probabilities = (self._files[PART_NAMES[name]] for name in (OFFSETS, PROBABILITIES))
         offsets.append(np.zeros(1, np.int64))
         for part in parts.parts():
             offsets.append(part.first + np.cumsum(part.counts))
@@ -588,7 +590,7 @@ class OutcomeJournal(Journal):
         self._written = {**self._written, "arrays": arrays}
         self.commit(complete=False)
         for name in (CODES, PALETTE):
-            self._drop(PARTS[name])
+            self._drop(PART_NAMES[name])
 
     # The end ----------------------------------------------------------------------------------------------------------
 
@@ -612,7 +614,7 @@ class OutcomeJournal(Journal):
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove the files of a build in progress that are left where a process completed it and was killed then."""
-    for name in PARTS.values():
+    """Remove the files of a build in progress that are left if a process completed it and was killed then."""
+    for name in PART_NAMES.values():
         with contextlib.suppress(OSError):
             (folder / name).unlink(missing_ok=True)

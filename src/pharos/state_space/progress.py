@@ -13,7 +13,7 @@ class BuildProgress:
     """Progress of a build, as a callback receives it.
 
     Attributes:
-        num_states, num_expanded: states numbered, and those of them that are expanded.
+        num_states, num_expanded: states numbered, and how many of them are expanded.
         depth: levels finished.
         seconds: since the build began.
         finished: whether this is the last report.

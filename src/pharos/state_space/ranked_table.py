@@ -3,9 +3,9 @@
 A *superstep* expands a block of states, in four exchanges. Each rank has an even part of the block's rows, and owns the
 states whose hash falls to it (kernels/hash_table.py).
 
-1. Each rank expands its rows, and asks the owners of the successors for their numbers, with the place of each in the
+1. Each rank expands its rows, and asks the owners of the successors for their numbers, with the index of each in the
    block: row x branches + branch, the order in which one process would meet them.
-2. An owner keeps the first of the places that lead to a new state, and sends it to the rank whose row that is in.
+2. An owner keeps the first of the indices that lead to a new state, and sends it to the rank whose row that is in.
 3. Each rank counts the new states in its rows; with the sum of the ranks before it, they have the numbers that one
    process would give them. It sends these to the owners.
 4. Owners answer.
@@ -14,7 +14,7 @@ So numbers, and all files, are the same whatever the number of ranks. Rank 0 dis
 
 Rank 0 runs the search and writes the files. While the frontier is narrow (Freeway: 148 thousand levels of 9 states) it
 works alone, as exchanges would cost more than the states. Once it is wide, or the table does not fit, all ranks share
-the table and expand blocks together; the memory for it is then that of all ranks.
+the table and expand blocks together; the memory for it is then the sum over ranks.
 """
 
 import contextlib
@@ -37,17 +37,17 @@ from pharos.state_space.search import Options, Search
 from pharos.state_space.table import BranchBlock, MemoryTable
 from pharos.system.memory import huge_pages
 
-ROWS = 1 << 16  # of a rank in a superstep, at most
-SUCCESSORS = 1 << 20  # of a rank's rows, at most
+SUPERSTEP_ROWS = 1 << 16  # of a rank in a superstep, at most
+SUPERSTEP_SUCCESSORS = 1 << 20  # of a rank's rows, at most
 _END, _TAKE, _EXPAND = range(3)
-_HEADER = np.zeros(4, np.int64)
+_COUNTS_HEADER = np.zeros(4, np.int64)
 _INT32 = np.dtype(np.int32)
-_NOTHING = np.full(1 << 16, -1, np.int32)  # a table that holds nothing, where the slot of a state is its bucket
+_NOTHING = np.full(1 << 16, -1, np.int32)  # a table that holds nothing, in which the slot of a state is its bucket
 
 
 def rows_of_rank(plan: Plan) -> int:
     """Number of rows that a rank expands in a superstep, at most: a multiple of 8."""
-    return min(ROWS, max(8, SUCCESSORS // plan.branches // 8 * 8))
+    return min(SUPERSTEP_ROWS, max(8, SUPERSTEP_SUCCESSORS // plan.branches // 8 * 8))
 
 
 class Owner:
@@ -70,13 +70,13 @@ class Owner:
         self.numbers = huge_pages(len(self.table.states), np.dtype(np.int64))
         self.count = 0
 
-    def claim(self, candidates: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Entries of candidates; new ones wait for their numbers. `places`: where in the block candidates stand."""
+    def claim(self, candidates: np.ndarray, block_indices: np.ndarray) -> np.ndarray:
+        """Entries of candidates; new ones wait for their numbers. `block_indices`: their indices in the block."""
         if self.table.is_full(self.count):
             self._grow()
         entries = np.empty(len(candidates), np.int64)
         arrays = self.table.slots, self.table.states, self.numbers
-        self.count = hash_table.claim(*arrays, self.count, candidates, places, entries)
+        self.count = hash_table.claim_entries(*arrays, self.count, candidates, block_indices, entries)
         return entries
 
     def _grow(self) -> None:
@@ -145,7 +145,7 @@ class RankedTable:
 
     def _send_header(self, *header: int) -> None:
         """Announce a step to the other ranks."""
-        self.rank.broadcast(np.array(header, np.int64), _HEADER)
+        self.rank.broadcast(np.array(header, np.int64), _COUNTS_HEADER)
 
     # The others -------------------------------------------------------------------------------------------------------
 
@@ -153,7 +153,7 @@ class RankedTable:
         """Run the steps that rank 0 announces, until the end."""
         no_states = np.empty((0, self.num_words), np.uint64)
         while True:
-            step, first, rows, count = map(int, self.rank.broadcast(None, _HEADER))
+            step, first, rows, count = map(int, self.rank.broadcast(None, _COUNTS_HEADER))
             if step == _END:
                 return
             if step == _TAKE:
@@ -194,16 +194,16 @@ class RankedTable:
         self.rules.expand_and_find(states, 0, len(states), 0, keys, indices, terminal, probabilities, _NOTHING)
         order, counts = self._routed(keys)
         candidates = rank.exchange(self._parts(keys[order], counts))
-        places = rank.exchange(self._parts(order + row * branches, counts))
+        block_indices = rank.exchange(self._parts(order + row * branches, counts))
         before = owner.count
-        entries = owner.claim(np.concatenate(candidates), np.concatenate(places))
-        # 2. the first place of each new state that this rank owns goes to the rank whose row it is in
+        entries = owner.claim(np.concatenate(candidates), np.concatenate(block_indices))
+        # 2. the first index of each new state that this rank owns goes to the rank whose row it is in
         fresh = np.arange(before, owner.count)
-        first_places = -1 - owner.numbers[fresh]
-        by_place = np.argsort(first_places)
-        first_places = first_places[by_place]
-        bounds = np.searchsorted(first_places, np.array(cuts) * branches)
-        wins = rank.exchange([first_places[bounds[i] : bounds[i + 1]] for i in range(rank.size)])
+        first_indices = -1 - owner.numbers[fresh]
+        by_index = np.argsort(first_indices)
+        first_indices = first_indices[by_index]
+        bounds = np.searchsorted(first_indices, np.array(cuts) * branches)
+        wins = rank.exchange([first_indices[bounds[i] : bounds[i + 1]] for i in range(rank.size)])
         wins = [each - row * branches for each in wins]
         # 3. number the new states in the rows of this rank, and send the numbers to the owners
         is_new = np.zeros(size, bool)
@@ -211,7 +211,7 @@ class RankedTable:
             is_new[each] = True
         counts_of_new = rank.allgather(np.array([np.count_nonzero(is_new)]))
         numbers = count + int(sum(each[0] for each in counts_of_new[: rank.rank])) + np.cumsum(is_new) - 1
-        owner.numbers[fresh[by_place]] = np.concatenate(rank.exchange([numbers[each] for each in wins]))
+        owner.numbers[fresh[by_index]] = np.concatenate(rank.exchange([numbers[each] for each in wins]))
         # 4. owners answer with the numbers of all successors
         lengths = np.cumsum([len(each) for each in candidates])[:-1]
         answers = rank.exchange(np.split(owner.numbers[entries], lengths))
@@ -232,7 +232,7 @@ class RankedTable:
 
 def end(rank: Rank) -> None:
     """Announce the end of the search to the other ranks."""
-    rank.broadcast(np.array([_END, 0, 0, 0], np.int64), _HEADER)
+    rank.broadcast(np.array([_END, 0, 0, 0], np.int64), _COUNTS_HEADER)
 
 
 def answer(plan: Plan, rank: Rank, memory: int | None) -> None:
@@ -262,7 +262,7 @@ def rank_of_build(plan: Plan, memory: int | None) -> Iterator[Rank]:
 # Ranked search --------------------------------------------------------------------------------------------------------
 
 
-WIDE = 10_000
+WORTH_RANKS = 10_000
 """A frontier of this many states is worth sharing between processes."""
 
 
@@ -270,7 +270,13 @@ class RankedSearch(Search):
     """The search of rank 0; the other ranks run `answer`."""
 
     def __init__(
-        self, plan: Plan, journal: Journal, options: Options, report: BuildCallback, rank: Rank, wide: int = WIDE
+        self,
+        plan: Plan,
+        journal: Journal,
+        options: Options,
+        report: BuildCallback,
+        rank: Rank,
+        wide: int = WORTH_RANKS,
     ):
         super().__init__(plan, journal, options, report)
         self.threads = 1

@@ -2,7 +2,7 @@
 
 While the frontier is wide, threads compute successors and look up those that the table has, a piece ahead of the one
 thread that numbers the new ones in order: so states are numbered as one thread would number them. While it is narrow
-(Freeway: 148 thousand levels of 9 states) one thread does everything. Where memory ends, the table goes to disk, and
+(Freeway: 148 thousand levels of 9 states) one thread does everything. If memory ends, the table goes to disk, and
 states stay in their file. docs/decisions has the measurements.
 """
 
@@ -28,19 +28,19 @@ from pharos.system.workers import usable_workers
 
 # States expanded between two looks at the clock; a multiple of 8, so that terminal bits fill whole bytes.
 CHUNK = 1 << 16
-# Successors of a chunk, where there are very many actions; with chance, whose probabilities are kept beside them.
+# Successors of a chunk, if there are very many actions; with chance, whose probabilities are kept beside them.
 CHUNK_SUCCESSORS = 1 << 26
 CHUNK_OUTCOMES = 1 << 21
 # Pieces of a chunk: threads expand one while the one before is numbered.
 PIECES = 4
 # A frontier of this many states is worth sharing between threads.
-WIDE = 1 << 13
+WIDE_FOR_THREADS = 1 << 13
 # States that one thread expands before it looks at the width of the frontier again.
-NARROW = 2048
+NARROW_LEVEL_STATES = 2048
 # Number of states from which on a table drops those that a class with an age has left behind; ages computed at a time.
 WORTH_FORGETTING = 1 << 16
 FORGETTING_BLOCK = 1 << 18
-# A table that holds nothing, where the slot of a state is its bucket.
+# A table that holds nothing, in which the slot of a state is its bucket.
 _NOTHING = np.full(1 << 16, -1, np.int32)
 
 
@@ -77,8 +77,8 @@ class Search:
         self.workers = usable_workers(options.workers)
         self._rules = rules_of(plan.env, workers=self.workers)
         self.rules, self.threads = self._rules.first_exploration, 1
-        # states that are interpreted: all those of a small space, none where compiled rules are loaded
-        self._interpreted = 0 if self._rules.is_ready else compiling.SMALL // 4 // self.branches // 8 * 8
+        # states that are interpreted: all those of a small space, none if compiled rules are loaded
+        self._interpreted = 0 if self._rules.is_ready else compiling.SMALL_STATES // 4 // self.branches // 8 * 8
         self.chunk = max(8, min(CHUNK, self._interpreted // 64 * 8))
         self.position = Position()
         margin = 32 * self.branches + len(self.plan.starts[0])
@@ -90,7 +90,7 @@ class Search:
         self._began = time.perf_counter()
 
     def run(self, manifest: dict[str, Any] | None) -> None:
-        """Search to the end; where that fails, what is in the files is committed, and the same command resumes."""
+        """Search to the end; if that fails, what is in the files is committed, and the same command resumes."""
         try:
             self.position = self.journal.open(manifest)
             self._take_stored_states()
@@ -139,7 +139,7 @@ class Search:
         return self.spilled is None
 
     def _take_stored_states(self) -> None:
-        """Load the states of the last checkpoint; onto disk where memory does not hold them."""
+        """Load the states of the last checkpoint; onto disk if memory does not hold them."""
         stored = self.journal.stored_states(self.position.count)
         if self.table.fits(self.position.count, self.journal.index_dtype):
             self.table.states[: self.position.count] = stored
@@ -165,7 +165,7 @@ class Search:
                     position.first -= (position.first - base) % 8  # what is appended has whole bytes of terminal bits
                     break
             # expand by one thread or by several, as wide as the frontier is now
-            is_wide = self.threads > 1 and min(last, position.count) - position.first >= WIDE
+            is_wide = self.threads > 1 and min(last, position.count) - position.first >= WIDE_FOR_THREADS
             if self._ahead or is_wide:
                 self._expand_wide(pool, block, base)
             else:
@@ -194,7 +194,7 @@ class Search:
     def _expand_narrow(self, block: BranchBlock, base: int, last: int) -> None:
         """Expand by one thread; with several threads it looks at the width of the frontier again after a while."""
         position, table = self.position, self.table
-        stop = min(last, max(position.first + NARROW, position.count)) if self.threads > 1 else last
+        stop = min(last, max(position.first + NARROW_LEVEL_STATES, position.count)) if self.threads > 1 else last
         progress = position.progress()
         self.rules.explore(table.states, *block, table.slots, base, stop, table.room, progress)
         position.take(progress)
@@ -212,7 +212,7 @@ class Search:
         rows = piece.stop - piece.first
         row = piece.first - base
         # let them expand the next one
-        if position.count - piece.stop >= WIDE:
+        if position.count - piece.stop >= WIDE_FOR_THREADS:
             next_row = (row + rows) % self.chunk
             self._ahead = self._expand_ahead(pool, piece.stop, next_row, reserved=rows * self.branches)
         # number the successors of this one meanwhile
@@ -227,7 +227,7 @@ class Search:
     def _expand_ahead(self, pool: ThreadPoolExecutor, first: int, row: int, reserved: int = 0) -> Piece | None:
         """Let threads expand a piece of the frontier, from state `first`, in row `row` of its chunk.
 
-        None where the table has no room left beside `reserved` other states: it grows while nobody reads it.
+        None if the table has no room left beside `reserved` other states: it grows while nobody reads it.
         """
         table, piece_rows = self.table, -(-self.chunk // PIECES)
         room = (table.room - self.position.count - reserved) // self.branches
@@ -249,7 +249,7 @@ class Search:
         return Piece(keys, np.empty(len(keys), np.int64), np.empty(rows, np.uint8), self._probabilities(rows))
 
     def _grow_table(self, pool: ThreadPoolExecutor) -> None:
-        """Grow the table; on disk where memory is not enough."""
+        """Grow the table; on disk if memory is not enough."""
         count, dtype, parts = self.position.count, self.journal.index_dtype, self._reachable_states()
         if self.table.fits(count, dtype, 0 if parts is None else count - sum(map(len, parts))):
             self.table.grow(count, dtype, pool, self.workers, parts)
@@ -257,7 +257,7 @@ class Search:
             self._spill()
 
     def _reachable_states(self) -> list[np.ndarray] | None:
-        """Parts of the states that successors may still be, where the class has an age; None: all states.
+        """Parts of the states that successors may still be, if the class has an age; None: all states.
 
         Those are the states older than the youngest one that waits to be expanded.
         """
@@ -292,7 +292,7 @@ class Search:
     def _widen_indices(self, pool: ThreadPoolExecutor) -> None:
         """Replace indices of 32 bits by indices of 40 in the file, of 64 in the table."""
         self.journal.finish_writes()
-        if self._ahead:  # its slots are those of the old table: it is expanded again
+        if self._ahead:  # its slots are in the old table: it is expanded again
             wait(self._ahead.futures)
             self._ahead = None
         self.journal.widen(self.position)
@@ -351,7 +351,7 @@ class Search:
         self, pool: ThreadPoolExecutor, states: np.ndarray, keys: np.ndarray, indices: np.ndarray, block: BranchBlock
     ) -> None:
         """Write the successors of states to keys; to indices -1 - bucket, or in terminal states their own row."""
-        threads = self.threads if len(states) >= WIDE else 1
+        threads = self.threads if len(states) >= WIDE_FOR_THREADS else 1
         cuts = [len(states) * i // threads for i in range(threads + 1)]
         arrays = (0, keys, indices, block.terminal, block.probabilities, _NOTHING)
         if threads == 1:
@@ -376,7 +376,9 @@ class Search:
     # Limits and reports -----------------------------------------------------------------------------------------------
 
     def _check_size(self) -> None:
-        check_size(self.env, self.position.count, self.position.count - self.position.first, self.options.max_states)
+        check_max_states(
+            self.env, self.position.count, self.position.count - self.position.first, self.options.max_states
+        )
 
     def _report(self, finished: bool = False) -> None:
         at, seconds = self.position, time.perf_counter() - self._began
@@ -388,8 +390,8 @@ def journal_of(path: Path, plan: Plan) -> Journal:
     return OutcomeJournal(path, plan) if plan.env.has_chance else Journal(path, plan)
 
 
-def check_size(env: Environment, count: int, left: int, max_states: int | None) -> None:
-    """Raise StateSpaceTooLarge where there are more than `max_states` states, of which `left` are not expanded."""
+def check_max_states(env: Environment, count: int, left: int, max_states: int | None) -> None:
+    """Raise StateSpaceTooLarge if there are more than `max_states` states, of which `left` are not expanded."""
     if count > INT40_STATES:
         raise StateSpaceTooLarge(f"{env} has more than {INT40_STATES} states, which indices of 40 bits cannot number")
     if max_states is None or count <= max_states:

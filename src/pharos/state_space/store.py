@@ -19,9 +19,9 @@ from pharos.errors import (
     StateSpaceIncomplete,
     StateSpaceMismatch,
 )
-from pharos.rules import Layout, pack, rules_of, unpack
+from pharos.rules import Layout, pack_states, rules_of, unpack_states
 from pharos.state_space.manifest import (
-    AGAIN,
+    BUILD_AGAIN,
     CHECKSUM_BYTES,
     MANIFEST,
     STATES,
@@ -32,17 +32,17 @@ from pharos.state_space.manifest import (
     successors_name,
 )
 from pharos.state_space.stored import (
-    blocks_of,
-    check_environment,
+    byte_blocks,
+    check_components,
     check_files,
     check_outcome_rules,
     check_outcomes,
     check_rules,
     check_states,
     check_successors,
+    file_parts,
     mapped,
     outcomes_to_check,
-    parts_of,
     states_to_check,
     stored_outcomes,
 )
@@ -51,8 +51,8 @@ from pharos.system.arrays import Indices, OutcomeRows, dtype_of, from_stored
 if TYPE_CHECKING:
     from pharos.mdp import Dynamics, TabularMDP
 
-LONGEST = 500  # characters of what a manifest says, in a message
-_BLOCK = 1 << 16  # states whose ages are asked for at a time
+MOST_QUOTED = 500  # characters of what a manifest says, in a message
+_AGE_BLOCK = 1 << 16  # states whose ages are asked for at a time
 
 
 # States whose sets of actions are worked out in one go.
@@ -66,7 +66,7 @@ class StateSpace:
 
     Attributes:
         environment: the environment, with its parameters; None for a folder whose class pharos does not know.
-        folder: where the files are.
+        folder: of the files.
         num_states, num_actions, num_terminal_states, depth: S, A, terminal states, largest distance from the start
             states.
         has_chance: whether actions have several outcomes, which `outcomes` has in place of `successors`.
@@ -114,7 +114,7 @@ class StateSpace:
 
     @cached_property
     def outcomes(self) -> OutcomeRows:
-        """Outcomes of each action, where it has several, in the form of the files, which `dynamics` hides.
+        """Outcomes of each action, if it has several, in the form of the files, which `dynamics` hides.
 
         Raises:
             StateSpaceCorrupted: an index is no state, probabilities do not sum to 1, or rows or codes are out of range.
@@ -139,14 +139,14 @@ class StateSpace:
 
         Raises:
             StateSpaceError: the class declares no age.
-        Cost: some 10 ns a state where Numba compiles the rule.
+        Cost: some 10 ns a state if Numba compiles the rule.
         """
         if self.environment is None or not self.environment.has_age:
             raise StateSpaceError(f"{self}: {self.manifest['environment']} declares no age of states")
         ages = np.empty(self.num_states, np.int64)
         rule = rules_of(self.environment).ages
-        for start in range(0, self.num_states, _BLOCK):
-            stop = min(start + _BLOCK, self.num_states)
+        for start in range(0, self.num_states, _AGE_BLOCK):
+            stop = min(start + _AGE_BLOCK, self.num_states)
             ages[start:stop] = rule.block(self.packed_states, start, stop)
         ages.flags.writeable = False
         return ages
@@ -173,7 +173,7 @@ class StateSpace:
     def terminal_bits(self) -> np.ndarray:
         """Terminal bits (ceil(S / 8),) uint8, a read-only memory map.
 
-        State i is terminal where bit i % 8 of byte i // 8 is set.
+        State i is terminal if bit i % 8 of byte i // 8 is set.
         """
         return self._map(TERMINAL, "|u1", (-(-self.num_states // 8),))
 
@@ -204,7 +204,7 @@ class StateSpace:
 
     def states(self, indices: "slice | Sequence[int] | np.ndarray" = slice(None)) -> np.ndarray:
         """States (N, D) int64 with these indices (an array of integers or a slice)."""
-        return unpack(self.layout, np.atleast_2d(self.packed_states[indices]))
+        return unpack_states(self.layout, np.atleast_2d(self.packed_states[indices]))
 
     def column(self, variable: int, block: slice = slice(None)) -> np.ndarray:
         """(N,) int64, the values of one component in a block of states."""
@@ -223,15 +223,15 @@ class StateSpace:
         return bool(self.terminal_bits[i // 8] >> (i % 8) & 1)
 
     def index(self, state: Sequence[int]) -> int:
-        """The number of a state; ParameterError where it is not reachable.
+        """The number of a state; ParameterError if it is not reachable.
 
         The first call indexes all states, in O(S).
         """
         return int(self.indices(np.array([tuple(state)]))[0])
 
     def indices(self, states: np.ndarray) -> np.ndarray:
-        """Numbers (N,) int64 of states (N, D); ParameterError where one is not reachable."""
-        from pharos.kernels.hash_table import find
+        """Numbers (N,) int64 of states (N, D); ParameterError if one is not reachable."""
+        from pharos.kernels.hash_table import find_states
 
         states = np.asarray(states)
         if states.ndim != 2 or states.shape[1] != len(self.component_names):
@@ -242,8 +242,8 @@ class StateSpace:
             raise ParameterError(f"{self}: a state consists of integers; found {states.dtype}")
         out = np.empty(len(states), np.int64)
         inside = (states >= self.layout.low) & (states < self.layout.low + self.layout.size)
-        keys = pack(self.layout, np.where(inside, states, self.layout.low))
-        find(self._table, self.packed_states, keys, out)
+        keys = pack_states(self.layout, np.where(inside, states, self.layout.low))
+        find_states(self._table, self.packed_states, keys, out)
         wrong = np.flatnonzero((out < 0) | ~inside.all(axis=1))
         if wrong.size:
             raise ParameterError(
@@ -274,7 +274,7 @@ class StateSpace:
             rewards: None for the environment's own, computed from the stored transitions; an (S, A) array; or a
                 function reward(self, state, action, next_state) in place of the environment's.
             by_range: compute the environment's own rewards when they are asked for, so that a rank of many computes
-                those of its range alone.
+                the rewards of its range alone.
         If the class declares an age, the MDP has it, so that values are solved in one backward pass.
         Raises:
             ParameterError: a transition leads to a state that is not older, or a state that is not terminal has no
@@ -316,7 +316,7 @@ class StateSpace:
 
     @cached_property
     def available(self) -> np.ndarray | None:
-        """(S, A) bool, the actions that exist in each state; None where all do everywhere.
+        """(S, A) bool, the actions that exist in each state; None if all do everywhere.
 
         Cost: the rule `is_available` for each state and action.
         """
@@ -329,20 +329,20 @@ class StateSpace:
         return None if sets.all() else sets
 
     def verify(self) -> None:
-        """Read every file once and compare it with its checksums; StateSpaceCorrupted where one differs."""
+        """Read every file once and compare it with its checksums; StateSpaceCorrupted if one differs."""
         for name, entry in self.manifest["arrays"].items():
-            blocks = blocks_of(parts_of(self.folder, self.manifest, name), CHECKSUM_BYTES)
+            blocks = byte_blocks(file_parts(self.folder, self.manifest, name), CHECKSUM_BYTES)
             for number, (expected, block) in enumerate(
                 itertools.zip_longest(entry["checksums"], blocks, fillvalue=b"")
             ):
                 if xxhash.xxh3_128_hexdigest(block) != expected:
                     raise StateSpaceCorrupted(
                         f"{self.folder / name}: block {number} (bytes {number * CHECKSUM_BYTES} on) does not match "
-                        f"its checksum: the file was changed after it was written; {AGAIN}"
+                        f"its checksum: the file was changed after it was written; {BUILD_AGAIN}"
                     )
 
     def _map(self, name: str, dtype: str | np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-        return mapped(parts_of(self.folder, self.manifest, name), dtype)[: math.prod(shape)].reshape(shape)
+        return mapped(file_parts(self.folder, self.manifest, name), dtype)[: math.prod(shape)].reshape(shape)
 
     def _check_index(self, i: int) -> None:
         if not 0 <= i < self.num_states:
@@ -357,9 +357,9 @@ def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environ
     """Open a state space that `build` wrote.
 
     Args:
-        folder: where it is.
+        folder: of the state space.
         verify: compare every file with its checksums (one read of the files, several GB/s); False trusts their lengths.
-        environment: whose state space it is; None for what the manifest says, where pharos knows its class.
+        environment: whose state space it is; None for what the manifest says, if pharos knows its class.
     Raises:
         StateSpaceError: there is no state space; StateSpaceIncomplete: its build did not finish; StateSpaceCorrupted: a
         file is missing, truncated or changed; StateSpaceMismatch: the rules of the environment are not those it was
@@ -380,7 +380,7 @@ def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environ
     if verify:
         space.verify()
     if space.environment is not None:
-        check_environment(folder, space.environment, manifest)
+        check_components(folder, space.environment, manifest)
         if space.has_chance:
             _check_outcome_rules(space, space.environment)
         else:
@@ -390,7 +390,7 @@ def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environ
 
 
 def _check_outcome_rules(space: StateSpace, env: Environment) -> None:
-    """Raise StateSpaceMismatch where the rules of `env` disagree with the stored outcomes of 64 states."""
+    """Raise StateSpaceMismatch if the rules of `env` disagree with the stored outcomes of 64 states."""
     states = states_to_check(space.num_states)
     outcomes = outcomes_to_check(space.folder, space.manifest, space._stored_outcomes, states)
     all_states = np.concatenate([states, *(successors for each in outcomes.values() for successors, _ in each)])
@@ -399,7 +399,7 @@ def _check_outcome_rules(space: StateSpace, env: Environment) -> None:
 
 
 def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | None:
-    """The environment that a manifest names, where its class is a built-in or registered one."""
+    """The environment that a manifest names, if its class is a built-in or registered one."""
     cls = class_called(manifest["environment"])
     if cls is None:
         return None
@@ -409,12 +409,12 @@ def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | Non
     except Exception as error:  # whatever a class does with parameters that are none of its own
         raise StateSpaceMismatch(
             f"{folder}: its parameters are not those of this pharos' {manifest['environment']}: "
-            f"{' '.join(str(error).split())[:LONGEST]}; build again"
+            f"{' '.join(str(error).split())[:MOST_QUOTED]}; build again"
         ) from error
     for key in ("rules_version", "parameters", "actions", "outcomes", "layout", "start"):
         if identity.get(key) != manifest.get(key):
             raise StateSpaceMismatch(
-                f"{folder}: {key} of {env.name} is {str(manifest.get(key))[:LONGEST]} in the folder and "
+                f"{folder}: {key} of {env.name} is {str(manifest.get(key))[:MOST_QUOTED]} in the folder and "
                 f"{identity.get(key)} in this pharos; build again"
             )
     return env

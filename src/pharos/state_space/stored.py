@@ -21,9 +21,9 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError, StateSpaceCorrupted, StateSpaceError, StateSpaceMismatch
-from pharos.rules import Layout, unpack
+from pharos.rules import Layout, unpack_states
 from pharos.state_space.manifest import (
-    AGAIN,
+    BUILD_AGAIN,
     CODES,
     OFFSETS,
     PALETTE,
@@ -51,14 +51,14 @@ _FIXED, _SHARED, _READ = 0x10, 0x01, 0x01  # MAP_FIXED, MAP_SHARED, PROT_READ
 
 
 def check_files(folder: Path, manifest: dict[str, Any]) -> None:
-    """Raise StateSpaceCorrupted where a file is missing, or shorter than committed; of shards see `parts_of`."""
+    """Raise StateSpaceCorrupted if a file is missing, or shorter than committed; of shards see `file_parts`."""
     if not (folder / SHARDS).exists():
         return check_lengths(folder, manifest)
     for name in manifest["arrays"]:
-        parts_of(folder, manifest, name)
+        file_parts(folder, manifest, name)
 
 
-def parts_of(folder: Path, manifest: dict[str, Any], name: str) -> list[Path]:
+def file_parts(folder: Path, manifest: dict[str, Any], name: str) -> list[Path]:
     """Paths of the files that make up a file of a state space, in order: itself, or its ranges in shards.
 
     Raises:
@@ -113,17 +113,17 @@ def mapped(parts: Sequence[Path], dtype: str | np.dtype) -> np.ndarray:
     library = ctypes.CDLL(None, use_errno=True)
     library.mmap.restype = ctypes.c_void_p
     library.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_longlong]
-    place = array.ctypes.data
+    address = array.ctypes.data
     for part, size in zip(parts, sizes, strict=True):  # in the place of what was reserved; goes when `memory` goes
         with open(part, "rb") as file:
-            if library.mmap(place, size, _READ, _SHARED | _FIXED, file.fileno(), 0) != place:
+            if library.mmap(address, size, _READ, _SHARED | _FIXED, file.fileno(), 0) != address:
                 error = ctypes.get_errno()
                 raise OSError(error, os.strerror(error), str(part))
-        place += size
+        address += size
     return array.view(dtype)
 
 
-def blocks_of(parts: Sequence[Path], size: int) -> Iterator[bytes]:
+def byte_blocks(parts: Sequence[Path], size: int) -> Iterator[bytes]:
     """The bytes of files in blocks of `size`, which may begin in one and end in another."""
     left = bytearray()
     for part in parts:
@@ -142,8 +142,8 @@ def blocks_of(parts: Sequence[Path], size: int) -> Iterator[bytes]:
 _BLOCK_ENTRIES = 1 << 17
 
 
-def check_environment(folder: Path, env: Environment, manifest: dict[str, Any]) -> None:
-    """Raise StateSpaceMismatch where the actions or the components of a state are not those of the environment."""
+def check_components(folder: Path, env: Environment, manifest: dict[str, Any]) -> None:
+    """Raise StateSpaceMismatch if actions or components of a state differ from the environment's."""
     expected = {"actions": list(env.actions), "names": list(env.components.names), "outcomes": int(env.outcomes)}
     stored = {
         "actions": manifest["actions"],
@@ -167,13 +167,13 @@ def states_to_check(num_states: int) -> np.ndarray:
 def check_rules(
     folder: Path, env: Environment, layout: Layout, states: np.ndarray, successors: Indices, bits: np.ndarray
 ) -> None:
-    """Raise StateSpaceMismatch where the rules of `env` disagree with the stored transitions of 64 states."""
+    """Raise StateSpaceMismatch if the rules of `env` disagree with the stored transitions of 64 states."""
     indices = states_to_check(len(successors))
     _check_range(folder / SUCCESSORS, successors[indices], len(states), indices)
-    next_states = unpack(layout, states[successors[indices].ravel()]).tolist()
+    next_states = unpack_states(layout, states[successors[indices].ravel()]).tolist()
     check_states(folder / STATES, layout, states[indices])
     check_states(folder / STATES, layout, states[successors[indices].ravel()])
-    for n, (i, row) in enumerate(zip(indices.tolist(), unpack(layout, states[indices]).tolist(), strict=True)):
+    for n, (i, row) in enumerate(zip(indices.tolist(), unpack_states(layout, states[indices]).tolist(), strict=True)):
         state = tuple(row)
         stored = [tuple(row) for row in next_states[n * env.num_actions : (n + 1) * env.num_actions]]
         try:
@@ -192,7 +192,7 @@ def check_rules(
 
 
 def check_successors(path: Path, successors: Indices, terminal_bits: np.ndarray, num_terminal: int) -> None:
-    """Raise StateSpaceCorrupted where an index is no state, or a terminal state does not lead to itself.
+    """Raise StateSpaceCorrupted if an index is no state, or a terminal state does not lead to itself.
 
     Cost: one pass over the successors, in blocks that fit into a processor's cache.
     """
@@ -209,26 +209,26 @@ def check_successors(path: Path, successors: Indices, terminal_bits: np.ndarray,
         leaving = (block[ended] != start + ended[:, None]).any(axis=1)
         if leaving.any():
             raise StateSpaceCorrupted(
-                f"{path}: terminal state {start + int(ended[leaving.argmax()])} leads to another state; {AGAIN}"
+                f"{path}: terminal state {start + int(ended[leaving.argmax()])} leads to another state; {BUILD_AGAIN}"
             )
     if terminal != num_terminal:
         raise StateSpaceCorrupted(
-            f"{path.with_name(TERMINAL)}: marks {terminal} terminal states; expected {num_terminal}; {AGAIN}"
+            f"{path.with_name(TERMINAL)}: marks {terminal} terminal states; expected {num_terminal}; {BUILD_AGAIN}"
         )
 
 
 def _check_range(path: Path, block: np.ndarray, num_states: int, numbers: Sequence[int] | np.ndarray) -> None:
-    """Raise StateSpaceCorrupted where an index is no state; `numbers`: the states whose rows are in the block."""
+    """Raise StateSpaceCorrupted if an index is no state; `numbers`: the states whose rows are in the block."""
     if block.min() < 0 or block.max() >= num_states:
         row, action = map(int, np.argwhere((block < 0) | (block >= num_states))[0])
         raise StateSpaceCorrupted(
             f"{path}: action {action} leads from state {numbers[row]} to state {block[row, action]}; "
-            f"expected 0 to {num_states - 1}; {AGAIN}"
+            f"expected 0 to {num_states - 1}; {BUILD_AGAIN}"
         )
 
 
 def check_states(path: Path, layout: Layout, states: np.ndarray) -> None:
-    """Raise StateSpaceCorrupted where a component of a packed state is out of its range."""
+    """Raise StateSpaceCorrupted if a component of a packed state is out of its range."""
     mask = layout.mask.astype(np.uint64)
     narrow = [i for i in range(len(mask)) if int(mask[i]) + 1 != int(layout.size[i])]  # the others cannot be
     if not narrow:
@@ -241,7 +241,7 @@ def check_states(path: Path, layout: Layout, states: np.ndarray) -> None:
             if int(field.max()) >= int(layout.size[i]):
                 raise StateSpaceCorrupted(
                     f"{path}: component {i} of state {start + int(field.argmax())} is {int(field.max())}; "
-                    f"expected less than {int(layout.size[i])}; {AGAIN}"
+                    f"expected less than {int(layout.size[i])}; {BUILD_AGAIN}"
                 )
 
 
@@ -261,7 +261,7 @@ def stored_outcomes(folder: Path, manifest: dict[str, Any]) -> OutcomeRows:
         PROBABILITIES: of_outcomes,
     }
     maps = {
-        name: mapped(parts_of(folder, manifest, name), dtype_of(arrays[name]["dtype"])).reshape(shape)
+        name: mapped(file_parts(folder, manifest, name), dtype_of(arrays[name]["dtype"])).reshape(shape)
         for name, shape in shapes.items()
         if name in arrays
     }
@@ -270,7 +270,7 @@ def stored_outcomes(folder: Path, manifest: dict[str, Any]) -> OutcomeRows:
 
 
 def check_outcomes(folder: Path, manifest: dict[str, Any], stored: OutcomeRows, terminal_bits: np.ndarray) -> None:
-    """Raise StateSpaceCorrupted where the arrays are not outcomes of a state space.
+    """Raise StateSpaceCorrupted if the arrays are not outcomes of a state space.
 
     Cost: one pass over them, in blocks that fit into a processor's cache.
     """
@@ -303,13 +303,13 @@ def check_outcomes(folder: Path, manifest: dict[str, Any], stored: OutcomeRows, 
 
 def _corrupted(folder: Path, manifest: dict[str, Any], error: WrongOutcomes) -> StateSpaceCorrupted:
     names = {"successors": successors_name(manifest["arrays"]), "terminal": TERMINAL}
-    return StateSpaceCorrupted(f"{folder / names.get(error.name, f'{error.name}.bin')}: {error}; {AGAIN}")
+    return StateSpaceCorrupted(f"{folder / names.get(error.name, f'{error.name}.bin')}: {error}; {BUILD_AGAIN}")
 
 
 def outcomes_to_check(
     folder: Path, manifest: dict[str, Any], stored: OutcomeRows, states: np.ndarray
 ) -> dict[int, OutcomesOfState]:
-    """Outcomes of some states, from arrays that are not checked yet; StateSpaceCorrupted where they are none."""
+    """Outcomes of some states, from arrays that are not checked yet; StateSpaceCorrupted if they are none."""
     shape = manifest["num_states"], manifest["num_actions"]
     try:
         check = OutcomeCheck(stored, shape, manifest["num_outcomes"], 0)
@@ -328,35 +328,36 @@ def check_outcome_rules(
     outcomes: dict[int, OutcomesOfState],
     bits: np.ndarray,
 ) -> None:
-    """Raise StateSpaceMismatch where the rules of `env` disagree with the stored outcomes of some states.
+    """Raise StateSpaceMismatch if the rules of `env` disagree with the stored outcomes of some states.
 
     Args:
         states: (S, W), packed. bits: which ones are terminal.
-        outcomes: those of the states that are compared.
+        outcomes: of the states that are compared.
     """
     for i, of_actions in outcomes.items():
-        state = tuple(unpack(layout, states[i : i + 1])[0].tolist())
+        state = tuple(unpack_states(layout, states[i : i + 1])[0].tolist())
         try:
             ended = bool(env.is_terminal(state))
-            expected = [_outcomes_of(env, state, a, ended) for a in range(env.num_actions)]
+            expected = [_outcomes_by_rules(env, state, a, ended) for a in range(env.num_actions)]
         except Exception as error:
             raise StateSpaceMismatch(
                 f"{folder}: was built with other rules: those of this {env.name} fail in state {state}: {error!r}; "
                 f"build in another folder"
             ) from error
         for action, (successors, probabilities) in enumerate(of_actions):
-            next_states = [tuple(row) for row in unpack(layout, states[successors]).tolist()]
+            next_states = [tuple(row) for row in unpack_states(layout, states[successors]).tolist()]
             wanted, p = expected[action]
             agree = next_states == wanted and np.abs(probabilities - p).max() <= SUM_TOLERANCE
             if not agree or ended != bool(bits[i // 8] >> (i % 8) & 1):
                 raise StateSpaceMismatch(
                     f"{folder}: was built with other rules: from state {state} action {env.actions[action]!r} leads to "
-                    f"{_text(next_states, probabilities)}, by the rules of this {env.name} to {_text(wanted, p)}; "
+                    f"{_text_of_outcomes(next_states, probabilities)}, by the rules of this {env.name} "
+                    f"to {_text_of_outcomes(wanted, p)}; "
                     f"build in another folder, and raise `version` when you change rules"
                 )
 
 
-def _outcomes_of(env: Environment, state: tuple, action: int, ended: bool) -> tuple[list[tuple], np.ndarray]:
+def _outcomes_by_rules(env: Environment, state: tuple, action: int, ended: bool) -> tuple[list[tuple], np.ndarray]:
     """(next states, probabilities) of the possible outcomes of an action, by the rules."""
     if ended:
         return [state], np.ones(1)
@@ -365,5 +366,5 @@ def _outcomes_of(env: Environment, state: tuple, action: int, ended: bool) -> tu
     return [env.next_state(state, action, outcome) for outcome in possible], np.array(probabilities)[possible]
 
 
-def _text(states: list[tuple], probabilities: np.ndarray) -> str:
+def _text_of_outcomes(states: list[tuple], probabilities: np.ndarray) -> str:
     return ", ".join(f"{state} ({p:.6g})" for state, p in zip(states, probabilities.tolist(), strict=True))

@@ -20,7 +20,7 @@ from pharos.system.arrays import INT32_STATES
 from pharos.system.memory import huge_pages, mapped_file, reserved_states, reserved_table
 
 LOAD = 0.5  # the table in memory grows beyond this share of used slots
-FULLEST = 0.8  # the same, where memory has no room for a table of twice the size
+FULLEST = 0.8  # the same, if memory has no room for a table of twice the size
 SLOTS = 1 << 16  # a table has a multiple of them
 PARALLEL_FILL = 1 << 16  # states that are worth sharing between threads when the table grows
 LEFT_OVER = 1 << 12  # states that may pass the end of a part of the table, which are a handful
@@ -81,7 +81,7 @@ class MemoryTable:
         return count + self._margin <= len(self.states) and self._size_for(count, dtype, forgotten) is not None
 
     def _size_for(self, count: int, dtype: np.dtype, forgotten: int) -> tuple[int, float] | None:
-        """(slots, share of them that may be used) of a larger table; None where it would hold hardly more states.
+        """(slots, share of them that may be used) of a larger table; None if it would hold hardly more states.
 
         It has room for about twice as many states, or is fuller and as large as memory allows.
         """
@@ -116,8 +116,8 @@ class MemoryTable:
         size = self._size_for(count, dtype, self.forgotten) or (self._slots_for(count - self.forgotten), LOAD)
         slots = max(size[0], len(self.slots) if parts is not None else 0)
         self._load = size[1]
-        # the new table, in the place of the old one where that can grow
-        self.slots = np.empty(0, dtype)  # free the old one first, where it cannot grow in its place
+        # the new table, in the place of the old one if that can grow
+        self.slots = np.empty(0, dtype)  # free the old one first, if it cannot grow in its place
         if self._space.nbytes < slots * dtype.itemsize:
             self._space = huge_pages(slots, dtype)
         self.slots = self._space.view(dtype)[:slots]
@@ -138,7 +138,7 @@ class MemoryTable:
             return fill_range(self.slots, self.states, count, cuts[i], cuts[i + 1], left_over[i])
 
         left = [*pool.map(fill_part, range(workers))]
-        if max(left) > left_over.shape[1]:  # only where a bad hash crowds the end of a part
+        if max(left) > left_over.shape[1]:  # only if a bad hash crowds the end of a part
             self._fill(count)
             return
         # states that found no slot in their part
@@ -158,7 +158,7 @@ class MemoryTable:
         insert_missing(self.slots, self.states, keys, indices, successors, progress)
 
     def release(self) -> None:
-        """Free the memory, also where a traceback keeps this table alive."""
+        """Free the memory, also if a traceback keeps this table alive."""
         self.states, self.slots = self.states[:0].copy(), self.slots[:0].copy()
         self._space = self._space[:0].copy()
 
@@ -221,7 +221,7 @@ class SpilledTable:
         looked_up = self._table.look_up(keys, indices, first, self._order, self._slots)
         from pharos.kernels import hash_table
 
-        hash_table.number(keys, indices, successors, self.states, self.appended, progress)
+        hash_table.number_states(keys, indices, successors, self.states, self.appended, progress)
         self._table.assign_numbers(looked_up, indices, self._order, self._slots)
 
 
@@ -238,7 +238,7 @@ def rows_of_chunk(memory: int, num_words: int, branches: int, has_chance: bool =
 
 
 DISK_LOAD = 0.7  # the table on disk grows beyond this share of used slots
-LEAST = 1 << 16  # slots of the smallest table
+LEAST_SLOTS = 1 << 16  # slots of the smallest table
 _AROUND = 1 << 19  # bytes that the system may bring along with a page (large folios)
 
 
@@ -254,7 +254,7 @@ class DiskTable:
         at a time.
         """
         self.folder, self.num_words, self.window = folder, num_words, window
-        slots = LEAST
+        slots = LEAST_SLOTS
         while slots * DISK_LOAD < states:
             slots *= 2
         self._open(slots)

@@ -28,7 +28,7 @@ from pharos.study.tables import cells, curves, hardness_table, paper_instance, p
 from pharos.system import lazy
 from pharos.training import run_id
 
-if TYPE_CHECKING:  # loaded where they are asked for
+if TYPE_CHECKING:  # loaded when they are asked for
     from pharos.study.cross_validation import class_predictions
     from pharos.study.leave_one_class_out import OUTCOMES, Cells, outcomes
     from pharos.study.leave_one_class_out import unseen_classes as validation

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 # Instances with more states are not counted for a report
-MOST_STATES = 100_000
+MOST_COUNTED_STATES = 100_000
 
 
 def aliasing_table(
@@ -44,7 +44,7 @@ def aliasing_table(
     for run in study.runs:
         key = (run.instance, run.cell["observation"])
         number = num_states.get(run.instance, np.inf)
-        if key in rows or key[1] == TABULAR_OBSERVATION or not number <= MOST_STATES:
+        if key in rows or key[1] == TABULAR_OBSERVATION or not number <= MOST_COUNTED_STATES:
             continue
         if progress is not None:
             progress(f"states that share an observation: {', '.join(key)}")
@@ -59,7 +59,7 @@ def aliasing_table(
 
 
 def with_aliasing(cells: "pd.DataFrame", counts: "pd.DataFrame") -> "pd.DataFrame":
-    """Cells with `aliasing` beside their regret: the share of states whose observation another state has; NaN where it
+    """Cells with `aliasing` beside their regret: the share of states whose observation another state has; NaN if it
     was not counted, 0 for the number of the state.
     """
     shares = counts[["environment", "instance", "observation", "share"]].rename(columns={"share": "aliasing"})
@@ -71,9 +71,9 @@ def with_aliasing(cells: "pd.DataFrame", counts: "pd.DataFrame") -> "pd.DataFram
 def _aliasing_of(folder: Path, config: Mapping[str, Any]) -> Aliasing:
     from pharos.observations import observe
     from pharos.state_space import build
-    from pharos.study.batches import task_of
+    from pharos.study.batches import task_of_config
 
-    task, cache = task_of(config), ResultCache(folder / "aliasing")
+    task, cache = task_of_config(config), ResultCache(folder / "aliasing")
     names = ("environment", "parameters", "observation", "observation_options")
     dependencies = json.loads(json.dumps({**{name: config[name] for name in names}, "version": task.env.version}))
     stored = cache.get(dependencies)

@@ -43,7 +43,7 @@ class Models:
         fits: those that there are enough rows for.
         notes: one line for whatever was left out, and why.
         representation_r_squared, class_r_squared: of the fits together; None without them.
-        leave_one_class_out: R2 for classes that the model has not seen; None where there are fewer than two,
+        leave_one_class_out: R2 for classes that the model has not seen; None if there are fewer than two,
             or no single model.
         class_alone: R2 of the single model without the measures: class and representation alone; None without a model.
         agent: whose regret it is.
@@ -63,7 +63,7 @@ class Models:
         return "" if self.agent == first else "_" + "".join(c if c.isalnum() else "_" for c in self.agent)
 
     def get(self, model: str, subset: str) -> Fit | None:
-        """The fit of a model to a subset of the rows; None where there is none."""
+        """The fit of a model to a subset of the rows; None if there is none."""
         return next((one for one in self.fits if (one.model, one.subset) == (model, subset)), None)
 
 
@@ -192,7 +192,7 @@ class PaperComparison:
 
 
 def compare(cells: "pd.DataFrame", runs: Sequence[Run], models: Sequence[Models]) -> PaperComparison:
-    """Comparison of each number that the paper prints with ours; NaN where the study has none."""
+    """Comparison of each number that the paper prints with ours; NaN if the study has none."""
     numbers = {run.instance: paper_instance(run.config["environment"], run.config["parameters"]) for run in runs}
     ours: dict[tuple, tuple[float, ...]] = {}
     for row in cells.to_dict("records"):
@@ -208,8 +208,8 @@ def compare(cells: "pd.DataFrame", runs: Sequence[Run], models: Sequence[Models]
         for row in returns.itertuples()
     ]
     nothing = (float("nan"),) * 3
-    for place, column in enumerate(("ours", "our_deviation", "our_steps")):
-        returns[column] = [ours.get(key, nothing)[place] for key in keys]
+    for index, column in enumerate(("ours", "our_deviation", "our_steps")):
+        returns[column] = [ours.get(key, nothing)[index] for key in keys]
     returns["difference"] = returns["ours"] - returns["mean"]
     return PaperComparison(returns, _regressions(cells, models))
 

@@ -12,7 +12,7 @@ import yaml
 from pharos import training
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.study import worker as _worker
-from pharos.study.execution import claim, opened
+from pharos.study.execution import opened, write_specification
 from pharos.study.specification import Source, Specification, parse
 from pharos.system import storage
 from pharos.training import run_id
@@ -20,11 +20,11 @@ from pharos.training import run_id
 if TYPE_CHECKING:
     import pyarrow as pa
 
-FORMAT = 1
+ARCHIVE_FORMAT = 1
 CURVE_COLUMNS = ("step",)
-_STUDY, _FORMAT, _DIGESTS = b"pharos.study", b"pharos.format", b"pharos.digests"
-_AGAIN = "fetch or pack it again"
-EARLIER = {
+_STUDY, _FORMAT_KEYS, _DIGESTS = b"pharos.study", b"pharos.format", b"pharos.digests"
+_FETCH_AGAIN = "fetch or pack it again"
+EARLIER_HYPERPARAMETERS = {
     "dqn": {
         "breakout": {
             "vector": {
@@ -53,24 +53,24 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
 
     A row for each run: `id`; `record`, its run.json; and for each column of the curve a list. Among the metadata of
     the file are the specification, its digest, and a digest of each run. What agents learnt stays in the folder: some
-    hundred kilobytes a run, where a row takes two. Files of code are named relative to the specification, or by their
-    name alone where they are elsewhere, with their checksums; nothing tells where they were on this machine.
+    hundred kilobytes a run; a row takes two. Files of code are named relative to the specification, or by their
+    name alone if they are elsewhere, with their checksums; no path of this machine is stored.
 
     Raises:
         ParameterError: no run is finished. OSError: the file cannot be written; an older one then stays as it was.
     """
     import pyarrow as pa
 
-    study, place = opened(source, folder)
+    study, directory = opened(source, folder)
     ids, records, curves = [], [], []
     for run in study.runs:
-        record = _worker.read_record(place / "runs" / run.id)
+        record = _worker.run_record(directory / "runs" / run.id)
         if record is not None and record["status"] == _worker.FINISHED:
             ids.append(run.id)
             records.append(json.dumps(_placeless(record, study.folder)))
-            curves.append(training.read_curve_table(place / "runs" / run.id, CURVE_COLUMNS))
+            curves.append(training.read_curve_table(directory / "runs" / run.id, CURVE_COLUMNS))
     if not ids:
-        raise ParameterError(f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first")
+        raise ParameterError(f"{directory}: no run of {study.name!r} is finished; execute `pharos study run` first")
     columns: dict[str, Any] = {"id": pa.array(ids), "record": pa.array(records)}
     for field in pa.unify_schemas([curve.schema for curve in curves]):
         lists = [curve.column(field.name).to_pylist() if field.name in curve.column_names else None for curve in curves]
@@ -78,7 +78,11 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
     text = study.to_yaml(folder=".")
     runs = zip(ids, records, curves, strict=True)
     digests = {"study": storage.digest_of_json(text), "runs": {id: _digest(id, *rest) for id, *rest in runs}}
-    metadata = {_STUDY: text.encode(), _FORMAT: str(FORMAT).encode(), _DIGESTS: json.dumps(digests).encode()}
+    metadata = {
+        _STUDY: text.encode(),
+        _FORMAT_KEYS: str(ARCHIVE_FORMAT).encode(),
+        _DIGESTS: json.dumps(digests).encode(),
+    }
     file = Path(file)
     file.parent.mkdir(parents=True, exist_ok=True)
     training.write_table(file, pa.table(columns).replace_schema_metadata(metadata), follow=True)
@@ -112,7 +116,7 @@ def unpack(
     Args:
         file: written by `pack`.
         folder: of the study; studies/NAME in the current directory when not given. Runs that it has stay as they are.
-        into: another study, which gets those of the runs that it has as well; None: the packed one, with the defaults
+        into: another study, which gets the runs that it has as well; None: the packed one, with the defaults
             of hyperparameters that it was packed with.
         trust: whether code that the packed study names may be imported, from beside the file; `into` is read in its
             place.
@@ -124,35 +128,35 @@ def unpack(
     """
     file = Path(file)
     text, table, digests = _read(file)
-    target, place = opened(_study(file, text, table, trust) if into is None else into, folder, trust=trust or None)
+    target, directory = opened(_study(file, text, table, trust) if into is None else into, folder, trust=trust or None)
     wanted = {run.id for run in target.runs}
     runs = []
     for row in _rows(file, table):
         id, record = row.pop("id"), row.pop("record")
         run = id, _checked(file, id, record, wanted if into is None else None), _curve(file, id, row, table.schema)
         if digests is not None and digests["runs"].get(id) != _digest(id, record, run[2]):
-            raise ResultCorrupted(f"{file}: run {id} was changed after it was packed; {_AGAIN}")
+            raise ResultCorrupted(f"{file}: run {id} was changed after it was packed; {_FETCH_AGAIN}")
         runs.append(run)
-    claim(target, place)
-    added = sum(_write(place, *run) for run in runs if run[0] in wanted)
+    write_specification(target, directory)
+    added = sum(_write(directory, *run) for run in runs if run[0] in wanted)
     with contextlib.suppress(OSError):  # others may be at work there
-        (place / "partial").rmdir()
-    return place, added
+        (directory / "partial").rmdir()
+    return directory, added
 
 
 def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
-    """The study in YAML, its runs, and the digests of both; None in place of digests where an older version packed
+    """The study in YAML, its runs, and the digests of both; None in place of digests if an older version packed
     it."""
     if not file.exists():
         raise ParameterError(f"{file}: no such file")
-    table = training.read_table(file, _AGAIN)
+    table = training.read_table(file, _FETCH_AGAIN)
     metadata = table.schema.metadata or {}
     if _STUDY not in metadata or not {"id", "record"} <= set(table.column_names):
         raise FileFormatError(f"{file}: not a packed study; expected a file made by `pharos study pack`")
-    if metadata.get(_FORMAT) != str(FORMAT).encode():
+    if metadata.get(_FORMAT_KEYS) != str(ARCHIVE_FORMAT).encode():
         raise FileFormatError(
-            f"{file}: format {metadata.get(_FORMAT, b'?').decode(errors='replace')} of packed studies; "
-            f"this version of pharos reads {FORMAT}"
+            f"{file}: format {metadata.get(_FORMAT_KEYS, b'?').decode(errors='replace')} of packed studies; "
+            f"this version of pharos reads {ARCHIVE_FORMAT}"
         )
     try:
         text = metadata[_STUDY].decode()
@@ -162,7 +166,7 @@ def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
         ):
             raise ValueError("its study, or the list of its runs, was changed after it was packed")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ResultCorrupted(f"{file}: its description cannot be read: {error}; {_AGAIN}") from None
+        raise ResultCorrupted(f"{file}: its description cannot be read: {error}; {_FETCH_AGAIN}") from None
     return text, table, digests
 
 
@@ -170,7 +174,7 @@ def _study(file: Path, text: str, table: "pa.Table", trust: bool) -> Specificati
     """The packed study, with the defaults of hyperparameters that the library had when it was packed."""
     study = parse(text, str(file), folder=file.absolute().parent, trust=trust)
     if not study.defaults and not set(table["id"].to_pylist()) <= {run.id for run in study.runs}:
-        defaults = yaml.safe_dump({"defaults": EARLIER})
+        defaults = yaml.safe_dump({"defaults": EARLIER_HYPERPARAMETERS})
         return parse(f"{text}\n{defaults}", str(file), folder=file.absolute().parent, trust=trust)
     return study
 
@@ -179,7 +183,7 @@ def _rows(file: Path, table: "pa.Table") -> list[dict[str, Any]]:
     try:
         return table.to_pylist()
     except (ValueError, TypeError) as error:  # text that is none
-        raise ResultCorrupted(f"{file}: its rows cannot be read: {error}; {_AGAIN}") from None
+        raise ResultCorrupted(f"{file}: its rows cannot be read: {error}; {_FETCH_AGAIN}") from None
 
 
 def _digest(id: str, record: str, curve: "pa.Table") -> str:
@@ -195,7 +199,7 @@ def _checked(file: Path, id: str, record: str, ids: set[str] | None) -> dict[str
         if not storage.is_intact(entry):
             raise ValueError("it was changed after it was written")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ResultCorrupted(f"{file}: the record of run {id} cannot be read: {error}; {_AGAIN}") from None
+        raise ResultCorrupted(f"{file}: the record of run {id} cannot be read: {error}; {_FETCH_AGAIN}") from None
     if (ids is not None and id not in ids) or run_id(config) != id:
         raise FileFormatError(f"{file}: run {id} is not one of the study, or its configuration was changed")
     if status != _worker.FINISHED:
@@ -214,14 +218,14 @@ def _curve(file: Path, id: str, row: dict[str, list | None], schema: "pa.Schema"
             {name: pa.array(values, schema.field(name).type.value_type) for name, values in columns.items()}
         )
     except (ValueError, TypeError, AttributeError, pa.ArrowException) as error:
-        raise FileFormatError(f"{file}: the curve of run {id} cannot be read: {error}; {_AGAIN}") from None
+        raise FileFormatError(f"{file}: the curve of run {id} cannot be read: {error}; {_FETCH_AGAIN}") from None
 
 
-def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> bool:
-    """Write a run into the folder; False where a finished one is there already, which stays."""
-    target = place / "partial" / id
+def _write(directory: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> bool:
+    """Write a run into the folder; False if a finished one is there already, which stays."""
+    target = directory / "partial" / id
     storage.remove_leftovers(target)
-    if _worker.read_status(place / "runs" / id) == _worker.FINISHED:
+    if _worker.read_status(directory / "runs" / id) == _worker.FINISHED:
         return False
     partial = storage.temporary_path(target)
     partial.mkdir(parents=True)
@@ -231,7 +235,7 @@ def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> b
         else:
             training.write_table(partial / "curve.parquet", curve)
         storage.replace_json(partial / "run.json", record)
-        _worker.publish(partial, place, id)
+        _worker.publish_run(partial, directory, id)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return True

@@ -1,11 +1,11 @@
 """Runs of a study that are trained as one program: which fit together, what trains them, and the values they share.
 
-A run belongs to a batch where the study says `engine: batched`. Batches are formed when a worker is free, from the
+A run belongs to a batch if the study says `engine: batched`. Batches are formed when a worker is free, from the
 runs that are missing then; a run does not depend on its batch, so neither do results. While a batch is trained, its
 checkpoints are in DIR/batches; a batch that was killed goes on from there with the runs that it had.
 
 Values at the start of each task are solved once for all runs of a study, and kept in the user's cache. A run needs the
-values of the optimal, the uniform and the worst policy only where episodes start; solving a large instance again for
+values of the optimal, the uniform and the worst policy only in start states; solving a large instance again for
 each run would take longer than some training.
 """
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pharos.training import Task
 
 
-def task_of(config: Mapping[str, Any]) -> "Task":
+def task_of_config(config: Mapping[str, Any]) -> "Task":
     """The task of a run of a study that was read already, so that code which it names is trusted."""
     return RunConfig.from_dict(config).task(trust=True, strict=True)
 
@@ -37,20 +37,20 @@ def solve(config: Mapping[str, Any]) -> dict[str, Any]:
     if values is None:
         from pharos.training import TaskValues  # loads what an MDP needs
 
-        task = task_of(config)
+        task = task_of_config(config)
         values = TaskValues(task.reference, task.return_range).to_dict()
         _cache().put(_dependencies(config), values=values)
     return values
 
 
 def stored_values(config: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The stored values for these rules; None where there are none, or where the file was changed."""
+    """The stored values for these rules; None if there are none, or if the file was changed."""
     stored = _cache().get(_dependencies(config))
     return None if stored is None else stored["values"]
 
 
 def has_regret(config: Mapping[str, Any]) -> bool:
-    """Whether a policy may be better than uniform play: False where stored values of the task tell otherwise."""
+    """Whether a policy may be better than uniform play: False if stored values of the task show otherwise."""
     values = stored_values(config)
     return values is None or not math.isnan(ReferenceValues(**values["reference"]).spread())
 
@@ -63,7 +63,7 @@ def _dependencies(config: Mapping[str, Any]) -> dict[str, Any]:
     """Key of stored values: parameters, rules by their code, start states, chance and setting."""
     from pharos.rules import fingerprint_of_rules
 
-    env = task_of(config).env
+    env = task_of_config(config).env
     states, probabilities = start_distribution(env)
     setting = {name: config[name] for name in ("environment", "parameters", "chance", "gamma", "horizon")}
     return json.loads(
@@ -95,25 +95,25 @@ def train_batch(
     tasks = TaskCache(values, trust=True, strict=True, device=device)
     errors: list[str | None] = [None] * len(configs)
 
-    def tell(message: tuple[Any, ...]) -> None:
+    def on_message(message: tuple[Any, ...]) -> None:
         match message:
-            case "end", place, FailedRun() as end:
-                errors[place] = end.error
-            case "halve", places, reason:
+            case "end", index, FailedRun() as end:
+                errors[index] = end.error
+            case "halve", indices, reason:
                 reason_of_all = HalfAsMany(reason)
-                for place in places:
-                    errors[place] = reason_of_all
+                for index in indices:
+                    errors[index] = reason_of_all
 
     runs = [PreparedRun(i, RunConfig.from_dict(config), folders[i], tasks) for i, config in enumerate(configs)]
-    train_group(runs, checkpoints, tell, is_single=len(runs) == 1, raises=len(runs) == 1)
+    train_group(runs, checkpoints, on_message, is_single=len(runs) == 1, raises=len(runs) == 1)
     return errors
 
 
 def batches(runs: Sequence[Run], checkpoints: Path, device: str = "cpu") -> list[list[Run]]:
-    """Return the runs by process, in the order of the first: those of a checkpoint as they were, others by lanes.
+    """Return the runs by process, in the order of the first: the runs of a checkpoint as they were, others by lanes.
 
     Args:
-        checkpoints: folder of those of batches. device: where networks are trained.
+        checkpoints: folder of the batches' checkpoints. device: on which networks are trained.
     """
     shapes, stored = Shapes(device), {id: ids for ids in stored_batches(checkpoints).values() for id in ids}
     keys: list[Hashable | None] = []

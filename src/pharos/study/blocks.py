@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pharos.agents import agent_called, agent_source, hyperparameters
-from pharos.environments import Environment, as_tuples, imported, make, source_of
+from pharos.environments import Environment, as_tuples, class_source, import_class, make
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.observations import OwnObservation, names, own_observation, title
 from pharos.study.regression import MEASURES
@@ -46,9 +46,9 @@ class Run:
     Attributes:
         configuration: what determines its result.
         instance: name of the environment as the specification gives it, such as "frozen_lake/4x4".
-        engine: "batched" where it is trained together with others; a table, too, whose configuration does not say so.
-        family: what it counts as where classes are compared: the class of its environment, unless the study says else.
-        setting: name that tells its cell from that of other blocks, where the study says so: "tuned".
+        engine: "batched" if it is trained together with others; a table, too, whose configuration does not say so.
+        family: what it counts as when classes are compared: the class of its environment, unless the study says else.
+        setting: name that distinguishes its cell from other blocks, if the study has one: "tuned".
         observation: the name of its observation in tables.
     """
 
@@ -181,7 +181,7 @@ class EnvironmentEntry(_Named):
 
     @cached_property
     def instance(self) -> Environment:
-        name = imported(self.name, self._folder).name if is_reference(self.name) else self.name
+        name = import_class(self.name, self._folder).name if is_reference(self.name) else self.name
         return make(name, **{name: as_tuples(value) for name, value in self.parameters.items()})
 
     @property
@@ -191,7 +191,7 @@ class EnvironmentEntry(_Named):
 
     @property
     def counts_as(self) -> str:
-        """Its family; for an imported MDP without one its label; "" where the class of the environment counts."""
+        """Its family; for an imported MDP without one its label; "" if the class of the environment counts."""
         return self.family or (self.label if self.is_imported else "")
 
     @cached_property
@@ -206,22 +206,22 @@ class Hardness(_Part):
     """Measures of hardness that are computed, their discount, and the seconds that each may take for one instance."""
 
     gamma: Gamma = 0.99
-    measures: list[str] = Field(default_factory=lambda: [name for name in MEASURES if name in registered()])
+    measures: list[str] = Field(default_factory=lambda: [name for name in MEASURES if name in registered_names()])
     budget: Annotated[float, BeforeValidator(_number)] = Field(default=60.0, gt=0)
 
     @field_validator("measures")
     @classmethod
     def _known(cls, measures: list[str]) -> list[str]:
         for measure in measures:
-            if measure not in registered():
-                raise UnknownName("measure of hardness", measure, registered())
+            if measure not in registered_names():
+                raise UnknownName("measure of hardness", measure, registered_names())
         return measures
 
     @property
     def predictors(self) -> list[str]:
-        """Measures that explain regret in the linear models: the paper's three, or all where none of them is taken.
+        """Measures that explain regret in the linear models: the paper's three, or all if none of them is taken.
 
-        The stationary effective horizon stands for the effective horizon where that is not taken.
+        The stationary effective horizon stands for the effective horizon if that is not taken.
         """
         stand_in = {"effective_horizon": "stationary_effective_horizon"}
         names = [name if name in self.measures else stand_in.get(name) for name in MEASURES]
@@ -321,7 +321,7 @@ class Specification(_Part):
             # A run for each observation and seed
             for observation, seed in product(observations, seeds):
                 sources = {
-                    "environment": source_of(type(instance)),
+                    "environment": class_source(type(instance)),
                     "observation": None if observation.own is None else observation.own.source,
                     "agent": agent_from,
                 }
@@ -364,7 +364,7 @@ class Specification(_Part):
         return hyperparameters(agent, environment, observation, own)
 
 
-def registered() -> list[str]:
+def registered_names() -> list[str]:
     """The names of the measures of hardness."""
     from pharos.hardness import measures
 

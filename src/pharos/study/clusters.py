@@ -13,12 +13,12 @@ from typing import Any
 from pharos.errors import MissingExtra, ParameterError
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, part_of
-from pharos.study.execution import Status, StudyExecution, claim, opened, run, shard_of, train
+from pharos.study.execution import Status, StudyExecution, opened, run, shard_of, train_run, write_specification
 from pharos.study.specification import Source, specification
 from pharos.system.records import takes
 from pharos.system.wording import in_one_line
 from pharos.system.workers import Workers
-from pharos.training import ATTEMPTS, ExecutionOptions
+from pharos.training import GROUP_ATTEMPTS, ExecutionOptions
 
 
 @takes(ExecutionOptions, workers=1)
@@ -29,7 +29,7 @@ def submit(
     shards: int,
     cluster: str = "slurm",
     parameters: Mapping[str, Any] | None = None,
-    runner: _worker.Runner = train,
+    runner: _worker.Runner = train_run,
     **options: Any,
 ) -> list[Any]:
     """Submit a study as an array of jobs, each of which executes one of `shards` parts with `workers` processes.
@@ -56,29 +56,29 @@ def submit(
     if shards < 1:
         raise ParameterError(f"shards is {shards}; expected at least 1")
     how = replace(ExecutionOptions(**options), shard=None, workers=options.get("workers") or 1)
-    study, place = opened(source, folder)
-    place = place.absolute()
-    claim(study, place)
+    study, directory = opened(source, folder)
+    directory = directory.absolute()
+    write_specification(study, directory)
     try:
-        executor = submitit.AutoExecutor(folder=str(place / "jobs"), cluster=cluster)
+        executor = submitit.AutoExecutor(folder=str(directory / "jobs"), cluster=cluster)
     except RuntimeError as error:  # there is no sbatch here
         raise ParameterError(f"cannot submit to {cluster}: {error}") from error
     usual = {"cpus_per_task": how.workers, "timeout_min": 24 * 60, "name": f"pharos-{study.name}"}
     executor.update_parameters(**{**usual, **(parameters or {})})
     parts = [f"{part}/{shards}" for part in range(1, shards + 1)]
     runs = tuple(part_of(study, how.block, how.agent, how.observation))
-    parts = [part for part in parts if _has_work(shard_of(runs, part), place, how.retry_failed)]
+    parts = [part for part in parts if _has_work(shard_of(runs, part), directory, how.retry_failed)]
     if not parts:
         return []
     with executor.batch():
         return [
-            executor.submit(run_shard, str(place), {**vars(how), "shard": part, "runner": runner}) for part in parts
+            executor.submit(run_shard, str(directory), {**vars(how), "shard": part, "runner": runner}) for part in parts
         ]
 
 
-def _has_work(runs: Iterable[Run], place: Path, retry_failed: bool) -> bool:
+def _has_work(runs: Iterable[Run], directory: Path, retry_failed: bool) -> bool:
     over = ("finished",) if retry_failed else ("finished", "failed")
-    return any(_worker.read_status(place / "runs" / run.id) not in over for run in runs)
+    return any(_worker.read_status(directory / "runs" / run.id) not in over for run in runs)
 
 
 def run_shard(folder: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def run_on_ray(
     *,
     address: str | None = None,
     progress: Callable[[Status], None] | None = None,
-    runner: _worker.Runner = train,
+    runner: _worker.Runner = train_run,
     batch_runner: _worker.BatchRunner | None = None,
     **options: Any,
 ) -> Status:
@@ -111,10 +111,10 @@ def run_on_ray(
         import ray
     except ImportError as error:
         raise MissingExtra("running on Ray", "ray", "ray") from error
-    study, place = opened(source, folder)
+    study, directory = opened(source, folder)
     own = replace(ExecutionOptions(**options), workers=None)
     pool = RayTasks(ray, address)
-    return StudyExecution(study, place.absolute(), own, runner, batch_runner, progress, pool).run()
+    return StudyExecution(study, directory.absolute(), own, runner, batch_runner, progress, pool).run()
 
 
 class RayTasks(Workers):
@@ -138,7 +138,7 @@ class RayTasks(Workers):
     def start(
         self, key: str, function: Callable[..., object], arguments: Sequence[Any], definitions: Sequence[object] = ()
     ) -> None:
-        remote = self.ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_attempt)
+        remote = self.ray.remote(num_cpus=1, max_retries=GROUP_ATTEMPTS - 1)(_attempt)
         self.tasks[remote.remote(*arguments)] = key
 
     def events(self, seconds: float | None = None) -> Iterator[tuple[str, Any]]:
@@ -147,7 +147,7 @@ class RayTasks(Workers):
             key = self.tasks.pop(reference)
             try:
                 *messages, code = self.ray.get(reference)
-            except Exception as error:  # of Ray: `attempt` keeps those of the run itself
+            except Exception as error:  # of Ray: `attempt` keeps errors of the run itself
                 messages, code = [], in_one_line(error)
             for event in (*messages, code):
                 yield key, event

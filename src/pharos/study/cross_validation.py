@@ -51,7 +51,7 @@ def resampled_classes(count: int, resamples: int, seed: int) -> Counts:
 def held_out(x: np.ndarray, y: np.ndarray, classes: np.ndarray, counts: Counts) -> tuple[np.ndarray, np.ndarray]:
     """((R,) R2, (R,) rho) of classes left out one by one, for samples of classes.
 
-    A class that counts twice is left out wherever it stands, so none is predicted from itself; its cells are ranked
+    A class that counts twice is left out both times, so none is predicted from itself; its cells are ranked
     twice. Rank correlations are of at most MOST_RANKED samples, the others are NaN.
     """
     means = np.stack([x[classes == each].mean(axis=0) for each in range(classes.max() + 1)]).mean(axis=0)
@@ -94,21 +94,21 @@ def _lines(counts: Counts, products: np.ndarray, targets: np.ndarray) -> np.ndar
 
 
 def permuted_classes(
-    x: np.ndarray, y: np.ndarray, classes: np.ndarray, places: Sequence[object], permutations: int, seed: int
+    x: np.ndarray, y: np.ndarray, classes: np.ndarray, positions: Sequence[object], permutations: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((1 + R,) R2, (1 + R,) rho) of left-out classes where each class has the predictors of another one.
+    """((1 + R,) R2, (1 + R,) rho) of left-out classes if each class has the predictors of another one.
 
-    First as it is, then for R permutations of classes. Only places that all classes have are looked at; NaN where
+    First as it is, then for R permutations of classes. Only positions that all classes have are looked at; NaN if
     there are fewer than three.
 
     Args:
-        places: (N,) what a row is within its class, such as (its first instance, plain, vector). A row gets the
-            predictors of the row at the same place of the other class.
+        positions: (N,) what a row is within its class, such as (its first instance, plain, vector). A row gets the
+            predictors of the row at the same position of the other class.
     """
     number = classes.max() + 1
-    keys = {place: i for i, place in enumerate(dict.fromkeys(places))}
+    keys = {position: i for i, position in enumerate(dict.fromkeys(positions))}
     row_at = np.full((number, len(keys)), -1)
-    row_at[classes, [keys[each] for each in places]] = np.arange(len(y))
+    row_at[classes, [keys[each] for each in positions]] = np.arange(len(y))
     row_at = row_at[:, (row_at >= 0).all(axis=0)]
     if row_at.shape[1] < 3 or np.ptp(y[row_at]) == 0:
         return np.full(1 + permutations, np.nan), np.full(1 + permutations, np.nan)
@@ -120,7 +120,7 @@ def permuted_classes(
 
 
 def _exchanged(x: np.ndarray, y: np.ndarray, orders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((R,) R2, (R,) rho) of left-out classes, x (C, K, P), y (C, K), where class c has the x of class orders[r, c]."""
+    """((R,) R2, (R,) rho) of left-out classes, x (C, K, P), y (C, K); class c has the x of class orders[r, c]."""
     design = np.concatenate([np.ones((*x.shape[:2], 1)), x], axis=2)
     products = np.einsum("ckp,ckq->cpq", design, design)[orders]
     targets = np.einsum("dkp,ck->dcp", design, y)[orders, np.arange(len(y))]
@@ -147,7 +147,7 @@ def ceiling(means: np.ndarray, noise: np.ndarray, classes: np.ndarray) -> float:
     Args:
         means, noise: (N,) of cells: the mean over seeds, and the variance over seeds / seeds; NaN of a single seed.
     Returns:
-        NaN where no cell has two seeds.
+        NaN if no cell has two seeds.
     """
     finite, weights = np.isfinite(noise), class_weights(classes)
     total = float(weights @ (means - weights @ means) ** 2)

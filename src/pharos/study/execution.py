@@ -24,20 +24,20 @@ from pharos.study import batches as _batches
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification, part_of
 from pharos.study.specification import Source
-from pharos.study.status import Forecast, Status, claim, duration, opened, status
+from pharos.study.status import Forecast, Status, duration, opened, status, write_specification
 from pharos.system.records import takes
 from pharos.system.storage import replace_json
 from pharos.system.workers import Workers, usable_workers
 from pharos.training import Execution, ExecutionOptions, Work
 
-__all__ = ["Status", "StudyExecution", "claim", "duration", "opened", "run", "shard_of", "status"]
+__all__ = ["Status", "StudyExecution", "duration", "opened", "run", "shard_of", "status", "write_specification"]
 
 STATUS_SECONDS = 2.0
 # Between two counts of the runs that other runners have finished in the same folder
 OTHERS_SECONDS = 20.0
 
 
-def train(config: Mapping[str, Any], folder: Path) -> None:
+def train_run(config: Mapping[str, Any], folder: Path) -> None:
     """Train a run as `config` says, and write run.json and curve.csv into `folder`: the runner of studies."""
     _batches.train_batch([config], [folder], folder)
 
@@ -61,7 +61,7 @@ def run(
     folder: str | os.PathLike | None = None,
     *,
     progress: Callable[[Status], None] | None = None,
-    runner: _worker.Runner = train,
+    runner: _worker.Runner = train_run,
     prepare: Callable[[Mapping[str, Any]], Any] | None = None,
     batch_runner: _worker.BatchRunner | None = None,
     foretold: Callable[[Forecast], None] | None = None,
@@ -90,11 +90,11 @@ def run(
     """
     execution = StudyExecution(*opened(source, folder), ExecutionOptions(**options), runner, batch_runner, progress)
     missing = execution.missing
-    if missing and runner is train:
+    if missing and runner is train_run:
         refuse_missing(execution.options.device)
     if foretold is not None and missing:
         foretold(execution.forecast())
-    if prepare is None and runner is train:
+    if prepare is None and runner is train_run:
         prepare = prepare_instance
     if prepare is not None:  # a failure there is left to the runs to tell
         prepare_instances(prepare, missing, execution.report)
@@ -118,7 +118,7 @@ class StudyExecution(Execution[Run]):
         study: Specification,
         folder: Path,
         options: ExecutionOptions,
-        runner: _worker.Runner = train,
+        runner: _worker.Runner = train_run,
         batch_runner: _worker.BatchRunner | None = None,
         progress: Callable[[Status], None] | None = None,
         pool: Workers | None = None,
@@ -126,8 +126,8 @@ class StudyExecution(Execution[Run]):
         self.study, self.folder, self.options, self.progress = study, folder, options, progress
         part = part_of(study, options.block, options.agent, options.observation)
         self.runs = shard_of(tuple(part), options.shard)
-        claim(study, folder)
-        if batch_runner is None and runner is train:
+        write_specification(study, folder)
+        if batch_runner is None and runner is train_run:
             batch_runner = partial(_batches.train_batch, device=options.device)
         self.runner, self.batch_runner = runner, batch_runner
         self.began = time.monotonic()
@@ -146,7 +146,7 @@ class StudyExecution(Execution[Run]):
             super().__init__(groups, pool, workers=len(self.runs), checkpoints=checkpoints, attempts=1)
             return
         # Stable-Baselines3 asks whether there is a GPU, and CUDA refuses in what is forked after that
-        preload = "pharos.study.warm" if runner is train else "pharos.study.worker"
+        preload = "pharos.study.warm" if runner is train_run else "pharos.study.worker"
         pool = Workers(preload if options.device == "cpu" else None)
         alone = options.workers is None and options.device != "cpu"  # several processes would share a GPU's memory
         workers = usable_workers(1 if alone else options.workers)
@@ -210,13 +210,13 @@ class StudyExecution(Execution[Run]):
         folder = self.folder / "partial" / run.id
         folder.mkdir(parents=True, exist_ok=True)
         _worker.write_failure(folder, run.config, run.id, reason, 0.0)
-        _worker.publish(folder, self.folder, run.id)
+        _worker.publish_run(folder, self.folder, run.id)
         self.record_result(run, False)
 
     def record_result(self, run: Run, again: bool = False) -> bool:
-        """Read and count the result of a run that is over; False where it has to be executed, a damaged one again."""
+        """Read and count the result of a run that is over; False if it has to be executed, a damaged one again."""
         try:
-            record = _worker.read_record(self.folder / "runs" / run.id)
+            record = _worker.run_record(self.folder / "runs" / run.id)
         except FileFormatError as error:
             self.damaged[run.id] = str(error)
             return False
@@ -290,16 +290,16 @@ POLL_SECONDS = 2.0
 
 def prepare_instance(config: Mapping[str, Any]) -> None:
     """Build the state space of a run into the cache, and keep the values of its task at the start."""
-    build(_batches.task_of(config).env, wait=False)
+    build(_batches.task_of_config(config).env, wait=False)
     _batches.solve(config)
 
 
 def prepare_instances(
-    prepare: Callable[[Mapping[str, Any]], Any], runs: Iterable[Run], tell: Callable[[str], Any]
+    prepare: Callable[[Mapping[str, Any]], Any], runs: Iterable[Run], progress: Callable[[str], Any]
 ) -> None:
-    """Call `prepare` with one config of each instance of the runs, and `tell` with its progress; failures are ignored.
+    """Call `prepare` with one config of each instance of the runs, and `progress` with a text; failures are ignored.
 
-    A process of their own prepares them one after the other; where it dies, another goes on with the next.
+    A separate process prepares them one after the other. If it dies, another goes on with the next.
     """
     instances: dict[str, Run] = {}
     for run in runs:
@@ -313,7 +313,7 @@ def prepare_instances(
                 definitions = [prepare, *(each for run in todo for each in run.configuration.definitions)]
                 workers.start("", _prepare_all, (prepare, [run.config for run in todo]), definitions)
             number, run = len(instances) - len(todo) + 1, todo[0]
-            tell(f"preparing {run.instance}, {run.chance} ({number} of {len(instances)}){waits_for}")
+            progress(f"preparing {run.instance}, {run.chance} ({number} of {len(instances)}){waits_for}")
             for _, message in workers.events(POLL_SECONDS):
                 waits_for = f"; {message}" if isinstance(message, str) and message else ""
                 if not waits_for and todo:  # one is prepared, or its process has died
@@ -347,7 +347,7 @@ def _ask_for_device(device: str, send: Callable[[ParameterError], None]) -> None
 def _prepare_all(
     prepare: Callable[[Mapping[str, Any]], Any], configs: Iterable[Mapping[str, Any]], send: Callable[[str], None]
 ) -> None:
-    """Prepare instances one after the other; send "" after each, and the reason where one waits."""
+    """Prepare instances one after the other; send "" after each, and the reason if one waits."""
     for config in configs:
         with contextlib.suppress(Exception):  # the runs of this instance will fail with the same error, and say so
             unless_locked(prepare, config, send)
@@ -355,13 +355,13 @@ def _prepare_all(
 
 
 def unless_locked(
-    prepare: Callable[[Mapping[str, Any]], Any], config: Mapping[str, Any], tell: Callable[[str], None]
+    prepare: Callable[[Mapping[str, Any]], Any], config: Mapping[str, Any], on_wait: Callable[[str], None]
 ) -> None:
-    """Prepare an instance; where another process is building it, wait for that one."""
+    """Prepare an instance; if another process is building it, wait for that one."""
     while True:
         try:
             prepare(config)
             return
         except StateSpaceLocked as error:
-            tell(str(error))
+            on_wait(str(error))
             time.sleep(POLL_SECONDS)

@@ -1,6 +1,6 @@
 """The figures of a study and its tables in LaTeX.
 
-Curves over steps or scores are numbers: what figures draw, and what the page shows where one points at it. Each figure
+Curves over steps or scores are numbers: what figures draw, and what the page shows when one points at it. Each figure
 is a function of tables: a matplotlib figure without global state, light or dark. Tables are in the paper's layout
 (packages booktabs, multirow), by pandas' Styler.
 """
@@ -18,7 +18,7 @@ from pharos.agents import TABULAR_OBSERVATION
 from pharos.environments import classes
 from pharos.plots import (
     DIAGONAL,
-    agent_name,
+    agent_label,
     color_among,
     label_edges,
     legend_below,
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 
 LINES = {"q_learning": "-", "dqn": "-", "ppo": "--"}
-OBSERVATIONS = {TABULAR_OBSERVATION: "", VECTOR: "vector", IMAGE: "image"}
+OBSERVATION_WORDS = {TABULAR_OBSERVATION: "", VECTOR: "vector", IMAGE: "image"}
 # More lines of runs than this are not told apart in one panel: the page does not offer them
-MOST_RUNS = 120
+MOST_CURVE_RUNS = 120
 # Significant digits of the numbers in the page
-DIGITS = 5
+CURVE_DIGITS = 5
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Line:
     Attributes:
         label: in words, `DQN, image`.
         color, dash: `#0072B2`; as matplotlib writes it, such as `--`.
-        x: (T,) where it is known; mean, lower, upper: (T,) the line and the ends of its interval.
+        x: (T,) if it is known; mean, lower, upper: (T,) the line and the ends of its interval.
         runs: name of each run -> (T,) its values.
     """
 
@@ -90,12 +90,12 @@ class Curves:
     draws_runs: bool = False
 
     def to_json(self) -> str:
-        """The curves as the page draws them: numbers of DIGITS digits; runs where there are at most MOST_RUNS."""
+        """The curves as the page draws them: numbers of DIGITS digits; runs if there are at most MOST_RUNS."""
         panels = []
         for panel in self.panels:
             num_runs = sum(len(line.runs) for line in panel.lines)
             panels.append(
-                {"title": panel.title, "lines": [_numbers(line, num_runs <= MOST_RUNS) for line in panel.lines]}
+                {"title": panel.title, "lines": [_numbers(line, num_runs <= MOST_CURVE_RUNS) for line in panel.lines]}
             )
         about = {"x": self.x_label, "y": self.y_label, "share": self.share, "runs": self.draws_runs}
         return json.dumps({**about, "panels": panels}, separators=(",", ":"), allow_nan=False)
@@ -109,14 +109,14 @@ def _numbers(line: Line, runs: bool) -> dict[str, Any]:
 
 def _short(values: np.ndarray) -> list[float | int | None]:
     """The values with DIGITS significant digits, whole ones as integers; null for what is not finite."""
-    texts = [f"{value:.{DIGITS}g}" if np.isfinite(value) else "null" for value in np.asarray(values, np.float64)]
+    texts = [f"{value:.{CURVE_DIGITS}g}" if np.isfinite(value) else "null" for value in np.asarray(values, np.float64)]
     return [None if text == "null" else int(float(text)) if float(text).is_integer() else float(text) for text in texts]
 
 
-def label(agent: str, observation: str) -> str:
+def line_label(agent: str, observation: str) -> str:
     """Label of an agent and its observation: `DQN, image`, `tabular Q-learning`."""
-    words = OBSERVATIONS.get(observation, observation)
-    return f"{agent_name(agent)}, {words}" if words else agent_name(agent)
+    words = OBSERVATION_WORDS.get(observation, observation)
+    return f"{agent_label(agent)}, {words}" if words else agent_label(agent)
 
 
 def regret_curves(
@@ -134,7 +134,7 @@ def regret_curves(
             steps, tasks, runs = same_steps(each)
             mean, lower, upper = mean_curve(tasks, resamples=resamples)
             color = observation_color(observation, observations)
-            words, dash = label(agent, observation), LINES.get(agent, ":")
+            words, dash = line_label(agent, observation), LINES.get(agent, ":")
             panel_lines.append(Line(words, color, dash, steps, mean, lower, upper, runs))
         text = name if isinstance(name, str) else ", ".join(map(str, name))
         panels.append(Panel(in_words(text), panel_lines))
@@ -142,10 +142,10 @@ def regret_curves(
 
 
 def same_steps(points: "pd.DataFrame") -> tuple[np.ndarray, list[np.ndarray], dict[str, np.ndarray]]:
-    """Steps, for each task the cumulative regret (runs, T) there, and that of each run by its name, of the runs that
-    were evaluated at the same steps.
+    """Steps, for each task the cumulative regret (runs, T) there, and the regret of each run by its name, for the runs
+    that were evaluated at the same steps.
 
-    Where blocks of a study differ in steps, those are the steps that most runs have.
+    If blocks of a study differ in steps, these are the steps that most runs have.
     """
     by_run = points.pivot_table(index=["instance", "chance", "id"], columns="step", values="cumulative_expected_regret")
     present = by_run.notna()
@@ -169,7 +169,7 @@ def performance_profiles(profiles: "pd.DataFrame") -> Curves:
         for (agent, observation), line in part.groupby(["agent", "observation"], sort=True):
             color = observation_color(observation, observations)
             values = (line[column].to_numpy(np.float64) for column in ("score", "share", "lower", "upper"))
-            panel_lines.append(Line(label(agent, observation), color, LINES.get(agent, ":"), *values))
+            panel_lines.append(Line(line_label(agent, observation), color, LINES.get(agent, ":"), *values))
         panels.append(Panel(in_words(str(name)), panel_lines))
     return Curves(panels, "score: 1 - normalised regret", "share of runs above it", share=True)
 
@@ -227,7 +227,7 @@ def class_color(name: str, names: Sequence[str]) -> str:
 
 
 def pairs_of(cells: "pd.DataFrame", agents: Sequence[str]) -> list[tuple[str, str]]:
-    """(agent, image) where some task has cells of the agent with that image and with a vector."""
+    """(agent, image) if some task has cells of the agent with that image and with a vector."""
     pairs = []
     for agent in agents:
         own = cells[cells["agent"] == agent]
@@ -251,7 +251,7 @@ def agents_figure(one: str, two: str) -> str:
 
 def representations(cells: "pd.DataFrame", *, agent: str = "dqn", image: str = IMAGE) -> "Figure | None":
     """Normalised regret with a vector against that with an image, a point for each task. The paper's figure 3."""
-    words = [f"normalised regret of {agent_name(agent)} with {sight}" for sight in ("an image", "a vector")]
+    words = [f"normalised regret of {agent_label(agent)} with {sight}" for sight in ("an image", "a vector")]
     figure = _against(cells[cells["agent"] == agent], "observation", "normalized_regret", (image, VECTOR), words)
     if figure is not None:
         (axis,) = figure.axes
@@ -262,15 +262,15 @@ def representations(cells: "pd.DataFrame", *, agent: str = "dqn", image: str = I
 
 
 def agents_against_each_other(cells: "pd.DataFrame", value: str, agents: tuple[str, str]) -> "Figure | None":
-    """The value of one agent against that of another, a point for each task and observation."""
-    words = [f"{REGRETS.get(value, value)} of {agent_name(agent)}" for agent in agents]
+    """The value of one agent against the value of another, a point for each task and observation."""
+    words = [f"{REGRETS.get(value, value)} of {agent_label(agent)}" for agent in agents]
     return _against(cells, "agent", value, agents, words)
 
 
 def _against(
     cells: "pd.DataFrame", column: str, value: str, both: tuple[str, str], words: Sequence[str]
 ) -> "Figure | None":
-    """The value with one entry of `column` against that with another; None where no cell has both."""
+    """The value with one entry of `column` against the value with another; None if no cell has both."""
     index = [name for name in CELL if name != column]
     wide = cells.pivot_table(index=index, columns=column, values=value)
     if not {*both} <= {*wide.columns} or not len(wide := wide[list(both)].dropna().reset_index()):
@@ -343,7 +343,7 @@ def _fits(fits: Sequence[Fit], regret: str) -> "Figure | None":
 
 
 # As the paper orders them
-COLUMNS = (("ppo", IMAGE), ("ppo", VECTOR), ("dqn", IMAGE), ("dqn", VECTOR))
+RETURN_COLUMNS = (("ppo", IMAGE), ("ppo", VECTOR), ("dqn", IMAGE), ("dqn", VECTOR))
 TITLES = {"ppo": "PPO", "dqn": "DQN", IMAGE: "IMAGE", VECTOR: "MINIMAL"}
 CHANCES = {"plain": "None", "random": "random", "sticky": "stick"}
 
@@ -354,7 +354,7 @@ def tables_of(cells: "pd.DataFrame", measured: "pd.DataFrame", models: Sequence[
         f"returns_{environment}": returns_table(cells, environment)
         for environment in dict.fromkeys(cells["environment"])
     }
-    tables["hardness"] = hardness_table(measured)
+    tables["hardness"] = latex_hardness(measured)
     for each in models:
         tables[f"models_{each.regret}{each.suffix(models[0].agent)}"] = models_table(each)
     return tables
@@ -363,16 +363,16 @@ def tables_of(cells: "pd.DataFrame", measured: "pd.DataFrame", models: Sequence[
 def returns_table(cells: "pd.DataFrame", environment: str) -> str:
     """The returns of one class, a line for each kind of chance.
 
-    As in appendix C where PPO and DQN see images and vectors: IMAGE and MINIMAL (the vector). Else a column for each
+    As in appendix C if PPO and DQN see images and vectors: IMAGE and MINIMAL (the vector). Else a column for each
     agent and observation that there is.
     """
     import pandas as pd
 
     wide = wide_returns(cells, environment, lambda row: _entry(row["return"], row["return_deviation"])).fillna("--")
     keys = list(wide)
-    titles = [(latex_text(agent_name(agent)), latex_text(in_words(name))) for agent, name in keys]
-    if {key for key in keys if key[1] != TABULAR_OBSERVATION} == set(COLUMNS):
-        keys, titles = list(COLUMNS), [(TITLES[agent], TITLES[name]) for agent, name in COLUMNS]
+    titles = [(latex_text(agent_label(agent)), latex_text(in_words(name))) for agent, name in keys]
+    if {key for key in keys if key[1] != TABULAR_OBSERVATION} == set(RETURN_COLUMNS):
+        keys, titles = list(RETURN_COLUMNS), [(TITLES[agent], TITLES[name]) for agent, name in RETURN_COLUMNS]
     rows = []
     for instance, chance in wide.index:
         kind = chance if "," in chance else CHANCES.get(chance.split()[0], chance)
@@ -384,7 +384,7 @@ def returns_table(cells: "pd.DataFrame", environment: str) -> str:
 
 def wide_returns(cells: "pd.DataFrame", environment: str, text: Callable[[Mapping[str, Any]], str]) -> "pd.DataFrame":
     """The text of each cell of a class: a row for each instance and kind of chance, a column for each agent and
-    observation, those of PPO first.
+    observation, PPO first.
     """
     part = cells[cells["environment"] == environment]
     texts = part.assign(text=[text(row) for row in part.to_dict("records")])
@@ -393,7 +393,7 @@ def wide_returns(cells: "pd.DataFrame", environment: str, text: Callable[[Mappin
     return wide.loc[rows, sorted(wide, key=lambda key: (key[0] != PAPER_AGENTS[1], *key))]
 
 
-def hardness_table(measured: "pd.DataFrame") -> str:
+def latex_hardness(measured: "pd.DataFrame") -> str:
     """The measures of each instance under each kind of chance."""
     names = [name for name in measured.columns if name not in ("environment", "instance", "chance", "notes")]
     texts = measured[["instance", "chance"]].map(latex_text)

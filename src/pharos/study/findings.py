@@ -17,13 +17,13 @@ from pharos.system.wording import in_words
 if TYPE_CHECKING:
     import pandas as pd
 
-LEVEL = 0.05  # of every test; each stands alone, without a correction for their number
-COLUMNS = ["finding", "of", "paper", "ours", "evidence", "effect", "lower", "upper", "p", "power", "verdict"]
+SIGNIFICANCE_LEVEL = 0.05  # of every test; each stands alone, without a correction for their number
+FINDING_COLUMNS = ["finding", "of", "paper", "ours", "evidence", "effect", "lower", "upper", "p", "power", "verdict"]
 # By the paper's sections 4.2 and 4.1
 _HARDER = {"simple_grid": "image", "frozen_lake": "image", "breakout": "vector", "freeway": "vector"}
 _OBSERVATIONS = {"image": ("dqn", IMAGE), "vector": ("dqn", VECTOR)}
 _SLOWER = {"simple_grid": "DQN", "frozen_lake": "DQN", "breakout": "table", "freeway": "table"}
-_LEARNERS = {"table": ("q_learning", TABULAR_OBSERVATION), "DQN": ("dqn", VECTOR)}
+_FINDING_LEARNERS = {"table": ("q_learning", TABULAR_OBSERVATION), "DQN": ("dqn", VECTOR)}
 _PRINTED_AGREEMENT = 0.81
 # R2 that the paper prints: of one model, of those by representation and by class together, with vectors and with images
 _PRINTED_R2 = {"single": 0.09, "representation": 0.48, "class": 0.65, "vector": 0.6, "image": 0.3}
@@ -40,9 +40,9 @@ def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) ->
 
     - Which observation costs DQN more regret, for each class: the normalised regret of both on the same tasks,
       Wilcoxon's signed-rank test, two-sided; likewise, whether a table or DQN with vectors has more regret. The effect
-      is the difference by Hodges and Lehmann, image less vector and table less DQN, its interval that of the test.
+      is the difference by Hodges and Lehmann, image less vector and table less DQN, with the interval of the test.
     - One linear model of all explains next to nothing: the F test of class and measures on the means of the tasks over
-      observations. Where it is significant, the verdict adds "mostly by class" if class and representation alone
+      observations. If it is significant, the verdict adds "mostly by class" if class and representation alone
       explain more than half of R2, and the evidence tests what the measures add.
     - Models by representation explain more: the F test of class and measures on the differences within tasks. Models
       by class explain more: the F test of their slopes on the means of the tasks. The single model is nested in both.
@@ -56,9 +56,9 @@ def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) ->
         models: of DQN's cumulative regret.
     Returns:
         One row a finding: what the paper says, ours, the statistic in words, the effect and the ends of its 95 %
-        interval, p-value (NaN where an interval decides), the power, and the verdict: "agrees" or "disagrees" where
-        the test is significant at 0.05, "undecided" where it is not, "no data".
-        The power is the probability that these tasks find the effect, at 0.05, where it is as large as the paper
+        interval, p-value (NaN if an interval decides), the power, and the verdict: "agrees" or "disagrees" if
+        the test is significant at 0.05, "undecided" if it is not, "no data".
+        The power is the probability that these tasks find the effect, at 0.05, if it is as large as the paper
         prints: its R2 for the F tests, its r, its difference of R2; of observations, whose sizes it does not print, a
         difference of SMALLEST_DIFFERENCE. "undecided" with little power says nothing against the paper.
     Cost: `resamples` small regressions.
@@ -70,11 +70,11 @@ def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) ->
         for environment, harder in _HARDER.items()
     ]
     rows += [
-        _compared(cells, "the learner with more regret", environment, slower, _LEARNERS)
+        _compared(cells, "the learner with more regret", environment, slower, _FINDING_LEARNERS)
         for environment, slower in _SLOWER.items()
     ]
     rows += [_single(models), *_nested(models), _vectors_explained_better(models, resamples), _agreement(cells)]
-    return pd.DataFrame(rows, columns=COLUMNS)
+    return pd.DataFrame(rows, columns=FINDING_COLUMNS)
 
 
 def _row(
@@ -88,7 +88,7 @@ def _row(
     power: float = math.nan,
     effect: Effect = (math.nan, math.nan, math.nan),
 ) -> dict[str, Any]:
-    return dict(zip(COLUMNS, (finding, of, paper, ours, evidence, *effect, p, power, verdict), strict=True))
+    return dict(zip(FINDING_COLUMNS, (finding, of, paper, ours, evidence, *effect, p, power, verdict), strict=True))
 
 
 def _power_of_mean(effect: float, deviation: float, number: int) -> float:
@@ -112,8 +112,8 @@ def _power_of_f(added: int, free: int, r_squared: float, without: float = 0.0) -
 
     shift = (r_squared - without) / (1 - r_squared) * (added + free + 1)
     if shift <= 0:
-        return LEVEL
-    return float(stats.ncf.sf(stats.f.isf(LEVEL, added, free), added, free, shift))
+        return SIGNIFICANCE_LEVEL
+    return float(stats.ncf.sf(stats.f.isf(SIGNIFICANCE_LEVEL, added, free), added, free, shift))
 
 
 def _nothing(finding: str, of: str, paper: str, why: str) -> dict[str, Any]:
@@ -153,14 +153,14 @@ def _signed_ranks(differences: np.ndarray) -> tuple[Effect, float]:
     for rank in range(1, len(differences) + 1):
         chances = (np.pad(chances, (0, rank)) + np.pad(chances, (rank, 0))) / 2
     tail = np.cumsum(chances)
-    excluded = int((tail <= LEVEL / 2).sum())
+    excluded = int((tail <= SIGNIFICANCE_LEVEL / 2).sum())
     ends = (averages[excluded - 1], averages[-excluded]) if excluded else (-math.inf, math.inf)
     p = min(1.0, 2 * float(tail[min((averages >= 0).sum(), (averages <= 0).sum())]))
     return (float(np.median(averages)), float(ends[0]), float(ends[1])), p
 
 
 def _verdict(agrees: bool, p: float) -> str:
-    if not p < LEVEL:
+    if not p < SIGNIFICANCE_LEVEL:
         return "undecided"
     return "agrees" if agrees else "disagrees"
 
@@ -172,7 +172,7 @@ class _Tasks:
     Attributes:
         names: of the tasks.
         regrets: (T, R).
-        design: (T, P) predictors that belong to a task, the intercept first; those of observations are left out.
+        design: (T, P) predictors that belong to a task, the intercept first; predictors of observations are left out.
         class_design: the first columns of that, without the measures of hardness.
     """
 
@@ -197,14 +197,16 @@ def _tasks(fit: Fit) -> _Tasks:
     observations = sorted(set(fit.observations)) or [""]
     rows = {key: row for row, key in enumerate(zip(names, fit.observations or [""] * len(names), strict=True))}
     complete = [name for name in dict.fromkeys(names) if all((name, each) in rows for each in observations)]
-    places = np.array([[rows[name, each] for each in observations] for name in complete], int).reshape(
+    row_numbers = np.array([[rows[name, each] for each in observations] for name in complete], int).reshape(
         -1, len(observations)
     )
     columns = [str(name) for name in fit.coefficients.index]
     of_task = [i for i, name in enumerate(columns) if not name.startswith("C(observation)")]
     of_class = [i for i in of_task if not columns[i].startswith("np.log(")]
-    first = places[:, 0]
-    return _Tasks(tuple(complete), fit.actual[places], fit.design[first][:, of_task], fit.design[first][:, of_class])
+    first = row_numbers[:, 0]
+    return _Tasks(
+        tuple(complete), fit.actual[row_numbers], fit.design[first][:, of_task], fit.design[first][:, of_class]
+    )
 
 
 def _rest(design: np.ndarray, values: np.ndarray) -> float:
@@ -222,7 +224,7 @@ def _f_test(small: float, large: float, added: int, free: int) -> tuple[float, f
 
 def _share(statistic: float, added: int, free: int) -> Effect:
     """Effect of an F test: the share of the smaller model's residual squares that the larger one explains; its
-    interval is that of the noncentrality.
+    interval follows from the interval of the noncentrality.
 
     Source: Steiger (2004), Beyond the F test, with f2 (u + v + 1) as the noncentrality.
     """
@@ -243,7 +245,7 @@ def _share(statistic: float, added: int, free: int) -> Effect:
         shift = float(optimize.brentq(excess, 0.0, highest))
         return shift / (shift + added + free + 1)
 
-    return added * statistic / (added * statistic + free), end(1 - LEVEL / 2), end(LEVEL / 2)
+    return added * statistic / (added * statistic + free), end(1 - SIGNIFICANCE_LEVEL / 2), end(SIGNIFICANCE_LEVEL / 2)
 
 
 def _single(models: Models) -> dict[str, Any]:
@@ -261,7 +263,7 @@ def _single(models: Models) -> dict[str, Any]:
     evidence = f"F({parameters - 1}, {number - parameters}) = {statistic:.1f} of task means"
     evidence += f"; R² {fit.cross_validated_r_squared:.2f} for tasks not seen"
     verdict = "agrees"
-    if p < LEVEL:
+    if p < SIGNIFICANCE_LEVEL:
         verdict = "disagrees"
         by_class = models.class_alone
         if by_class is not None and by_class > fit.r_squared / 2:
@@ -356,7 +358,7 @@ def _power_of_error(effect: float, error: float) -> float:
 
 
 def _r_squared(fit: Fit, rows: np.ndarray) -> float:
-    """R2 of the same model fitted to some of the rows; NaN where they are all alike."""
+    """R2 of the same model fitted to some of the rows; NaN if they are all alike."""
     design, actual = fit.design[rows], fit.actual[rows]
     coefficients, *_ = np.linalg.lstsq(design, actual, rcond=None)
     return r_squared(actual, actual - design @ coefficients)

@@ -40,11 +40,11 @@ TENTH = 0.1
 RESAMPLES = 1000
 PERMUTATIONS = 4999
 CONTROL = "tabular_regret"
-IMAGES, VECTOR = ("simple_image", "complex_image", "recorded"), "vector"
+IMAGES, VECTOR_NAME = ("simple_image", "complex_image", "recorded"), "vector"
 TABULAR, SCALE, CLASSES = "tabular measures", "random play", "class alone"
-TABLES = ("tabular_regret", "tabular_regret_played", "policy_tabular_regret", "clipped_tabular_regret")
+TABULAR_PREDICTORS = ("tabular_regret", "tabular_regret_played", "policy_tabular_regret", "clipped_tabular_regret")
 """Learners without a kernel."""
-BASELINES = (CLASSES, SCALE, TABULAR, "exploration_time", "num_states", *TABLES)
+BASELINE_MODELS = (CLASSES, SCALE, TABULAR, "exploration_time", "num_states", *TABULAR_PREDICTORS)
 P_VALUES = ("p_rho", "p_agreement", "p_slope")
 
 
@@ -95,10 +95,12 @@ def models_of(frame: "pd.DataFrame", predictors: Sequence[str], measures: Sequen
     """Models of the predictors, and of the baselines that the table has columns for.
 
     Args:
-        measures: tabular ones; each alone too, where there are no predictions.
+        measures: tabular ones; each alone too, if there are no predictions.
     """
     models = [
-        Model(name, (name,), name in BASELINES) for name in predictors if name in frame and frame[name].notna().any()
+        Model(name, (name,), name in BASELINE_MODELS)
+        for name in predictors
+        if name in frame and frame[name].notna().any()
     ]
     if not models:
         models = [Model(name, (name,), True) for name in measures]
@@ -177,7 +179,7 @@ def unseen_classes(
 
 
 def _predictors_of(predictions: "pd.DataFrame") -> list[str]:
-    """Names of pharos' predictors, and of other columns of numbers, such as those of a user's measures."""
+    """Names of pharos' predictors, and of other columns of numbers, such as a user's measures."""
     ours = (*PREDICTORS, SAMPLED_PREDICTORS[0], *POLICY_PREDICTORS)
     others = {*CELL, *SAMPLED_PREDICTORS, "estimated_error"}
     added = [name for name in predictions if name not in (*ours, *others) and predictions[name].dtype.kind in "fiu"]
@@ -225,7 +227,7 @@ class Cells:
         return Cells(frame, x[usable], y[usable], *numbers)
 
     @property
-    def places(self) -> list[tuple[int, str, str]]:
+    def positions(self) -> list[tuple[int, str, str]]:
         """(Position of the instance in its class, chance, observation) of each row."""
         position: dict[int, int] = {}
         counts: dict[int, int] = {}
@@ -250,7 +252,7 @@ def _numbers(frame: "pd.DataFrame", columns: Sequence[str]) -> np.ndarray:
 def _line(
     part: "pd.DataFrame", model: Model, outcome: str, tabular: Sequence[str], permutations: int, seed: int
 ) -> dict[str, float] | None:
-    """Statistics of a model of an outcome, by column; None with fewer than two classes, or where nothing varies."""
+    """Statistics of a model of an outcome, by column; None with fewer than two classes, or if nothing varies."""
     cells = Cells.of(part, model.columns, outcome)
     count = len(np.unique(cells.classes))
     if count < 2 or np.ptp(cells.y) == 0 or (model.columns and (np.ptp(cells.x, axis=0) == 0).all()):
@@ -262,7 +264,7 @@ def _line(
 
 
 def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[str, float]:
-    """Statistics of classes and MDPs left out; rank correlations are NaN where there is no predictor."""
+    """Statistics of classes and MDPs left out; rank correlations are NaN if there is no predictor."""
     x, y, classes = cells.x, cells.y, cells.classes
     count = classes.max() + 1
     scores, rho = cross_validation.held_out(x, y, classes, np.ones((1, count), int))
@@ -275,7 +277,7 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
     noise = _noise(cells, outcome)
     floors, p = [np.nan, np.nan], np.nan
     if permutations and x.shape[1] and count >= 3:
-        shuffled = cross_validation.permuted_classes(x, y, classes, cells.places, permutations, seed)
+        shuffled = cross_validation.permuted_classes(x, y, classes, cells.positions, permutations, seed)
         floors = [float(percentiles(each[1:], 95)[0]) for each in shuffled]
         p = permutation_p_value(shuffled[1][0], shuffled[1][1:])
     return {
@@ -296,7 +298,7 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
 
 
 def _noise(cells: Cells, outcome: str) -> np.ndarray | None:
-    """(N,) the variance of the mean over seeds; None where it is not known, or is not that of the logarithm."""
+    """(N,) the variance of the mean over seeds; None if it is not known, or does not hold for the logarithm."""
     if outcome == ABSOLUTE or f"{outcome}_noise" not in cells.frame:
         return None
     return cells.frame[f"{outcome}_noise"].to_numpy(float)
@@ -314,19 +316,19 @@ def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[st
     within = [spearman(x[classes == each], y[classes == each]) for each in range(classes.max() + 1)]
     if np.isfinite(within).any():
         row["rho_within"] = float(np.nanmean(within))
-    # Pairs of observations: all, then those of an image and a vector
+    # Pairs of observations: all, then pairs of an image and a vector
     pairs = Pairs.of(y, cells.mdps)
     row |= {"pairs": len(pairs.first), "agreement": pairs.agreement(x)}
     noise = _noise(cells, outcome)
     if noise is not None:
         row["agreement_ceiling"] = pairs.ceiling(y, noise)
     names = cells.frame["observation"].to_numpy()
-    is_vector = names == VECTOR
+    is_vector = names == VECTOR_NAME
     is_image = np.array([name.split("(")[0] in IMAGES for name in names])
     first, second = pairs.first, pairs.second
     of_both = pairs.only((is_image[first] & is_vector[second]) | (is_vector[first] & is_image[second]))
     row |= {"image_pairs": len(of_both.first), "image_agreement": of_both.agreement(x)}
-    # Interval and p-value, where the predictor tells observations apart
+    # Interval and p-value, if the predictor distinguishes observations
     if (pairs.right(x) == 0.5).all():
         return row
     drawn = cross_validation.resampled_classes(classes.max() + 1, RESAMPLES, seed)
@@ -394,7 +396,7 @@ def mixed_fit(x: np.ndarray, y: np.ndarray, classes: np.ndarray, mdps: np.ndarra
     """Fit the model to cells: x, y (N,), classes and mdps (N,) integers; MDPs of different classes are different.
 
     Returns:
-        None where there are fewer than three classes, x is constant, or the likelihood has no maximum that is found.
+        None if there are fewer than three classes, x is constant, or no maximum of the likelihood is found.
     Source: statsmodels' MixedLM; Laird and Ware (1982).
     """
     import pandas as pd

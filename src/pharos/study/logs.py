@@ -12,10 +12,10 @@ from pharos.errors import FileFormatError, MissingExtra, UnknownName
 from pharos.plots import slug
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
-from pharos.study.figures import label
+from pharos.study.figures import line_label
 from pharos.study.specification import Source
 from pharos.study.status import opened
-from pharos.study.tables import described, read_curve
+from pharos.study.tables import described, run_curve
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,8 +48,8 @@ def log(
     Raises:
         UnknownName: `to` is neither. MissingExtra: the package is not installed.
     """
-    study, place = opened(source, folder, trust=trust)
-    return RunLog(study, place, to, project=project, offline=offline).update(progress or (lambda _: None))
+    study, directory = opened(source, folder, trust=trust)
+    return RunLog(study, directory, to, project=project, offline=offline).update(progress or (lambda _: None))
 
 
 @dataclass
@@ -60,7 +60,7 @@ class RunLog:
     """
 
     study: Specification
-    place: Path
+    directory: Path
     to: str
     project: str | None = None
     offline: bool = False
@@ -73,16 +73,16 @@ class RunLog:
 
     def update(self, progress: Callable[[str], None] = lambda _: None) -> int:
         """Write the runs that are finished and not written yet; return how many."""
-        written = self.place / self.to / "written"
+        written = self.directory / self.to / "written"
         number = 0
-        for run, name in named(self.study):
+        for run, name in named_runs(self.study):
             if (written / run.id).exists():
                 continue
             try:
-                record = _worker.read_record(self.place / "runs" / run.id)
+                record = _worker.run_record(self.directory / "runs" / run.id)
                 if record is None or record["status"] != _worker.FINISHED:
                     continue
-                curve = read_curve(self.place, run.id)
+                curve = run_curve(self.directory, run.id)
             except FileFormatError:  # `status` and `report` tell which, and why
                 continue
             progress(name)
@@ -102,11 +102,11 @@ class RunLog:
             raise MissingExtra("logs for TensorBoard", "tensorboard", "agents") from error
 
         def write(run: Run, name: str, record: Mapping[str, Any], curve: object) -> None:
-            folder = self.place / self.to / name
+            folder = self.directory / self.to / name
             for old in folder.glob("events.out.tfevents.*"):  # of an attempt that was killed
                 old.unlink()
             writer = EventFileWriter(str(folder))
-            ended = (self.place / "runs" / run.id / "run.json").stat().st_mtime
+            ended = (self.directory / "runs" / run.id / "run.json").stat().st_mtime
             began = ended - float(record["seconds"])
             writer.add_event(Event(wall_time=began, step=0, summary=hparams_pb(_settings(run), trial_id=run.id)))
             for step, seconds, values in _points(curve):
@@ -124,14 +124,14 @@ class RunLog:
             raise MissingExtra("logs for Weights & Biases", "wandb", "wandb") from error
 
         def write(run: Run, name: str, record: Mapping[str, Any], curve: object) -> None:
-            (self.place / self.to).mkdir(parents=True, exist_ok=True)
+            (self.directory / self.to).mkdir(parents=True, exist_ok=True)
             logged = wandb.init(
                 project=self.project or self.study.name,
                 id=run.id,
                 name=name,
                 group=name.rpartition("/")[0],
                 config={**run.config, **_settings(run)},
-                dir=str(self.place),
+                dir=str(self.directory),
                 mode="offline" if self.offline else None,
                 resume="allow" if not self.offline else None,
                 settings=wandb.Settings(silent=True, console="off"),
@@ -144,8 +144,8 @@ class RunLog:
         return write
 
 
-def named(study: Specification) -> Iterator[tuple[Run, str]]:
-    """Yield (run, its name): INSTANCE/CHANCE/AGENT/SEED, and its id where others have the same name."""
+def named_runs(study: Specification) -> Iterator[tuple[Run, str]]:
+    """Yield (run, its name): INSTANCE/CHANCE/AGENT/SEED, and its id if others have the same name."""
     names = [_name(run) for run in study.runs]
     often = Counter(names)
     for run, name in zip(study.runs, names, strict=True):
@@ -154,7 +154,7 @@ def named(study: Specification) -> Iterator[tuple[Run, str]]:
 
 def _name(run: Run) -> str:
     columns = described(run)
-    parts = (run.instance, run.chance, label(columns["agent"], columns["observation"]))
+    parts = (run.instance, run.chance, line_label(columns["agent"], columns["observation"]))
     return "/".join((*(slug(part.replace(", ", "-")) for part in parts), f"seed-{columns['seed']}"))
 
 

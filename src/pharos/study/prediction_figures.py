@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.plots import DIAGONAL, agent_name, label_edges, legend_below, observation_color, panels, slug
+from pharos.plots import DIAGONAL, agent_label, label_edges, legend_below, observation_color, panels, slug
 from pharos.system.wording import in_words
 from pharos.training import CELL
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 MOST_PANELS = 24
 # Predictors and curves of the idealised learners; the first that there is counts.
-LEARNERS = ("clipped_regret_evaluated", "policy_regret", "kernel_regret")
+LEARNER_COLUMNS = ("clipped_regret_evaluated", "policy_regret", "kernel_regret")
 CURVES = ("clipped_curve", "policy_curve", "curve")
 LONGEST_TITLE = 34
 
@@ -63,7 +63,7 @@ def predicted_by_class(part: "pd.DataFrame", predictor: str | None = None) -> "F
         axis.plot([low, high], [low, high], ":", color=DIAGONAL, lw=1.2)
         axis.set_title(in_words(str(name)))
         axis.set(xlim=(low - 0.05, high + 0.05), ylim=(low - 0.05, high + 0.05))
-    label_edges(axes, "predicted regret", f"regret of {agent_name(str(part['agent'].iloc[0]))}")
+    label_edges(axes, "predicted regret", f"regret of {agent_label(str(part['agent'].iloc[0]))}")
     legend_below(figure, axes)
     return figure
 
@@ -82,7 +82,7 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> 
     top = max(1.0, part[[predictor, "greedy"]].max().max())
     for axis, (key, rows) in zip(axes, groups, strict=True):
         rows = rows.set_index("observation").reindex(observations)
-        places = np.arange(len(observations))
+        ticks = np.arange(len(observations))
         for i, observation in enumerate(observations):
             color = observation_color(observation, observations)
             pair = rows[[predictor, "greedy"]].iloc[i].to_numpy(float)
@@ -90,10 +90,10 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> 
             axis.scatter([i], pair[:1], s=34, facecolors="none", edgecolors=color, lw=1.4)
             axis.scatter([i], pair[1:], s=34, color=color, lw=0, label=observation)
         axis.set_title(_short(*map(str, key)), fontsize=8)
-        axis.set(xticks=places, xticklabels=[], ylim=(-0.05, top + 0.08), xlim=(-0.6, len(observations) - 0.4))
+        axis.set(xticks=ticks, xticklabels=[], ylim=(-0.05, top + 0.08), xlim=(-0.6, len(observations) - 0.4))
     hollow, full = {"facecolors": "none", "edgecolors": DIAGONAL}, {"color": DIAGONAL}
     axes[0].scatter([], [], s=34, lw=1.4, label="predicted", **hollow)
-    axes[0].scatter([], [], s=34, lw=0, label=agent_name(str(part["agent"].iloc[0])), **full)
+    axes[0].scatter([], [], s=34, lw=0, label=agent_label(str(part["agent"].iloc[0])), **full)
     label_edges(axes, "", "regret")
     legend_below(figure, axes)
     return figure
@@ -119,7 +119,7 @@ def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame") -> "Figure | 
         axis.set_title(_short(*map(str, key)), fontsize=8)
         axis.set(ylim=(-0.05, 1.5))
     axes[0].plot([], [], "--", color=DIAGONAL, lw=1.2, label="idealised learner")
-    axes[0].plot([], [], color=DIAGONAL, lw=1.5, label=agent_name(str(part["agent"].iloc[0])))
+    axes[0].plot([], [], color=DIAGONAL, lw=1.5, label=agent_label(str(part["agent"].iloc[0])))
     label_edges(axes, "steps", "regret")
     legend_below(figure, axes)
     return figure
@@ -127,8 +127,8 @@ def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame") -> "Figure | 
 
 def _learner(part: "pd.DataFrame") -> str:
     """The predictor that an agent is held against."""
-    has = (name for name in LEARNERS if name in part and part[name].notna().any())
-    return next(has, LEARNERS[-1])
+    has = (name for name in LEARNER_COLUMNS if name in part and part[name].notna().any())
+    return next(has, LEARNER_COLUMNS[-1])
 
 
 def _spread(groups: list[Any], max_panels: int = MOST_PANELS) -> list[Any]:
@@ -143,7 +143,7 @@ def _spread(groups: list[Any], max_panels: int = MOST_PANELS) -> list[Any]:
 
 
 def _short(environment: str, instance: str, chance: str) -> str:
-    """`taxi: size 7`, with the chance, where there is some, in a line of its own."""
+    """`taxi: size 7`, with the chance, if there is some, in a separate line."""
     inside = instance[instance.find("(") + 1 : -1] if instance.endswith(")") else instance.partition("/")[2] or instance
     first, *others = [part.strip().replace("=", " ").replace("_", " ") for part in inside.split(",")]
     text = f"{in_words(environment)}: {first}"

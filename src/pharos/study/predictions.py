@@ -38,9 +38,9 @@ class NamedStudy(Protocol):
 def write_predictions(study: "NamedStudy", predictions: "pd.DataFrame", file: str | os.PathLike) -> dict[str, str]:
     """Write predictions into a Parquet file with their SHA-256, the date and the version; return these.
 
-    The hash is of the rows alone: the same predictions have the same hash on any day. No prediction is lost: where the
-    file holds the same ones it stays, with the date that it has, which is returned; where it holds others it is kept
-    beside, with its date in its name.
+    The hash is of the rows alone: the same predictions have the same hash on any day. No prediction is lost.
+    If the file holds the same ones, it stays, and its date is returned. If it holds others, it is kept beside, with its
+    date in its name.
 
     Raises:
         OSError: the file cannot be written; an older one then stays as it was.
@@ -75,7 +75,7 @@ def write_predictions(study: "NamedStudy", predictions: "pd.DataFrame", file: st
 
 
 def _description(file: Path) -> dict[str, str] | None:
-    """Study, hash, date and version of a file of predictions; None where there is no such file."""
+    """Study, hash, date and version of a file of predictions; None if there is no such file."""
     try:
         return read_predictions(file)[1]
     except PharosError:
@@ -83,10 +83,10 @@ def _description(file: Path) -> dict[str, str] | None:
 
 
 def _place_beside(file: Path, date: str) -> Path:
-    """`predictions.2026-11-23T034702Z.parquet`, or with a number where that is taken."""
+    """`predictions.2026-11-23T034702Z.parquet`, or with a number if that is taken."""
     name = f"{file.stem}.{date.replace(':', '')}"
     names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
-    return next(place for each in names if not (place := file.with_name(each + file.suffix)).exists())
+    return next(path for each in names if not (path := file.with_name(each + file.suffix)).exists())
 
 
 def read_predictions(file: str | os.PathLike) -> "tuple[pd.DataFrame, dict[str, str]]":
@@ -148,14 +148,14 @@ class PredictedCells:
 
     @staticmethod
     def of(predictions: "Predictions | Sequence[Predictions] | None") -> "PredictedCells | None":
-        """Predictions of one file or of several; None where there are none."""
+        """Predictions of one file or of several; None if there are none."""
         parts = [predictions] if isinstance(predictions, tuple) else list(predictions or ())
         return PredictedCells(parts) if parts else None
 
     def late(self, runs: "pd.DataFrame") -> tuple[int, int]:
         """Numbers of (runs that had begun when the predictions were written, runs that do not say when they began).
 
-        Where there are several parts, each is compared with the runs that it predicts.
+        If there are several parts, each is compared with the runs that it predicts.
         """
         if len(self.parts) == 1:
             return late(runs, self.parts[0][1])

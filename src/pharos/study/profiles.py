@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 THRESHOLDS = np.linspace(-0.25, 1.0, 51)
 GROUP = ["agent", "observation"]
-TASK = ["instance", "chance"]
+TASK_KEYS = ["instance", "chance"]
 DIFFERENCE_COLUMNS = ["ours", "theirs", "tasks", "difference", "lower", "upper", "p_value", "adjusted"]
 IMPROVEMENT_COLUMNS = ["environment", "ours", "theirs", "tasks", "probability", "lower", "upper"]
 
@@ -106,8 +106,9 @@ def regret_differences(runs: "pd.DataFrame") -> "pd.DataFrame":
         runs: as from `table`.
     Returns:
         Columns DIFFERENCE_COLUMNS; `ours` and `theirs` are pairs (agent, observation), `difference` is the regret of
-        the first less that of the second, with Student's 95 % interval over runs within tasks; `p_value` is that of
-        Welch's t, and `adjusted` the same after Holm's correction for the number of rows. NaN if a task has one run.
+        the first less the regret of the second, with Student's 95 % interval over runs within tasks; `p_value` belongs
+        to Welch's t, and `adjusted` is the same after Holm's correction for the number of rows. NaN if a task has one
+        run.
     """
     import pandas as pd
 
@@ -139,19 +140,19 @@ def other_winners(runs: "pd.DataFrame") -> "pd.DataFrame":
     import pandas as pd
 
     rows, tasks = [], 0
-    means = runs.groupby([*TASK, *GROUP], sort=True)[["return", "normalized_regret"]].mean().dropna()
-    for task, part in means.groupby(level=TASK, sort=True):
+    means = runs.groupby([*TASK_KEYS, *GROUP], sort=True)[["return", "normalized_regret"]].mean().dropna()
+    for task, part in means.groupby(level=TASK_KEYS, sort=True):
         if len(part) < 2:
             continue
         tasks += 1
-        part = part.droplevel(TASK)
+        part = part.droplevel(TASK_KEYS)
         most, least = part["return"].idxmax(), part["normalized_regret"].idxmin()
         if part.loc[most, "return"] > part.loc[least, "return"] and (
             part.loc[most, "normalized_regret"] > part.loc[least, "normalized_regret"]
         ):
             rows.append((*task, most, least, *part.loc[most], *part.loc[least]))
     numbers = ["most_return", "most_regret", "least_return", "least_regret"]
-    result = pd.DataFrame(rows, columns=[*TASK, "most", "least", *numbers])
+    result = pd.DataFrame(rows, columns=[*TASK_KEYS, "most", "least", *numbers])
     result.attrs["tasks"] = tasks
     return result
 
@@ -159,4 +160,4 @@ def other_winners(runs: "pd.DataFrame") -> "pd.DataFrame":
 def _scores(part: "pd.DataFrame") -> dict[Any, np.ndarray]:
     """Scores of the runs of each task."""
     defined = part[np.isfinite(part["normalized_regret"].to_numpy(float))]
-    return {task: 1.0 - own["normalized_regret"].to_numpy(float) for task, own in defined.groupby(TASK, sort=True)}
+    return {task: 1.0 - own["normalized_regret"].to_numpy(float) for task, own in defined.groupby(TASK_KEYS, sort=True)}

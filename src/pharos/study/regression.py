@@ -5,7 +5,7 @@ columns `environment` (class), `observation`, `regret`, and the measures `effect
 `diameter`, which enter as logarithms.
 
 A task is an instance under one kind of chance. Its rows, one for each observation, have the same measures, so they are
-not independent: tests and R2 outside the sample count a task once. Where every task has the same observations, the
+not independent: tests and R2 outside the sample count a task once. If every task has the same observations, the
 estimates of least squares come from two strata that are independent of each other (a split plot): class and measures
 from the means of the tasks, observations from the differences within tasks. Otherwise standard errors are clustered by
 task.
@@ -42,7 +42,7 @@ class Fit:
         coefficients: one row a predictor: estimate, standard error, p-value, lower and upper end of its 95 % interval.
         dropped: predictors left out because they are constant or a linear combination of the others.
         condition_number: of the standardised predictors.
-        fitted, actual: one entry a row; influence: Cook's distances, NaN where a row alone determines a coefficient;
+        fitted, actual: one entry a row; influence: Cook's distances, NaN if a row alone determines a coefficient;
             classes: of environments; tasks: instance and chance; observations: what the agent saw.
         design: (rows, predictors), as they entered, in the order of `coefficients`.
     """
@@ -149,7 +149,7 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
 
 
 def _tasks(rows: "pd.DataFrame") -> tuple[str, ...]:
-    """The task of each row; empty where the rows have no instance and chance."""
+    """The task of each row; empty if the rows have no instance and chance."""
     if not {"instance", "chance"} <= {*rows}:
         return ()
     return tuple(map(" ".join, zip(rows["instance"], rows["chance"], strict=True)))
@@ -157,14 +157,14 @@ def _tasks(rows: "pd.DataFrame") -> tuple[str, ...]:
 
 def _errors_without_the_task(design: np.ndarray, residuals: np.ndarray, tasks: Sequence[str]) -> np.ndarray:
     """(N,) the error of each row under the model fitted without its task: (I - H)^-1 residuals, H the task's block of
-    the hat matrix; the shortest such vector where the task alone determines a coefficient.
+    the hat matrix; the shortest such vector if the task alone determines a coefficient.
     """
     basis, _ = np.linalg.qr(design)
     errors = np.empty(len(residuals))
-    places: dict[Any, list[int]] = {}
+    rows_by_task: dict[Any, list[int]] = {}
     for row, task in enumerate(tasks or range(len(residuals))):
-        places.setdefault(task, []).append(row)
-    for rows in places.values():
+        rows_by_task.setdefault(task, []).append(row)
+    for rows in rows_by_task.values():
         remainder = np.eye(len(rows)) - basis[rows] @ basis[rows].T
         if len(rows) == 1:
             remainder = np.maximum(remainder, 1e-12)
@@ -182,7 +182,7 @@ def leave_one_class_out_r_squared(rows: "pd.DataFrame", measures: Sequence[str] 
     """R2 of predictions for each class by a model fitted on the others (representation and measures only).
 
     Returns:
-        NaN where all regrets are the same.
+        NaN if all regrets are the same.
     Raises:
         ParameterError: a table that `fit_models` refuses, or there is one class alone.
     """
@@ -272,7 +272,7 @@ def _strata(
 ) -> tuple["pd.Series", "pd.Series"] | None:
     """Standard errors and degrees of freedom from the strata between and within tasks.
 
-    None where tasks differ in their observations, or there are too few tasks.
+    None if tasks differ in their observations, or there are too few tasks.
     """
     import pandas as pd
 
@@ -297,7 +297,7 @@ def _strata(
         inside -= inside.groupby(observations).transform("mean")
         difference = np.sqrt(2 * float((inside**2).sum()) / ((number - 1) * (each - 1)) / number)
         errors |= dict.fromkeys(within, difference)
-        # The intercept is the level of the first observation: the mean of the tasks less that of the differences
+        # The intercept is the level of the first observation: the mean of the tasks less the mean of the differences
         if "Intercept" in errors:
             errors["Intercept"] = np.hypot(errors["Intercept"], difference * np.sqrt((each - 1) / (2 * each)))
     return pd.Series(errors)[design.columns], pd.Series(free)[design.columns]

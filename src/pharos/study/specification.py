@@ -11,12 +11,12 @@
         observations: [vector, {name: simple_image, options: {size: 84}}]
         agents: [dqn, ppo, q_learning]
         hyperparameters: {dqn: patient, ppo: {n_steps: 256}}
-        engine: {dqn: batched}         # or a word for all agents; of the study where a block does not say
+        engine: {dqn: batched}         # or a word for all agents; of the study if a block does not say
 
 A block is the product of its lists. Tabular agents see the index of the state whatever the block's observations are.
 Environments, observations and agents of one's own are named as module:Name or file.py:Name, and looked for in
-`folder`: that of the YAML file when not given. Such code is imported where the user names the YAML file. It is never
-imported where the user names a folder, for the study.yaml beside results, or for a packed study, which somebody else
+`folder`, by default the folder of the YAML file. Such code is imported if the user names the YAML file. It is never
+imported if the user names a folder, for the study.yaml beside results, or for a packed study, which somebody else
 may have written, unless it is trusted.
 
 Messages name the line of the node of the YAML file that they are about.
@@ -49,7 +49,7 @@ Loc = tuple[int | str, ...]
 
 
 def where(name: str, root: "yaml.Node | None", loc: Loc) -> str:
-    """`file:line`, the line of the innermost node on the path that exists; the path itself where there is no file."""
+    """`file:line`, the line of the innermost node on the path that exists; the path itself if there is no file."""
     if root is None:
         return ".".join(map(str, (name, *loc)))
     node, line = root, root.start_mark.line
@@ -72,7 +72,7 @@ GIVEN = "given"
 STUDY_FILE = "study.yaml"
 
 
-_PARTS: dict[Loc, type[BaseModel]] = {
+_SPECIFICATION_PARTS: dict[Loc, type[BaseModel]] = {
     (): Specification,
     ("hardness",): Hardness,
     ("blocks",): Block,
@@ -100,7 +100,7 @@ def specification(
     Args:
         environments: a YAML file with a list of environments, for blocks that say `environments: given`; see
             `given_environments`.
-        trust: whether code that it names may be imported; None: where `source` is a YAML file, but for the study.yaml
+        trust: whether code that it names may be imported; None: if `source` is a YAML file, but for the study.yaml
             beside results.
     Raises:
         UnknownName: no such file or preset. ParameterError: something in it is wrong; the message names file, line and
@@ -181,7 +181,7 @@ def _studies_here() -> list[str]:
 
 
 def study_name(file: Path) -> str | None:
-    """The name in a YAML file of a study, which is not looked at otherwise; None where there is none."""
+    """The name in a YAML file of a study, which is not looked at otherwise; None if there is none."""
     try:
         _, data = nodes_and_data(read_text(file), str(file))
     except ParameterError:
@@ -207,7 +207,7 @@ def parse(
 
     Args:
         name: stands before the line number in messages.
-        folder: where modules and files that it names are looked for; None: in the current directory.
+        folder: of the modules and files that it names; None: the current directory.
         trust: whether they may be imported.
         entries: the environments of blocks that say `environments: given`.
     """
@@ -339,7 +339,7 @@ def _messages(error: ValidationError, name: str, root: object) -> str:
             loc = loc[:-1]
         key = str(loc[-1]) if loc else ""
         if problem["type"] == "extra_forbidden":
-            part = _PARTS.get(tuple(part for part in loc[:-1] if isinstance(part, str)))
+            part = _SPECIFICATION_PARTS.get(tuple(part for part in loc[:-1] if isinstance(part, str)))
             message = str(UnknownName("key", key, part.model_fields if part else ()))
         elif problem["type"] == "missing":
             message = f"the key {key!r} is missing"

@@ -125,19 +125,19 @@ def opened(
     if folder is None and isinstance(source, str | Path):
         folder = study_folder(source)
     study = specification(source, trust=trust, environments=environments)
-    place = Path(STUDIES, study.name) if folder is None else Path(folder)
-    warn_of_changes(study, place)
-    return study, place
+    directory = Path(STUDIES, study.name) if folder is None else Path(folder)
+    warn_of_changes(study, directory)
+    return study, directory
 
 
 def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
     """The progress of a study, from its files; `remaining` is the last estimate of its runners."""
-    study, place = opened(source, folder)
+    study, directory = opened(source, folder)
     # Records of runs that are over
     errors, damaged, finished = {}, {}, 0
     for run in study.runs:
         try:
-            record = _worker.read_record(place / "runs" / run.id)
+            record = _worker.run_record(directory / "runs" / run.id)
         except FileFormatError as error:
             damaged[run.id] = str(error)
             continue
@@ -146,7 +146,7 @@ def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
         finished += record is not None and record["status"] == _worker.FINISHED
     # Status files of runners that are alive
     running, remaining = 0, None
-    for file in sorted(place.glob("status*.json")):
+    for file in sorted(directory.glob("status*.json")):
         with contextlib.suppress(ValueError, OSError, KeyError, TypeError, OverflowError):
             record = read_json(file)
             if _is_alive(record):
@@ -155,7 +155,7 @@ def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
                     remaining = max(remaining or 0.0, record["remaining"])
     return Status(
         name=study.name,
-        folder=str(place),
+        folder=str(directory),
         total=len(study.runs),
         finished=finished,
         failed=len(errors),
@@ -180,7 +180,7 @@ def _is_alive(record: Mapping[str, Any]) -> bool:
     return time.time() - record["updated"] < 60
 
 
-def claim(study: Specification, folder: Path) -> None:
+def write_specification(study: Specification, folder: Path) -> None:
     """Write the specification into the folder, so that it can be reported on alone; refuse a folder of another
     study."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -35,17 +35,17 @@ if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
 
 
-PLAIN = {"sticky": 0.0, "random": 0.0}
+NO_CHANCE = {"sticky": 0.0, "random": 0.0}
 # A proven interval enters as one number if its upper end is at most so many times its lower end
-WIDEST = 2
+WIDEST_FACTOR = 2
 # Part of the evaluations at the end over which the return is averaged
-LAST = 0.1
-NUMBERS = ("cumulative_regret", "normalized_regret", "final_value", "value_optimal", "value_uniform")
+LAST_SHARE = 0.1
+RUN_NUMBERS = ("cumulative_regret", "normalized_regret", "final_value", "value_optimal", "value_uniform")
 """Entries that the result of every run has, numbers or null."""
 POINTS = ("step", "episodes", "value", "cumulative_expected_regret", "normalized_regret", "mean_return")
 DATE = "%Y-%m-%dT%H:%M:%SZ"
 # Numbers beyond this are no results, and no figure can hold them
-LARGEST = 1e100
+LARGEST_VALUE = 1e100
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class FinishedRuns:
     damaged: Mapping[str, str]
 
 
-def finished_runs(study: Specification, place: Path) -> FinishedRuns:
+def finished_runs(study: Specification, directory: Path) -> FinishedRuns:
     """Read every finished run of a study once; one that cannot be read is named and left out.
 
     Raises:
@@ -74,11 +74,11 @@ def finished_runs(study: Specification, place: Path) -> FinishedRuns:
     rows, points, damaged = [], [], {}
     for run in study.runs:
         try:
-            record = _worker.read_record(place / "runs" / run.id)
+            record = _worker.run_record(directory / "runs" / run.id)
             if record is None or record["status"] != _worker.FINISHED:
                 continue
-            curve = read_curve(place, run.id)
-            row = {"id": run.id} | row_of(run, record, curve, place / "runs" / run.id)
+            curve = run_curve(directory, run.id)
+            row = {"id": run.id} | row_of(run, record, curve, directory / "runs" / run.id)
         except FileFormatError as error:
             damaged[run.id] = str(error)
             continue
@@ -86,7 +86,7 @@ def finished_runs(study: Specification, place: Path) -> FinishedRuns:
         points.append(curve.assign(id=run.id, **described(run)))
     if not rows:
         raise ParameterError(
-            f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first"
+            f"{directory}: no run of {study.name!r} is finished; execute `pharos study run` first"
             + (f" ({len(damaged)} damaged: {next(iter(damaged.values()))})" if damaged else "")
         )
     return FinishedRuns(pd.DataFrame(rows), pd.concat(points, ignore_index=True), damaged)
@@ -97,11 +97,11 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
 
     Returns:
         Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`,
-        `began` (date; "" where the record does not say);
+        `began` (date; "" if the record does not say);
         the result of the run (`cumulative_regret`, `normalized_regret`, `value_optimal`, ...); `return`, the mean
         return of the training episodes in the last tenth of the run, undiscounted; `exact`, whether every value behind
-        the regret is computed; and `half_width`, by how much `normalized_regret` may at worst be wrong where some are
-        estimated, 0 where none is.
+        the regret is computed; and `half_width`, by how much `normalized_regret` may at worst be wrong if some are
+        estimated, 0 if none is.
     Raises:
         ParameterError: no run is finished.
     """
@@ -136,15 +136,15 @@ def _warned(runs: FinishedRuns) -> FinishedRuns:
 def _result_of(record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """The entries of a result that are one number or text each; NaN for null."""
     result = {name: value for name, value in record["result"].items() if not isinstance(value, dict | list)}
-    for name in NUMBERS:
+    for name in RUN_NUMBERS:
         value = result.get(name, "nothing")
-        if isinstance(value, bool) or not isinstance(value, int | float | None) or abs(value or 0) > LARGEST:
+        if isinstance(value, bool) or not isinstance(value, int | float | None) or abs(value or 0) > LARGEST_VALUE:
             raise FileFormatError(f"{folder / 'run.json'}: {name} is {str(value)[:30]}; expected a number below 1e100")
     return {name: float("nan") if value is None else value for name, value in result.items()}
 
 
 def _began(record: Mapping[str, Any]) -> str:
-    """Date at which a run began: that of its record less the seconds of its program; "" where the record lacks it."""
+    """Date at which a run began: its record's date less the seconds of its program; "" if the record lacks it."""
     try:
         seconds = float(record.get("batch", {}).get("seconds") or record["seconds"])
         began = datetime.strptime(record["written"], DATE).replace(tzinfo=UTC) - timedelta(seconds=seconds)
@@ -164,10 +164,10 @@ def _exactness(curve: "pd.DataFrame", row: Mapping[str, Any]) -> tuple[bool, flo
 
 
 def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.DataFrame":
-    """The means over seeds, a row for each cell; joined with hardness where `measures` (of `hardness_table`) is given.
+    """The means over seeds, a row for each cell; joined with hardness if `measures` (of `hardness_table`) is given.
 
     Returns:
-        Columns of the cell; `seeds`; `steps` (the most, where runs differ); means of `cumulative_regret`,
+        Columns of the cell; `seeds`; `steps` (the most, if runs differ); means of `cumulative_regret`,
         `normalized_regret`, `final_value`, `value_optimal`, `return`; `return_deviation` over seeds (population, as
         0.00 is printed for equal runs; NaN for one seed); `exact`, whether all runs are; the mean of `half_width`; and
         the measures.
@@ -186,11 +186,11 @@ def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.D
     return means.merge(measures, on=["environment", "instance", "chance"], how="left")
 
 
-def read_curve(folder: Path, id: str) -> "pd.DataFrame":
+def run_curve(folder: Path, id: str) -> "pd.DataFrame":
     """The curve of one run.
 
     Raises:
-        FileFormatError: it cannot be read, is not that of its record, or has no evaluation.
+        FileFormatError: it cannot be read, does not match its record, or has no evaluation.
     """
     curve = training.read_curve(folder / "runs" / id, columns=POINTS)
     if len(curve) == 0 or any(curve[name].dtype.kind not in "iufb" for name in POINTS):
@@ -203,7 +203,7 @@ def _last_return(curve: "pd.DataFrame") -> float:
     ended = np.diff(curve["episodes"].to_numpy(), prepend=0)
     returns = curve["mean_return"].to_numpy(float)
     is_defined = np.isfinite(returns) & (ended > 0)
-    last = max(1, int(len(returns) * LAST))
+    last = max(1, int(len(returns) * LAST_SHARE))
     is_defined[: len(returns) - last] &= not is_defined[-last:].any()
     return float(np.average(returns[is_defined], weights=ended[is_defined])) if is_defined.any() else float("nan")
 
@@ -228,16 +228,19 @@ def hardness_table(
     Args:
         tasks: (instance, chance) of those that are wanted; None for all.
     Returns:
-        Columns `environment`, `instance`, `chance`; each measure as a number; `num_states`; and `notes`: where a
-        measure is undefined or unknown, where it is the geometric mean of a proven interval (whose ends differ by a
-        factor of at most two), and where it is that of the instance without chance, because the measure does not
-        exist, or cannot be computed within the budget, under this chance.
+        Columns `environment`, `instance`, `chance`; each measure as a number; `num_states`; and `notes`, which name a
+        measure if
+
+        - it is undefined or unknown,
+        - it is the geometric mean of a proven interval (whose ends differ by a factor of at most two),
+        - it belongs to the instance without chance, because the measure does not exist, or cannot be computed within
+          the budget, under this chance.
     Cost: a state space and a report of hardness for each row, each measure at most the budget of the specification;
         `hardness_cost` tells beforehand.
     """
     import pandas as pd
 
-    study, place = opened(source, folder)
+    study, directory = opened(source, folder)
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     for run in study.runs:
         key = (run.instance, run.chance)
@@ -245,15 +248,15 @@ def hardness_table(
             continue
         if progress is not None:
             progress(f"hardness of {run.instance}, {run.chance}")
-        plain = {**run.config, "chance": PLAIN}
-        own = _measured(study, place, run.config)
-        without = _measured(study, place, plain) if run.chance != "plain" else own
+        plain = {**run.config, "chance": NO_CHANCE}
+        own = _measured(study, directory, run.config)
+        without = _measured(study, directory, plain) if run.chance != "plain" else own
         rows[key] = {"environment": run.cell["environment"], "instance": run.instance, "chance": run.chance}
         rows[key] |= _row_of_measures(study.hardness.measures, own, without)
     return pd.DataFrame(list(rows.values()))
 
 
-def hardness_cost(study: Specification, place: Path, tasks: Container[tuple[str, str]]) -> tuple[int, float]:
+def hardness_cost(study: Specification, directory: Path, tasks: Container[tuple[str, str]]) -> tuple[int, float]:
     """(number of tasks that `hardness_table` has to measure, the seconds that this takes at most).
 
     Building the state spaces comes on top.
@@ -261,15 +264,15 @@ def hardness_cost(study: Specification, place: Path, tasks: Container[tuple[str,
     missing: dict[Path, int] = {}
     for run in study.runs:
         if (run.instance, run.chance) in tasks:
-            for config in (run.config, {**run.config, "chance": PLAIN}):
-                cache, dependencies = ResultCache(place / "hardness"), _dependencies(study, config)
+            for config in (run.config, {**run.config, "chance": NO_CHANCE}):
+                cache, dependencies = ResultCache(directory / "hardness"), _dependencies(study, config)
                 stored = (cache.get(dependencies) or {"measures": {}})["measures"]
                 missing[cache.file(dependencies)] = sum(name not in stored for name in study.hardness.measures)
     return sum(number > 0 for number in missing.values()), sum(missing.values()) * study.hardness.budget
 
 
 def _row_of_measures(names: Sequence[str], own: Mapping[str, Any], plain: Mapping[str, Any]) -> dict[str, Any]:
-    """The measures of a task as columns: with chance where that is known, else without, which `notes` say."""
+    """The measures of a task as columns: with chance if that is known, else without, which `notes` say."""
     row: dict[str, Any] = {"num_states": own.get("num_states") or plain.get("num_states")}
     notes = []
     for name in names:
@@ -287,13 +290,17 @@ def _row_of_measures(names: Sequence[str], own: Mapping[str, Any], plain: Mappin
 
 def _usable(measure: dict[str, Any]) -> dict[str, Any]:
     """The measure, or the reason against it: a proven interval that is too wide to be one number."""
-    if measure.get("value") is None or measure.get("exact", True) or measure["upper"] <= WIDEST * measure["lower"]:
+    if (
+        measure.get("value") is None
+        or measure.get("exact", True)
+        or measure["upper"] <= WIDEST_FACTOR * measure["lower"]
+    ):
         return measure
     return {"value": None, "why": f"only {measure['lower']:g} to {measure['upper']:g} is proven within the budget"}
 
 
 def _dependencies(study: Specification, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Key of stored measures: what those of a run's task depend on."""
+    """Key of stored measures: what the measures of a run's task depend on."""
     dependencies = {name: config[name] for name in ("environment", "parameters", "chance", "horizon")}
     dependencies["gamma"] = study.hardness.gamma
     if "environment" in config.get("sources", {}):  # a class of the user's own, which may change
@@ -301,8 +308,8 @@ def _dependencies(study: Specification, config: Mapping[str, Any]) -> dict[str, 
     return dependencies
 
 
-def _measured(study: Specification, place: Path, config: Mapping[str, Any]) -> dict[str, Any]:
-    cache, dependencies = ResultCache(place / "hardness"), _dependencies(study, config)
+def _measured(study: Specification, directory: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+    cache, dependencies = ResultCache(directory / "hardness"), _dependencies(study, config)
     stored = cache.get(dependencies) or {"measures": {}, "num_states": None}
     missing = [name for name in study.hardness.measures if name not in stored["measures"]]
     if missing:
@@ -386,8 +393,8 @@ def _key(parameters: Mapping[str, Any]) -> str:
 def paper_instance(environment: str, parameters: Mapping[str, Any]) -> int | None:
     """The number of the instance among the blocks of its class in the paper's appendix C, counted from 1; None if not
     there."""
-    place = _paper_instances().get((environment, _key(parameters)))
-    return None if place is None else place[1]
+    entry = _paper_instances().get((environment, _key(parameters)))
+    return None if entry is None else entry[1]
 
 
 # Regret of each cell, predicted before its runs by measures of representations ----------------------------------------
@@ -410,15 +417,15 @@ def predict(
         blocks, agents, observations: a part of the study: numbers of blocks from 1, names of agents, and of
             observations without their options; None: all.
         primary: only the predictor that stands for each agent (`pharos.agents.Idealised`) with its table; other
-            columns are NaN, and `estimated_error` is that of this predictor. A small part of the time.
+            columns are NaN, and `estimated_error` belongs to this predictor. A small part of the time.
         progress: called with what is being done.
     Returns:
         Columns `environment`, `instance`, `chance`, `agent`, `observation`; PREDICTORS; `network`; `estimated_error`,
-        that of `kernel_regret` where landmarks stand for the kernel; `curve` and `adam_curve`, the learner's steps and
-        greedy regrets as JSON; `notes`, why a number is missing. The idealised learner has the steps of the run, and of
-        a DQN its discount, exploration and target network; of actor-critics, with the rollouts, steps and discount of
-        the agent, POLICY_PREDICTORS, `policy_curve` and `clipped_curve`, that of the distribution over actions with
-        PPO's clipping, NaN and "" in rows of others.
+        the error of `kernel_regret` if landmarks stand for the kernel; `curve` and `adam_curve`, the learner's steps
+        and greedy regrets as JSON; `notes`, why a number is missing. The idealised learner has the steps of the run,
+        and of a DQN its discount, exploration and target network; of actor-critics, with the rollouts, steps and
+        discount of the agent, POLICY_PREDICTORS, `policy_curve` and `clipped_curve`, the curve of the distribution over
+        actions with PPO's clipping, NaN and "" in rows of others.
     Raises:
         ParameterError: the study has no such cell.
     Cost: measures of hardness are kept beside the state spaces, so that a second call is quick.

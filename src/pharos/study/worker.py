@@ -25,7 +25,7 @@ from pharos.system.wording import in_one_line
 
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 # Seconds in a record that no run can take: ten thousand years
-LONGEST = 3e11
+LONGEST_SECONDS = 3e11
 
 BATCHES = "batches"
 EXIT_BUSY = 75
@@ -41,16 +41,16 @@ class HalfAsMany(str):
 
 
 def read_status(folder: Path) -> str | None:
-    """`finished` or `failed`; None where a run has no folder yet, or a damaged record."""
+    """`finished` or `failed`; None if a run has no folder yet, or a damaged record."""
     try:
-        record = read_record(folder)
+        record = run_record(folder)
     except FileFormatError:
         return None
     return None if record is None else str(record["status"])
 
 
-def read_record(folder: Path) -> dict[str, Any] | None:
-    """The record in run.json of a run; None where there is none.
+def run_record(folder: Path) -> dict[str, Any] | None:
+    """The record in run.json of a run; None if there is none.
 
     Raises:
         FileFormatError: it is not the record of a run that is over. ResultCorrupted: it, or the curve of a finished
@@ -66,7 +66,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     if record.get("status") not in (FINISHED, FAILED):
         raise FileFormatError(f"{file}: is not the record of a run that is over")
     seconds = record.get("seconds")
-    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 <= seconds < LONGEST:
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 <= seconds < LONGEST_SECONDS:
         raise FileFormatError(f"{file}: seconds are {str(seconds)[:20]}; expected how long the run took")
     if record["status"] == FINISHED:
         if not isinstance(record.get("result"), dict):
@@ -75,7 +75,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     return record
 
 
-def attempt(
+def attempt_run(
     runner: BatchRunner,
     configs: Sequence[Mapping[str, Any]],
     ids: Sequence[str],
@@ -106,7 +106,7 @@ def attempt(
                 ends[id] = done
             elif read_status(partial) == FINISHED:  # its process was killed before it could publish it
                 training.clear_run(partial)
-                publish(partial, folder, id)
+                publish_run(partial, folder, id)
             else:
                 if partial.exists() and not resume:
                     shutil.rmtree(partial)
@@ -120,26 +120,26 @@ def attempt(
 def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, Path]], folder: Path) -> dict[str, str]:
     """Call the runner, and put every run into its place, finished or failed; return HalfAsMany by id of the others."""
     began = time.perf_counter()
-    first, *others = places = [partial for _, _, partial in todo]
-    with log(first / "log.txt"):
+    first, *others = partials = [partial for _, _, partial in todo]
+    with redirected_output(first / "log.txt"):
         try:
-            errors = list(runner([config for config, _, _ in todo], places, folder / BATCHES))
+            errors = list(runner([config for config, _, _ in todo], partials, folder / BATCHES))
         except Exception as error:
             traceback.print_exc()
             errors = [in_one_line(error)] * len(todo)
     left: dict[str, str] = {
         id: reason for (_, id, _), reason in zip(todo, errors, strict=True) if isinstance(reason, HalfAsMany)
     }
-    for place in others:
-        shutil.copyfile(first / "log.txt", place / "log.txt")
+    for partial in others:
+        shutil.copyfile(first / "log.txt", partial / "log.txt")
     seconds = (time.perf_counter() - began) / len(todo)
-    for (config, id, place), reason in zip(todo, errors, strict=True):
+    for (config, id, partial), reason in zip(todo, errors, strict=True):
         if id in left:
             continue
-        if read_status(place) != FINISHED:
+        if read_status(partial) != FINISHED:
             missing = "the runner returned without a finished run.json and a curve"
-            write_failure(place, config, id, reason or missing, seconds)
-        publish(place, folder, id)
+            write_failure(partial, config, id, reason or missing, seconds)
+        publish_run(partial, folder, id)
     return left
 
 
@@ -157,22 +157,22 @@ def write_failure(folder: Path, config: Mapping[str, Any], id: str, error: str, 
     storage.replace_json(folder / "run.json", storage.sealed(record))
 
 
-def publish(partial: Path, folder: Path, id: str) -> None:
+def publish_run(partial: Path, folder: Path, id: str) -> None:
     """Move a run's folder to its place, on disk before it is there; an earlier failed attempt makes room."""
     for path in partial.rglob("*"):
         if path.is_file():
             storage.sync(path)
     runs = storage.inside(folder, "runs")
     runs.mkdir(parents=True, exist_ok=True)
-    place = runs / id
-    if place.exists():
+    target = runs / id
+    if target.exists():
         old = folder / "partial" / f"{id}.failed"
         _remove(old)
-        os.rename(place, old)
-        os.rename(partial, place)
+        os.rename(target, old)
+        os.rename(partial, target)
         _remove(old)
     else:
-        os.rename(partial, place)
+        os.rename(partial, target)
     storage.sync(runs)
 
 
@@ -184,7 +184,7 @@ def _remove(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def log(path: Path):
+def redirected_output(path: Path):
     """Redirect the output of this process to a file."""
     sys.stdout.flush()
     sys.stderr.flush()
@@ -221,7 +221,7 @@ def main(
     """The body of a worker process; it sends the ids of runs that cannot be trained together, and why."""
     use_one_thread()
     try:
-        ends = attempt(runner, configs, ids, folder, again=again, resume=resume)
+        ends = attempt_run(runner, configs, ids, folder, again=again, resume=resume)
     except OSError as error:  # a full disk, on which not even the log can say so
         sys.exit(f"pharos: run {ids[0]}: {error.strerror or error}")
     for reason in {id(end): end for end in ends if isinstance(end, HalfAsMany)}.values():

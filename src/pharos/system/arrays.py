@@ -1,12 +1,12 @@
 """Indices of states, and outcomes of actions, as files and memory hold them.
 
-Indices that take five bytes each: 40 bits, where 32 are too few and 64 a waste.
+Indices that take five bytes each: 40 bits, if 32 are too few and 64 a waste.
 
 A number n from -2^39 to 2^39 - 1 is n mod 2^40, little-endian (two's complement), so that -1, the end of an episode, is
 five bytes of 255. NumPy has no such type: `PackedIndices` is an array of them to those who read rows, and
 kernels/outcomes.py the same to compiled loops. docs/decisions/0017-indices-of-40-bits.md has the measurements.
 
-Outcomes: two layouts, two ways to keep probabilities, and one way to read (`OutcomeRows`). Row s A + a is that of
+Outcomes: two layouts, two ways to keep probabilities, and one way to read (`OutcomeRows`). Row s A + a belongs to
 action a in state s. Nobody else asks which layout it is; kernels/outcomes.py says the same to compiled loops.
 """
 
@@ -33,14 +33,14 @@ Where = int | np.integer | slice | np.ndarray | tuple[int | slice | np.ndarray |
 """What an array is indexed by."""
 
 # Entries that are unpacked at a time.
-_BLOCK = 1 << 20
+_ENTRIES_AT_ONCE = 1 << 20
 
 
 class PackedIndices:
     """An array of indices of 40 bits, which reads as one of int64: what is asked for is unpacked, and nothing else.
 
     `indices[s]`, `indices[first:last]`, `indices[rows, columns]` are arrays of int64, or numbers; `np.asarray(indices)`
-    all of them, in 8 bytes each. Compiled loops read the entries where they are.
+    all of them, in 8 bytes each. Compiled loops read the entries without a copy.
 
     Attributes:
         packed: the same, of type `PACKED`, in C order; may be a memory map.
@@ -119,7 +119,7 @@ def unpacked(entries: np.ndarray) -> np.ndarray:
     return (entries["high"].astype(np.int64) << 32) | entries["low"]
 
 
-def as_array(indices: object) -> Indices:
+def as_index_array(indices: object) -> Indices:
     """Indices as an array of NumPy; `PackedIndices` stay as they are."""
     return indices if isinstance(indices, PackedIndices) else np.asarray(indices)
 
@@ -136,14 +136,14 @@ def read_only(array: T) -> T:
     return view
 
 
-def blocks_of(indices: Indices) -> Iterator[tuple[int, np.ndarray]]:
-    """(first row, some rows), from the first one on: some million entries at a time, unpacked where they are packed."""
-    rows = max(1, _BLOCK * len(indices) // max(1, indices.size))
+def index_blocks(indices: Indices) -> Iterator[tuple[int, np.ndarray]]:
+    """(first row, some rows), from the first one on: some million entries at a time, unpacked if they are packed."""
+    rows = max(1, _ENTRIES_AT_ONCE * len(indices) // max(1, indices.size))
     for first in range(0, len(indices), rows):
         yield first, np.asarray(indices[first : first + rows])
 
 
-def rows_of(indices: Indices, start: int, stop: int) -> Indices:
+def index_rows(indices: Indices, start: int, stop: int) -> Indices:
     """View of rows [start, stop): nothing is copied."""
     return indices.rows(start, stop) if isinstance(indices, PackedIndices) else indices[start:stop]
 
@@ -155,7 +155,7 @@ def room_for_indices(shape: tuple[int, ...], num_states: int) -> Indices:
 
 def holds_end(indices: Indices) -> bool:
     """Whether an entry is -1."""
-    return any(bool((rows == -1).any()) for _, rows in blocks_of(indices))
+    return any(bool((rows == -1).any()) for _, rows in index_blocks(indices))
 
 
 # Files ----------------------------------------------------------------------------------------------------------------
@@ -172,7 +172,7 @@ def as_stored(indices: np.ndarray, name: str) -> np.ndarray:
 
 
 def from_stored(stored: np.ndarray) -> Indices:
-    """Indices that read as integers, of the array that a file holds: `PackedIndices` where its type is `PACKED`."""
+    """Indices that read as integers, of the array that a file holds: `PackedIndices` if its type is `PACKED`."""
     return PackedIndices(stored) if stored.dtype == PACKED else stored
 
 
@@ -196,12 +196,12 @@ class OutcomeRows:
     """Possible outcomes of executing actions, for S states, A actions and at most K outcomes of each pair.
 
     Attributes:
-        successors: (S, A, K) int32, int64 or `PackedIndices`, -1 where the episode ends, of which impossible outcomes
-            repeat the first; or (N,), the rows one after another.
-        offsets: (S A + 1,) where the rows begin; None where successors are (S, A, K).
+        successors: (S, A, K) int32, int64 or `PackedIndices`; -1 if the episode ends; impossible outcomes repeat the
+            first one. Or (N,), the rows one after another.
+        offsets: (S A + 1,) index of the first entry of each row; None if successors are (S, A, K).
         codes: (S, A) uint8 or uint16, which vector of the palette has the probabilities; None without a palette.
         palette: (P, K) float64, the probabilities of possible outcomes in their order, then zeros; None without one.
-        probabilities: float64 in the shape of successors; None where there is a palette.
+        probabilities: float64 in the shape of successors; None if there is a palette.
     """
 
     NAMES = ("successors", "offsets", "codes", "palette", "probabilities")
@@ -222,7 +222,7 @@ class OutcomeRows:
         """
         if (palette is None) != (codes is None) or (palette is None) == (probabilities is None):
             raise ParameterError("outcomes take codes with a palette, or probabilities; found both or neither")
-        self.successors = as_array(successors)
+        self.successors = as_index_array(successors)
         self.offsets, self.codes, self.palette, self.probabilities = (
             None if array is None else np.asarray(array) for array in (offsets, codes, palette, probabilities)
         )
@@ -248,8 +248,8 @@ class OutcomeRows:
         """(R,) positions of the first outcomes of some rows among the successors."""
         return rows * self.num_outcomes if self.offsets is None else self.offsets[rows].astype(np.int64)
 
-    def places(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(index in `rows`, place among the successors) of all entries of some rows."""
+    def entry_indices(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(index in `rows`, index among the successors) of all entries of some rows."""
         first = self.begins(rows)
         counts = self.begins(rows + 1) - first
         which = np.repeat(np.arange(len(rows)), counts)
@@ -263,11 +263,11 @@ class OutcomeRows:
             vectors = probabilities.reshape(-1, self.num_outcomes)[rows] if codes is None else palette[codes]
             which, k = np.nonzero(vectors)
             return which, self.successors.reshape(-1, self.num_outcomes)[rows][which, k], vectors[which, k]
-        which, places = self.places(rows)
+        which, indices = self.entry_indices(rows)
         if codes is None:
-            return which, self.flat[places], probabilities[places]
+            return which, self.flat[indices], probabilities[indices]
         first = np.searchsorted(which, np.arange(len(rows)))
-        return which, self.flat[places], palette[codes[which], np.arange(len(which)) - first[which]]
+        return which, self.flat[indices], palette[codes[which], np.arange(len(which)) - first[which]]
 
     def of_states(self, states: np.ndarray, num_actions: int) -> dict[int, OutcomesOfState]:
         """The outcomes of some states."""
@@ -294,12 +294,12 @@ class OutcomeCheck:
     """Validation of outcomes from files that anybody may have written, a block of states at a time.
 
     Attributes:
-        most: the outcomes that a row may have, at most. least: the least index of a next state, -1 where episodes may
+        most: the outcomes that a row may have, at most. least: the least index of a next state, -1 if episodes may
             end without one.
     """
 
     def __init__(self, stored: OutcomeRows, shape: tuple[int, int], most: int, least: int):
-        """Check the ends of the offsets and the palette; WrongOutcomes where they are wrong. shape: (S, A)."""
+        """Check the ends of the offsets and the palette; WrongOutcomes if they are wrong. shape: (S, A)."""
         self.stored, self.most, self.least = stored, most, least
         self.num_states, self.num_actions = shape
         offsets, size = stored.offsets, stored.successors.size
@@ -336,7 +336,7 @@ class OutcomeCheck:
                 text = f"{self._pair(rows[0])} begins at {begins[0]}; expected 0 to {stored.successors.size}"
                 self._refuse("offsets", text)
         # Next states and probabilities
-        next_states = np.asarray(stored.flat[int(begins[0]) : int(begins[-1])])  # unpacked, where indices are packed
+        next_states = np.asarray(stored.flat[int(begins[0]) : int(begins[-1])])  # unpacked, if indices are packed
         self._check_range(next_states, np.repeat(rows, lengths))
         if counts is None:
             probabilities = np.zeros((len(rows), self.most))
@@ -357,7 +357,7 @@ class OutcomeCheck:
                 self._refuse("successors", f"{pair} has padding that does not repeat its first outcome")
         return counts, first
 
-    def _sizes(self, probabilities: np.ndarray, name: str, whose: Callable[[int], str]) -> np.ndarray:
+    def _sizes(self, probabilities: np.ndarray, name: str, source: Callable[[int], str]) -> np.ndarray:
         """(R,) how many of the probabilities (R, K) of each row are not 0; they come first and sum to 1."""
         with np.errstate(invalid="ignore", over="ignore"):
             possible = probabilities > 0
@@ -368,7 +368,7 @@ class OutcomeCheck:
             row = int((~good).argmax())
             shown = ", ".join(map(str, probabilities[row, :8].tolist())) + (", ..." if self.most > 8 else "")
             expected = "expected positive ones that sum to 1, then 0"
-            self._refuse(name, f"{whose(row)} has the probabilities {shown}; {expected}")
+            self._refuse(name, f"{source(row)} has the probabilities {shown}; {expected}")
         return np.asarray(possible.sum(axis=1))
 
     def _check_range(self, next_states: np.ndarray, rows: np.ndarray) -> None:

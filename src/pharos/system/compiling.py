@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import gc
 import os
 import re
 import stat
@@ -19,7 +20,7 @@ from pharos.errors import ParameterError
 from pharos.system import storage
 from pharos.system.storage import compiled_folders
 
-SMALL = 1 << 16
+SMALL_STATES = 1 << 16
 """Entries below which rules and kernels are interpreted, as compiling takes longer (benchmarks/startup.py); 0: none."""
 
 TOLD_AFTER, TOLD_EVERY = 2.0, 10.0
@@ -71,12 +72,20 @@ def prepare() -> None:
         raise ParameterError(f"Numba cannot be loaded: {error}; look at its variables, NUMBA_...") from error
 
     class Compiling(event.Listener):
-        """Adds up the seconds of compiling; kernels that others call are compiled within them."""
+        """Adds up the seconds of compiling; kernels that others call are compiled within them.
+
+        Meanwhile no garbage is sought, which was a tenth of compiling: it makes many objects, and all live until its
+        end.
+        """
+
+        _collects = False
 
         def on_start(self, event: event.Event) -> None:
             global _running, _began
             with _lock:
                 if not _running:
+                    self._collects = gc.isenabled()
+                    gc.disable()
                     _began = time.perf_counter()
                     _announce_later(event.data["dispatcher"].py_func)
                 _running += 1
@@ -87,6 +96,8 @@ def prepare() -> None:
                 _running -= 1
                 if not _running:
                     _total += time.perf_counter() - _began
+                    if self._collects:
+                        gc.enable()
                     if _timer is not None:
                         _timer.cancel()
 
@@ -124,16 +135,16 @@ def _announce(name: str) -> None:
 
 
 def _name_of(function: Callable) -> str:
-    """A kernel's name, and that of the class of environments for whose rules it is made."""
+    """A kernel's name, and the name of the class of environments for whose rules it is made."""
     owner = re.fullmatch(r"(\w+)_[0-9a-f]{20}\.\w+", function.__qualname__)
     return f"{function.__name__} for {owner[1]}" if owner else function.__name__
 
 
 @cache
 def private_folder(cache_directory: Path) -> Path | None:
-    """The folder of compiled code, which is this user's and which nobody else can write to; None where there is none.
+    """The folder of compiled code, which is this user's and which nobody else can write to; None if there is none.
 
-    It is `compiled`, or, where several users share the cache, `compiled-` and the user's number. A warning says what is
+    It is `compiled`, or, if several users share the cache, `compiled-` and the user's number. A warning says what is
     wrong with a folder that is refused.
     """
     problems = []
@@ -154,7 +165,7 @@ def private_folder(cache_directory: Path) -> Path | None:
 
 
 def _problem_of(folder: Path) -> str:
-    """Make the folder where it is missing. Returns the reason against its use, "" where there is none."""
+    """Make the folder if it is missing. Returns the reason against its use, "" if there is none."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):

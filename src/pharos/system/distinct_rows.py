@@ -20,7 +20,7 @@ from pharos.system import storage
 CHUNK_BYTES = 1 << 20
 """Size of a chunk before it is deflated: the least that is read for one row."""
 CACHED_BYTES = 1 << 26
-LEVEL = 6
+COMPRESSION_LEVEL = 6
 
 
 class DistinctRows:
@@ -101,7 +101,7 @@ class DistinctRows:
             return self._cache[chunk]
         count = min(self.rows_in_chunk, self.num_distinct - chunk * self.rows_in_chunk)
         try:
-            rows = unpacked(self.chunk(chunk), (count, *self.shape[1:]), self.dtype)
+            rows = inflate_rows(self.chunk(chunk), (count, *self.shape[1:]), self.dtype)
         except ValueError as error:
             raise error if isinstance(error, FileFormatError) else FileFormatError(f"{self.name}: {error}") from None
         self._cache[chunk] = rows
@@ -139,7 +139,7 @@ class RowCollector:
             number = self._numbers[digest] = len(self._numbers)
             self.pending.append(array.copy())
             if len(self.pending) == self.rows_in_chunk:
-                self.chunks.append(packed(np.stack(self.pending)))
+                self.chunks.append(deflate_rows(np.stack(self.pending)))
                 self.pending = []
         return number
 
@@ -149,7 +149,7 @@ class RowCollector:
 
     def packed_pending(self) -> bytes:
         """The distinct rows that fill no chunk yet."""
-        return packed(np.stack(self.pending)) if self.pending else b""
+        return deflate_rows(np.stack(self.pending)) if self.pending else b""
 
     def resume(self, chunks: Sequence[bytes], pending: bytes, digests: Sequence[str]) -> None:
         """Add what another collector had added since.
@@ -163,7 +163,7 @@ class RowCollector:
         for digest in digests:
             self._numbers[digest] = len(self._numbers)
         rest = self.num_distinct - len(self.chunks) * self.rows_in_chunk
-        self.pending = [*unpacked(pending, (rest, *self.shape), self.dtype)] if rest else []
+        self.pending = [*inflate_rows(pending, (rest, *self.shape), self.dtype)] if rest else []
 
     def rows(self, index: np.ndarray) -> DistinctRows:
         """Rows (N, ...) of an index (N,) into the distinct ones."""
@@ -190,7 +190,7 @@ def stretch(rows: np.ndarray | DistinctRows) -> np.ndarray:
     return (255 // np.maximum(largest, 1)).astype(np.uint8)
 
 
-def collected(rows: npt.ArrayLike) -> DistinctRows:
+def collect_rows(rows: npt.ArrayLike) -> DistinctRows:
     """The rows of an array (N, ...), the distinct ones in the order in which they appear first."""
     array = np.asarray(rows)
     collector = RowCollector(array.shape[1:], array.dtype)
@@ -198,23 +198,23 @@ def collected(rows: npt.ArrayLike) -> DistinctRows:
     return collector.rows(index)
 
 
-def shortened(rows: DistinctRows, count: int) -> DistinctRows:
+def shorten_rows(rows: DistinctRows, count: int) -> DistinctRows:
     """The same rows, if only the first `count` distinct ones occur in them, with chunks of these alone."""
     full, rest = divmod(count, rows.rows_in_chunk)
-    last = [packed(rows.distinct(np.arange(full * rows.rows_in_chunk, count)))] if rest else []
+    last = [deflate_rows(rows.distinct(np.arange(full * rows.rows_in_chunk, count)))] if rest else []
     chunks = [*map(rows.chunk, range(full)), *last]
     return DistinctRows(rows.index, rows.shape[1:], rows.dtype, count, rows.rows_in_chunk, chunks.__getitem__)
 
 
-def packed(rows: np.ndarray) -> bytes:
+def deflate_rows(rows: np.ndarray) -> bytes:
     """A chunk of rows (M, ...)."""
     flat = np.ascontiguousarray(rows).reshape(len(rows), -1).view(np.uint8)
     differences = flat.copy()
     differences[1:] ^= flat[0]
-    return zlib.compress(differences.tobytes(), LEVEL)
+    return zlib.compress(differences.tobytes(), COMPRESSION_LEVEL)
 
 
-def unpacked(chunk: bytes, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
+def inflate_rows(chunk: bytes, shape: Sequence[int], dtype: np.dtype) -> np.ndarray:
     """The rows of a chunk.
 
     Raises:

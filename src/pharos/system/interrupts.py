@@ -6,18 +6,20 @@ command would go on to exit code 0. So:
 
 - While the command loads, the process ends at once (`pharos/__init__.py`): nothing has begun.
 - While it works, KeyboardInterrupt is raised, so that locks and processes end in order; not within an import, whose end
-  is awaited, and once more where it was lost.
+  is awaited, and once more if it was lost.
 - When it has ended, the line is printed, what `atexit` has to clean up is cleaned up, and the exit code becomes 130.
 """
 
 import _thread
 import atexit
 import contextlib
+import math
 import os
 import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from types import FrameType
 
 EXIT_INTERRUPTED = 130
@@ -118,3 +120,33 @@ def is_importing(frame: FrameType | None) -> bool:
 
 
 interrupts = CommandInterrupts()
+
+
+@contextlib.contextmanager
+def time_limit(seconds: float | None, error: type[BaseException]) -> Iterator[None]:
+    """Raise an error in the block after that many seconds of wall-clock time, and every second until the block ends.
+
+    A compiled kernel is not interrupted; it raises when it returns. Only the main thread can be stopped, by SIGALRM:
+    elsewhere, and on Windows, there is no limit.
+
+    Args:
+        seconds: None, or infinity: no limit. error: called with a text.
+    """
+    able = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+    if not able or seconds is None or not seconds < math.inf:
+        yield
+        return
+
+    def stop(*_: object) -> None:
+        raise error(f"takes more than {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-6), 1.0)
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+    finally:  # once more: the alarm may have come before the block began, or while it was turned off
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)

@@ -3,7 +3,7 @@
 `import pharos` and a script's first lines need few of the names that a package publishes; the others cost nothing then.
 
 The distribution `pharos-rl` is this project. The distribution `pharos` is Graviti's SDK for pictures, whose files lie
-in the same folder where both are installed; whichever came last has replaced the other's `__init__.py`.
+in the same folder if both are installed. The one installed last has replaced the other's `__init__.py`.
 """
 
 import ast
@@ -24,7 +24,7 @@ def attributes(package: str) -> Callable[[str], object]:
     """
 
     @functools.cache
-    def places() -> dict[str, tuple[str, str]]:
+    def origins() -> dict[str, tuple[str, str]]:
         module = sys.modules[package]
         tree = ast.parse(module.__loader__.get_source(package))  # type: ignore[union-attr]  # also inside of a zip
         blocks = [node for node in tree.body if isinstance(node, ast.If)]
@@ -32,9 +32,9 @@ def attributes(package: str) -> Callable[[str], object]:
         return {alias.asname or alias.name: (str(node.module), alias.name) for node in imports for alias in node.names}
 
     def attribute(name: str) -> object:
-        if name.startswith("__") or name not in places():
+        if name.startswith("__") or name not in origins():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module, name_there = places()[name]
+        module, name_there = origins()[name]
         if module == package:
             return importlib.import_module(f"{package}.{name_there}")
         value = getattr(importlib.import_module(module), name_there)
@@ -52,10 +52,10 @@ FOREIGN_FILE = "__version__.py"
 
 
 def conflict(folder: Path | None = None) -> str | None:
-    """Message about the other project in the same folder, and how to mend it; None where it is not there.
+    """Message about the other project in the same folder, and how to mend it; None if it is not there.
 
     Args:
-        folder: of the package; None: that of pharos.
+        folder: of the package; None: of pharos.
     """
     folder = folder or Path(__file__).parents[1]
     if not (folder / FOREIGN_FILE).exists():

@@ -41,7 +41,7 @@ _PROC, _GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
 
 def available_memory() -> int:
-    """Free bytes of the machine's memory, or of a control group that this process is in (Slurm, containers) where that
+    """Free bytes of the machine's memory, or of a control group that this process is in (Slurm, containers) if that
     is less.
 
     The cache of files counts as free: the system drops it when memory is needed.
@@ -86,12 +86,12 @@ def _of_files(statistics: Path) -> int:
 
 
 # Bytes that are always taken from memory; beyond them, the share of what is free that one array may take.
-SMALL, SHARE = 1 << 26, 4
+SMALL_BYTES, MEMORY_SHARE = 1 << 26, 4
 # The same of values, all of which are read and written in each sweep.
 SHARE_OF_VALUES = 1.5
-_BLOCK = 1 << 24
+_BYTES_AT_ONCE = 1 << 24
 # Rows of a mapped array that are swept while the next ones are read.
-RANGE = 1 << 22
+RANGE_ROWS = 1 << 22
 # Rows of one that memory has no room for: they are read at a time, into one of two arrays.
 PIECE = 1 << 19
 # Advice of Linux 5.4 that Python has no name for: these pages may go first.
@@ -109,7 +109,7 @@ def reserved_states(num_words: int) -> np.ndarray:
 
 
 def reserved_table() -> np.ndarray:
-    """(N,) zero bytes of reserved address space, in which the table grows; empty where there is no address space."""
+    """(N,) zero bytes of reserved address space, in which the table grows; empty if there is no address space."""
     for size in (1 << 35, 1 << 33, 1 << 31):
         with contextlib.suppress(OSError, ValueError):
             return huge_pages(size, np.dtype("|u1"))
@@ -117,7 +117,7 @@ def reserved_table() -> np.ndarray:
 
 
 def huge_pages(length: int, dtype: np.dtype) -> np.ndarray:
-    """An array of zeros in huge pages, where the system has them."""
+    """An array of zeros in huge pages, if the system has them."""
     if not hasattr(mmap, "MAP_PRIVATE"):
         return np.zeros(min(length, 1 << 28), dtype)
     no_reserve = 0x4000 if sys.platform == "linux" else 0  # MAP_NORESERVE, which Python names from 3.13 on
@@ -129,11 +129,11 @@ def huge_pages(length: int, dtype: np.dtype) -> np.ndarray:
     return np.frombuffer(memory, dtype)
 
 
-def large_zeros(shape: tuple[int, ...], dtype: DTypeLike, share: float = SHARE) -> np.ndarray:
-    """An array of zeros: in memory, or, where it would take more than 1 / share of what is free, a mapped file.
+def large_zeros(shape: tuple[int, ...], dtype: DTypeLike, share: float = MEMORY_SHARE) -> np.ndarray:
+    """An array of zeros: in memory, or, if it would take more than 1 / share of what is free, a mapped file.
 
-    The file is in the cache's folder and has no name: it is gone with the array, whatever becomes of the process. What
-    is read and written in order, or near to where it was before, costs little more there than in memory.
+    The file is in the cache's folder and has no name: it is gone with the array, whatever becomes of the process.
+    Reading and writing in order, or near the last position, costs little more there than in memory.
 
     Raises:
         DiskFull: the file cannot be written.
@@ -153,14 +153,14 @@ def large_zeros(shape: tuple[int, ...], dtype: DTypeLike, share: float = SHARE) 
         ) from error
 
 
-def fits(size: int, share: float = SHARE) -> bool:
+def fits(size: int, share: float = MEMORY_SHARE) -> bool:
     """Whether so many bytes are at most 1 / share of what is free, or few."""
-    return size <= SMALL or size <= available_memory() / share
+    return size <= SMALL_BYTES or size <= available_memory() / share
 
 
 def mapped_file(folder: Path, size: int) -> mmap.mmap:
     """A file of zeros without a name, its room on the disk taken: a mapped file that finds the disk full when it is
-    written kills the process. OSError where that room is missing.
+    written kills the process. OSError if that room is missing.
     """
     with tempfile.TemporaryFile(dir=folder) as file:
         append_zeros(file, size)
@@ -168,32 +168,32 @@ def mapped_file(folder: Path, size: int) -> mmap.mmap:
 
 
 def append_zeros(file: BinaryIO, size: int) -> None:
-    """Append so many zero bytes to what was written, their room on the disk taken. OSError where it cannot be."""
+    """Append so many zero bytes to what was written, their room on the disk taken. OSError if it cannot be."""
     file.flush()
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file.fileno(), file.tell(), size)
     else:
-        for start in range(0, size, _BLOCK):
-            file.write(bytes(min(_BLOCK, size - start)))
+        for start in range(0, size, _BYTES_AT_ONCE):
+            file.write(bytes(min(_BYTES_AT_ONCE, size - start)))
         file.flush()
 
 
 def ranges_from_the_end(rows: object, low: int, high: int, have_room: bool = False) -> Iterator[tuple[int, int]]:
     """Ranges [start, stop) that make up [low, high), the last one first: how rows are swept from the last to the first.
 
-    Rows in memory are one range. Of a mapped array, `RANGE` rows are swept while the system reads those before them: it
-    finds out by itself what is read from the first byte to the last, but not what is read the other way round. Where
-    the rows fill memory, unless these `have_room` in it, those that were swept go before anything else: values, which
-    may be mapped as well, are needed all the time.
+    Rows in memory are one range. Of a mapped array, `RANGE_ROWS` rows are swept while the system reads the rows before
+    them: it reads ahead by itself from the first byte to the last, but not the other way round. If the rows fill
+    memory, unless these `have_room` in it, those that were swept go before anything else: values, which may be mapped
+    as well, are needed all the time.
     """
     rows = rows.packed if isinstance(rows, PackedIndices) else rows
     if not isinstance(rows, np.memmap):
         yield low, high
         return
     fills_memory = not have_room and 2 * rows.nbytes > available_memory()
-    for stop in range(high, low, -RANGE):
-        start = max(stop - RANGE, low)
-        _advise(rows, max(start - RANGE, low), start, getattr(mmap, "MADV_WILLNEED", None))
+    for stop in range(high, low, -RANGE_ROWS):
+        start = max(stop - RANGE_ROWS, low)
+        _advise(rows, max(start - RANGE_ROWS, low), start, getattr(mmap, "MADV_WILLNEED", None))
         yield start, stop
         if fills_memory and sys.platform == "linux":
             _advise(rows, start, stop, _COLD)
@@ -210,9 +210,9 @@ def rows_with_room(rows: object, low: int, high: int) -> int:
 def pieces_from_the_end(rows: R, low: int, high: int, border: int) -> Iterator[tuple[R | np.ndarray, int, int]]:
     """(array, start, stop): ranges that make up [low, high), the last one first, each with an array that has its rows.
 
-    They are those of `ranges_from_the_end` as far as `border`, see `rows_with_room`. Rows from there on are read into
-    memory of this process, the next ones while some are swept, and leave nothing in that of the system: pages of files
-    that come and go cost more than sweeps.
+    They are the ranges of `ranges_from_the_end` as far as `border`, see `rows_with_room`. Rows from there on are read
+    into memory of this process, the next ones while some are swept, and leave nothing in memory of the system: pages of
+    files that come and go cost more than sweeps.
     """
     border = room = min(max(low, border), high)
     with contextlib.ExitStack() as stack:
@@ -236,7 +236,7 @@ def pieces_from_the_end(rows: R, low: int, high: int, border: int) -> Iterator[t
 
 
 class _UncachedFile:
-    """The file of a mapped array, read past the memory of the system where that is possible."""
+    """The file of a mapped array, read past the memory of the system if that is possible."""
 
     def __init__(self, rows: object):
         assert isinstance(rows, np.memmap), "arrays in memory have room"
@@ -332,7 +332,7 @@ def _make(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
 
 @contextlib.contextmanager
 def _locked(path: Path, file: BinaryIO, what: str) -> Iterator[contextlib.ExitStack]:
-    """Lock the file, by a claim beside it where the file system has no locks (`storage.lock`); yield that claim."""
+    """Lock the file, by a claim beside it if the file system has no locks (`storage.lock`); yield that claim."""
     with contextlib.ExitStack() as claim:
         try:
             if fcntl is not None:
@@ -342,12 +342,12 @@ def _locked(path: Path, file: BinaryIO, what: str) -> Iterator[contextlib.ExitSt
         except OSError as error:
             if not storage.has_no_locks(error):
                 raise
-            claim.enter_context(storage.claim(path.with_name(f"{path.name}.claim"), FolderLocked, f"using {what}"))
+            claim.enter_context(storage.hold_claim(path.with_name(f"{path.name}.claim"), FolderLocked, f"using {what}"))
         yield claim
 
 
 def _checked_offset(path: Path, file: BinaryIO, shape: tuple[int, ...], dtype: np.dtype, what: str) -> int:
-    """The byte of the file at which the array begins; FileFormatError where the file holds something else."""
+    """The byte of the file at which the array begins; FileFormatError if the file holds something else."""
     try:
         np.lib.format.read_magic(file)
         file_shape, is_fortran, file_dtype = np.lib.format.read_array_header_1_0(file)

@@ -1,8 +1,8 @@
 """Frozen dataclasses made of keywords or read from JSON.
 
 Options that travel together are declared once, and documented under *Attributes* of the class; Python's keywords, the
-command line and YAML files are read into them. Records are JSON of unknown origin: names and types of entries are those
-of the fields.
+command line and YAML files are read into them. Records are JSON of unknown origin: names and types of entries must be
+the names and types of the fields.
 """
 
 import functools
@@ -18,10 +18,10 @@ from pharos.errors import FileFormatError
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
-SHOWN = 60  # letters of a wrong entry, in errors
+SHOWN_LETTERS = 60  # letters of a wrong entry, in errors
 
 
-def meanings(documented: object) -> dict[str, str]:
+def docstring_entries(documented: object) -> dict[str, str]:
     """Texts by name, of entries such as `height, width: of the grid` in the section Attributes or Args of a docstring;
     also of the classes that a class extends.
     """
@@ -62,11 +62,11 @@ def parts(cls: type) -> dict[str, type]:
 
 
 def option_names(cls: type) -> set[str]:
-    """Names of the fields of a dataclass, and of those of its parts."""
+    """Names of the fields of a dataclass, and of the fields of its parts."""
     return {each.name for owner in (cls, *parts(cls).values()) for each in _fields(owner)}
 
 
-def joined(cls: type, options: Mapping[str, Any]) -> dict[str, Any]:
+def nested_options(cls: type, options: Mapping[str, Any]) -> dict[str, Any]:
     """Options of a dataclass, with fields of its parts given by their own names: `sticky=0.1` as `chance=...`."""
     own = dict(options)
     for name, part in parts(cls).items():
@@ -82,7 +82,7 @@ def flat(cls: type[T]) -> type[T]:
 
     @functools.wraps(init)
     def flat_init(self: T, *args: object, **options: object) -> None:
-        init(self, *args, **joined(cls, options))
+        init(self, *args, **nested_options(cls, options))
 
     cls.__init__ = flat_init  # type: ignore[method-assign, assignment]
     for name, part in parts(cls).items():  # type: ignore[arg-type]
@@ -112,17 +112,17 @@ def takes(cls: type, **defaults: object) -> Callable[[F], F]:
     return shown
 
 
-def split(cls: type[T], options: Mapping[str, Any]) -> tuple[T, dict[str, Any]]:
+def split_options(cls: type[T], options: Mapping[str, Any]) -> tuple[T, dict[str, Any]]:
     """An object of the options that are fields of a dataclass or of its parts; and the other options."""
     names = option_names(cls)
     own = {name: value for name, value in options.items() if name in names}
-    return cls(**joined(cls, own)), {name: value for name, value in options.items() if name not in names}
+    return cls(**nested_options(cls, own)), {name: value for name, value in options.items() if name not in names}
 
 
 # Records --------------------------------------------------------------------------------------------------------------
 
 
-def read(cls: type[T], entry: object, whose: str, optional: Collection[str] = ()) -> T:
+def parse_record(cls: type[T], entry: object, source: str, optional: Collection[str] = ()) -> T:
     """An object of a dataclass from its entries; dataclasses among fields by their `from_dict`, or likewise.
 
     A whole number is a number; no value is converted, so that digests of the entries stay what they are.
@@ -135,25 +135,27 @@ def read(cls: type[T], entry: object, whose: str, optional: Collection[str] = ()
     """
     names = [each.name for each in _fields(cls)]
     if not isinstance(entry, Mapping):
-        raise FileFormatError(f"{whose} is {repr(entry)[:SHOWN]}; expected {', '.join(names)}")
+        raise FileFormatError(f"{source} is {repr(entry)[:SHOWN_LETTERS]}; expected {', '.join(names)}")
     missing = [name for name in names if name not in entry and name not in optional]
     unknown = [name for name in entry if name not in names]
     if missing or unknown:
-        wrong = f"lacks {', '.join(missing)}" if missing else f"has the unknown entry {str(unknown[0])[:SHOWN]!r}"
-        raise FileFormatError(f"{whose} {wrong}; expected {', '.join(names)}")
+        wrong = (
+            f"lacks {', '.join(missing)}" if missing else f"has the unknown entry {str(unknown[0])[:SHOWN_LETTERS]!r}"
+        )
+        raise FileFormatError(f"{source} {wrong}; expected {', '.join(names)}")
     hints = get_type_hints(cls)
-    return cls(**{name: _checked(value, hints[name], f"{whose}: {name}") for name, value in entry.items()})
+    return cls(**{name: _checked(value, hints[name], f"{source}: {name}") for name, value in entry.items()})
 
 
-def _checked(value: object, hint: object, whose: str) -> object:
+def _checked(value: object, hint: object, source: str) -> object:
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if is_dataclass(hint) and isinstance(hint, type) and isinstance(value, Mapping):
-        return getattr(hint, "from_dict", lambda entry: read(hint, entry, whose))(value)
+        return getattr(hint, "from_dict", lambda entry: parse_record(hint, entry, source))(value)
     kinds = inner if kind is types.UnionType else (int, float) if kind is float else (kind,)
     is_number = isinstance(value, bool) and bool not in kinds  # Python counts truths as numbers
     if kind is not Any and (is_number or not isinstance(value, kinds)):
         expected = getattr(hint, "__name__", hint) if not inner or kind is types.UnionType else "an object"
-        raise FileFormatError(f"{whose} is {repr(value)[:SHOWN]}; expected {expected}")
+        raise FileFormatError(f"{source} is {repr(value)[:SHOWN_LETTERS]}; expected {expected}")
     if isinstance(value, Mapping) and kind is Mapping and inner[1] is not Any:
-        return {name: _checked(each, inner[1], f"{whose}: {name}") for name, each in value.items()}
+        return {name: _checked(each, inner[1], f"{source}: {name}") for name, each in value.items()}
     return value

@@ -25,13 +25,13 @@ from safetensors.numpy import save
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.system import storage
 
-FORMAT = 1
+SEALED_FORMAT = 1
 SUFFIX = ".safetensors"
 LARGEST_HEADER = 1 << 22
-LARGEST_FILE = 1 << 30
+LARGEST_SEALED_FILE = 1 << 30
 LONGEST_TEXT = 2000
-DEEPEST = 50
-SHOWN = ("name", "author", "note")
+DEEPEST_JSON = 50
+SHOWN_TEXTS = ("name", "author", "note")
 INVISIBLE = "\u034f\u115f\u1160\u17b4\u17b5\u180b\u180c\u180d\u180f\u2800\u3164\uffa0"
 """Printable, and nothing to see: joiners, selectors, fillers of Hangul and the empty pattern of Braille."""
 LOOKALIKES = "АВЕЅІЈКМНОРСТУХаеорсухѕіјΑΒΕΖΗΙΚΜΝΟΡΤΥΧοερν"
@@ -39,7 +39,7 @@ LOOKALIKES = "АВЕЅІЈКМНОРСТУХаеорсухѕіјΑΒΕΖΗΙΚΜ
 MOST_MARKS = 4
 _RECORD, _ARRAYS = "pharos", "arrays"
 T = TypeVar("T")
-_AGAIN = "fetch it again, or ask for it again"
+_ASK_AGAIN = "fetch it again, or ask for it again"
 
 
 def write_sealed(
@@ -58,10 +58,14 @@ def write_sealed(
     """
     checked = {name: _checked(name, array) for name, array in arrays.items()}
     digests = {name: _digest(array) for name, array in checked.items()}
-    text = json.dumps(storage.sealed({**record, "format": FORMAT, _ARRAYS: digests}), sort_keys=True, allow_nan=False)
+    text = json.dumps(
+        storage.sealed({**record, "format": SEALED_FORMAT, _ARRAYS: digests}), sort_keys=True, allow_nan=False
+    )
     data = save(checked, {_RECORD: text})
-    if len(data) > LARGEST_FILE:
-        raise ParameterError(f"{file}: the {what} would have {len(data):,} bytes; expected at most {LARGEST_FILE:,}")
+    if len(data) > LARGEST_SEALED_FILE:
+        raise ParameterError(
+            f"{file}: the {what} would have {len(data):,} bytes; expected at most {LARGEST_SEALED_FILE:,}"
+        )
     storage.replace_file(file, data, follow=follow)
 
 
@@ -89,39 +93,41 @@ def read_sealed(file: str | os.PathLike, what: str, make: Callable[[dict[str, An
         is_intact = storage.DIGEST in record and storage.is_intact(record)
     except SafetensorError as error:
         raise ResultCorrupted(
-            f"{path}: is no {what}, or was cut short or changed: {_reason(error)}; {_AGAIN}"
+            f"{path}: is no {what}, or was cut short or changed: {_reason(error)}; {_ASK_AGAIN}"
         ) from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, ParameterError) as error:
-        raise FileFormatError(f"{path}: is no {what}: {_reason(error)}; {_AGAIN}") from None
+        raise FileFormatError(f"{path}: is no {what}: {_reason(error)}; {_ASK_AGAIN}") from None
     if not is_intact:
-        raise ResultCorrupted(f"{path}: what it says was changed after it was written; {_AGAIN}")
-    if record.get("format") != FORMAT:
-        raise FileFormatError(f"{path}: is in format {record.get('format')!r}; this version of pharos reads {FORMAT}")
+        raise ResultCorrupted(f"{path}: what it says was changed after it was written; {_ASK_AGAIN}")
+    if record.get("format") != SEALED_FORMAT:
+        raise FileFormatError(
+            f"{path}: is in format {record.get('format')!r}; this version of pharos reads {SEALED_FORMAT}"
+        )
     if record.get(_ARRAYS) != {name: _digest(array) for name, array in arrays.items()}:
-        raise ResultCorrupted(f"{path}: its arrays were changed after it was written; {_AGAIN}")
+        raise ResultCorrupted(f"{path}: its arrays were changed after it was written; {_ASK_AGAIN}")
     try:
         return make(record, arrays)
     except (FileFormatError, ParameterError) as error:
         raise FileFormatError(f"{path}: {str(error)[:LONGEST_TEXT]}") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise FileFormatError(f"{path}: its record is damaged: {_reason(error)}; {_AGAIN}") from None
+        raise FileFormatError(f"{path}: its record is damaged: {_reason(error)}; {_ASK_AGAIN}") from None
 
 
 def _check_sizes(path: Path) -> None:
-    """ValueError where the file or its header is too large to be read."""
+    """ValueError if the file or its header is too large to be read."""
     total = path.stat().st_size
     with open(path, "rb") as file:
         length = int.from_bytes(file.read(8), "little")
-    if not 8 < total <= LARGEST_FILE:
-        raise ValueError(f"it has {total:,} bytes; expected at most {LARGEST_FILE:,}")
+    if not 8 < total <= LARGEST_SEALED_FILE:
+        raise ValueError(f"it has {total:,} bytes; expected at most {LARGEST_SEALED_FILE:,}")
     if length > min(LARGEST_HEADER, total - 8):
         raise ValueError(f"its header would have {length:,} bytes, of {total:,} in the file")
 
 
 def check_values(value: object, name: str = "record", depth: int = 0) -> None:
     """Refuse texts with unprintable or invisible characters, and numbers that are not finite."""
-    if depth > DEEPEST:
-        raise ValueError(f"its {name} is nested deeper than {DEEPEST} times")
+    if depth > DEEPEST_JSON:
+        raise ValueError(f"its {name} is nested deeper than {DEEPEST_JSON} times")
     if isinstance(value, Mapping):
         for key, item in value.items():
             check_values(key, name)
@@ -132,7 +138,7 @@ def check_values(value: object, name: str = "record", depth: int = 0) -> None:
     elif isinstance(value, str):
         if not all(character.isprintable() or character == "\n" for character in value):
             raise ValueError(f"a text of its {name} has characters that cannot be printed")
-        if name in SHOWN:
+        if name in SHOWN_TEXTS:
             _check_shown(value, name)
     elif isinstance(value, int | float) and not abs(value) <= sys.float_info.max:
         raise ValueError(f"its {name} is {str(value)[:20]}; expected a finite number")

@@ -1,8 +1,8 @@
 """Code of the user's own: a class or a function that is named as `module:Name` or `file.py:Name`.
 
-A name in a command or a script of the user is trusted: `load(find(name))` imports it. A name in a file that somebody
-else may have written (a run.json, a study's folder, a packed study) is not: `resolve` returns what this process has
-already imported under that name, and imports nothing by itself unless it is told to trust the file.
+A name in a command or a script of the user is trusted: `load_source(find_source(name))` imports it. A name in a file
+that somebody else may have written (a run.json, a study's folder, a packed study) is not: `resolve` returns what this
+process has already imported under that name, and imports nothing by itself unless it is told to trust the file.
 """
 
 import importlib
@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any, TypeGuard
 
 from pharos.errors import FileFormatError, ParameterError, UntrustedCode
-from pharos.system.records import read
+from pharos.system.records import parse_record
 
 # Modules loaded from files, by their path: (digest of the file, module).
 _MODULES: dict[str, tuple[str, ModuleType]] = {}
@@ -30,7 +30,7 @@ class Source:
 
     Attributes:
         name: "module:Name" or "file.py:Name", without a folder: the same on every machine.
-        file: the file, or that of the module: an absolute path.
+        file: the file, or the file of the module: an absolute path.
         checksum: digest of the file.
     """
 
@@ -45,7 +45,7 @@ class Source:
         Raises:
             FileFormatError: it is damaged.
         """
-        source = read(Source, entry, "the source of a class")
+        source = parse_record(Source, entry, "the source of a class")
         if ":" not in source.name:
             raise FileFormatError(f"the source of a class: name is {source.name!r}; expected module:Name")
         return source
@@ -75,11 +75,11 @@ class Source:
 
 
 def is_reference(name: object) -> TypeGuard[str]:
-    """Whether a name is that of the user's own code, `module:Name` or `file.py:Name`."""
+    """Whether a name means the user's own code, `module:Name` or `file.py:Name`."""
     return isinstance(name, str) and ":" in name
 
 
-def find(name: str, folder: str | Path | None = None) -> Source:
+def find_source(name: str, folder: str | Path | None = None) -> Source:
     """The source of `module:Name` or `file.py:Name`; nothing but the parents of the module is imported.
 
     Args:
@@ -92,7 +92,7 @@ def find(name: str, folder: str | Path | None = None) -> Source:
     if where.endswith(".py"):
         path = base / Path(where).expanduser()
         if not path.is_file():
-            raise ParameterError(f"{name!r}: there is no file {path}; {_EXPECTED}")
+            raise ParameterError(f"{name!r}: there is no file {path}; {_EXPECTED_REFERENCE}")
         return Source(f"{path.name}:{attribute}", str(path.resolve()), _checksum(path))
     inside = base.joinpath(*where.split("."))
     for candidate in (inside.with_suffix(".py"), inside / "__init__.py"):
@@ -101,15 +101,15 @@ def find(name: str, folder: str | Path | None = None) -> Source:
     try:
         spec = importlib.util.find_spec(where)
     except Exception as error:  # of the module's parents
-        raise ParameterError(f"{name!r}: {_in_a_line(error)}; {_EXPECTED}") from error
+        raise ParameterError(f"{name!r}: {_in_a_line(error)}; {_EXPECTED_REFERENCE}") from error
     if spec is None:
-        raise ParameterError(f"{name!r}: No module named {where!r}; {_EXPECTED}")
+        raise ParameterError(f"{name!r}: No module named {where!r}; {_EXPECTED_REFERENCE}")
     origin = spec.origin if spec.has_location and spec.origin else ""
     return Source(name, origin, _checksum(origin))
 
 
-def load(source: Source) -> Any:
-    """Import what a source names; None where it has no such name. A file is executed again only where it has changed.
+def load_source(source: Source) -> Any:
+    """Import what a source names; None if it has no such name. A file is executed again only if it has changed.
 
     Raises:
         ParameterError: it cannot be imported.
@@ -119,8 +119,8 @@ def load(source: Source) -> Any:
     try:
         module = _module_of_file(source) if source.module is None else _module_called(source)
         target = getattr(module, source.attribute, None) if source.attribute else None
-    except (Exception, SystemExit) as error:  # a script may end where it is loaded
-        raise ParameterError(f"{source.name!r}: {_in_a_line(error)}; {_EXPECTED}") from error
+    except (Exception, SystemExit) as error:  # a script may end while it is loaded
+        raise ParameterError(f"{source.name!r}: {_in_a_line(error)}; {_EXPECTED_REFERENCE}") from error
     _LOADED[source.name] = (source, target)
     return target
 
@@ -156,16 +156,16 @@ def resolve(source: Source, *, trust: bool = False, strict: bool = False) -> Any
     now = source
     if not Path(source.file).is_file():
         if source.module is None:
-            raise ParameterError(f"{source.name!r}: there is no file {source.file}; {_EXPECTED}")
-        now = find(source.name, folder=Path(sys.prefix))  # installed here, elsewhere than there
+            raise ParameterError(f"{source.name!r}: there is no file {source.file}; {_EXPECTED_REFERENCE}")
+        now = find_source(source.name, folder=Path(sys.prefix))  # installed here, elsewhere than there
     now = Source(source.name, now.file, _checksum(now.file))
     if now.checksum != source.checksum:
         _tell_change(source, now, strict)
-    return load(now)
+    return load_source(now)
 
 
 def source_of(value: object, attribute: str | None = None) -> Source | None:
-    """The source by which others can import a class or function; None where they cannot, as in a notebook.
+    """The source by which others can import a class or function; None if they cannot, as in a notebook.
 
     Args:
         attribute: the name in its module; None: its own.
@@ -181,7 +181,7 @@ def source_of(value: object, attribute: str | None = None) -> Source | None:
     return Source(f"{name}:{attribute}", str(Path(path).resolve()), _checksum(path))
 
 
-def announce(value: object) -> Source:
+def register_source(value: object) -> Source:
     """The source of a class or function that this process has, which `resolve` then finds here.
 
     One of a notebook, of the script itself, or within a function has a name and no file: other processes lack it.
@@ -198,7 +198,7 @@ def announced(name: str) -> Source | None:
     return source if source is not None and not source.file else None
 
 
-_EXPECTED = "expected 'module:Name' or 'file.py:Name'"
+_EXPECTED_REFERENCE = "expected 'module:Name' or 'file.py:Name'"
 
 
 def _tell_change(source: Source, now: Source, strict: bool) -> None:
@@ -260,7 +260,7 @@ def _module_called(source: Source) -> ModuleType:
 
 
 def _checksum(file: str | Path) -> str:
-    """The digest of a file; empty where there is none."""
+    """The digest of a file; empty if there is none."""
     from pharos.system.storage import digest_of_file  # which built-in classes do without
 
     return digest_of_file(file) if file and Path(file).is_file() else ""

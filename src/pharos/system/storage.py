@@ -40,11 +40,11 @@ except ImportError:  # Windows
 LOCK = "lock"
 CLAIM = "lock.claim"
 """File that stands in for a lock where the file system has none: the process that makes it holds the folder."""
-WAITING_SECONDS = 0.2
+LOCK_POLL_SECONDS = 0.2
 CLAIM_ATTEMPTS = 200
 
 DIGEST = "digest"
-BLOCK_BYTES = 1 << 24
+DIGEST_BLOCK_BYTES = 1 << 24
 
 _HELD = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 _UNSUPPORTED = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL)
@@ -56,7 +56,7 @@ _LEFTOVER_SECONDS = 86400.0
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike, *, durable: bool = True, follow: bool = False) -> Iterator[BinaryIO]:
-    """Open a file for writing that takes the place of `path` when the block ends, and never where it raises.
+    """Open a file for writing that takes the place of `path` when the block ends, and never if it raises.
 
     Args:
         path: a symbolic link, a pipe or a device there is replaced, so that a folder of results that somebody else has
@@ -124,12 +124,12 @@ class _Writer:
 
 def inside(root: Path, *names: str) -> Path:
     """The path of a folder within a folder of results; a symbolic link on the way below `root` is removed."""
-    place = root
+    path = root
     for name in names:
-        place = place / name
-        if place.is_symlink():
-            place.unlink()
-    return place
+        path = path / name
+        if path.is_symlink():
+            path.unlink()
+    return path
 
 
 def own_file(path: str, flags: int) -> int:
@@ -176,7 +176,7 @@ def sync(path: Path) -> None:
 def write_out(descriptor: int, start: int, size: int) -> None:
     """Ask the system to begin writing a part of a file to the disk, so that a later fsync has less to wait for.
 
-    It waits for nothing and promises nothing; where the system knows no such call (it is Linux' own), nothing happens.
+    It waits for nothing and promises nothing. If the system has no such call (only Linux has it), nothing happens.
     """
     call = _sync_file_range()
     if call is not None:
@@ -246,7 +246,7 @@ def _host() -> str:
 
 
 def _is_alive(process: int) -> bool:
-    """Whether a process of this machine is alive; True where that is unknown."""
+    """Whether a process of this machine is alive; True if that is unknown."""
     if os.name == "nt":
         return True
     try:
@@ -269,14 +269,14 @@ def _is_alive(process: int) -> bool:
 def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = "at work") -> Iterator[None]:
     """Hold a folder for this process: by `flock` on its file `lock`, so that a process that is killed holds nothing.
 
-    Where the file system has no such locks (ENOSYS, ENOLCK, EOPNOTSUPP: Lustre without `-o flock`, some network file
+    If the file system has no such locks (ENOSYS, ENOLCK, EOPNOTSUPP: Lustre without `-o flock`, some network file
     systems), the folder is held by a file `lock.claim` that only one process can make. It says who made it. One whose
     process is gone is removed by the next process of the same machine; from another machine nobody can tell, so the
     error names the file.
 
     Args:
         folder: exists.
-        error, activity: raised where another process holds the folder: "another process (process 7) is `activity`
+        error, activity: raised if another process holds the folder: "another process (process 7) is `activity`
             there".
     Raises:
         ParameterError: the folder cannot be written to, or cannot be locked at all.
@@ -290,7 +290,7 @@ def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = 
         raise ParameterError(f"{folder}: cannot be written to: {problem.strerror}; choose another folder") from problem
     with file:
         if not _flock(file, folder, error, activity):
-            with claim(folder / CLAIM, error, activity):
+            with hold_claim(folder / CLAIM, error, activity):
                 yield
             return
         if not _is_at(path, file):  # who held it has removed it, and another may hold a new one
@@ -312,7 +312,7 @@ def _is_at(path: Path, file: TextIO) -> bool:
 
 
 def waiting_lock(
-    folder: Path, error: type[PharosError], activity: str, tell: Callable[[str], Any]
+    folder: Path, error: type[PharosError], activity: str, on_wait: Callable[[str], Any]
 ) -> contextlib.ExitStack:
     """Hold a folder as `lock` does, waiting while another process holds it; `tell` is called once, with a line.
 
@@ -326,13 +326,13 @@ def waiting_lock(
             return held
         except error:
             if not is_announced:
-                tell(f"{folder}: another process is {activity} there; waiting until it is done")
+                on_wait(f"{folder}: another process is {activity} there; waiting until it is done")
                 is_announced = True
-            time.sleep(WAITING_SECONDS)
+            time.sleep(LOCK_POLL_SECONDS)
 
 
 def _flock(file: TextIO, folder: Path, error: type[PharosError], activity: str) -> bool:
-    """Take the lock; False where the file system has none."""
+    """Take the lock; False if the file system has none."""
     if fcntl is None:
         return False
     try:
@@ -353,7 +353,7 @@ def has_no_locks(problem: OSError) -> bool:
 
 
 @contextlib.contextmanager
-def claim(path: Path, error: type[PharosError], activity: str) -> Iterator[None]:
+def hold_claim(path: Path, error: type[PharosError], activity: str) -> Iterator[None]:
     """Hold the folder of `path` by making that file, which only one process can; see `lock`."""
     folder = path.parent
     mine = f"{_holder()}, {uuid.uuid4().hex}"
@@ -376,7 +376,7 @@ def claim(path: Path, error: type[PharosError], activity: str) -> Iterator[None]
 
 
 def _create(path: Path, text: str) -> bool:
-    """Make a file that is not there; False where it is."""
+    """Make a file that is not there; False if it is."""
     try:
         descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
     except FileExistsError:
@@ -475,7 +475,7 @@ def read_json(path: str | os.PathLike, error: type[PharosError] = FileFormatErro
     """The value that a file of JSON holds.
 
     Args:
-        error, advice: raised where the file is none, in one line that ends with the advice.
+        error, advice: raised if the file is none, in one line that ends with the advice.
     Raises:
         FileNotFoundError: there is no such file.
     """
@@ -508,7 +508,7 @@ def digest_of_bytes(data: bytes | memoryview) -> str:
     return xxhash.xxh3_128_hexdigest(data)
 
 
-def digest_of_file(path: str | os.PathLike, block_bytes: int = BLOCK_BYTES) -> str:
+def digest_of_file(path: str | os.PathLike, block_bytes: int = DIGEST_BLOCK_BYTES) -> str:
     """XXH3-128 of a file, read in blocks."""
     digest = xxhash.xxh3_128()
     check_regular(path)
@@ -544,10 +544,10 @@ class ResultCache:
         return self.folder / f"{xxhash.xxh3_64_hexdigest(json.dumps(dependencies, sort_keys=True).encode())}.json"
 
     def get(self, dependencies: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The entries of a result; None where there is none, or where its file was changed."""
+        """The entries of a result; None if there is none, or if its file was changed."""
         try:
             record = read_json(self.file(dependencies))
-            entries = record.get("task", record)  # where values of 0.1.0 have it
+            entries = record.get("task", record)  # as values of 0.1.0 have it
             is_ours = DIGEST in record and all(entries.get(name) == value for name, value in dependencies.items())
             return record if is_ours and is_intact(record) else None
         except (FileNotFoundError, FileFormatError, AttributeError, TypeError):
@@ -568,27 +568,27 @@ _temporary: list[Path] = []
 def cache_directory() -> Path:
     """The folder of cached state spaces and compiled code: PHAROS_CACHE_DIR, else `pharos` in the user's cache.
 
-    Where there is no such folder and none can be made (no home, or one that cannot be written to, as in containers), it
-    is a temporary one for this process and those that it starts.
+    If there is no such folder and none can be made (no home, or one that cannot be written to, as in containers), it
+    is a temporary one for this process and the processes that it starts.
     """
     if folder := os.environ.get("PHAROS_CACHE_DIR"):
         return Path(folder).expanduser()
     try:
-        place, problem = _of_user(), ""
+        directory, problem = _of_user(), ""
     except RuntimeError:
-        place, problem = None, "there is no home directory"
-    if place is not None:
-        problem = _problem_of(place)
-    if place is None or problem:
-        place = temporary_folder("pharos-")
-        os.environ["PHAROS_CACHE_DIR"] = str(place)
+        directory, problem = None, "there is no home directory"
+    if directory is not None:
+        problem = _problem_of(directory)
+    if directory is None or problem:
+        directory = temporary_folder("pharos-")
+        os.environ["PHAROS_CACHE_DIR"] = str(directory)
         warnings.warn(
             f"{problem}; state spaces and compiled code go to a temporary folder and are deleted on exit: "
             f"to keep them set PHAROS_CACHE_DIR",
             RuntimeWarning,
             stacklevel=2,
         )
-    return place
+    return directory
 
 
 def _of_user() -> Path:
@@ -600,12 +600,12 @@ def _of_user() -> Path:
 
 
 @cache
-def _problem_of(place: Path) -> str:
+def _problem_of(folder: Path) -> str:
     try:
-        place.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        return f"the cache {place} cannot be made ({error.strerror})"
-    return "" if os.access(place, os.W_OK | os.X_OK) else f"the cache {place} cannot be written to"
+        return f"the cache {folder} cannot be made ({error.strerror})"
+    return "" if os.access(folder, os.W_OK | os.X_OK) else f"the cache {folder} cannot be written to"
 
 
 def temporary_folder(prefix: str) -> Path:
@@ -628,6 +628,6 @@ def is_cache_temporary() -> bool:
 
 
 def compiled_folders(cache: Path) -> list[Path]:
-    """Folders for compiled rules in a cache, best first: `compiled-NUMBER` is for where another user has the first."""
+    """Folders for compiled rules in a cache, best first: `compiled-NUMBER` is used if another user has the first."""
     users = [cache / f"compiled-{os.getuid()}"] if hasattr(os, "getuid") else []
     return [cache / "compiled", *users]

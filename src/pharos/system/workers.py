@@ -43,11 +43,11 @@ class _Begun:
 class Workers:
     """Processes that work for this one, each under a key: what they send, and how they end.
 
-    They leave interrupts to this one, and end with it, however it goes; those that still run where the block ends are
-    ended.
+    They leave interrupts to this one, and end with it, however it ends. Processes that still run at the end of the
+    block are ended.
 
     Args:
-        preload: modules that one process loads, from which the others are forked, where the system can do that; none
+        preload: modules that one process loads, from which the others are forked, if the system can do that; none
             (or None): each begins anew.
         groups: whether processes that one of them starts, and leaves behind, are killed when it has ended.
     """
@@ -159,7 +159,8 @@ def _work(
 ) -> None:
     """The body of a process; `environment` are the variables of the one that started it, now.
 
-    They may not be those of when processes began to be forked; Numba refuses that the numbers of threads change.
+    They may have changed since the process from which others are forked was started; Numba refuses that the number of
+    threads changes.
 
     Args:
         announces: whether it says that it compiles: others compile the same.
@@ -181,7 +182,7 @@ def _work(
         except OSError:  # nobody listens any more
             sys.exit(1)
 
-    send(_Begun())  # an exit code is that of the work from here on
+    send(_Begun())  # from here on an exit code is about the work
     function(*arguments, send)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends by itself: an exception in what is given back is printed
 
@@ -223,7 +224,7 @@ def without_main(*definitions: object) -> Iterator[None]:
     """Keep processes that are started within from importing the user's script, which then needs no guard.
 
     multiprocessing lets each new process import the `__main__` of the first one, under another name. Code of the user's
-    own travels by its file (`sources`), so nothing is missing; but where one of the `definitions` (classes, functions)
+    own travels by its file (`sources`), so nothing is missing. But if one of the `definitions` (classes, functions)
     that the processes need stands in the script, they import it, and it needs the guard (`check_guard`).
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
@@ -247,7 +248,7 @@ def is_in_main(*definitions: object) -> bool:
 
 
 def check_guard(exit_code: int | None) -> None:
-    """Raise ParameterError where a process has ended because the script that it imported starts processes."""
+    """Raise ParameterError if a process has ended because the script that it imported starts processes."""
     if exit_code == NO_GUARD:
         raise ParameterError(
             "workers import this script, since it defines an environment, observation or function of the runs, and "

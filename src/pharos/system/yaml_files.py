@@ -1,4 +1,4 @@
-"""YAML that somebody else may have written: data alone, refused in one line where no file of pharos needs it."""
+"""YAML that somebody else may have written: data alone, and refused in one line if no file of pharos needs it."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,7 @@ except ImportError as error:
     raise MissingExtra("reading YAML", "pyyaml", "study") from error
 
 # Limit that keeps aliases from standing for millions of entries
-MOST_NODES = 1_000_000
+MOST_YAML_NODES = 1_000_000
 
 
 class Loader(yaml.SafeLoader):
@@ -51,8 +51,8 @@ def nodes_and_data(text: str, name: str, error: type[PharosError] = ParameterErr
         return root, yaml.load(text, Loader)
     except yaml.YAMLError as problem:
         mark = getattr(problem, "problem_mark", None)
-        place = f"{name}:{mark.line + 1}" if mark is not None else name
-        raise error(f"{place}: {getattr(problem, 'problem', None) or 'this is no YAML'}") from problem
+        position = f"{name}:{mark.line + 1}" if mark is not None else name
+        raise error(f"{position}: {getattr(problem, 'problem', None) or 'this is no YAML'}") from problem
     except RecursionError:
         raise error(f"{name}: is nested too deeply; expected a mapping with names") from None
     except ParameterError as problem:
@@ -64,7 +64,7 @@ def nodes_and_data(text: str, name: str, error: type[PharosError] = ParameterErr
 def _check_nodes(root: "yaml.Node", name: str) -> None:
     """Refuse what no file needs: keys that are no words or repeated, nodes within themselves, millions by aliases.
 
-    A node that aliases share is looked at once; its size counts wherever it stands.
+    A node that aliases share is looked at once; its size counts at each alias.
     """
     sizes: dict[int, int] = {}
 
@@ -82,9 +82,11 @@ def _check_nodes(root: "yaml.Node", name: str) -> None:
         elif isinstance(node, yaml.SequenceNode):
             children = node.value
         total = 1 + sum(map(size, children))
-        if total > MOST_NODES:
+        if total > MOST_YAML_NODES:
             line = node.start_mark.line + 1
-            raise ParameterError(f"{name}:{line}: stands for more than {MOST_NODES:,} entries, aliases written out")
+            raise ParameterError(
+                f"{name}:{line}: stands for more than {MOST_YAML_NODES:,} entries, aliases written out"
+            )
         sizes[id(node)] = total
         return total
 

@@ -38,9 +38,9 @@ from pharos.training.task import RunConfig
 Values = dict[int, Evaluation | PharosError]
 Counts = tuple[int, np.ndarray, np.ndarray]
 """Steps of each run, and finished episodes and their returns by run."""
-Tell = Callable[[tuple[Any, ...]], object]
-"""tell(("rows", steps so far of the runs that are trained now, {place: row})), tell(("end", place, result)), or
-tell(("halve", places, why they cannot be trained together))."""
+ReportCallback = Callable[[tuple[Any, ...]], object]
+"""report(("rows", steps so far of the runs that are trained now, {index: row})), report(("end", index, result)), or
+report(("halve", indices, why they cannot be trained together))."""
 
 
 class CallbackError(BaseException):
@@ -50,7 +50,7 @@ class CallbackError(BaseException):
 def train_group(
     runs: Sequence[PreparedRun],
     checkpoints: Path | None,
-    tell: Tell,
+    report: ReportCallback,
     *,
     lane: int | None = None,
     is_single: bool = False,
@@ -60,9 +60,9 @@ def train_group(
     """Train runs in this process: those with equal keys as one program, one program after the other.
 
     Args:
-        runs: none of which was trained before, each with its place.
-        checkpoints: folder for those of programs; None: none are written.
-        tell: called with each evaluation and each end.
+        runs: none of which was trained before, each with its index.
+        checkpoints: folder for checkpoints of programs; None: none are written.
+        report: called with each evaluation and each end.
         lane: the most runs in a program; None: all that fit together.
         is_single: whether the run is the only one of its call.
         raises: whether errors of runs are raised, and not written down if the run cannot begin.
@@ -75,38 +75,38 @@ def train_group(
         try:
             done = None if run.folder is None else finished_result(run.folder, run.config)
         except (ParameterError, FileFormatError) as error:
-            _refuse(run, error, tell, raises)
+            _refuse(run, error, report, raises)
             continue
         if done is not None and run.folder is not None:
             clear_run(run.folder)
             finished.add(run.id)
-            tell(("end", run.place, done))
+            report(("end", run.index, done))
             continue
         try:
             run.prepare(is_single=is_single or (run.folder is not None and (run.folder / "checkpoint").exists()))
         except Exception as error:
-            _refuse(run, error, tell, raises)
+            _refuse(run, error, report, raises)
             continue
         waiting.append(run)
     # Runs alone, programs of checkpoints, and the rest by what fits together
     programs = [[run] for run in waiting if run.is_alone]
-    joint = {run.place: run for run in waiting if not run.is_alone}
+    joint = {run.index: run for run in waiting if not run.is_alone}
     programs += _stored_programs(runs, joint, finished, checkpoints)
     rest = list(joint.values())
     programs += [[rest[i] for i in each] for each in lanes([run.key for run in rest], [lane or len(rest)] * len(rest))]
     for program in programs:
-        Program(program, checkpoints, tell, raises=raises, tensorboard=tensorboard).train()
+        Program(program, checkpoints, report, raises=raises, tensorboard=tensorboard).train()
 
 
-def _refuse(run: PreparedRun, error: Exception, tell: Tell, raises: bool) -> None:
-    """Raise the error of a run that could not begin where `raises` is set, else write it down and tell it."""
+def _refuse(run: PreparedRun, error: Exception, report: ReportCallback, raises: bool) -> None:
+    """Raise the error of a run that could not begin if `raises` is set, else write it down and report it."""
     if raises:
         raise error
     if run.folder is not None and not (run.folder / _results.RECORD).exists():
         run.folder.mkdir(parents=True, exist_ok=True)
         run.hyperparameters = dict(run.config.hyperparameters)
         run.write("failed", error=in_one_line(error))
-    tell(("end", run.place, FailedRun(run.config.to_dict(), run.folder, error)))
+    report(("end", run.index, FailedRun(run.config.to_dict(), run.folder, error)))
 
 
 def remove_batch(folder: Path) -> None:
@@ -119,7 +119,7 @@ def _stored_programs(
     runs: Sequence[PreparedRun], waiting: dict[int | None, PreparedRun], finished: set[str], checkpoints: Path | None
 ) -> Iterator[list[PreparedRun]]:
     """Yield programs of checkpoints, with the runs that they had, which are taken from `waiting`."""
-    by_id = {run.id: place for place, run in waiting.items()}
+    by_id = {run.id: index for index, run in waiting.items()}
     for folder in [] if checkpoints is None else sorted(checkpoints.glob("*")):
         try:
             configs = [RunConfig.from_dict(entry) for entry in read_json(folder / "batch.json")["configs"]]
@@ -138,7 +138,7 @@ def _stored_programs(
         try:
             for run in program:
                 run.prepare()
-        except Exception:  # what is wrong with a run is said later, where it fails alone
+        except Exception:  # what is wrong with a run is said later, when it fails alone
             continue
         for config in configs:
             if config.id in by_id:
@@ -159,20 +159,26 @@ def _is_foreign(config: RunConfig, runs: Sequence[PreparedRun]) -> bool:
 class Program:
     """Runs under one loop: trained, evaluated, resumed, and brought into their folders; arguments as `train_group`."""
 
-    learner: Learner  # from when the runs begin; gone where they failed
-    evaluators: Evaluators | None = None  # where policies are evaluated apart
+    learner: Learner  # from when the runs begin; gone if they failed
+    evaluators: Evaluators | None = None  # if policies are evaluated apart
     pending: Counts | None = None  # of the policies that are evaluated apart
 
     def __init__(
-        self, runs: list[PreparedRun], checkpoints: Path | None, tell: Tell, *, raises: bool, tensorboard: bool
+        self,
+        runs: list[PreparedRun],
+        checkpoints: Path | None,
+        report: ReportCallback,
+        *,
+        raises: bool,
+        tensorboard: bool,
     ):
         self.runs, self.config, self.is_alone = runs, runs[0].config, runs[0].is_alone
-        self.checkpoints, self.tell, self.raises, self.tensorboard = checkpoints, tell, raises, tensorboard
+        self.checkpoints, self.report, self.raises, self.tensorboard = checkpoints, report, raises, tensorboard
         self.has_begun = self.holds = False  # whether runs are marked as running; whether checkpoints are this batch's
-        self.held = contextlib.ExitStack()  # the folder of checkpoints, or that of a run alone
+        self.held = contextlib.ExitStack()  # the folder of checkpoints, or the folder of a run alone
 
     def train(self) -> None:
-        """Train the runs, and tell what becomes of them."""
+        """Train the runs, and report what becomes of them."""
         with self.held:
             try:
                 self._train()
@@ -192,7 +198,7 @@ class Program:
             self._fail(failure)
             return
         reason = "out of memory" if _is_memory(failure) else in_one_line(failure)
-        self.tell(("halve", [run.place for run in self.runs if run.place is not None], reason))
+        self.report(("halve", [run.index for run in self.runs if run.index is not None], reason))
 
     def _train(self) -> None:
         began, compiled = time.perf_counter(), compiling.seconds()
@@ -226,23 +232,23 @@ class Program:
 
     @property
     def _folder(self) -> Path | None:
-        """The folder for checkpoints of a batch; None for a run alone, or where none are written."""
+        """The folder for checkpoints of a batch; None for a run alone, or if none are written."""
         if self.is_alone or self.checkpoints is None:
             return None
         return self.checkpoints / digest_of_json([run.id for run in self.runs])[:16]
 
     def _is_finished(self) -> bool:
         """Lock the folder of a run alone; return whether another process has finished it meanwhile."""
-        folder, place = self.runs[0].folder, self.runs[0].place
-        if folder is None or place is None:
+        folder, index = self.runs[0].folder, self.runs[0].index
+        if folder is None or index is None:
             return False
         folder.mkdir(parents=True, exist_ok=True)
         self.held.enter_context(lock(folder, FolderLocked, "training"))
-        remove_leftovers(folder / "regret.png")  # of a killed process; those of other files go with the next one
+        remove_leftovers(folder / "regret.png")  # of a killed process; leftovers of other files go with the next one
         done = finished_result(folder, self.config)
         if done is not None:
             clear_run(folder)
-            self.tell(("end", place, done))
+            self.report(("end", index, done))
         return done is not None
 
     def _checkpoint(self) -> Checkpoint | None:
@@ -279,7 +285,7 @@ class Program:
         steps, interval = self.config.steps, self.config.evaluation_interval
         if not any(run.curve.rows for run in self.runs):
             self._evaluate(0)
-        # Steps of the evaluations to come, after those of a checkpoint
+        # Steps of the evaluations to come, after the steps of a checkpoint
         start = max((run.curve.rows[-1]["step"] for run in self.runs if run.curve.rows), default=0)
         points = [point for point in [*range(interval, steps, interval), steps] if point > start]
 
@@ -293,7 +299,7 @@ class Program:
             if not self.is_alone:
                 save(step)
             if self.evaluators is None:
-                self._tell(step, rows)
+                self._report(step, rows)
             if self.is_alone:
                 save(step)
             return rows.get(0)
@@ -309,12 +315,12 @@ class Program:
             return self.runs[0].curve.rows
         return [{"rows": run.curve.rows, "error": run.error and in_one_line(run.error)} for run in self.runs]
 
-    def _tell(self, step: int, rows: Mapping[int, Mapping[str, Any]]) -> None:
-        places = {place: row for i, row in rows.items() if (place := self.runs[i].place) is not None}
-        self.tell(("rows", step * sum(run.place is not None for run in self.runs), places))
+    def _report(self, step: int, rows: Mapping[int, Mapping[str, Any]]) -> None:
+        by_index = {index: row for i, row in rows.items() if (index := self.runs[i].index) is not None}
+        self.report(("rows", step * sum(run.index is not None for run in self.runs), by_index))
 
     def _evaluate(self, step: int) -> dict[int, dict[str, Any]]:
-        """Evaluate the policies, or let them be evaluated: rows by place in the group, as far as they are there."""
+        """Evaluate the policies, or let them be evaluated: rows by index in the group, as far as they are there."""
         counts = step, np.array(self.learner.episodes), np.array(self.learner.returns)
         if self.evaluators is not None:
             self._await_values()
@@ -328,18 +334,18 @@ class Program:
         return self._add(counts, values, policies)
 
     def _await_values(self) -> None:
-        """Add the rows of the policies that are being evaluated apart, and tell them."""
+        """Add the rows of the policies that are being evaluated apart, and report them."""
         if self.evaluators is None or self.pending is None:
             return
         counts, self.pending = self.pending, None
         rows = self._add(counts, self.evaluators.values())
         if counts[0]:
-            self._tell(counts[0], rows)
+            self._report(counts[0], rows)
 
     def _add(
         self, counts: Counts, values: Values, policies: Sequence[PolicyLike | Evaluation] = ()
     ) -> dict[int, dict[str, Any]]:
-        """Add a row to the curve of each run that has not failed; return them by its place in the group."""
+        """Add a row to the curve of each run that has not failed; return them by its index in the group."""
         rows: dict[int, dict[str, Any]] = {}
         step, episodes, returns = counts
         for i, run in enumerate(self.runs):
@@ -358,7 +364,7 @@ class Program:
         return rows
 
     def _publish(self, seconds: float, compiled: float) -> None:
-        """Write and keep the result of each run; its seconds are its share of those of the batch."""
+        """Write and keep the result of each run; its seconds are its share of the seconds of the batch."""
         size = {"runs": len(self.runs), "seconds": seconds, "device": self.runs[0].tasks.device}
         share = seconds - compiled if self.is_alone else seconds / len(self.runs)
         entries: dict[str, Any] = {"compiling_seconds": compiled} if self.is_alone else {"batch": size}
@@ -366,11 +372,11 @@ class Program:
         if notes:
             entries["notes"] = notes
         for i, run in enumerate(self.runs):
-            if run.place is None:
+            if run.index is None:
                 continue
             config, folder, curve = run.config.to_dict(), run.folder, run.curve.rows
             if run.error is not None:
-                self.tell(("end", run.place, FailedRun(config, folder, run.error)))
+                self.report(("end", run.index, FailedRun(config, folder, run.error)))
                 continue
             result = run.curve.result()
             if folder is not None:
@@ -381,7 +387,7 @@ class Program:
             policy = self.learner.policy(i)
             learnt = None if isinstance(policy, Evaluation) else policy
             end = TrainingResult(config, result, rows, learnt, folder, share, notes)
-            self.tell(("end", run.place, end))
+            self.report(("end", run.index, end))
         self._remove_checkpoint()
         if self.is_alone and (folder := self.runs[0].folder) is not None:
             clear_run(folder)
@@ -389,16 +395,16 @@ class Program:
     def _fail(self, error: Exception) -> None:
         """Record that the only run of the group has failed."""
         (run,) = self.runs
-        if run.place is None:
+        if run.index is None:
             return
         if self.is_alone and not self.has_begun:
-            _refuse(run, error, self.tell, self.raises)
+            _refuse(run, error, self.report, self.raises)
             return
         if run.error is None:
             run.fail(error)
         if self.raises:
             raise error
-        self.tell(("end", run.place, FailedRun(run.config.to_dict(), run.folder, error)))
+        self.report(("end", run.index, FailedRun(run.config.to_dict(), run.folder, error)))
 
 
 def _is_memory(error: BaseException) -> bool:

@@ -23,6 +23,7 @@ curve. What looks like a mistake and is no error is a note (`PolicyRecorder.note
 import contextlib
 import copy
 import os
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -41,25 +42,25 @@ from pharos.system.workers import Terminated
 from pharos.training.curve import Curve, Evaluation, evaluate_agent, policy_facts
 from pharos.training.task import Task
 
-BLOCK = 4096  # observations that a policy is asked about at once
-LARGEST = 100_000  # states that it is asked about in advance
-LONGEST = 500  # letters of an agent's error
+RECORDER_BLOCK = 4096  # observations that a policy is asked about at once
+MOST_STATES_ASKED = 100_000  # states that it is asked about in advance
+MOST_LETTERS = 500  # letters of an agent's error
 KEPT = 1 << 28  # bytes of observations that are kept between snapshots
-TOLERANCE = 1e-9  # of normalised regret: as far from uniform play a policy without a step may be, by rounding
+UNIFORM_TOLERANCE = 1e-9  # of normalised regret: as far from uniform play a policy without a step may be, by rounding
 IGNORED = 1000
 """Steps beyond the budget, or policies in a row without a step, after which an agent is ended that goes on."""
 OFTEN = 10
 """A slip that happens more often than this in a run is noted."""
-SHARE = 0.01
+MOST_UNNOTED = 0.01
 """Of steps after the end of an episode that is not noted."""
-SAME = 1e-3
+SAME_PROBABILITY = 1e-3
 """Probabilities that differ by less are the same: a network may round in another way."""
 NETWORK_POLICY = "network(torch.as_tensor(seen)).argmax(dim=1).numpy()"
 CHECKED = 3
 """First policies of a run that are asked again."""
-AGAIN, FEW = 8, 128
-"""Up to AGAIN times, as long as the answers together are FEW: a policy that samples seldom would answer the same by
-chance where there are few observations."""
+MOST_QUERIES, FEW_ANSWERS = 8, 128
+"""Up to MOST_QUERIES times, up to FEW_ANSWERS in all: a policy that samples seldom would answer the same by
+chance if there are few observations."""
 INFO = ("action_mask", "prob")
 """Entries of `info` that Gymnasium's own environments give as well; others say what an agent is to find out."""
 SEVERAL = (
@@ -127,7 +128,7 @@ class StepBudget:
 class CountedEnv(gymnasium.Wrapper):
     """The environment of a task, whose steps count against a budget.
 
-    Without a seed in its first `reset` it has that of the run, as its action space has, so that a run is the same
+    Without a seed in its first `reset` it has the seed of the run, as its action space has, so that a run is the same
     again. `copy()` gives another one with the same budget, for vector environments:
     `gymnasium.vector.SyncVectorEnv([env.copy] * 8)`.
 
@@ -135,7 +136,8 @@ class CountedEnv(gymnasium.Wrapper):
     pickled, nor be used in another process than the one that made it: nobody would count there.
 
     `info` has nothing of what an agent is to learn: neither the state nor its index, neither the executed action nor
-    what was earned without noise; INFO is what is left. Episodes begin where the task says: `reset` takes no options.
+    what was earned without noise; INFO is what is left. Episodes begin in the start states of the task: `reset` takes
+    no options.
     """
 
     def __init__(self, task: Task, budget: StepBudget, seed: int):
@@ -245,7 +247,7 @@ class Snapshots:
         if isinstance(policy, SB3Model):
             policy = deep_policy(policy)
         has_no_table = isinstance(policy, np.ndarray | RecurrentPolicy)
-        if has_no_table or task.observer.frames > 1 or task.mdp.num_states > LARGEST:
+        if has_no_table or task.observer.frames > 1 or task.mdp.num_states > MOST_STATES_ASKED:
             return evaluate_agent(policy, task)
         answers = PolicyAnswers(policy, task.mdp, task.observer)
         if task.observer.observe.observation.irrelevant:
@@ -256,18 +258,18 @@ class Snapshots:
             tables.append(_answer(answers, policy, observations, count))
             if len(tables) == 1 and self._num_checked < CHECKED:
                 self._num_checked += 1
-                for _ in range(min(max(1, FEW // count), AGAIN)):
-                    _check_again(tables[0], _answer(answers, policy, observations, count))
+                for _ in range(min(max(1, FEW_ANSWERS // count), MOST_QUERIES)):
+                    _check_same_answers(tables[0], _answer(answers, policy, observations, count))
         return np.concatenate(tables)
 
     def _observations(self) -> Iterator[tuple[int, Any]]:
-        """Blocks of observations of all states, kept where they are small."""
+        """Blocks of observations of all states, kept if they are small."""
         if self._kept is not None:
             yield from self._kept
             return
         blocks, size = [], 0
-        for first in range(0, self.task.mdp.num_states, BLOCK):
-            states = np.arange(first, min(first + BLOCK, self.task.mdp.num_states))
+        for first in range(0, self.task.mdp.num_states, RECORDER_BLOCK):
+            states = np.arange(first, min(first + RECORDER_BLOCK, self.task.mdp.num_states))
             context = self.task.observer.space.states(states), np.full(len(states), -1), np.zeros(len(states), np.int64)
             block = len(states), self.task.observer.observe(*context)
             size += getattr(block[1], "nbytes", KEPT)
@@ -294,9 +296,9 @@ def _answer(answers: PolicyAnswers, policy: PolicyLike, observations: Any, count
         ) from error
 
 
-def _check_again(table: np.ndarray, again: np.ndarray) -> None:
+def _check_same_answers(table: np.ndarray, again: np.ndarray) -> None:
     """Raise ParameterError for a policy whose second answer is another one than the first."""
-    differ = np.abs(table - again).max(axis=1) > SAME
+    differ = np.abs(table - again).max(axis=1) > SAME_PROBABILITY
     if differ.any():
         raise ParameterError(
             f"the policy was asked twice, and answered otherwise for {differ.sum():,} of {len(table):,} observations; "
@@ -326,7 +328,7 @@ class PolicyRecorder:
         self.budget = StepBudget(steps, interval)
         self.env = CountedEnv(task, self.budget, seed)
         self.count = 0
-        self.in_force: PolicyLike | Evaluation = uniform_policy(task)
+        self.in_force: PolicyLike | Evaluation = uniform_choice(task.mdp)
         self.ended = 0, 0.0
         self.at_point: Callable[[int], object] = self._remember
         self._points = deque([*range(interval, steps, interval), steps])  # to come
@@ -389,8 +391,8 @@ class PolicyRecorder:
 
     def check_steps(self, curve: Curve) -> None:
         """Raise ParameterError if a curve ends elsewhere than it begins, and no step was counted."""
-        first, last = (curve.rows[place]["normalized_regret"] for place in (0, -1))
-        if not self.budget.steps and abs(last - first) > TOLERANCE:
+        first, last = (curve.rows[index]["normalized_regret"] for index in (0, -1))
+        if not self.budget.steps and abs(last - first) > UNIFORM_TOLERANCE:
             raise not_stepped(self.budget.limit)
 
     def notes(self) -> dict[str, str]:
@@ -408,7 +410,7 @@ class PolicyRecorder:
                 f"its first policy came after {self._first_step:,} of {budget.limit:,} steps: {random} of {points} "
                 f"evaluations are random play; expected one about every {budget.interval:,} steps"
             )
-        if budget.after_end > SHARE * budget.steps:
+        if budget.after_end > MOST_UNNOTED * budget.steps:
             notes["steps after an end"] = (
                 f"{budget.after_end / budget.steps:.0%} of {budget.steps:,} steps came after the end of an episode; "
                 f"expected reset() after a step that is terminated or truncated"
@@ -438,7 +440,7 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
     """Train with a generator, and evaluate the policy in force at each evaluation point, and uniform play before.
 
     Returns:
-        A row before the first step, that of uniform play, and one for each point; and the number of counted steps.
+        A row before the first step, for uniform play, and one for each point; and the number of counted steps.
     Raises:
         ParameterError: it is no generator of policies; or it has a second policy, or ends with another one than uniform
             play, when no step was counted; or whatever its code raises.
@@ -446,6 +448,16 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
     recorder = PolicyRecorder(task, steps=steps, interval=steps // evaluations, seed=seed)
     generate(learn, recorder, seed)
     return recorder.curve()
+
+
+def end_process(agent: str, limit: int) -> NoReturn:
+    """End this process: what catches BudgetSpent around `step`, and goes on, cannot be ended otherwise."""
+    sys.stderr.write(
+        f"pharos: agent {agent} went on for {IGNORED:,} steps after its {limit:,}; expected its loop to end: catch no "
+        f"BudgetSpent (`except:`, `except BaseException`) around step\n"
+    )
+    sys.stderr.flush()
+    os._exit(1)
 
 
 @contextlib.contextmanager
@@ -461,7 +473,7 @@ def errors_in_one_line(agent: str, file: str | None) -> Iterator[None]:
     except BaseException as error:
         if not (line := line_in(error, file)):
             raise
-        text = capped(in_one_line(error).rstrip(": "), LONGEST)
+        text = capped(in_one_line(error).rstrip(": "), MOST_LETTERS)
         raise PharosError(f"agent {agent} raised {text}{line}") from error
 
 
@@ -502,8 +514,3 @@ def not_stepped(steps: int) -> ParameterError:
         f"learn has a policy other than uniform play, and 0 of its {steps:,} steps were counted; expected it to step "
         f"the environment that it was given, or copies of it; {SEVERAL}"
     )
-
-
-def uniform_policy(task: Task) -> np.ndarray:
-    """(S, A) probabilities of uniform play."""
-    return uniform_choice(task.mdp)

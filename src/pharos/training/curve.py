@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from pharos.training.prepared import PreparedRun
 
 
-BLOCK = 4096  # observations that policies are asked about at once
+CURVE_BLOCK = 4096  # observations that policies are asked about at once
 CERTAIN, TIE = 0.999, 1e-9  # probability of a certain choice; difference of equal ones
 
 
@@ -62,15 +62,15 @@ def evaluate_agent(
         deterministic: whether the most probable action is taken (the first among equals) instead of one at random.
         masks: the actions that a model trained under masks (MaskablePPO) may choose, (S, A) bool by the states of
             `task.space`, or a function from states (N, D) to (N, A) bool.
-        max_states: how many states (pairs, where previous actions matter; histories, of a memory) the policy may
+        max_states: how many states (pairs, if previous actions matter; histories, of a memory) the policy may
             reach for an exact value.
         episodes, seed: of the estimate beyond that.
         again: whether more policies of the task will be evaluated: what they share is remembered. Changes no value.
-            Policies of vectors under chance are then asked in blocks about all states that any policy reaches, where
-            these are few enough, else about those that they reach, step by step.
+            Policies of vectors under chance are then asked in blocks about all states that any policy reaches, if
+            these are few enough, else about the states that they reach, step by step.
     Returns:
         Its `Evaluation`; with the `gain` if the objective of the task is the average reward: if the policy reaches more
-        than `max_states`, between those of the worst and the best policy.
+        than `max_states`, between the gains of the worst and the best policy.
     Raises:
         ParameterError: the agent is none of these, its answers are no probabilities, or it was trained on other
             observations, behind a VecNormalize that is not with it, or under masks that are not given.
@@ -81,7 +81,7 @@ def evaluate_agent(
     limits: dict[str, Any] = {"deterministic": deterministic, "masks": masks, "max_states": max_states}
     value = policy_value(
         agent,
-        task.mdp,
+        task.measured,
         lambda: task.observer,
         lambda: task.return_range,
         episodes=episodes,
@@ -96,10 +96,10 @@ def evaluate_agent(
 
 
 def joint_values(batch: Learner, runs: "Sequence[PreparedRun]") -> dict[int, Evaluation]:
-    """Values of policies by place in the batch, where computing them at once costs less; others are left out.
+    """Values of policies by index in the batch, if computing them at once costs less; others are left out.
 
-    These are policies of DQN where nothing is random, and of runs that share a task of few states and see one frame.
-    Where gains are measured, too, each policy is evaluated alone.
+    These are policies of DQN if nothing is random, and of runs that share a task of few states and see one frame.
+    If gains are measured, too, each policy is evaluated alone.
     """
     joint = [i for i, each in enumerate(runs) if each.error is None and each.task.objective != "average"]
     walks = [i for i in joint if _walks(runs[i])] if hasattr(batch, "best_actions") else []
@@ -107,11 +107,11 @@ def joint_values(batch: Learner, runs: "Sequence[PreparedRun]") -> dict[int, Eva
     tasks = defaultdict(list)
     for i in joint:
         run = runs[i]
-        if i not in values and is_small_table(run.task.mdp) and _frames(run) == 1:
+        if i not in values and is_small_table(run.task.measured) and _frames(run) == 1:
             tasks[id(run.task)].append(i)
-    for places in tasks.values():
-        if len(places) > 1:
-            values |= _values_of_tables(batch, runs[places[0]].task, places)
+    for indices in tasks.values():
+        if len(indices) > 1:
+            values |= _values_of_tables(batch, runs[indices[0]].task, indices)
     return values
 
 
@@ -120,36 +120,36 @@ def _walks(run: "PreparedRun") -> bool:
 
 
 def _frames(run: "PreparedRun") -> int:
-    """Number of states in one observation of the agent: more than 1 where frames are stacked."""
+    """Number of states in one observation of the agent: more than 1 if frames are stacked."""
     return 1 if agent_called(run.config.agent).has_table else run.task.observer.frames
 
 
-def _values_of_walks(batch: Learner, runs: "Sequence[PreparedRun]", places: Sequence[int]) -> dict[int, Evaluation]:
-    """Values by place: an episode of T steps costs T calls of the networks of all runs at once, not of each."""
-    if not places:
+def _values_of_walks(batch: Learner, runs: "Sequence[PreparedRun]", indices: Sequence[int]) -> dict[int, Evaluation]:
+    """Values by index: an episode of T steps costs T calls of the networks of all runs at once, not of each."""
+    if not indices:
         return {}
     best_actions = getattr(batch, "best_actions")  # noqa: B009  (which not every learner has)
-    frames = _frames(runs[places[0]])
+    frames = _frames(runs[indices[0]])
     states = np.zeros((len(runs), frames) if frames > 1 else len(runs), np.int64)
 
     def act(now: np.ndarray) -> np.ndarray:
-        states[places] = now
-        return best_actions(states)[places]
+        states[indices] = now
+        return best_actions(states)[indices]
 
-    mdps = [runs[i].task.mdp for i in places]
-    return dict(zip(places, walk_values(mdps, act, frames=frames), strict=True))
+    mdps = [runs[i].task.mdp for i in indices]
+    return dict(zip(indices, walk_values(mdps, act, frames=frames), strict=True))
 
 
-def _values_of_tables(batch: Learner, task: Task, places: Sequence[int]) -> dict[int, Evaluation]:
-    """Values by place, each policy queried once in every state. One that gives no probabilities is left out."""
-    actions = batch.greedy_actions(places)
+def _values_of_tables(batch: Learner, task: Task, indices: Sequence[int]) -> dict[int, Evaluation]:
+    """Values by index, each policy queried once in every state. One that gives no probabilities is left out."""
+    actions = batch.greedy_actions(indices)
     if actions is not None:
-        return dict(zip(actions, table_values(task.mdp, list(actions.values())), strict=True))
-    mdp, observer = task.mdp, task.observer
-    answers = {i: PolicyAnswers(batch.policy(i), mdp, observer) for i in places}
-    tables: dict[int, list[np.ndarray]] = {i: [] for i in places}
-    for first in range(0, mdp.num_states, BLOCK):
-        states = np.arange(first, min(first + BLOCK, mdp.num_states))
+        return dict(zip(actions, table_values(task.measured, list(actions.values())), strict=True))
+    mdp, observer = task.measured, task.observer
+    answers = {i: PolicyAnswers(batch.policy(i), mdp, observer) for i in indices}
+    tables: dict[int, list[np.ndarray]] = {i: [] for i in indices}
+    for first in range(0, mdp.num_states, CURVE_BLOCK):
+        states = np.arange(first, min(first + CURVE_BLOCK, mdp.num_states))
         context = observer.space.states(states), np.full(len(states), -1), np.zeros(len(states), np.int64)
         observations = observer.observe(*context)
         for i in list(tables):
@@ -174,8 +174,8 @@ class Curve:
     """Learning curve of a run: a row for each evaluation so far, with the regret of the episodes between them.
 
     Attributes:
-        table: the policy of the last row, where it is a table.
-        counted_steps: of the environment, where it counts them itself (`pharos.benchmark`).
+        table: the policy of the last row, if it is a table.
+        counted_steps: of the environment, if it counts them itself (`pharos.benchmark`).
         policies: facts on the policies, see `policy_facts`; empty if nobody asked for them.
     """
 
@@ -363,7 +363,7 @@ class RegretCurve:
     def normalized(self, cumulative: np.ndarray, reference: str = "uniform") -> np.ndarray:
         """A cumulative regret of this run divided by what the reference policy loses in as many episodes.
 
-        NaN before the first episode is finished, and where the reference policy is optimal.
+        NaN before the first episode is finished, and if the reference policy is optimal.
         """
         lost = self.episodes * self.values.spread(reference)
         return np.divide(cumulative, lost, out=np.full(len(lost), math.nan), where=lost > 0)

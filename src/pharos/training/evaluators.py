@@ -43,7 +43,7 @@ class NetworkLearner(Learner, Protocol):
 def evaluates_apart(device: str, runs: Sequence[PreparedRun]) -> bool:
     """Whether the policies of runs that learn joint are evaluated in processes of their own.
 
-    Never where these would have to import the user's script, which may have no guard.
+    Never if these would have to import the user's script, which may have no guard.
     """
     return device != "cpu" and len(runs) >= FEWEST and not is_in_main(*runs[0].config.definitions)
 
@@ -100,14 +100,14 @@ def _evaluate(configs: Sequence[dict[str, Any]], receiver: Connection, send: Cal
     with contextlib.suppress(EOFError):  # nothing more comes
         while parameters := receiver.recv():
             for group, learner in zip(groups, learners, strict=True):
-                for i, place in enumerate(group):
-                    learner.set_parameters(i, parameters[place])
-                joint = joint_values(learner, [runs[place] for place in group])
-                for i, place in enumerate(group):
+                for i, index in enumerate(group):
+                    learner.set_parameters(i, parameters[index])
+                joint = joint_values(learner, [runs[index] for index in group])
+                for i, index in enumerate(group):
                     try:
-                        values[place] = joint.get(i) or evaluate_agent(learner.policy(i), runs[place].task, again=True)
+                        values[index] = joint.get(i) or evaluate_agent(learner.policy(i), runs[index].task, again=True)
                     except Exception as error:
-                        values[place] = PharosError(in_one_line(error))
+                        values[index] = PharosError(in_one_line(error))
             send([values[i] for i in range(len(runs))])
 
 

@@ -1,7 +1,7 @@
 """Execution: the one loop behind `train`, `train_many`, `tune`, studies and the benchmark.
 
 Groups of runs wait until a process is free, are trained there (or in this process), and end. A group is halved here
-alone: where its program failed for several runs, as for want of memory, or where its process was killed too often. A
+alone: if its program failed for several runs, as for want of memory, or if its process was killed too often. A
 run does not depend on who else is in its group, so nothing does on how groups are made, halved and begun again.
 """
 
@@ -25,12 +25,12 @@ from pharos.training.batch import CallbackError, remove_batch, train_group
 from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
 from pharos.training.results import TrainingResult
 from pharos.training.schedule import halves, plan
-from pharos.training.task import RunConfig
+from pharos.training.task import RunConfig, TaskValues
 
-ATTEMPTS = 3
+GROUP_ATTEMPTS = 3
 """How often a group is begun whose process is killed, before it is halved, or fails."""
 BUSY_SECONDS = 0.5
-WAITING_SECONDS = 1.0
+PROCESS_WAITING_SECONDS = 1.0
 # How often in a row the process that forks workers is begun again
 LOST_SERVERS = 10
 
@@ -48,15 +48,15 @@ Work = tuple[Callable[..., Any], Sequence[Any], Sequence[object]]
 
 
 class Execution(Generic[R]):
-    """Groups of runs that wait, are trained, and end; a subclass says what a run is, and where its result lies.
+    """Groups of runs that wait, are trained, and end; a subclass says what a run is, and which folder its result is in.
 
     Args:
         groups: runs that one process trains.
         pool: of processes; None: they are trained in this one.
         workers: most processes at a time.
-        checkpoints: folder for those of programs of several runs; None: none are written.
+        checkpoints: folder for checkpoints of programs of several runs; None: none are written.
         timeout: seconds for each run, after which it has failed.
-        attempts: ATTEMPTS; 1 for a pool that begins again itself.
+        attempts: GROUP_ATTEMPTS; 1 for a pool that begins again itself.
     Attributes:
         waiting: (the earliest time to begin, runs). running: key of the process -> (runs, when it began).
         lost_servers: how often in a row the process that forks workers was gone.
@@ -76,7 +76,7 @@ class Execution(Generic[R]):
         workers: float,
         checkpoints: Path | None,
         timeout: float | None = None,
-        attempts: int = ATTEMPTS,
+        attempts: int = GROUP_ATTEMPTS,
     ):
         self.waiting = deque((0.0, list(group)) for group in groups)
         self.running: dict[str, tuple[list[R], float]] = {}
@@ -129,7 +129,7 @@ class Execution(Generic[R]):
         """Let the halves of runs that cannot be trained together begin anew, before all others.
 
         Args:
-            key: of the process that has, or had, them. reason: told once; empty where each run will say it.
+            key: of the process that has, or had, them. reason: told once; empty if each run will say it.
         """
         if key in self.running:
             group, leaving = self.running[key][0], {id(run) for run in runs}
@@ -195,7 +195,7 @@ class Execution(Generic[R]):
             time.sleep(BUSY_SECONDS)
             return
         has_room = self.waiting and len(self.running) < self.num_workers
-        for key, event in self.pool.events(BUSY_SECONDS if has_room else WAITING_SECONDS):
+        for key, event in self.pool.events(BUSY_SECONDS if has_room else PROCESS_WAITING_SECONDS):
             if isinstance(event, tuple):
                 self.receive(key, event)
             else:
@@ -264,7 +264,7 @@ class TrainingProgress:
 
     Attributes:
         done, total: environment steps of all runs together.
-        rows: of the curves, by the place of the run among the configurations; of this evaluation alone.
+        rows: of the curves, by the index of the run among the configurations; of this evaluation alone.
         finished, failed: numbers of runs.
     """
 
@@ -290,18 +290,18 @@ def train_configs(
     workers: int = 1,
     seconds: Sequence[float] | None = None,
 ) -> list[TrainingResult | FailedRun]:
-    """Train a run for each configuration; those of the batched engine that fit together train as one program.
+    """Train a run for each configuration; runs of the batched engine that fit together train as one program.
 
     Args:
         folders: of the runs, one for each; None: nothing is written. Finished runs there are returned.
-        checkpoints: folder for those of whole batches; None: none are written. A batch that was killed goes on from
-            there with the runs that it had.
+        checkpoints: folder for checkpoints of whole batches; None: none are written. A batch that was killed goes on
+            from there with the runs that it had.
         progress: called after each evaluation; what it raises ends the training and is raised here.
-        tasks: makes tasks, with values that are known already, and code of the user's own where it is trusted; None:
+        tasks: makes tasks, with values that are known already, and code of the user's own if it is trusted; None:
             from scratch, trusting none.
-        device: "cpu" or "cuda"; None: that of the tasks, and "cpu" where there are none.
+        device: "cpu" or "cuda"; None: the tasks' device, and "cpu" if there are none.
         lane: the most runs in a batch; None: all that fit together. Changes no result.
-        workers: processes that share the runs, lane by lane, where there are folders; what they learn is in these
+        workers: processes that share the runs, lane by lane, if there are folders; what they learn is in these
             alone. They trust the code that the configurations name. Changes no result.
         seconds: that each run takes, in any unit, by which they are shared out; None: all take as long.
     Returns:
@@ -337,10 +337,10 @@ class Training(Execution[PreparedRun]):
     """Execution of the runs of one call: in this process if they are one group, else each group in one of its own.
 
     Args:
-        groups: places of runs among the configurations.
+        groups: indices of runs among the configurations.
         options: of `train_group`.
     Attributes:
-        results: of the runs that have ended, by place.
+        results: of the runs that have ended, by index.
     """
 
     def __init__(
@@ -353,14 +353,14 @@ class Training(Execution[PreparedRun]):
         tasks: TaskCache,
         **options: Any,
     ):
-        places = [None] * len(configs) if folders is None else [Path(folder) for folder in folders]
-        self.runs = [PreparedRun(i, *each, tasks) for i, each in enumerate(zip(configs, places, strict=True))]
+        paths = [None] * len(configs) if folders is None else [Path(folder) for folder in folders]
+        self.runs = [PreparedRun(i, *each, tasks) for i, each in enumerate(zip(configs, paths, strict=True))]
         self.progress, self.tasks = progress, tasks
         self.options = {**options, "is_single": len(configs) == 1}
         self.results: dict[int, TrainingResult | FailedRun] = {}
         self.steps: dict[str, int] = {}  # of runs that are being trained, by process
         pool = Workers() if len(groups) > 1 else None
-        prepared = [[self.runs[place] for place in group] for group in groups]
+        prepared = [[self.runs[index] for index in group] for group in groups]
         super().__init__(prepared, pool, workers=len(groups), checkpoints=checkpoints)
 
     def results_in_order(self) -> list[TrainingResult | FailedRun]:
@@ -370,18 +370,19 @@ class Training(Execution[PreparedRun]):
         except CallbackError as stop:
             (cause,) = stop.args
             raise cause from None
-        return [self.results[place] for place in range(len(self.runs))]
+        return [self.results[index] for index in range(len(self.runs))]
 
     def work(self, group: Sequence[PreparedRun]) -> Work:
         if self.pool is None:
-            fresh = [PreparedRun(run.place, run.config, run.folder, self.tasks) for run in group]
+            fresh = [PreparedRun(run.index, run.config, run.folder, self.tasks) for run in group]
             return partial(train_group, **self.options), (fresh, self.checkpoints), ()
-        entries = [(run.place, run.config.to_dict(), run.folder) for run in group]
+        values = [None if self.tasks.values is None else self.tasks.values(run.config) for run in group]
+        entries = [(run.index, run.config.to_dict(), run.folder, own) for run, own in zip(group, values, strict=True)]
         arguments = entries, self.checkpoints, self.tasks.device, self.options
         return _train_in_process, arguments, group[0].config.definitions
 
     def is_over(self, run: PreparedRun, *, ended: bool = False) -> bool:
-        return run.place in self.results
+        return run.index in self.results
 
     def receive(self, key: str, message: tuple[Any, ...]) -> None:
         """Take what `train_group` tells."""
@@ -394,23 +395,23 @@ class Training(Execution[PreparedRun]):
             return
         self.steps[key] = 0
         if kind == "end":
-            place, self.results[place] = content
+            index, self.results[index] = content
         else:
-            places, reason = content
-            self.halve(key, [self.runs[place] for place in places], reason)
+            indices, reason = content
+            self.halve(key, [self.runs[index] for index in indices], reason)
 
     def fail(self, run: PreparedRun, reason: str) -> None:
-        assert run.place is not None
+        assert run.index is not None
         error = PharosError(reason)
         run.fail(error)
-        self.results[run.place] = FailedRun(run.config.to_dict(), run.folder, error)
+        self.results[run.index] = FailedRun(run.config.to_dict(), run.folder, error)
 
     def _report(self, rows: Mapping[int, Mapping[str, Any]]) -> None:
         """Call the progress function; CallbackError for what it raises, which is not an error of the runs."""
         if self.progress is None:
             return
         failed = sum(isinstance(end, FailedRun) for end in self.results.values())
-        done = sum(self.runs[place].config.steps for place in self.results) + sum(self.steps.values())
+        done = sum(self.runs[index].config.steps for index in self.results) + sum(self.steps.values())
         total = sum(run.config.steps for run in self.runs)
         try:
             self.progress(TrainingProgress(done, total, rows, len(self.results) - failed, failed))
@@ -419,21 +420,27 @@ class Training(Execution[PreparedRun]):
 
 
 def _train_in_process(
-    entries: Sequence[tuple[int, dict[str, Any], Path]],
+    entries: Sequence[tuple[int, dict[str, Any], Path, TaskValues | None]],
     checkpoints: Path | None,
     device: str,
     options: Mapping[str, Any],
     send: Callable[[tuple[Any, ...]], None],
 ) -> None:
-    """Body of a process: train a group, and send what `train_group` tells.
+    """Body of a process: train a group, and send what `train_group` reports.
 
     SIGTERM ends it at once, as there is nothing to clean up, and a repeated call needs its locks.
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    tasks = TaskCache(trust=True, device=device)  # of code that the process which started this one has imported
-    runs = [PreparedRun(place, RunConfig.from_dict(config), folder, tasks) for place, config, folder in entries]
+    run_configs = [RunConfig.from_dict(config) for _, config, _, _ in entries]
+    stored = {config.id: own for config, (*_, own) in zip(run_configs, entries, strict=True)}
+    # Code is that which the process that started this one has imported
+    tasks = TaskCache(lambda config: stored[config.id], trust=True, device=device)
+    runs = [
+        PreparedRun(index, config, folder, tasks)
+        for config, (index, _, folder, _) in zip(run_configs, entries, strict=True)
+    ]
 
-    def tell(message: tuple[Any, ...]) -> None:
+    def report(message: tuple[Any, ...]) -> None:
         kind, *content, last = message
         if isinstance(last, TrainingResult):  # what was learnt is in the folder
             last = replace(last, agent=None)
@@ -442,6 +449,6 @@ def _train_in_process(
         send((kind, *content, last))
 
     try:
-        train_group(runs, checkpoints, tell, **options)
+        train_group(runs, checkpoints, report, **options)
     except OSError as error:
         send(("error", error))

@@ -5,20 +5,19 @@ seed alone.
 """
 
 import math
-import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
 from pharos.agents import COMPILED, GENERATOR, generator_of, register_form
 from pharos.errors import ParameterError
+from pharos.mdp import uniform_choice
 from pharos.policies import PolicyLike
 from pharos.solvers import GainInterval
-from pharos.training.budget import IGNORED, PolicyRecorder, errors_in_one_line, generate, uniform_policy
+from pharos.training.budget import PolicyRecorder, end_process, errors_in_one_line, generate
 from pharos.training.curve import Evaluation, evaluate_agent
 from pharos.training.jax_agents import compiled_curves
 from pharos.training.results import write_policy
@@ -32,7 +31,7 @@ class GeneratorLearner(PolicyRecorder):
         config = run.config
         super().__init__(run.task, steps=config.steps, interval=config.evaluation_interval, seed=config.seed)
         self.run, self.function = run, learn
-        self.budget.give_up = self._give_up
+        self.budget.give_up = partial(end_process, self.run.config.agent, self.budget.limit)
 
     @property
     def episodes(self) -> np.ndarray:
@@ -63,15 +62,6 @@ class GeneratorLearner(PolicyRecorder):
         source = self.run.config.sources.get("agent")
         return source.file if source else getattr(getattr(self.function, "__code__", None), "co_filename", None)
 
-    def _give_up(self) -> NoReturn:
-        """End this process: what catches BudgetSpent around `step`, and goes on, cannot be ended otherwise."""
-        sys.stderr.write(
-            f"pharos: agent {self.run.config.agent} went on for {IGNORED:,} steps after its {self.budget.limit:,}; "
-            f"expected its loop to end: catch no BudgetSpent (`except:`, `except BaseException`) around step\n"
-        )
-        sys.stderr.flush()
-        os._exit(1)
-
     def policy(self, i: int) -> PolicyLike | Evaluation:
         return self.in_force
 
@@ -87,7 +77,7 @@ class CompiledLearner:
     def __init__(self, runs: Sequence[Any], learn: Callable[..., Any]):
         self.runs, self.function = runs, learn
         self.episodes, self.returns = np.zeros(len(runs), np.int64), np.zeros(len(runs))
-        self.values = [evaluate_agent(uniform_policy(runs[0].task), runs[0].task)] * len(runs)
+        self.values = [evaluate_agent(uniform_choice(runs[0].task.mdp), runs[0].task)] * len(runs)
 
     def learn(self, points: Sequence[int], at_point: Callable[[int], object]) -> None:
         """Train, then call `at_point` at each point. ParameterError: these are not equally distant."""

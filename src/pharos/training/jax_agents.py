@@ -4,7 +4,7 @@
         ...
         return apply, snapshots
 
-`env, params` are those of `pharos.to_gymnax`, `key` is that of the seed, and `steps` an integer that is known when it
+`env, params` come from `pharos.to_gymnax`, `key` from the seed, and `steps` is an integer that is known when it
 is compiled. `snapshots` are parameters: a tree of arrays whose first axis has K entries, after steps / K, 2 steps / K,
 ..., `steps` steps. `apply(parameters, observations)` gives (N, A) probabilities or (N,) actions. Observations of all
 states are one batch, so that a policy is one forward pass.
@@ -25,7 +25,7 @@ from pharos.policies import PolicyAnswers
 from pharos.training.curve import Curve, evaluate_agent
 from pharos.training.task import Task
 
-BLOCK = 4096  # observations that are made at once
+TABLE_BLOCK = 4096  # observations that are made at once
 
 LearnCompiled = Callable[..., tuple[Callable[..., Any], Any]]
 """learn(env, params, steps, key) -> (apply, snapshots)."""
@@ -37,7 +37,7 @@ def compiled_curves(
     """Train with a function of JAX for each seed, and evaluate the policy in force at each evaluation point.
 
     Returns:
-        A curve for each seed: a row before the first step, that of uniform play, and one for each point. There are no
+        A curve for each seed: a row before the first step, for uniform play, and one for each point. There are no
         episodes in it.
     Raises:
         MissingExtra: JAX or gymnax is not installed.
@@ -59,7 +59,7 @@ def compiled_curves(
         raise ParameterError(f"agents in JAX learn from tables, which have no {', '.join(lacking)}; leave it out")
     # The task as an environment of gymnax, with the observations of all states
     count = task.mdp.num_states
-    blocks = [np.arange(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
+    blocks = [np.arange(first, min(first + TABLE_BLOCK, count)) for first in range(0, count, TABLE_BLOCK)]
     observations = np.concatenate([context.observation(task.space.states(block)) for block in blocks])
     env = to_gymnax(
         task.mdp, observations, time_limit=task.env.max_episode_steps, reward_noise=task.chance.reward_noise
@@ -84,14 +84,14 @@ def compiled_curves(
     (number,) = numbers
     ask = jax.jit(jax.vmap(functions[-1], (0, None)))
     everything, answers = env.default_params.observations[:-1], PolicyAnswers(functions[-1], task.mdp, task.observer)
-    places = [point * number // evaluations - 1 for point in range(evaluations + 1)]
+    indices = [point * number // evaluations - 1 for point in range(evaluations + 1)]
     uniform, curves = uniform_choice(task.mdp), []
     for i in range(len(seeds)):
         tables = np.asarray(ask(jax.tree.map(lambda leaf, i=i: leaf[i], snapshots), everything))
-        policies = {place: answers.checked(tables[place], count) for place in sorted(set(places) - {-1})}
+        policies = {index: answers.checked(tables[index], count) for index in sorted(set(indices) - {-1})}
         curve = Curve(task)
-        values = {place: evaluate_agent(policy, task) for place, policy in {-1: uniform, **policies}.items()}
-        for point, place in enumerate(places):
-            curve.add(point * (steps // evaluations), 0, 0.0, None, values[place])
+        values = {index: evaluate_agent(policy, task) for index, policy in {-1: uniform, **policies}.items()}
+        for point, index in enumerate(indices):
+            curve.add(point * (steps // evaluations), 0, 0.0, None, values[index])
         curves.append(curve)
     return curves

@@ -67,7 +67,7 @@ class TrainingOptions:
             `module:name` or `file.py:name`; tables see the index of the state.
         observation_options: option of the observation, such as size=natural.
         chance: of acting, and in how rewards are paid. Values, returns and regret are of what is earned.
-        hyperparameters: hyperparameter of the agent, such as learning_rate=0.001. These go before those of
+        hyperparameters: hyperparameter of the agent, such as learning_rate=0.001. These go before the entries of
             agents/hyperparameters.py. `train` also takes a YAML file of the same form, such as one that `tune` wrote.
         steps: steps to learn from.
         gamma: discount of values and returns. The agent's own discount is a hyperparameter.

@@ -14,12 +14,12 @@ from pharos.mdp import TabularMDP
 from pharos.state_space import StateSpace
 from pharos.system.wording import in_one_line
 from pharos.training.curve import Curve
-from pharos.training.results import FORMAT, versions, write_record
+from pharos.training.results import RECORD_FORMAT, versions, write_record
 from pharos.training.task import RunConfig, Task, TaskValues
 
 T = TypeVar("T")
 # Entries of a configuration that decide about the task
-TASK = (
+TASK_ENTRIES = (
     *("environment", "parameters", "chance", "observation", "observation_options", "gamma", "horizon", "objective"),
     "sources",
 )
@@ -43,9 +43,9 @@ class TaskCache:
     """Tasks of runs by configuration; they share spaces, rewards, solved values and observations.
 
     Args:
-        values: config -> values at the start of its task, where they are known.
+        values: config -> values at the start of its task, if they are known.
         trust, strict: as for `RunConfig.task`.
-        device: where networks are trained, which decides about what fits together.
+        device: on which networks are trained, which decides about what fits together.
     """
 
     def __init__(
@@ -61,11 +61,11 @@ class TaskCache:
 
     def task(self, config: RunConfig) -> Task:
         """The task of a run, the same object for all runs on it; tasks share spaces and rewards."""
-        return self.shared("task", config, TASK, lambda: self._task(config))
+        return self.shared("task", config, TASK_ENTRIES, lambda: self._task(config))
 
     def adopt(self, config: RunConfig, task: Task) -> None:
-        """Keep a task that exists already as that of a run."""
-        self.shared("task", config, TASK, lambda: task)
+        """Keep a task that exists already as the task of a run."""
+        self.shared("task", config, TASK_ENTRIES, lambda: task)
 
     def _task(self, config: RunConfig) -> Task:
         values = self.values(config) if self.values is not None else None
@@ -92,14 +92,14 @@ class PreparedRun:
     """A run before and while it is trained: a `pharos.agents.LearningRun`, with its curve and its record.
 
     Attributes:
-        place: among the configurations; None for a run of a checkpoint that nobody asks for.
+        index: among the configurations; None for a run of a checkpoint that nobody asks for.
         tasks: that it shares with other runs.
         key: runs with equal keys train together, see `pharos.agents.Agent.prepare`; None: it is alone, has checkpoints
             in its own folder, and holds that.
         error: why it has failed.
     """
 
-    place: int | None
+    index: int | None
     config: RunConfig
     folder: Path | None
     tasks: TaskCache
@@ -118,7 +118,7 @@ class PreparedRun:
 
     @cached_property
     def hyperparameters(self) -> dict[str, Any]:
-        """All that are known, those of the configuration first."""
+        """All that are known, the configuration's first."""
         config = self.config
         return hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
 
@@ -153,11 +153,11 @@ class PreparedRun:
         self.key = None if key is None else (config.agent, config.steps, config.evaluation_interval, key)
 
     def write(self, status: str, **entries: object) -> None:
-        """Replace run.json where there is a folder: the run is "running", "failed" or "finished"."""
+        """Replace run.json if there is a folder: the run is "running", "failed" or "finished"."""
         if self.folder is None:
             return
         config = self.config
-        record = {"format": FORMAT, "id": config.id, "config": config.to_dict(), "versions": versions()}
+        record = {"format": RECORD_FORMAT, "id": config.id, "config": config.to_dict(), "versions": versions()}
         if (rules := class_called(config.environment)) is not None:
             record["rules_version"] = rules.version
         record |= {"status": status, "hyperparameters": self.hyperparameters, **entries}

@@ -5,7 +5,7 @@
     FOLDER/checkpoint/      while it runs: what the next attempt goes on from; arrays, JSON and tensors, never code
 
 A run that is killed goes on from its last checkpoint when it is started again: at most the last interval between
-evaluations is lost (or the last ten seconds, where intervals are shorter). Without interruption the same seed gives the
+evaluations is lost (or the last ten seconds, if intervals are shorter). Without interruption the same seed gives the
 same curve file.
 """
 
@@ -19,7 +19,7 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.observations import own_observation
-from pharos.system.records import split, takes
+from pharos.system.records import split_options, takes
 from pharos.training.execution import ProgressCallback, Training, TrainingProgress, train_configs
 from pharos.training.options import TrainingOptions
 from pharos.training.prepared import FailedRun, TaskCache
@@ -53,8 +53,8 @@ def train(
         tensorboard: write TensorBoard's logs into `out`/tensorboard (algorithms of Stable-Baselines3).
         progress: called after each evaluation with steps done, steps in all, and the row of the curve.
         options: of `TrainingOptions`: steps, observation, observation_options, sticky, random, lazy, reward_noise,
-            reward_delay, gamma, horizon, objective, evaluation_interval, hyperparameters, engine; and those of the
-            environment.
+            reward_delay, gamma, horizon, objective, evaluation_interval, hyperparameters, engine; and the parameters of
+            the environment.
     Raises:
         ParameterError: an option is wrong, or `out` holds another run. UnknownName: no such name; the nearest is
             suggested.
@@ -83,7 +83,7 @@ def train_many(
     Args:
         seeds: of the runs, each another.
         device: of the batched engine: "cpu" or "cuda".
-        workers: processes that share the runs, lane by lane, where there is a folder for results; runs that train alone
+        workers: processes that share the runs, lane by lane, if there is a folder for results; runs that train alone
             stay in one. Results do not depend on it.
         out: a folder, in which each run has its own, seed-0 and so on; None: nothing is written. Finished runs there
             are returned, and what was killed goes on from its last checkpoint.
@@ -129,7 +129,7 @@ def train_config(
     """Train as a configuration says, the `config` of a run.json or of a study; results go into `folder`.
 
     Args:
-        values: at the start of the task, where they are known already.
+        values: at the start of the task, if they are known already.
         trust: whether code that the configuration names may be imported: an environment, observation or agent of its
             own.
         strict: whether a file of such code that has changed since is an error instead of a warning.
@@ -157,13 +157,13 @@ def _train(
             f"and a folder (out)"
         )
 
-    def tell(now: TrainingProgress) -> None:
+    def report(now: TrainingProgress) -> None:
         if progress is not None and 0 in now.rows:
             progress(now.rows[0]["step"], config.steps, now.rows[0])
 
     folders, checkpoints = (None, None) if folder is None else ([folder], folder / "checkpoints")
     options = {"raises": True, "tensorboard": tensorboard}
-    (end,) = Training([config], folders, [[0]], checkpoints, tell, tasks, **options).results_in_order()
+    (end,) = Training([config], folders, [[0]], checkpoints, report, tasks, **options).results_in_order()
     assert isinstance(end, TrainingResult)
     return end
 
@@ -175,7 +175,7 @@ def _runs(
     environment: Environment | str, options: Mapping[str, Any], seeds: Sequence[int]
 ) -> tuple[Task, list[RunConfig]]:
     """The task, and the configuration of a run with each of the seeds; `options` as `train` takes them."""
-    training, parameters = split(TrainingOptions, options)
+    training, parameters = split_options(TrainingOptions, options)
     agent, hyperparameters, table = training.agent, training.hyperparameters, options.get("hyperparameters")
     name = agent_called(agent).observation(training.observation)
     task = Task.of(

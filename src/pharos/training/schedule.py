@@ -27,7 +27,7 @@ def plan(
 
     Args:
         workers: most processes.
-        device: where networks are trained.
+        device: on which networks are trained.
         seconds: that each run takes, in any unit; None: all take as long.
     """
     if workers < 2 or len(configs) < 2:
@@ -94,15 +94,15 @@ class Shapes:
         return agent_called(config.agent).width(_Sizes(config, self), self.device)
 
     def shape(self, config: RunConfig) -> RunShape:
-        """The sizes of a run; those of an observation that needs states, or cannot be made, are not known."""
+        """The sizes of a run; the sizes of an observation that needs states, or cannot be made, are not known."""
         entry = config.to_dict()
         key = json.dumps([entry.get(name) for name in SEEN], sort_keys=True)
         if key not in self._shapes:
-            self._shapes[key] = _shape(config, key)
+            self._shapes[key] = _run_shape(config, key)
         return self._shapes[key]
 
 
-def _shape(config: RunConfig, unknown: str) -> RunShape:
+def _run_shape(config: RunConfig, unknown: str) -> RunShape:
     try:
         env = config.make_environment(trust=True)
         sizes = env.num_actions, float(np.prod(env.components.size.astype(float)))

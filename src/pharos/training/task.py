@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pharos.agents import agent_called, agent_source, is_known
-from pharos.environments import Environment, as_tuples, class_called, class_of, make, source_of
+from pharos.environments import Environment, as_tuples, class_called, class_of, class_source, make
 from pharos.errors import DivergenceError, FileFormatError, ParameterError, UnknownName
 from pharos.mdp import (
     ChanceSetting,
@@ -29,11 +29,14 @@ from pharos.policies import Observer, ReachableRows, endless_value, reachable_ro
 from pharos.regret import ReferenceValues
 from pharos.solvers import GainInterval, Solution, average_reward, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
-from pharos.system.records import flat, read
+from pharos.system.records import flat, parse_record
 from pharos.system.sources import Source, is_reference, resolve, untrusted_code
 from pharos.training.options import ENGINES, OBJECTIVES, Horizon, TrainingOptions
 
-TAIL = 1e-9  # part of a discounted return that is not looked at
+RETURN_TAIL = 1e-9  # part of a discounted return that is not looked at
+HELD_OUT = 2.0**-1000
+"""Probability of start states in which no episode begins, as no random number is so small: they are held out. If a task
+has some, values and regret are those of episodes that begin there, each state as likely."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ class Task:
     Attributes:
         env: the environment.
         chance: of acting, and in how agents are paid; its fields are keywords too, `Task(env, sticky=0.1)`. Values and
-            regret are those of the rewards without noise and delay.
+            regret count the rewards without noise and delay.
         observation, observation_options: what the agent sees, as `pharos.observe` takes it.
         previous_action: whether the agent also sees the previously executed action.
         gamma: discount of values and returns.
@@ -80,7 +83,7 @@ class Task:
             environment's time limit.
         objective: "average": policies are also measured by what a step earns in the long run; "total" stands for
             gamma 1 without a horizon, and None for values alone.
-        values: at the start, where they are known already; None: solved for when they are needed.
+        values: at the start, if they are known already; None: solved for when they are needed.
     """
 
     env: Environment
@@ -175,6 +178,15 @@ class Task:
         return self.chance.of(self._mdp_without_chance)
 
     @cached_property
+    def measured(self) -> TabularMDP:
+        """The tabular MDP with the start states that values are of: those that are held out, where there are any."""
+        is_held_out = self.mdp.start_probabilities <= HELD_OUT
+        if not is_held_out.any():
+            return self.mdp
+        starts = self.mdp.start_states[is_held_out]
+        return replace(self.mdp, start_states=starts, start_probabilities=np.full(len(starts), 1.0 / len(starts)))
+
+    @cached_property
     def _reaches(self) -> dict[tuple[int, int], ReachableRows]:
         return {}
 
@@ -182,7 +194,7 @@ class Task:
         """Rows that policies of positive probability reach, remembered; see `pharos.policies.reachable_rows`."""
         key = max_rows, steps
         if key not in self._reaches:
-            self._reaches[key] = reachable_rows(self.mdp, *key, sees_previous_action=self.previous_action)
+            self._reaches[key] = reachable_rows(self.measured, *key, sees_previous_action=self.previous_action)
         return self._reaches[key]
 
     @property
@@ -192,17 +204,17 @@ class Task:
     @cached_property
     def optimal(self) -> Solution:
         """Optimal values."""
-        return value_iteration(self.mdp)
+        return value_iteration(self.measured)
 
     @cached_property
     def uniform(self) -> Solution:
         """Values of the uniformly random policy."""
-        return uniform_value(self.mdp)
+        return uniform_value(self.measured)
 
     @cached_property
     def worst(self) -> Solution:
         """Values of the worst policy."""
-        return worst_value(self.mdp)
+        return worst_value(self.measured)
 
     @property
     def reference(self) -> ReferenceValues:
@@ -211,7 +223,7 @@ class Task:
 
     @cached_property
     def _solved_reference(self) -> ReferenceValues:
-        mdp = self._episodes(self.mdp)
+        mdp = self._episodes(self.measured)
         best = value_iteration(mdp)
         values, error = [float(best.value_at_start)], best.error_bound
         for solve in (uniform_value, worst_value):
@@ -219,7 +231,7 @@ class Task:
                 solution = solve(mdp)
                 values.append(float(solution.value_at_start))
                 error = max(error, solution.error_bound)
-            except DivergenceError:  # of total rewards: the policy may go on for ever where something is paid
+            except DivergenceError:  # of total rewards: the policy may go on for ever while something is paid
                 values.append(-math.inf if solve is worst_value else endless_value(mdp, "uniform"))
         optimal, uniform, worst = values
         return ReferenceValues(optimal, uniform, worst, error)
@@ -275,7 +287,7 @@ def _range_of_returns(mdp: TabularMDP) -> tuple[float, float]:
     largest = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
     steps, rest = mdp.horizon, 0.0
     if steps is None:  # what is left out of a discounted return is less than rest
-        steps = max(1, math.ceil(math.log(TAIL) / math.log(mdp.gamma))) if mdp.gamma > 0 else 1
+        steps = max(1, math.ceil(math.log(RETURN_TAIL) / math.log(mdp.gamma))) if mdp.gamma > 0 else 1
         rest = largest * mdp.gamma**steps / (1 - mdp.gamma)
     rest += 1e-12 * largest * steps  # rounding
     ends, rewards, terminal = [], mdp.rewards, np.asarray(mdp.terminal)
@@ -296,7 +308,7 @@ def _range_of_returns(mdp: TabularMDP) -> tuple[float, float]:
 
 CELL = ["environment", "instance", "chance", "agent", "observation"]  # columns that tell the cells of a study
 # In the order of run.json
-KEYS = (
+CONFIG_KEYS = (
     *("environment", "parameters", "chance", "observation", "observation_options", "agent", "hyperparameters", "steps"),
     *("seed", "gamma", "horizon", "objective", "evaluation_interval", "engine", "sources"),
 )
@@ -312,14 +324,14 @@ class RunConfig(TrainingOptions):
         parameters: all parameters of the environment, JSON-able.
         seed: of everything random.
         horizon: number of steps of an episode in values and returns; None: discounted values without a horizon, or
-            total rewards where gamma is 1.
+            total rewards if gamma is 1.
         objective: "average", of runs that also measure what a step earns in the long run; else None, and not in `id`
             and `to_dict`.
         evaluation_interval: steps between evaluations of the policy.
         hyperparameters: of the agent, which go before its defaults.
         engine: what trains networks, one of ENGINES. Tables are the same with each, so theirs is always "sb3"; `id` and
-            `to_dict` have it only where it is another.
-        sources: where a class, observation or agent of the user's own comes from, under "environment", "observation"
+            `to_dict` have it only if it is another.
+        sources: the origin of a class, observation or agent of the user's own, under "environment", "observation"
             and "agent". Their names belong to the `id`; files and checksums do not.
     """
 
@@ -360,7 +372,7 @@ class RunConfig(TrainingOptions):
         """
         observation = task.observation
         sources = {
-            "environment": source_of(type(task.env)),
+            "environment": class_source(type(task.env)),
             "observation": observation.source if isinstance(observation, OwnObservation) else None,
             "agent": agent_source(agent),
         }
@@ -392,7 +404,9 @@ class RunConfig(TrainingOptions):
             FileFormatError: an entry is missing, unknown or of another type.
         """
         try:
-            return read(RunConfig, entry, "the configuration of a run", optional=("engine", "sources", "objective"))
+            return parse_record(
+                RunConfig, entry, "the configuration of a run", optional=("engine", "sources", "objective")
+            )
         except ParameterError as error:
             raise FileFormatError(f"the configuration of a run is damaged: {error}") from error
 
@@ -406,7 +420,7 @@ class RunConfig(TrainingOptions):
             del entry["sources"]
         if self.objective is None:
             del entry["objective"]
-        ordered = {name: entry[name] for name in KEYS if name in entry}
+        ordered = {name: entry[name] for name in CONFIG_KEYS if name in entry}
         return {name: dict(value) if isinstance(value, Mapping) else value for name, value in ordered.items()}
 
     @property
@@ -434,7 +448,7 @@ class RunConfig(TrainingOptions):
         """The task of the run.
 
         Args:
-            values: at the start, which are not computed again where they are given.
+            values: at the start, which are not computed again if they are given.
             trust, strict: as for `make_environment`.
         """
         observation: str | OwnObservation = self.observation
@@ -455,7 +469,7 @@ class RunConfig(TrainingOptions):
 
     @property
     def definitions(self) -> tuple[Any, ...]:
-        """The registered class of the environment, and the registration of the observation, where there are any."""
+        """The registered class of the environment, and the registration of the observation, if there are any."""
         return (class_called(self.environment), *(registered(self.observation) or ()))
 
     def algorithm(self, *, trust: bool = False, strict: bool = False) -> "str | Callable[..., Any]":
@@ -479,7 +493,7 @@ class RunConfig(TrainingOptions):
 def run_id(config: Mapping[str, Any]) -> str:
     """The digest of a run's `config`: XXH3 with 64 bits of its sorted JSON, 16 hexadecimal digits.
 
-    Of code of the user's own its name counts, not where it lies, so that the id is the same on every machine.
+    Of code of the user's own its name counts, not its folder, so that the id is the same on every machine.
     """
     import xxhash
 

@@ -43,10 +43,10 @@ from pharos.training.task import RunConfig, Task, run_id
 if TYPE_CHECKING:
     import optuna
 
-EVALUATIONS = 20  # of a run
+RUN_EVALUATIONS = 20  # of a run
 JOURNAL = "journal.log"
 _STATUS = {"COMPLETE": "finished", "PRUNED": "given up"}
-_AGAIN = "delete the folder and search again"
+_SEARCH_AGAIN = "delete the folder and search again"
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ class TuningResult:
         agent, environment, observation: whose hyperparameters these are; `environment` is the name of the class.
         hyperparameters: the best that were found, all of them, those that were not searched included.
         score: mean normalised regret of the best trial.
-        first_score: that of the first trial, what the table said before; None where it was not finished.
+        first_score: the score of the first trial, what the table said before; None if it was not finished.
         trials: a dictionary for each: number, hyperparameters, score, status ("finished", "given up"), seconds,
             reports (number of evaluations -> mean so far).
-        folder: where it was written, or None.
+        folder: to which it was written, or None.
     """
 
     agent: str
@@ -213,7 +213,7 @@ class _Search:
 
     @cached_property
     def table(self) -> dict[str, Any]:
-        """Hyperparameters without the search: those of the first trial, and of every trial where none is searched."""
+        """Hyperparameters without the search: as in the first trial, and in every trial if none is searched."""
         return hyperparameters_of(self.agent, self.environment, self.observation_name)
 
     @cached_property
@@ -251,7 +251,7 @@ class _Search:
     def score(self, trial: "optuna.Trial", pruned: type[Exception]) -> float:
         """The mean normalised regret of evaluations after the first, over all runs; `pruned` is raised on the way."""
         hyperparameters = {**self.table, **self.proposal(trial)}
-        interval = max(1, self.steps // EVALUATIONS)
+        interval = max(1, self.steps // RUN_EVALUATIONS)
         configs: list[RunConfig] = []
         regrets: list[float] = []
         # A run for each task and seed
@@ -283,7 +283,7 @@ class _Search:
 
 
 def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dict[str, tuple[Any, ...]]:
-    """`space`, or that of the agent; ParameterError where there is none, or an entry is wrong."""
+    """`space`, or the space of the agent; ParameterError if there is none, or an entry is wrong."""
     searched = space if space is not None else agent_called(agent).space
     if not searched:
         raise ParameterError(
@@ -401,9 +401,9 @@ def _earlier_trials(optuna: ModuleType, search: _Search, folder: Path) -> list[d
     """
     file, journal = folder / "tuning.json", folder / JOURNAL
     try:
-        stored = storage.read_json(file, advice=_AGAIN)
+        stored = storage.read_json(file, advice=_SEARCH_AGAIN)
         if not storage.is_intact(stored):
-            raise FileFormatError(f"{file}: was changed after it was written; {_AGAIN}")
+            raise FileFormatError(f"{file}: was changed after it was written; {_SEARCH_AGAIN}")
         before, now = stored["config"], search.config
         different = [key for key in {**now, **before} if before.get(key) != now.get(key)]
         trials = [trial for trial in stored["trials"] if trial["status"] in _STATUS.values()]
@@ -424,7 +424,7 @@ def _earlier_trials(optuna: ModuleType, search: _Search, folder: Path) -> list[d
         return [_record(trial) for trial in old.trials if trial.state.name in _STATUS]
     except Exception as error:  # Optuna trusts what it reads
         message = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise FileFormatError(f"{journal}: is not as Optuna wrote it ({message}); {_AGAIN}") from error
+        raise FileFormatError(f"{journal}: is not as Optuna wrote it ({message}); {_SEARCH_AGAIN}") from error
 
 
 def _write(folder: Path, search: _Search, trials: Sequence[dict[str, Any]]) -> None:
@@ -457,6 +457,6 @@ def _record(trial: "optuna.trial.FrozenTrial") -> dict[str, Any]:
 
 
 def _best(trials: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The first of the best trials; a score of infinity where none is finished."""
+    """The first of the best trials; a score of infinity if none is finished."""
     finished = [trial for trial in trials if trial["status"] == "finished"]
     return min(finished, key=lambda trial: trial["score"], default={"score": math.inf, "hyperparameters": {}})

@@ -18,8 +18,8 @@ from pharos.kernels import batched as kernels
 class PinnedBuffer:
     """A host array and its tensor on a device, with copies in both directions.
 
-    On the processor both are one. Elsewhere the array lies where a GPU can reach it, so that neither waits; whoever
-    writes into it, or reads from it, waits for the device first (`wait`).
+    On the processor both are one. Otherwise the array lies in memory that a GPU can reach, so that neither waits;
+    whoever writes into it, or reads from it, waits for the device first (`wait`).
 
     Attributes:
         array: on the processor.
@@ -46,7 +46,7 @@ class CudaGraph:
     """Operations on tensors with fixed addresses, recorded as a CUDA graph on a GPU and run as one launch.
 
     The first call runs them one by one, which also takes all the room that they need; the second one records them.
-    Where that fails they are run one by one, with a warning, as recording changes no result.
+    If that fails they are run one by one, with a warning, as recording changes no result.
     """
 
     def __init__(self, operations: Callable[[], None], device: str):
@@ -215,9 +215,9 @@ class TensorArithmetic(CompiledArithmetic):
 
 
 def fused_adam() -> Callable[[Sequence[Tensor], Tensor], None] | None:
-    """Adam in one pass over a GPU's memory, by Triton, which torch for CUDA brings along; None where it does not."""
+    """Adam in one pass over a GPU's memory, by Triton, which torch for CUDA brings along; None if it does not."""
     try:
         from pharos.agents.batched import fused
     except ImportError:
         return None
-    return fused.adam
+    return fused.adam_on_gpu

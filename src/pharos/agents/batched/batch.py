@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import torch
 
-from pharos.agents.agent import joined_states, state_of
+from pharos.agents.agent import joined_states, learner_state
 from pharos.agents.batched.arithmetic import is_gpu
 from pharos.agents.batched.lane import RunPolicy
 from pharos.agents.batched.runs import BatchRun, group_key, lane_width, lane_widths
@@ -73,7 +73,7 @@ class Batch:
             [lane.best_actions(states[k * self.width : (k + 1) * self.width]) for k, lane in enumerate(self.lanes)]
         )
 
-    def greedy_actions(self, places: Sequence[int]) -> None:
+    def greedy_actions(self, indices: Sequence[int]) -> None:
         """None: these policies are no tables of states; they are queried about observations."""
 
     def policy(self, i: int) -> RunPolicy:
@@ -95,14 +95,14 @@ class Batch:
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Restore a state that `state` returned, in a batch of the same runs."""
         for k, lane in enumerate(self.lanes):
-            lane.restore(state_of(state, k))
+            lane.restore(learner_state(state, k))
 
 
 def make_batch(agent: str, runs: Sequence[BatchRun], *, device: str = "cpu", threads: int | None = None) -> Batch:
     """A batch of runs of one group.
 
     Args:
-        device: of torch, where networks are; episodes and replay memories stay on the processor.
+        device: of torch, for the networks; episodes and replay memories stay on the processor.
         threads: of torch; None for one, as studies use processes.
     Raises:
         ParameterError: the engine lacks a hyperparameter, or the runs are of several groups.

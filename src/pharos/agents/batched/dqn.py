@@ -1,7 +1,7 @@
 """DQN of W runs at once (Mnih et al., 2015), as Stable-Baselines3 has it; `double` as van Hasselt et al. (2016).
 
-Its replay memory has numbers of states instead of what they look like, 14 bytes a transition. Where several frames are
-seen a transition is no larger: the states before are those of the rows before.
+Its replay memory has numbers of states instead of what they look like, 14 bytes a transition. If several frames are
+seen a transition is no larger: the states before are in the rows before.
 """
 
 from collections.abc import Sequence
@@ -19,12 +19,12 @@ from pharos.kernels import batched as kernels
 class Replay:
     """The last transitions of W runs with E copies each; a row is one step of all copies.
 
-    As in Stable-Baselines3 minibatches are drawn from the last max(buffer_size // E, 1) rows. Where k frames are seen,
+    As in Stable-Baselines3 minibatches are drawn from the last max(buffer_size // E, 1) rows. If k frames are seen,
     k - 1 rows before them are kept as well.
 
     Attributes:
         size: of how many rows minibatches are drawn; rows: how many there are, of which the oldest is overwritten.
-        states, next_states (W, B) int64, or (W, B, k) where k frames are seen, actions (W, B) int64, rewards, discounts
+        states, next_states (W, B) int64, or (W, B, k) if k frames are seen, actions (W, B) int64, rewards, discounts
             (W, B) float32: the minibatch that was drawn.
     """
 
@@ -47,7 +47,7 @@ class Replay:
             np.zeros(shape, np.int32),
             np.zeros(shape, np.uint8),
             np.zeros(shape, np.float32),
-            np.full(shape, kernels.DONE, np.uint8),  # so that nothing comes before what is written first
+            np.full(shape, kernels.ENDED, np.uint8),  # so that nothing comes before what is written first
         )
         kinds, depth = [torch.int64] * 3 + [torch.float32] * 2, (frames,) if frames > 1 else ()
         shapes = [(width, batch_size, *depth)] * 2 + [(width, batch_size)] * 3
@@ -64,9 +64,9 @@ class Replay:
         flags: np.ndarray,
     ) -> None:
         """Keep the transitions (W, E) of step `calls`, counted from 0."""
-        place = calls % self.rows
+        row = calls % self.rows
         for array, new in zip(self.memory, (state, next_state, actions, reward, flags), strict=True):
-            array[:, place] = new
+            array[:, row] = new
 
     def sample(self, calls: int, draw: int, gammas: np.ndarray, num_steps: int) -> None:
         """Draw a minibatch for each run that is not idle, after `calls` steps; see `kernels.sample`."""
@@ -157,7 +157,7 @@ class DQNLane(Lane[QNetworks]):
         kernels.anneal(first, last, share, progress, self.epsilon)
 
     def copy_to_targets(self, runs: np.ndarray) -> None:
-        """Move the target networks of some runs towards the online ones, all the way where tau is 1."""
+        """Move the target networks of some runs towards the online ones, all the way if tau is 1."""
         rows = torch.from_numpy(runs).to(self.device)
         tau = torch.from_numpy(self.own["tau"][runs].astype(np.float32)[:, None]).to(self.device)
         self._target_table = None

@@ -6,7 +6,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-BLOCK = 1024  # parameters of a program
+PROGRAM_PARAMETERS = 1024  # parameters of a program
 
 
 @triton.jit
@@ -17,21 +17,21 @@ def step_of_adam(parameters, gradients, means, squares, plans, length, size: tl.
     if step != 0.0:
         scale, first = tl.load(plans + run * 5), tl.load(plans + run * 5 + 1)
         second, eps = tl.load(plans + run * 5 + 2), tl.load(plans + run * 5 + 4)
-        place = tl.program_id(1) * size + tl.arange(0, size)
-        inside = place < length
-        place += run * length
-        gradient = scale * tl.load(gradients + place, mask=inside, other=0.0)
-        mean = tl.load(means + place, mask=inside, other=0.0)
-        square = tl.load(squares + place, mask=inside, other=0.0)
+        index = tl.program_id(1) * size + tl.arange(0, size)
+        inside = index < length
+        index += run * length
+        gradient = scale * tl.load(gradients + index, mask=inside, other=0.0)
+        mean = tl.load(means + index, mask=inside, other=0.0)
+        square = tl.load(squares + index, mask=inside, other=0.0)
         mean += (gradient - mean) * first
         square += (gradient * gradient - square) * second
-        tl.store(means + place, mean, mask=inside)
-        tl.store(squares + place, square, mask=inside)
-        old = tl.load(parameters + place, mask=inside, other=0.0)
-        tl.store(parameters + place, old - step * mean / (tl.sqrt(square) + eps), mask=inside)
+        tl.store(means + index, mean, mask=inside)
+        tl.store(squares + index, square, mask=inside)
+        old = tl.load(parameters + index, mask=inside, other=0.0)
+        tl.store(parameters + index, old - step * mean / (tl.sqrt(square) + eps), mask=inside)
 
 
-def adam(state: Sequence[Tensor], plans: Tensor) -> None:
+def adam_on_gpu(state: Sequence[Tensor], plans: Tensor) -> None:
     """A step for each run whose step is not 0; state: (parameters, gradients, means, squares) (W, P), plans (W, 5)."""
     width, length = state[0].shape
-    step_of_adam[(width, triton.cdiv(length, BLOCK))](*state, plans, length, BLOCK)
+    step_of_adam[(width, triton.cdiv(length, PROGRAM_PARAMETERS))](*state, plans, length, PROGRAM_PARAMETERS)

@@ -1,6 +1,6 @@
 """A lane: a fixed number of runs that advance together; the common part of DQN and PPO.
 
-Observations of W runs are tensors: gathered from one table where it fits, else drawn for those who ask.
+Observations of W runs are tensors: gathered from one table if it fits, else drawn for those who ask.
 
 The episodes of W runs: each walks the table of its own MDP; runs of one MDP are advanced by one compiled call.
 """
@@ -15,19 +15,26 @@ import torch
 
 from pharos.agents.batched.arithmetic import CompiledArithmetic, CudaGraph, PinnedBuffer, TensorArithmetic, is_gpu, wait
 from pharos.agents.batched.networks import (
-    MASK,
+    PIXEL_MASK,
     BatchedNetwork,
     Values,
     aligned_zeros,
     flat_view,
-    names_of,
+    input_indices,
     pad,
-    places_of,
+    parameter_names,
 )
-from pharos.agents.batched.runs import BLOCK, BatchRun, ObservationSource, as_networks_see, is_small, resolved
+from pharos.agents.batched.runs import (
+    OBSERVED_AT_ONCE,
+    BatchRun,
+    ObservationSource,
+    as_networks_see,
+    is_small,
+    resolved,
+)
 from pharos.kernels import batched as kernels
 
-LARGEST_TABLE = 1 << 28  # bytes of observations as networks take them, on the processor
+OBSERVED_BYTES = 1 << 28  # bytes of observations as networks take them, on the processor
 SHARE_OF_DEVICE = 0.5  # of a GPU's free memory that a table may take
 
 
@@ -55,18 +62,18 @@ class NetworkView:
     def in_blocks(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yield (first state, single frames) of all states in blocks."""
         look = self.source.at if self.frames == 1 else self.source.frame
-        for first in range(0, self.source.num_states, BLOCK):
-            yield first, look(np.arange(first, min(first + BLOCK, self.source.num_states)))
+        for first in range(0, self.source.num_states, OBSERVED_AT_ONCE):
+            yield first, look(np.arange(first, min(first + OBSERVED_AT_ONCE, self.source.num_states)))
 
 
 class ObservationTable:
     """Observations of runs whose observations have the same shape.
 
-    Images are kept as bytes. Where they do not fit, minibatches are drawn: 0.3 us an image of a small Breakout. Where
+    Images are kept as bytes. If they do not fit, minibatches are drawn: 0.3 us an image of a small Breakout. If
     several frames are seen single ones are kept, and put together for those who ask.
 
     Attributes:
-        views: of the distinct sources; which: (W,) the place in `views` of each run's.
+        views: of the distinct sources; which: (W,) the index in `views` of each run's.
         frames: k, how many states are seen at once.
         shape: of an observation as the lane's network takes it.
         size: numbers that its first layer takes.
@@ -79,9 +86,9 @@ class ObservationTable:
     def __init__(self, runs: Sequence[BatchRun], device: str = "cpu"):
         self.device, self.is_image = device, runs[0].observe.is_image
         sources = list({id(run.observe): run.observe for run in runs}.values())
-        place = {id(source): i for i, source in enumerate(sources)}
+        index = {id(source): i for i, source in enumerate(sources)}
         self.views = [NetworkView(source) for source in sources]
-        self.which = np.array([place[id(run.observe)] for run in runs])
+        self.which = np.array([index[id(run.observe)] for run in runs])
         self._ends = np.cumsum([0, *(source.num_states for source in sources)])
         self._begins = self._ends[self.which]
         self.shape, self.frames = self.views[0].shape, self.views[0].frames
@@ -92,7 +99,7 @@ class ObservationTable:
         kind = torch.uint8 if self.is_image else torch.float32
         self._table: torch.Tensor | None = None
         length = self.size // self.frames
-        if self._ends[-1] * length * kind.itemsize > LARGEST_TABLE:
+        if self._ends[-1] * length * kind.itemsize > OBSERVED_BYTES:
             return
         self._table = torch.empty((int(self._ends[-1]), length), dtype=kind)
         for view, begin in zip(self.views, self._ends, strict=False):
@@ -103,11 +110,11 @@ class ObservationTable:
     def at(self, states: PinnedBuffer, out: torch.Tensor) -> torch.Tensor:
         """Write the observations of states (W, B) into out (W, B, size) float32; images from 0 to 255.
 
-        Where k frames are seen states are (W, B, k), the last ones of the episode, the oldest first.
+        If k frames are seen states are (W, B, k), the last ones of the episode, the oldest first.
         """
         target = flat_view(out).numpy()
         if self._table is not None:
-            kernels.look_up(self._table.numpy(), self._begins, states.array.reshape(len(target), -1), target)
+            kernels.look_up_rows(self._table.numpy(), self._begins, states.array.reshape(len(target), -1), target)
         else:
             for i, view in enumerate(self.views):
                 runs = np.flatnonzero(self.which == i)
@@ -151,10 +158,10 @@ class DeviceObservationTable(ObservationTable):
                 f"more than {SHARE_OF_DEVICE:.0%} of what is free; a run alone that is too large trains on cpu"
             )
         table = torch.zeros((total, length), dtype=kind)
-        of_views = [places_of(view.shape, is_small(view.shape, self.is_image)) for view in self.views]
+        of_views = [input_indices(view.shape, is_small(view.shape, self.is_image)) for view in self.views]
         self.size = max(map(len, of_views))
-        places = np.full((len(self.views), self.size), length - 1)
-        for view, own, row, begin in zip(self.views, of_views, places, self._ends, strict=False):
+        indices = np.full((len(self.views), self.size), length - 1)
+        for view, own, row, begin in zip(self.views, of_views, indices, self._ends, strict=False):
             frame, inside = np.divmod(own, view.length)
             row[: len(own)] = np.where(frame < view.frames, frame * length + inside, length - 1)
             for first, block in view.in_blocks():
@@ -163,7 +170,7 @@ class DeviceObservationTable(ObservationTable):
         self._table = table.to(self.device)
         offsets = self._begins[:, None] if self.frames == 1 else self._begins[:, None, None]
         self._offsets = torch.from_numpy(offsets).to(self.device)
-        self._places = torch.from_numpy(places[self.which][:, None]).to(self.device)
+        self._indices = torch.from_numpy(indices[self.which][:, None]).to(self.device)
         self._in_an_observation = [torch.from_numpy(own).to(self.device) for own in of_views]
 
     def at(self, states: PinnedBuffer, out: torch.Tensor) -> torch.Tensor:
@@ -171,7 +178,7 @@ class DeviceObservationTable(ObservationTable):
         assert self._table is not None
         rows = (states.tensor + self._offsets).view(-1)
         raw = self._table.index_select(0, rows).view(*states.tensor.shape[:2], -1)
-        return out.copy_(raw.gather(2, self._places.expand(-1, raw.shape[1], -1)))
+        return out.copy_(raw.gather(2, self._indices.expand(-1, raw.shape[1], -1)))
 
     def encoded(self, observations: np.ndarray, i: int) -> torch.Tensor:
         """See `ObservationTable`; what travels is a 36th of the neighbours of pixels as float32."""
@@ -202,7 +209,7 @@ class ActionSets:
 
     @staticmethod
     def of(runs: Sequence[BatchRun], device: str) -> "ActionSets | None":
-        """The sets of runs; None where all actions are available to all of them."""
+        """The sets of runs; None if all actions are available to all of them."""
         return None if all(run.mdp.available is None for run in runs) else ActionSets(runs, device)
 
     def of_states(self, states: torch.Tensor) -> torch.Tensor:
@@ -222,7 +229,7 @@ MASKED = -1e8
 
 
 Net = TypeVar("Net", bound=BatchedNetwork)
-ASKED = (16, 64, 256)  # rows of the blocks in which a policy is asked
+POLICY_BLOCKS = (16, 64, 256)  # rows of the blocks in which a policy is asked
 
 
 class Lane(Generic[Net]):
@@ -235,7 +242,7 @@ class Lane(Generic[Net]):
         shared: hyperparameters of all of them; own: name -> (W,) those that are numbers.
         steps: of each run so far; calls: of all copies together; collected: calls of the rollout that goes on.
         total: steps of the whole training.
-        depth: (k,) where k frames are seen, so that what is seen is k numbers of states; else ().
+        depth: (k,) if k frames are seen, so that what is seen is k numbers of states; else ().
         is_due: whether an update waits.
     """
 
@@ -322,7 +329,7 @@ class Lane(Generic[Net]):
     def views(self, rows: torch.Tensor) -> Values:
         """name -> (W, ...) view of parameters (W, P), with the mask of observations if there is one."""
         views = self.network.parameters.views(rows)
-        return views if self.seen.mask is None else {**views, MASK: self.seen.mask}
+        return views if self.seen.mask is None else {**views, PIXEL_MASK: self.seen.mask}
 
     def observed(self, states: PinnedBuffer) -> torch.Tensor:
         """(W, B, size) float32 observations of states (W, B, *depth), in a buffer reused for this B."""
@@ -379,7 +386,7 @@ class Lane(Generic[Net]):
         self.arithmetic.adam((self.parameters, self.gradients, self.means, self.squares))
 
     def _initial(self) -> np.ndarray:
-        """(W, P) initial parameters; each run draws those of its own network."""
+        """(W, P) initial parameters; each run draws the parameters of its own network."""
         if all(network is self.network for network in self._own_networks):
             return self.network.initial(partial(self._draws, self.keys))
         rows = np.zeros((self.width, self.network.parameters.length), np.float32)
@@ -400,7 +407,7 @@ class Lane(Generic[Net]):
     # Training state -------------------------------------------------------------------------------------------------
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Arrays of the training state by name; those of more than one number are changed in place."""
+        """Arrays of the training state by name; arrays of more than one number are changed in place."""
         tensors = {name: getattr(self, name).cpu().numpy() for name in self.tensors}
         counters = np.array([self.steps, self.calls, self.collected, self.is_due], np.int64)
         return {**tensors, "updates": self.updates, "counters": counters, **self.worlds.arrays(), **self.own_arrays()}
@@ -421,7 +428,7 @@ class Lane(Generic[Net]):
     def restore_network(self, i: int, parameters: Mapping[str, np.ndarray]) -> None:
         """Restore parameters of run i that `stored` returned, in a lane of observations of one shape."""
         for shape in self.network.parameters.shapes:
-            own = shape.own(parameters[names_of(shape.name)[0]])
+            own = shape.own(parameters[parameter_names(shape.name)[0]])
             self.values[shape.name][i] = torch.from_numpy(np.ascontiguousarray(own)).view(shape.shape)
 
     def as_stored(self, views: Values, i: int) -> dict[str, np.ndarray]:
@@ -431,7 +438,7 @@ class Lane(Generic[Net]):
         for shape in shapes:
             part = views[shape.name][i].cpu().numpy()[tuple(slice(n) for n in shape.shape)]
             arrays[shape.name] = np.array(shape.stored(part), order="C")
-        return {name: value for own_name, value in arrays.items() for name in names_of(own_name)}
+        return {name: value for own_name, value in arrays.items() for name in parameter_names(own_name)}
 
 
 class RunPolicy:
@@ -451,7 +458,7 @@ class RunPolicy:
         wait(lane.device)
         answers, first = [], 0
         while first < len(observations):
-            size = next((size for size in ASKED if size >= len(observations) - first), ASKED[-1])
+            size = next((size for size in POLICY_BLOCKS if size >= len(observations) - first), POLICY_BLOCKS[-1])
             rows = lane.seen.encoded(observations[first : first + size], self.i)
             block = torch.zeros((1, size, lane.seen.size), device=lane.device)
             block[0, : len(rows)] = rows  # of one of two sizes, as layers keep room for each size
@@ -486,8 +493,8 @@ class BatchedEpisodes:
     """The running episodes of W runs with E copies of their environment each.
 
     Attributes:
-        state: (W, E) int64, where each is.
-        depth: () where an agent sees the state alone, (k,) where it sees the last k states of the episode.
+        state: (W, E) int64, the state of each copy.
+        depth: () if an agent sees the state alone, (k,) if it sees the last k states of the episode.
         history: (W, E, k), those states, the oldest first; the first one of an episode stands for those before it.
         episodes, returns: (W,) finished episodes, and the sums of their returns.
         next_state, reward, flags: (W, E) of the last step; the reward is what was paid, late or with noise.
@@ -507,7 +514,7 @@ class BatchedEpisodes:
         for i, run in enumerate(runs):
             parts = (run.mdp.dynamics, run.mdp.reward_table, run.mdp.terminal, run.mdp.start_states)
             by_table.setdefault((*map(id, parts), id(run.outcome_rewards), id(run.staying)), []).append(i)
-        self.worlds = [World(runs[places[0]], places) for places in by_table.values()]
+        self.worlds = [World(runs[indices[0]], indices) for indices in by_table.values()]
         self.keys = keys
         self._chances = np.array([(*run.mdp.chance.triple, run.mdp.chance.first_chosen) for run in runs], np.float64)
         # what is executed is drawn by the sets then, not in the kernel of all
@@ -543,12 +550,12 @@ class BatchedEpisodes:
         return self.next_history if self.depth else self.next_state
 
     def step(self, step: int, actions: np.ndarray, *, counts: bool) -> None:
-        """Execute actions (W, E); finished episodes are added up where `counts` is true."""
+        """Execute actions (W, E); finished episodes are added up if `counts` is true."""
         chances = self._chances
         if self._sets is not None:
             choices, actions, chances = actions, np.empty_like(actions), self._none
             sets = self._sets.of_episodes(self.state)
-            kernels.execute_in_sets(self.keys, step, self._chances, sets, self.previous, choices, actions)
+            kernels.execute_runs_in_sets(self.keys, step, self._chances, sets, self.previous, choices, actions)
         setting = (self.keys, step, chances, self._limits, self._gammas)
         episodes = (self.state, self.previous, self.elapsed, self.running, self.discount, self.episodes, self.returns)
         transition = (self.next_state, self.reward, self.flags)
@@ -559,7 +566,7 @@ class BatchedEpisodes:
             )  # fmt: skip
         if self.depth:
             self.next_history[..., :-1], self.next_history[..., -1] = self.history[..., 1:], self.next_state
-            ended = (self.flags & kernels.DONE) > 0
+            ended = (self.flags & kernels.ENDED) > 0
             self.history[:] = np.where(ended[..., None], self.state[..., None], self.next_history)
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -19,10 +19,10 @@ from pharos.agents.batched.runs import is_small
 from pharos.kernels import patches
 from pharos.kernels.batched import linear_row
 
-ALIGNED = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
+ALIGNED_FLOATS = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
 RELU, TANH, NONE = "relu", "tanh", "none"
-ROWS = "all parameters"
-MASK = "which pixels there are"
+ALL_PARAMETERS = "all parameters"
+PIXEL_MASK = "which pixels there are"
 KERNEL, FILTERS = 3, patches.FILTERS  # of the small convolution
 FEATURES = 128
 
@@ -39,7 +39,7 @@ class Shape:
     Attributes:
         name: in Stable-Baselines3.
         shape: of one run's, here.
-        offset: where it begins in a row of parameters.
+        offset: at which it begins in a row of parameters.
         fan_in: of the layer.
         stored: (shape) -> the array as Stable-Baselines3 has it.
         own: the array as Stable-Baselines3 has it -> as it is kept here.
@@ -58,7 +58,7 @@ class Shape:
 
 
 class Parameters:
-    """The places of all parameters of a network in a row of P numbers.
+    """The positions of all parameters of a network in a row of P numbers.
 
     Attributes:
         shapes: in their order.
@@ -79,21 +79,21 @@ class Parameters:
     ) -> None:
         """Append a parameter."""
         self.shapes.append(Shape(name, shape, self.length, fan_in, stored, own))
-        self.length += -(-self.shapes[-1].size // ALIGNED) * ALIGNED
+        self.length += -(-self.shapes[-1].size // ALIGNED_FLOATS) * ALIGNED_FLOATS
 
     def views(self, rows: Tensor) -> Values:
-        """name -> (W, ...) view of (W, P); all of it under the name ROWS."""
+        """name -> (W, ...) view of (W, P); all of it under the name ALL_PARAMETERS."""
         views = {
             each.name: rows[:, each.offset : each.offset + each.size].view(len(rows), *each.shape)
             for each in self.shapes
         }
-        return {**views, ROWS: rows}
+        return {**views, ALL_PARAMETERS: rows}
 
 
 def aligned_zeros(width: int, *shape: int, device: str | torch.device | None = None) -> Tensor:
-    """(W, ...) float32 zeros; each run begins at a multiple of 64 bytes, so that its place changes no result."""
+    """(W, ...) float32 zeros; each run begins at a multiple of 64 bytes, so that its position changes no result."""
     size = math.prod(shape)
-    rows = torch.zeros((width, -(-size // ALIGNED) * ALIGNED), device=device)
+    rows = torch.zeros((width, -(-size // ALIGNED_FLOATS) * ALIGNED_FLOATS), device=device)
     return rows[:, :size].view(width, *shape)
 
 
@@ -147,7 +147,7 @@ class LinearLayer(NetworkLayer):
     """y = activation(x w + b).
 
     Args:
-        pixels: where the inputs are `pixels` places of a picture with all channels each; Stable-Baselines3 has the
+        pixels: if the inputs are `pixels` cells of a picture with all channels each; Stable-Baselines3 has the
             channels outside.
     """
 
@@ -171,8 +171,8 @@ class LinearLayer(NetworkLayer):
         """The outputs."""
         y, _ = self._buffers(x)
         if x.shape[1] == 1 and x.device.type == "cpu" and self.activation != TANH:
-            # to act once is to read all weights; those of inputs that a ReLU made 0 need not be
-            rows = values[ROWS].numpy()
+            # to act once is to read all weights; weights of inputs that a ReLU made 0 need not be
+            rows = values[ALL_PARAMETERS].numpy()
             weight, bias = self._offsets
             linear_row(rows, weight, bias, x[:, 0].numpy(), self.activation == RELU, y[:, 0].numpy())
             return y
@@ -193,8 +193,8 @@ class PatchConvolutionLayer(NetworkLayer):
     """A convolution of 3 x 3 with padding as one product: x holds the 9 C neighbours of each pixel, from 0 to 255.
 
     They come out of a table, so that nothing is unfolded here; 1 / 255 is a factor of the weights. y is (W, B, pixels
-    x filters). Runs whose pictures are smaller than those of others in their lane have a mask (W, pixels) among the
-    values, which keeps what is no pixel of theirs at 0.
+    x filters). Runs whose pictures are smaller than the pictures of others in their lane have a mask (W, pixels) among
+    the values, which keeps what is no pixel of theirs at 0.
     """
 
     def __init__(self, parameters: Parameters, name: str, shape: tuple[int, ...], filters: int):
@@ -217,8 +217,8 @@ class PatchConvolutionLayer(NetworkLayer):
         weights = values[f"{self.name}.weight"] * (1 / 255)
         torch.baddbmm(values[f"{self.name}.bias"], self._rows(x), weights, out=self._rows(y))
         self._activate(y)
-        if MASK in values:
-            y.view(*y.shape[:2], self.pixels, self.filters).mul_(values[MASK][:, None, :, None])
+        if PIXEL_MASK in values:
+            y.view(*y.shape[:2], self.pixels, self.filters).mul_(values[PIXEL_MASK][:, None, :, None])
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
@@ -315,11 +315,11 @@ class ConvolutionLayer(NetworkLayer):
 class PictureLayers(NetworkLayer):
     """The small convolution and the linear layer after it, on the processor: each different patch once.
 
-    x (W, B, C pixels), from 0 to 255. The parameters are those of the two layers; see kernels/patches.py.
+    x (W, B, C pixels), from 0 to 255. The parameters belong to the two layers; see kernels/patches.py.
     """
 
     def __init__(self, parameters: Parameters, name: str, shape: tuple[int, ...]):
-        self.shape, self.places = shape, places_of(shape, True).reshape(math.prod(shape[1:]), -1)
+        self.shape, self.indices = shape, input_indices(shape, True).reshape(math.prod(shape[1:]), -1)
         super().__init__(name, math.prod(shape), FEATURES, RELU)
         picture_layers(parameters, name, shape)
         self._offsets = tuple(each.offset for each in parameters.shapes[-4:])
@@ -328,7 +328,7 @@ class PictureLayers(NetworkLayer):
     def forward(self, values: Values, x: Tensor) -> Tensor:
         """The outputs."""
         y, _ = self._buffers(x)
-        width, number, pixels = *x.shape[:2], len(self.places)
+        width, number, pixels = *x.shape[:2], len(self.indices)
         if (width, number) not in self._memories:
             groups = (width, number * pixels)  # at most
             self._memories[width, number] = (
@@ -338,23 +338,25 @@ class PictureLayers(NetworkLayer):
                 np.empty((width, pixels, number), np.int32),
             )
         memory, pictures = self._memories[width, number], flat_view(x).numpy()
-        patches.forward(values[ROWS].numpy(), self._offsets, self.shape, self.places, pictures, y.numpy(), memory)
+        patches.forward(
+            values[ALL_PARAMETERS].numpy(), self._offsets, self.shape, self.indices, pictures, y.numpy(), memory
+        )
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
         """See `NetworkLayer`; there is no gradient of the input."""
         dy = self._before_activation(dy, self._buffers(x)[0])
-        rows, written = values[ROWS].numpy(), gradients[ROWS].numpy()
+        rows, written = values[ALL_PARAMETERS].numpy(), gradients[ALL_PARAMETERS].numpy()
         memory, pictures = self._memories[x.shape[0], x.shape[1]], flat_view(x).numpy()
-        patches.backward(rows, written, self._offsets, self.shape, self.places, pictures, dy.numpy(), memory)
+        patches.backward(rows, written, self._offsets, self.shape, self.indices, pictures, dy.numpy(), memory)
 
 
-def places_of(shape: tuple[int, ...], is_small: bool) -> np.ndarray:
+def input_indices(shape: tuple[int, ...], is_small: bool) -> np.ndarray:
     """Places of the first layer's input in an observation of a shape with a 0 behind it."""
-    places = np.arange(math.prod(shape))
+    indices = np.arange(math.prod(shape))
     if not is_small:
-        return places
-    inside = places.reshape(shape)  # the small convolution takes the 9 C neighbours of each pixel
+        return indices
+    inside = indices.reshape(shape)  # the small convolution takes the 9 C neighbours of each pixel
     padded = np.pad(inside, ((0, 0), (1, 1), (1, 1)), constant_values=inside.size)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (KERNEL, KERNEL), axis=(1, 2))  # type: ignore[call-overload]
     return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).ravel()
@@ -397,7 +399,7 @@ def picture_layers(parameters: Parameters, name: str, shape: tuple[int, ...]) ->
     return [small, LinearLayer(parameters, f"{name}.layers.1", small.outputs, FEATURES, RELU, pixels=small.pixels)]
 
 
-def extractor(
+def extractor_layers(
     parameters: Parameters, name: str, shape: tuple[int, ...], is_image: bool, device: str
 ) -> list[NetworkLayer]:
     """The layers from an observation to 128 features: SmallMLP, or SmallCNN with one or three convolutions."""
@@ -420,8 +422,8 @@ def pad(own: Parameters, rows: np.ndarray, common: Parameters) -> np.ndarray:
     The larger network has more inputs in its first layers, after those that both have.
     """
     result = np.zeros((len(rows), common.length), np.float32)
-    for each, place in zip(own.shapes, common.shapes, strict=True):
-        part = result[:, place.offset : place.offset + place.size].reshape(-1, *place.shape)
+    for each, slot in zip(own.shapes, common.shapes, strict=True):
+        part = result[:, slot.offset : slot.offset + slot.size].reshape(-1, *slot.shape)
         part[:, *(slice(n) for n in each.shape)] = rows[:, each.offset : each.offset + each.size].reshape(
             -1, *each.shape
         )
@@ -441,11 +443,11 @@ def sizes_of(net_arch: NetArch, head: str = "pi") -> list[int]:
     return list(net_arch.get(head, ())) if isinstance(net_arch, dict) else list(net_arch)
 
 
-def names_of(name: str) -> list[str]:
+def parameter_names(name: str) -> list[str]:
     """All names of a parameter in Stable-Baselines3; parameters of shared parts have several."""
     extractors = [name]
     if name.startswith("features_extractor."):
-        extractors += [f"{whose}_{name}" for whose in ("pi", "vf")]
+        extractors += [f"{part}_{name}" for part in ("pi", "vf")]
     return [*extractors, *(each.replace(".layers.0.", ".convolutions.") for each in extractors if ".layers.0." in each)]
 
 
@@ -453,7 +455,7 @@ class BatchedNetwork(Protocol):
     """W networks of one shape; interface to a lane.
 
     Attributes:
-        parameters: their places. eps: of Adam.
+        parameters: their positions. eps: of Adam.
     """
 
     parameters: Parameters
@@ -478,7 +480,7 @@ class QNetworks:
     ):
         self.parameters = parameters = Parameters()
         sizes = sizes_of(net_arch)
-        layers = extractor(parameters, "q_net.features_extractor", shape, is_image, device)
+        layers = extractor_layers(parameters, "q_net.features_extractor", shape, is_image, device)
         layers += hidden(parameters, "q_net.q_net", sizes, RELU)
         last = LinearLayer(parameters, f"q_net.q_net.{2 * len(sizes)}", [FEATURES, *sizes][-1], num_actions, NONE)
         self.stack = Stack([*layers, last])
@@ -509,7 +511,7 @@ class ActorCritics:
         self, shape: tuple[int, ...], is_image: bool, net_arch: NetArch, num_actions: int, device: str = "cpu"
     ):
         self.parameters = parameters = Parameters()
-        self.trunk = Stack(extractor(parameters, "features_extractor", shape, is_image, device))
+        self.trunk = Stack(extractor_layers(parameters, "features_extractor", shape, is_image, device))
         actor, critic = sizes_of(net_arch, "pi"), sizes_of(net_arch, "vf")
         actor_layers = hidden(parameters, "mlp_extractor.policy_net", actor, TANH)
         critic_layers = hidden(parameters, "mlp_extractor.value_net", critic, TANH)
@@ -556,7 +558,7 @@ class ActorCritics:
 
 
 def orthogonal(drawn: np.ndarray) -> np.ndarray:
-    """Orthonormal rows, or columns where there are more rows, from a matrix of normal numbers."""
+    """Orthonormal rows, or columns if there are more rows, from a matrix of normal numbers."""
     turned = len(drawn) < drawn.shape[1]
     q, r = np.linalg.qr(drawn.T if turned else drawn)
     q = q * np.sign(np.diag(r))

@@ -11,7 +11,7 @@ from pharos.agents.batched.networks import ActorCritics
 from pharos.agents.batched.runs import BatchRun
 from pharos.kernels import batched as kernels
 
-WEIGHTS = ("clip_range", "ent_coef", "vf_coef")
+LOSS_WEIGHTS = ("clip_range", "ent_coef", "vf_coef")
 
 
 class PPOLane(Lane[ActorCritics]):
@@ -19,7 +19,7 @@ class PPOLane(Lane[ActorCritics]):
 
     Attributes:
         states, next_states (W, T, E, *depth), actions_taken (W, T, E) int64, log_probabilities, kept_values, rewards,
-            begins, advantages (W, T, E) float32: the rollout that goes on; begins is 1 where a step is the first of its
+            begins, advantages (W, T, E) float32: the rollout that goes on; begins is 1 if a step is the first of its
             episode.
         timeouts: (W, T, E) bool, whether a step was cut off by the time limit.
         begin: (W, E) float32, whether the next step is the first of its episode.
@@ -43,8 +43,8 @@ class PPOLane(Lane[ActorCritics]):
         self._order = np.zeros((width, shape[1] * shape[2]), np.int64)
         self._valued = PinnedBuffer((width, self.copies, 1), torch.float32, device)
         self.divergence = PinnedBuffer((width,), torch.float64, device)
-        self.weights = tuple(PinnedBuffer((width,), torch.float64, device) for _ in WEIGHTS)
-        for buffer, name in zip(self.weights, WEIGHTS, strict=True):
+        self.weights = tuple(PinnedBuffer((width,), torch.float64, device) for _ in LOSS_WEIGHTS)
+        for buffer, name in zip(self.weights, LOSS_WEIGHTS, strict=True):
             buffer.array[:] = self.own[name]
             buffer.send()
         self._minibatch_updates: dict[int, MinibatchUpdate] = {}
@@ -76,7 +76,7 @@ class PPOLane(Lane[ActorCritics]):
         self.log_probabilities[:, t], self.kept_values[:, t] = self._log_p, self._valued.array[..., 0]
         self.rewards[:, t], self.begins[:, t] = worlds.reward, self.begin
         self.timeouts[:, t] = worlds.flags & kernels.TIMEOUT
-        self.begin[:] = worlds.flags & kernels.DONE
+        self.begin[:] = worlds.flags & kernels.ENDED
         self.steps += self.copies
         self.calls += 1
         self.collected = (t + 1) % self.states.shape[1]
@@ -106,21 +106,21 @@ class PPOLane(Lane[ActorCritics]):
                     return
 
     def add_values_of_cut_episodes(self) -> None:
-        """rewards += gamma V(s') where the time limit cut an episode off, a block of E steps of each run at a time."""
-        runs, places = np.nonzero(self.timeouts.reshape(self.width, -1))
+        """Add gamma V(s') to rewards of steps at which the time limit cut an episode off, E steps a run at once."""
+        runs, indices = np.nonzero(self.timeouts.reshape(self.width, -1))
         if not len(runs):
             return
-        rank = np.arange(len(runs)) - np.searchsorted(runs, runs)  # of each among those of its run
+        rank = np.arange(len(runs)) - np.searchsorted(runs, runs)  # of each in its run
         rewards, next_values = (
             part.reshape(self.width, -1, *part.shape[3:]) for part in (self.rewards, self.next_states)
         )
         for block in range(int(rank.max()) // self.copies + 1):
             now = rank // self.copies == block
-            i, place, column = runs[now], places[now], rank[now] % self.copies
+            i, index, column = runs[now], indices[now], rank[now] % self.copies
             states = self.worlds.seen.copy()
-            states[i, column] = next_values[i, place]
+            states[i, column] = next_values[i, index]
             value = self.own["gamma"][i] * self.values_of(states)[i, column].astype(np.float64)
-            rewards[i, place] = (rewards[i, place] + value).astype(np.float32)
+            rewards[i, index] = (rewards[i, index] + value).astype(np.float32)
 
     def values_of(self, states: np.ndarray) -> np.ndarray:
         """(W, E) float32 values of states (W, E, *depth)."""
@@ -142,7 +142,7 @@ class PPOLane(Lane[ActorCritics]):
         for buffer, part in zip(update.minibatch, minibatch, strict=True):
             buffer.array[:] = part
         if self.shared["normalize_advantage"] and size > 1:
-            kernels.normalize(update.minibatch[3].array)
+            kernels.normalize_advantages(update.minibatch[3].array)
         update.forward()
         if self.shared["target_kl"] is not None:
             wait(self.device)

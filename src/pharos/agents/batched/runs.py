@@ -19,7 +19,7 @@ WIDTH_OF_VECTORS, WIDTH_OF_IMAGES = 32, 8  # most runs of a lane
 NARROWEST = 4
 WIDTH_ELSEWHERE = 256  # on other devices than the processor
 
-# What Stable-Baselines3 takes where nothing is given. The first part may differ among the runs of a batch.
+# What Stable-Baselines3 takes if nothing is given. The first part may differ among the runs of a batch.
 OF_A_RUN: dict[str, dict[str, Any]] = {
     "dqn": {
         "learning_rate": 1e-4,
@@ -80,7 +80,7 @@ ONLY: dict[str, Any] = {
 }
 NATURE = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in sb3.py
 MOST_REMEMBERED = 1 << 14  # states whose target values are kept
-BLOCK = 4096  # states that are observed at once
+OBSERVED_AT_ONCE = 4096  # states that are observed at once
 
 
 class ObservationSource:
@@ -124,7 +124,7 @@ class ObservationSource:
         return ObservationSource(space, observe)
 
     def at(self, indices: np.ndarray) -> np.ndarray:
-        """(N, ...): the observations of states (N,); of histories (N, k), the oldest first, where k frames are seen."""
+        """(N, ...): the observations of states (N,); of histories (N, k), the oldest first, if k frames are seen."""
         states = self.space.states(indices.ravel())
         if self.frames == 1:
             return np.asarray(self.observe(states))
@@ -152,7 +152,7 @@ class BatchRun:
             are paid.
         chance: of it laziness, and noise and delay in what is paid; the rest is in `mdp`. Returns are of what is
             earned.
-        staying: (S, A) what an action without effect pays; needed where actions are lazy.
+        staying: (S, A) what an action without effect pays; needed if actions are lazy.
     """
 
     mdp: TabularMDP
@@ -201,7 +201,7 @@ def supports(agent: str, hyperparameters: Mapping[str, Any]) -> str | None:
 
 
 def resolved(agent: str, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
-    """All hyperparameters of an agent; ParameterError where the engine lacks one."""
+    """All hyperparameters of an agent; ParameterError if the engine lacks one."""
     lacking = supports(agent, hyperparameters)
     if lacking is not None:
         raise ParameterError(f"{lacking}; the engine sb3 has it")
@@ -216,9 +216,9 @@ def resolved(agent: str, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
 def group_key(agent: str, run: SizedRun, device: str = "cpu") -> Hashable:
     """Key of a run; runs with equal keys can share a batch.
 
-    On the processor they see observations of one shape. Elsewhere, where a wide lane costs hardly more than a narrow
-    one, vectors share a batch with others of about their length, and small images with those of as many channels and
-    about as many pixels (see `_scale`).
+    On the processor they see observations of one shape. On other devices a wide lane costs hardly more than a
+    narrow one: vectors share a batch with others of about their length, and small images with images of as many
+    channels and about as many pixels (see `_scale`).
     """
     options, size = resolved(agent, run.hyperparameters), run.shape
     shared = tuple((name, repr(options[name])) for name in OF_A_BATCH[agent])
@@ -256,7 +256,7 @@ def as_networks_see(shape: tuple[int, ...], is_image: bool) -> tuple[tuple[int, 
 def remembers_targets(run: SizedRun) -> bool:
     """Whether DQN queries its target network for every state once per copy: fewer queries than all minibatches make.
 
-    Never where several frames are seen: there are more histories than states.
+    Never if several frames are seen: there are more histories than states.
     """
     if run.shape.frames > 1:
         return False

@@ -242,10 +242,10 @@ def lava_gap(size: int, seed: int) -> GridLayout:
 def crossing(size: int, crossings: int, seed: int, obstacle: str) -> GridLayout:
     """Straight obstacles across the room, and one opening in each, along a path that crosses them in random order."""
     canvas = _walled(size, size, seed)
-    lines = [(side, place) for side in (RIGHT, DOWN) for place in range(2, size - 2, 2)]
+    lines = [(side, line) for side in (RIGHT, DOWN) for line in range(2, size - 2, 2)]
     canvas.rng.shuffle(lines)  # type: ignore[arg-type]
-    columns = sorted(place for side, place in lines[:crossings] if side == RIGHT)
-    rows = sorted(place for side, place in lines[:crossings] if side == DOWN)
+    columns = sorted(line for side, line in lines[:crossings] if side == RIGHT)
+    rows = sorted(line for side, line in lines[:crossings] if side == DOWN)
     canvas.cells[1:-1, rows] = obstacle
     canvas.cells[columns, 1:-1] = obstacle
     path = [RIGHT] * len(columns) + [DOWN] * len(rows)
@@ -361,7 +361,7 @@ def _chain(canvas: Canvas, size: int, rooms: int) -> list[Room]:
 
 
 def _exit(canvas: Canvas, room: Room) -> tuple[int, Place]:
-    """A side of a room other than that of its entry, and a cell there."""
+    """A side of a room other than the side with its entry, and a cell there."""
     sides = [side for side in range(4) if side != room.side]
     side = sides[canvas.integer(0, 3)]
     if side in (RIGHT, LEFT):
@@ -411,7 +411,7 @@ class Recipe(NamedTuple):
 
     Attributes:
         draw: function of the parameters below, by name, that returns the layout.
-        parameters: name -> what it may be; "seed" where something is drawn.
+        parameters: name -> what it may be; "seed" if something is drawn.
         max_steps: the time limit of minigrid, by size and number of rooms.
     """
 

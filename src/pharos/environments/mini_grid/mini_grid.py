@@ -45,7 +45,7 @@ class Level:
 
 
 def level_of(layout: GridLayout) -> Level:
-    """The numbers of a layout; ParameterError where its text is none, or the player can walk out of the grid."""
+    """The numbers of a layout; ParameterError if its text is none, or if the player can walk out of the grid."""
     rows = [re.findall("..", row) for row in layout.rows]
     cells = np.full((len(rows), len(rows[0])), FREE, np.int64)
     starts: list[tuple[int, int, int]] = []
@@ -86,7 +86,7 @@ def level_of(layout: GridLayout) -> Level:
     )
 
 
-def rows_of(text: object) -> tuple[str, ...]:
+def layout_rows(text: object) -> tuple[str, ...]:
     """The rows of a level as text, in capitals except the player; ParameterError if their lengths differ."""
     rows = tuple(text.upper().replace("VV", "vv").replace("/", " ").split()) if isinstance(text, str) else ()
     if not rows or len(set(map(len, rows))) > 1 or len(rows[0]) % 2 or len(rows[0]) < 6 or len(rows) < 3:
@@ -113,7 +113,7 @@ def _target(target: str | None, doors: list[str], things: list[str]) -> tuple[in
 
 
 def _check_walls(cells: np.ndarray, start: tuple[int, int]) -> None:
-    """ParameterError where the player can come to the border of the grid, through doors of any condition."""
+    """ParameterError if the player can come to the border of the grid, through doors of any condition."""
     region, frontier = {start}, [start]
     while frontier:
         row, column = frontier.pop()
@@ -172,16 +172,16 @@ class MiniGrid(Environment):
              `importers.minigrid` and BRIDGE.
     Ends     with that reward, or in lava.
     Limit    the max_steps of minigrid.
-    Ours     Layouts are those of minigrid 3.2.0 for the same seed, drawn without it. Other sizes, and levels of one's
-             own, are possible.
+    Ours     The layouts equal minigrid 3.2.0 for the same seed, and are drawn without it. Other sizes and other levels
+             are possible.
     Source   Chevalier-Boisvert et al. (2023).
 
     Attributes:
         kind: of the layout: empty, empty_random (start anywhere), four_rooms, door_key, unlock, unlock_pickup,
             key_corridor, lava_gap, lava_crossing, simple_crossing, multi_room, dist_shift. None stands for empty.
         size: cells on a side, walls included: of the grid, of a room (unlock, unlock_pickup, key_corridor), or of the
-            largest room (multi_room, on 25 x 25 cells). The grid of dist_shift is size - 2 high. None: that of
-            minigrid.
+            largest room (multi_room, on 25 x 25 cells). The grid of dist_shift is size - 2 high. None: the
+            size in minigrid.
         seed: of the layout, as given to minigrid's `reset`; None stands for 0.
         rows: of rooms, in key_corridor; None stands for 3.
         rooms: how many, in multi_room; None stands for 6.
@@ -229,7 +229,7 @@ class MiniGrid(Environment):
             others = [name for name, value in {"kind": self.kind, **options}.items() if value is not None]
             if others:
                 raise ParameterError(f"MiniGrid: level was given with {', '.join(others)}; expected a level alone")
-            store(self, "level", "/".join(rows_of(self.level)))
+            store(self, "level", "/".join(layout_rows(self.level)))
             store(self, "target", None if self.target is None else str(self.target).upper())
         else:
             if self.target is not None:
@@ -240,7 +240,7 @@ class MiniGrid(Environment):
         _ = self.parsed
 
     def _completed(self, name: str, value: int | None) -> int | None:
-        """The default of the kind in place of None; ParameterError where the kind takes other values, or none."""
+        """The default of the kind in place of None; ParameterError if the kind takes other values, or none."""
         declared = KINDS[str(self.kind)].parameters
         if name not in declared:
             if value is None:
@@ -265,7 +265,7 @@ class MiniGrid(Environment):
     def layout(self) -> GridLayout:
         """The grid as text, as `level` takes it, and the target."""
         if self.level is not None:
-            return GridLayout(rows_of(self.level), self.target)
+            return GridLayout(layout_rows(self.level), self.target)
         recipe = KINDS[str(self.kind)]
         return recipe.draw(**{name: getattr(self, name) for name in recipe.parameters})
 

@@ -19,10 +19,10 @@ from pharos.errors import ParameterError
 class MiniGridRooms(RoomGrid):
     """Turn and walk through `n_rooms` rooms of `room_size` x `room_size` cells to a goal in a corner room.
 
-    Neighbouring rooms share a wall with one opening in its middle. State, reward, limit and chance are those of
+    Neighbouring rooms share a wall with one opening in its middle. State, reward, limit and chance are as in
     `mini_grid_empty`.
 
-    Actions  those of `mini_grid_empty`: forward, turn right, turn left.
+    Actions  as in `mini_grid_empty`: forward, turn right, turn left.
     Start    one of `n_starting_states` states of a corner room, all equally likely.
     Source   Conserva and Rauber (2022), "Hardness in Markov decision processes: theory and practice".
 

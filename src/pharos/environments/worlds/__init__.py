@@ -1,6 +1,6 @@
 """The built-in worlds: a file for each class, with its rules, its look and its named instances.
 
-Here stand hyperparameters that suit several classes; those of a single class stand in its file.
+Hyperparameters that suit several classes are here. Hyperparameters of a single class are in its file.
 """
 
 from typing import Any

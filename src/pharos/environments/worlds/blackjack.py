@@ -22,11 +22,11 @@ class Blackjack(Environment):
     """Draw cards to come nearer to 21 than the dealer, who shows one of his two cards, but not beyond it.
 
     State    total of the player; card that the dealer shows (1: ace); whether an ace counts 11 in the total; whether
-             the first two cards are an ace and a ten (only where that matters); result of the hand.
+             the first two cards are an ace and a ten (only if that matters); result of the hand.
     Actions  stick, hit, numbered as in Gymnasium.
     Chance   cards come from an infinite deck: 2 to 9 and the ace 1/13 each, tens and faces 4/13. Outcome k of a hit is
              the card k + 1. Outcomes of sticking are results; their probabilities follow from the dealer's rule: he
-             draws up to 16 and sticks from 17 on, an ace counting 11 where it can.
+             draws up to 16 and sticks from 17 on, an ace counting 11 if it can.
     Reward   1 for a hand that is won, -1 for one that is lost, 0 for a draw.
     Ends     with a bust, or when the player sticks.
     Limit    100 steps, which no hand needs.

@@ -15,7 +15,7 @@ WIDE_PADDLE = ("." * 16,) * 2 + ("#" * 16,) * 5 + ("." * 16,) * 5
 WIDE_TRAIL = ("." * 16,) * 4 + ("." * 6 + "#" * 4 + "." * 6,) * 4 + ("." * 16,) * 4
 WIDE_BALL = ("." * 16,) * 3 + ("." * 6 + "#" * 4 + "." * 6,) * 6 + ("." * 16,) * 3
 
-# (height, columns, paddle width): those of the paper's table, then those that its appendix B draws
+# (height, columns, paddle width): first the paper's table, then the drawings of its appendix B
 PAPER = tuple(
     (height, columns, width) for width in (1, 3) for height, columns in ((12, 10), (12, 8), (16, 8), (20, 8), (24, 8))
 )
@@ -191,7 +191,7 @@ class Breakout(Environment):
         planes[2, state[BALL_ROW], state[BALL_COLUMN]] = 1
 
     def draw_motion(self, state, planes):
-        # the cell from which the ball goes as it does, or, where that lies in a wall, the one beside it
+        # the cell from which the ball goes as it does; if that lies in a wall, the one beside it
         row = min(max(state[BALL_ROW] - 2 * state[BALL_DOWN] + 1, 0), self.height - 1)
         column = min(max(state[BALL_COLUMN] - 2 * state[BALL_RIGHT] + 1, 0), self.columns - 1)
         planes[0, row, column] = 1

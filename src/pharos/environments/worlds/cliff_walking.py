@@ -17,7 +17,7 @@ class CliffWalking(Environment):
 
     State    (row, column), counted from the top-left corner.
     Actions  up, right, down, left, numbered as in Gymnasium; walking into a wall changes nothing.
-    Chance   where it is slippery, an action is executed as itself or as one of the two perpendicular ones, 1/3 each.
+    Chance   if it is slippery, an action is executed as itself or as one of the two perpendicular ones, 1/3 each.
     Reward   -1 a step; a fall over the cliff pays -100 and leads back to the start.
     Ends     on reaching the goal.
     Limit    none in Gymnasium; here 25 steps for each cell of the longer side.

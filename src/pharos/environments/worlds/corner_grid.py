@@ -35,7 +35,7 @@ class CornerGrid(Environment):
         pays: which corners, said of "not left" and "not at the bottom": and (the upper right), nand (the other three),
             or (all but the lower left), xor (the upper left and the lower right).
         n_starting_states: at most (size - 1)^2.
-        seed: of the starts, where several cells are equally near, as Colosseum draws them.
+        seed: of the starts, if several cells are equally near, as Colosseum draws them.
         p_lazy, p_rand: from 0 to 0.9999.
     """
 
@@ -84,7 +84,7 @@ class CornerGrid(Environment):
 
     @cached_property
     def corners(self) -> np.ndarray:
-        """(size, size) int64: 1 where staying pays, 2 in the other corners, 0 elsewhere."""
+        """(size, size) int64: 1 in cells that pay for staying, 2 in the other corners, 0 elsewhere."""
         table = np.zeros((self.size, self.size), np.int64)
         for right in (False, True):
             for up in (False, True):

@@ -24,8 +24,8 @@ class DeepSea(Environment):
     Ends     after the last row.
     Limit    `size` steps: a dive.
     Ours     bsuite's stochastic sea adds noise with mean 0 to the rewards in both corners of the last row; rewards here
-             are the means. Its optimal return, (1 - 1/size)^(size - 1) - move_cost, is that of going right every time,
-             also when the treasure is lost; the optimum saves the cost from then on and has move_cost (1 - 1/size)^size
+             are the means. bsuite's optimal return, (1 - 1/size)^(size - 1) - move_cost, is for going right every time,
+             even if the treasure is lost. The optimum saves the cost from then on and has move_cost (1 - 1/size)^size
              more.
     Source   bsuite deep_sea; Osband, Van Roy, Russo and Wen (2019), "Deep Exploration via Randomized Value Functions".
              Colosseum's DeepSea is `endless_sea`.
@@ -65,7 +65,7 @@ class DeepSea(Environment):
 
     @property
     def outcomes(self) -> int:  # type: ignore[override]
-        """Outcomes: the chosen action; the other one; and each of them where going right fails."""
+        """Outcomes: the chosen action; the other one; and each of them with a failure of going right."""
         return (2 if self.p_rand > 0 else 1) * (2 if self.stochastic else 1)
 
     @property

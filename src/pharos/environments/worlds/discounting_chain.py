@@ -20,7 +20,7 @@ class DiscountingChain(Environment):
     Reward   1 at the step of the delay of the chain, 1 + bonus on the chain `mapping_seed` modulo their number.
     Ends     after the longest delay.
     Limit    the same.
-    Source   bsuite discounting_chain, where the bonus is 0.1 and an episode has 100 steps.
+    Source   bsuite discounting_chain, with a bonus of 0.1 and episodes of 100 steps.
 
     Attributes:
         delays: of the chains, in steps, each another one.

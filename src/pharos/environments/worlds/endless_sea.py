@@ -1,4 +1,4 @@
-"""Colosseum's DeepSea: deep sea where a dive follows another one, and every choice of left pays a little."""
+"""Colosseum's DeepSea: deep sea in which a dive follows another one, and every choice of left pays a little."""
 
 from dataclasses import dataclass
 

@@ -24,7 +24,7 @@ CHICKEN = (  # in pictures for people
     "..#.#...",
     ".##.##..",
 )
-WIDE_CAR = (  # in complex images, whose pixels are wide as those of the Atari 2600
+WIDE_CAR = (  # in complex images, with wide pixels as on the Atari 2600
     "....................",
     "...9999.....9999....",
     "...9999.....9999....",
@@ -88,7 +88,7 @@ class Freeway(Environment):
     Source   the pharos paper, section 3.3 and appendix B.
 
     All cars together are a clock with lane_length * lcm(periods) phases, which the player cannot influence; the states
-    are at most that number times num_cars + 2 rows (times player_speed where it does not divide the clock).
+    are at most that number times num_cars + 2 rows (times player_speed if it does not divide the clock).
 
     Attributes:
         num_cars: lanes, one car each; at least 1.

@@ -13,7 +13,7 @@ LEFT, DOWN, RIGHT, UP = range(4)
 ICE, START, HOLE, GOAL = range(4)
 LETTERS = "FSHG"
 
-MAPS = {  # those of Gymnasium's FrozenLake-v1
+MAPS = {  # as in Gymnasium's FrozenLake-v1
     4: "SFFF/FHFH/FFFH/HFFG",
     8: "SFFFFFFF/FFFFFFFF/FFFHFFFF/FFFFFHFF/FFFHFFFF/FHHFFFHF/FHFFHFHF/FFFHFFFG",
 }
@@ -37,7 +37,7 @@ class FrozenLake(Environment):
     Source   Gymnasium FrozenLake-v1 (Brockman et al., 2016); the pharos paper, section 3.3.
 
     Attributes:
-        size: 4 or 8 for Gymnasium's maps, or the side of a random map; None stands for 4, or for that of `map`.
+        size: 4 or 8 for Gymnasium's maps, or the side of a random map; None stands for 4, or for the size of `map`.
         map: own map, rows of S (start), F (ice), H (hole) and G (goal) separated by "/", spaces or line ends; one S, at
             least one G, and a way from S to a G.
         seed: draws a random map of `size` x `size` that has a way to the goal, start top left, goal bottom right.

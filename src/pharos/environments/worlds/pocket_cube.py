@@ -52,7 +52,7 @@ SCRAMBLE = Kind("turns such as U R2 F'", _scramble)
 class PocketCube(Environment):
     """Turn the faces of a cube of 2 x 2 x 2 corners until each face has one colour.
 
-    Rules    The corner down back left stays where it is, so the faces up, right and front are those that turn; turning
+    Rules    The corner down back left stays where it is, so the faces up, right and front turn. Turning
              one of the others is the same as turning the face opposite to it, and the whole cube.
     State    which corner is in each of the seven other places (up right front, up front left, up left back, up back
              right, down front right, down left front, down right back), and how each is twisted: clockwise thirds.

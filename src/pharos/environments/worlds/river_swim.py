@@ -6,7 +6,7 @@ from pharos.environments.base import Environment, Layer, Look, integers, paramet
 from pharos.errors import ParameterError
 
 LEFT, RIGHT = range(2)
-BACK, STAY, FORWARD = range(3)  # outcomes, where there is chance
+BACK, STAY, FORWARD = range(3)  # outcomes, if there is chance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,8 +19,8 @@ class RiverSwim(Environment):
     Chance   right goes one place forward with probability `forward`, back with `backward`, and stays otherwise. At the
              left end it goes forward with `forward_at_ends` and else stays; at the right end it stays with that and
              else goes back. Besides, with `p_lazy` nothing happens; else with `p_rand` an action is drawn evenly.
-    Reward   left_reward for left at the left end, right_reward for right at the right end; where the swimmer stays
-             there, or with `pays_for_action` also where he is swept away.
+    Reward   left_reward for left at the left end, right_reward for right at the right end; if the swimmer stays
+             there, or with `pays_for_action` also if he is swept away.
     Ends     never.
     Limit    Colosseum's shortest horizon without a current, `length` steps; 20 times that against one.
     Source   Strehl and Littman (2008), "An analysis of model-based interval estimation for Markov decision processes".
@@ -85,7 +85,7 @@ class RiverSwim(Environment):
 
     @property
     def outcomes(self) -> int:  # type: ignore[override]
-        """Back, stay, forward; 1 where nothing is left to chance."""
+        """Back, stay, forward; 1 if nothing is left to chance."""
         still = self.forward == 1 and self.at_ends == 1
         return 1 if still and self.p_lazy == 0 and self.p_rand == 0 else 3
 

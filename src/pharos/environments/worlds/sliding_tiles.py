@@ -29,8 +29,8 @@ class SlidingTiles(Environment):
     Rules    One cell is empty. An action moves this blank by one cell; the tile that lay there slides into its place.
              Against the edge of the tray nothing moves.
     State    the tile in each cell, row by row; 0 is the blank.
-    Start    the tiles from the last to the first, then the blank; where this cannot be solved, with the tiles 1 and 2
-             exchanged. Or a position of one's own (`start`), or one drawn by `seed`.
+    Start    the tiles from the last to the first, then the blank; if this cannot be solved, with the tiles 1 and 2
+             exchanged. Or another position (`start`), or one drawn by `seed`.
     Actions  up, right, down, left: the way of the blank.
     Reward   -1 a step, so that the undiscounted optimal return is minus the least number of moves.
     Ends     when the tiles lie in order, the blank in the last cell.

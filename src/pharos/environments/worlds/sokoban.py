@@ -47,7 +47,7 @@ class Sokoban(Environment):
     Attributes:
         level: rows of # (wall), - or a space (floor), @ (player), $ (box), . (target), + (player on a target) and *
             (box on a target), separated by "/" or line ends; or a file of levels, such as Boxoban's, and the number of
-            one: "000.txt:17". None stands for the level "corner", or for that of `seed`.
+            one: "000.txt:17". None stands for the level "corner", or for the level of `seed`.
         seed: draws a level of `height` x `width` cells, walls around it included, that can be solved.
         height, width: of a random level; at least 4.
         boxes: of a random level; at least 1.
@@ -238,7 +238,7 @@ def level_text(source: str) -> str:
 
 
 def _levels_of(file: Path) -> dict[int, list[str]]:
-    """The rows of each level of a file by its number; ValueError where it is not clear which is which."""
+    """The rows of each level of a file by its number; ValueError if it is not clear which is which."""
     from pharos.system.storage import check_regular  # which levels in text do without
 
     try:
@@ -293,7 +293,7 @@ def within_reach(text: str) -> tuple[list[Cell], dict[Cell, str]]:
 
 
 def random_level(height: int, width: int, boxes: int, seed: int) -> str:
-    """A level that can be solved: boxes on targets, pulled away from them at random. ValueError where there is none.
+    """A level that can be solved: boxes on targets, pulled away from them at random. ValueError if there is none.
 
     Source: ours, after the reverse play of Racaniere et al. (2017), appendix.
     """

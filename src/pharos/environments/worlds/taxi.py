@@ -34,10 +34,10 @@ class Taxi(Environment):
              probability.
     Actions  down, up, right, left, pick up, set down, numbered as in Gymnasium; walls stop the taxi.
     Chance   rainy: a move that no wall stops goes its way with `rainy_probability`, else to its left or right, with the
-             same probability, where walls do not stop that.
+             same probability, if walls do not stop that.
              fickle: the first time that the taxi changes its cell with the passenger in it, he takes another
              destination with `fickle_probability`, each with the same probability.
-    Reward   -1 a step, -10 for picking up or setting down where that is impossible, 20 for setting him down at his
+    Reward   -1 a step, -10 for picking up or setting down if that is impossible, 20 for setting him down at his
              destination. He can be set down at landmarks only.
     Ends     when he is set down at his destination.
     Limit    200 steps on 5 x 5 cells, as in Gymnasium; 8 for each cell.
@@ -155,7 +155,7 @@ class Taxi(Environment):
 
     @cached_property
     def wall_right(self) -> np.ndarray:
-        """(size, size) int64: 1 where something stops the taxi on its way to the right."""
+        """(size, size) int64: 1 if something stops the taxi on its way to the right."""
         walls = np.zeros((self.size, self.size), np.int64)
         walls[:, -1] = 1
         for cell in self.walls:

@@ -15,7 +15,7 @@ class UmbrellaChain(Environment):
     State    steps taken; whether an umbrella is needed; whether there is one.
     Start    needed or not, there or not, all equally likely.
     Actions  leave, take; only the first one matters.
-    Reward   at the last step 1 where an umbrella is there exactly if it is needed, else -1; before that 0.
+    Reward   at the last step 1 if an umbrella is there exactly when it is needed, else -1; before that 0.
     Ends     after `chain_length` steps.
     Limit    the same.
     Ours     bsuite pays 1 or -1 by the toss of a coin at each step but the last, which has mean 0; rewards here are the

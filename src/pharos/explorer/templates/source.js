@@ -68,7 +68,7 @@ function ofData(data) {
     const axis = (name) => about.axes.find((each) => each.name === name);
     const names = about.variables.map((each) => each.name);
     const fixed = Object.entries(words).filter(([name]) => name.startsWith("fix.")).map(([name, value]) => [names.indexOf(name.slice(4)), Number(value)]);
-    const at = (each, values) => {  // as Axis.places
+    const at = (each, values) => {  // as Axis.indices
       const part = Math.floor((values[each.variable] - each.origin) / each.divisor);
       return Math.floor((each.modulus ? part % each.modulus : part) / each.width);
     };

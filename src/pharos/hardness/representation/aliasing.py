@@ -24,7 +24,7 @@ class Aliasing:
 
     @property
     def share(self) -> float:
-        """The part of the states that share their observation; 0 where the observation tells the state."""
+        """The part of the states that share their observation; 0 if the observation tells the state."""
         return self.num_sharing / self.num_states
 
 

@@ -17,8 +17,8 @@ NETWORKS = 20  # random ones, if there is no closed form
 
 def kernel_of_module(network: object, shape: tuple[int, ...]) -> tuple[Callable[..., np.ndarray], dict[str, Any]]:
     """Return (kernel of inputs x, y; its description) of a function of a shape that makes networks, or of its name."""
-    source = sources.find(network) if isinstance(network, str) else sources.source_of(network)
-    function = sources.load(source) if isinstance(network, str) and source is not None else network
+    source = sources.find_source(network) if isinstance(network, str) else sources.source_of(network)
+    function = sources.load_source(source) if isinstance(network, str) and source is not None else network
     name = source.name if source is not None else str(getattr(network, "__name__", network))
     if function is None:
         raise ParameterError(f"network {name!r}: there is no such name in the file")
@@ -51,7 +51,7 @@ def empirical_ntk(
         networks: how many; the standard error falls with the square root.
         seed: of PyTorch's random numbers, which are left as they were.
     Returns:
-        (N, M) float32; symmetric where `others` is None.
+        (N, M) float32; symmetric if `others` is None.
     Raises:
         MissingExtra: PyTorch is not installed. ParameterError: no network, or none was asked for; its outputs are not
             (N, A), or its gradients are not finite.

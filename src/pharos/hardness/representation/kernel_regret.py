@@ -23,7 +23,7 @@ import numpy as np
 
 from pharos.errors import UndefinedMeasure
 from pharos.hardness.representation.learning import (
-    MARGIN,
+    STEP_MARGIN,
     WORST_GREEDY,
     WORST_PLAYED,
     Grouped,
@@ -42,7 +42,7 @@ from pharos.hardness.visitation import StandardOccupancy, standard_occupancy
 from pharos.mdp import TabularMDP, require_mdp
 from pharos.solvers import Solution
 
-RAREST = 1e-9  # of the largest weight: observations are taken to be at least as frequent where gradients are rescaled
+RAREST = 1e-9  # of the largest weight: observations are taken to be at least as frequent if gradients are rescaled
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class KernelRegret:
         observations: different ones that it learns from; states: that can be met and are not terminal.
         landmarks: of the approximation; None: the kernel is exact.
         estimated_error, estimated_error_played: half of the landmarks change the regret of the greedy policies, and
-            what is played, by that much: estimates, not bounds; 0 where exact.
+            what is played, by that much: estimates, not bounds; 0 if exact.
         conventions: schedule, episode, observation and network.
         name: of the measure.
     """
@@ -76,7 +76,7 @@ class KernelRegret:
 
     @property
     def note(self) -> str:
-        """Landmarks and the error that they are estimated to cause; empty where the kernel is exact."""
+        """Landmarks and the error that they are estimated to cause; empty if the kernel is exact."""
         if self.landmarks is None:
             return ""
         return (
@@ -133,8 +133,8 @@ def kernel_regret(
 
     Args:
         representation: the kernel; see `pharos.observations.representation`.
-        schedule: None: that of `Schedule`.
-        solution: the optimal values of `mdp`, where they are known.
+        schedule: None: the default of `Schedule`.
+        solution: the optimal values of `mdp`, if they are known.
         horizon: steps of an episode that the learner sees; None: the MDP's, else the time limit.
         progress: called with a line now and then; an exception of its own ends the computation.
     Returns:
@@ -154,7 +154,7 @@ def kernel_regret(
 
 
 def regret_in_kernel(learner: IdealisedLearner, settings: Mapping[str, Any]) -> KernelRegret:
-    """The regret of a learner with a kernel, by landmarks where there are too many observations, and with a table.
+    """The regret of a learner with a kernel, by landmarks if there are too many observations, and with a table.
 
     Args:
         settings: of the learner, the first of the conventions.
@@ -213,14 +213,14 @@ def kernel_policy_regret(
     pi is above 1 + clip_range is no longer pushed up, one below 1 - clip_range no longer down. eta is 1 / (1.05 times
     the largest eigenvalue of K diag(d)), d of states: no learning rate, and what K learns slowly stays slow.
     The value is the mean over rollouts of (V* - V of the most probable actions) / (V* - V of uniform play); as played,
-    that of pi, weighted by episodes; as evaluated, that of pi with all rollouts alike, which is what evaluations of the
-    distribution over actions see.
+    the same of pi, weighted by episodes; as evaluated, the same of pi with all rollouts alike, which is what
+    evaluations of the distribution over actions see.
 
     Args:
         representation: the kernel; of an actor-critic `initialisation="sb3"`.
-        schedule: for its steps, discount and optimizer; None: that of `Schedule`.
-        rollouts: None: those of `Rollouts`.
-        solution: the optimal values of `mdp`, where they are known.
+        schedule: for its steps, discount and optimizer; None: the default of `Schedule`.
+        rollouts: None: the defaults of `Rollouts`.
+        solution: the optimal values of `mdp`, if they are known.
         horizon: steps of an episode that the learner sees; None: the MDP's, else the time limit.
         progress: called with a line now and then; an exception of its own ends the computation.
     Returns:
@@ -254,7 +254,7 @@ class PolicyLearner(IdealisedLearner):
         returns = np.zeros((len(self.states), self.mdp.num_actions))
         rows, steps = [], self.rollouts.gradient_steps
         for step in range(0, self.schedule.steps, self.rollouts.steps):
-            self.tell(f"step {step:,} of {self.schedule.steps:,}")
+            self.report(f"step {step:,} of {self.schedule.steps:,}")
             behaviour = softmax(observations.masked(logits))
             policy, memory = behaviour[observations.groups], Memory(self.mdp, self.states)
             played, length = memory.play(self.visits(policy), policy, 1)
@@ -273,7 +273,7 @@ class PolicyLearner(IdealisedLearner):
             gain = visits * standardised(returns - v[:, None], visits)
             if largest > 0:
                 pull, up = observations.sums(gain), observations.sums(np.maximum(gain, 0.0))
-                rate = 1 / (MARGIN * largest)
+                rate = 1 / (STEP_MARGIN * largest)
                 logits = ascended(observations.masked(logits), pull, up, apply, rate, self.rollouts)
         return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))
 
@@ -297,7 +297,7 @@ def ascended(
 
     Args:
         pull: (C, A) weighted advantages, summed over the states of an observation; up: the positive ones alone.
-        rollouts: how many steps; where p / pi is `clip_range` above 1 the positive ones count no more, where it is as
+        rollouts: how many steps; if p / pi is `clip_range` above 1 the positive ones count no more, if it is as
             far below the negative ones. Logits of actions that are not available are -inf.
     """
     behaviour = np.maximum(softmax(logits), 1e-30)
@@ -309,7 +309,7 @@ def ascended(
         of_action = counted * policy / behaviour
         logits = logits + rate * apply(of_action - policy * of_action.sum(axis=1, keepdims=True))
         shifted = logits - logits.max(axis=1, keepdims=True)
-        logits = np.where(shifted > -np.inf, np.maximum(shifted, -SPAN), -np.inf)  # those of no action stay so
+        logits = np.where(shifted > -np.inf, np.maximum(shifted, -SPAN), -np.inf)  # logits of no action stay so
     return logits
 
 
@@ -320,7 +320,7 @@ def softmax(logits: np.ndarray) -> np.ndarray:
 
 
 def standardised(advantages: np.ndarray, visits: np.ndarray) -> np.ndarray:
-    """(N, A) of mean 0 and variance 1 under visits of sum 1; 0 where they are all the same."""
+    """(N, A) of mean 0 and variance 1 under visits of sum 1; 0 if they are all the same."""
     centred = advantages - (visits * advantages).sum()
     spread = float(np.sqrt((visits * centred**2).sum()))
     return centred / spread if spread > 1e-12 else np.zeros_like(centred)
@@ -330,10 +330,10 @@ def standardised(advantages: np.ndarray, visits: np.ndarray) -> np.ndarray:
 
 
 MOST_EIGENVALUES = 2000  # observations whose kernel is decomposed; of more, as many are drawn
-LEFT = 0.1  # the share of energy, or of variance, that may be left
-LONGEST = 1e14  # gradient-flow time that is looked at
+ENERGY_LEFT = 0.1  # the share of energy, or of variance, that may be left
+MOST_LEARNING_TIME = 1e14  # gradient-flow time that is looked at
 RIDGE = 1e-6  # of the trace, in regressions
-FLOOR = 1e-9  # of the largest eigenvalue: what float32 kernels tell of an eigenvalue
+LEAST_EIGENVALUE = 1e-9  # of the largest eigenvalue: what float32 kernels tell of an eigenvalue
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,10 +341,10 @@ class Spectral:
     """A number that follows from a kernel's spectrum.
 
     Attributes:
-        value: the number, at least 1; infinite where it is beyond what was looked at.
+        value: the number, at least 1; infinite if it is beyond what was looked at.
         observations: different ones that were decomposed; of how many: `of`.
         estimated_error: with half of the observations drawn the natural logarithm differs by that much: an estimate of
-            the error, not a bound; 0 where all were decomposed.
+            the error, not a bound; 0 if all were decomposed.
         conventions: what it refers to.
     """
 
@@ -357,7 +357,7 @@ class Spectral:
 
     @property
     def note(self) -> str:
-        """Sampled observations and the error that they are estimated to cause; empty where all were decomposed."""
+        """Sampled observations and the error that they are estimated to cause; empty if all were decomposed."""
         if self.observations == self.of:
             return ""
         return (
@@ -391,13 +391,13 @@ def kernel_learning_time(
     optimal play; v_i: the energy of A* = Q* - V* (all actions) on its eigenvectors.
 
     Args:
-        schedule: for its discount, that of Q*; None: that of `Schedule`.
+        schedule: for its discount, which Q* has; None: the default of `Schedule`.
         horizon: steps of an episode, for visits; None: the MDP's, else the time limit.
         progress: called with a line now and then; an exception of its own ends the computation.
     Raises:
         UndefinedMeasure: there are no episodes, or every action is optimal everywhere.
         ParameterError: the representation is of other states.
-    Cost: C^3 for C different observations, at most 2,000, drawn by visits where there are more.
+    Cost: C^3 for C different observations, at most 2,000, drawn by visits if there are more.
     Source: pharos; Jacot et al. (2018), section 5, for gradient flow in a kernel.
     """
 
@@ -405,7 +405,7 @@ def kernel_learning_time(
         best = q.max(axis=1, keepdims=True, where=np.isfinite(q), initial=-np.inf)
         advantage = np.where(np.isfinite(q), q - best, 0.0)
         eigenvalues, energy = _spectrum(kernel, advantage, weights)
-        return _time(eigenvalues / eigenvalues.sum(), energy)
+        return _learning_time(eigenvalues / eigenvalues.sum(), energy)
 
     return _spectral("kernel_learning_time", mdp, representation, schedule, horizon, time, progress or str)
 
@@ -450,7 +450,7 @@ def aliasing_floor(
 ) -> float:
     """Return the share of the variance of Q* that no function of the observation explains: E Var(Q* | o) / Var Q*.
 
-    Visits and arguments as for `kernel_learning_time`; summed over actions. 0 where the observation tells the state.
+    Visits and arguments as for `kernel_learning_time`; summed over actions. 0 if the observation tells the state.
 
     Raises:
         UndefinedMeasure: there are no episodes, or Q* is the same everywhere.
@@ -477,10 +477,10 @@ def _setting(
     schedule: Schedule | None,
     horizon: int | None,
     name: str,
-    tell: Callable[[str], object],
+    report: Callable[[str], object],
 ) -> StandardOccupancy:
     episode = representation.episode(mdp, horizon, name)
-    return standard_occupancy(mdp, (schedule or Schedule()).gamma, episode, tell)
+    return standard_occupancy(mdp, (schedule or Schedule()).gamma, episode, report)
 
 
 def _centred(q: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -501,38 +501,38 @@ def _spectral(
     schedule: Schedule | None,
     horizon: int | None,
     function: Callable[[np.ndarray, np.ndarray, np.ndarray], float],
-    tell: Callable[[str], object],
+    report: Callable[[str], object],
 ) -> Spectral:
     """Spectral result of a function of (kernel (C, C), weights (C,), mean values (C, A)) of the observations; values of
     actions that are not available are -inf."""
-    setting = _setting(mdp, representation, schedule, horizon, name, tell)
+    setting = _setting(mdp, representation, schedule, horizon, name, report)
     states = np.flatnonzero(setting.states > 0)
     observations = Grouped(representation.classes, states, mdp.available)
     weights = observations.sums(setting.states[states])
     q = observations.sums(setting.states[states, None] * setting.q[states]) / weights[:, None]
 
     def of(count: int) -> float:
-        tell(f"the spectrum of {min(count, len(observations)):,} observations")
-        places, share = _drawn(weights, count)
-        rows = observations.representatives[places]
-        return function(representation.kernel(rows, rows).astype(np.float64), share, q[places])
+        report(f"the spectrum of {min(count, len(observations)):,} observations")
+        indices, share = _sampled_indices(weights, count)
+        rows = observations.representatives[indices]
+        return function(representation.kernel(rows, rows).astype(np.float64), share, q[indices])
 
     value = of(MOST_EIGENVALUES)
     count = min(MOST_EIGENVALUES, len(observations))
     error = 0.0 if count == len(observations) else abs(float(np.log(value / of(count // 2))))
-    conventions = {"left": LEFT, "gamma": (schedule or Schedule()).gamma, **representation.conventions}
+    conventions = {"left": ENERGY_LEFT, "gamma": (schedule or Schedule()).gamma, **representation.conventions}
     return Spectral(name, value, count, len(observations), error, conventions)
 
 
-def _drawn(weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(places, their weights): all where there are at most `count`, else drawn evenly along the sum of weights."""
+def _sampled_indices(weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(indices, their weights): all if there are at most `count`, else drawn evenly along the sum of weights."""
     if len(weights) <= count:
         return np.arange(len(weights)), weights / weights.sum()
     order = np.random.default_rng(0).permutation(len(weights))
     edges = np.cumsum(weights[order]) / weights.sum()
     hits = np.minimum(np.searchsorted(edges, (np.arange(count) + 0.5) / count), len(weights) - 1)
-    places, counts = np.unique(order[hits], return_counts=True)
-    return places, counts / count
+    indices, counts = np.unique(order[hits], return_counts=True)
+    return indices, counts / count
 
 
 def _spectrum(kernel: np.ndarray, values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -540,10 +540,10 @@ def _spectrum(kernel: np.ndarray, values: np.ndarray, weights: np.ndarray) -> tu
     root = np.sqrt(weights)
     eigenvalues, vectors = np.linalg.eigh(root[:, None] * kernel * root)
     energy = ((vectors.T @ (root[:, None] * values)) ** 2).sum(axis=1)
-    return np.maximum(eigenvalues, FLOOR * eigenvalues[-1]), energy
+    return np.maximum(eigenvalues, LEAST_EIGENVALUE * eigenvalues[-1]), energy
 
 
-def _time(eigenvalues: np.ndarray, energy: np.ndarray) -> float:
+def _learning_time(eigenvalues: np.ndarray, energy: np.ndarray) -> float:
     total = energy.sum()
     if total <= 1e-24:
         raise UndefinedMeasure("kernel_learning_time: every action is optimal everywhere")
@@ -552,13 +552,13 @@ def _time(eigenvalues: np.ndarray, energy: np.ndarray) -> float:
     def left(time: float) -> float:
         return float(np.exp(-2 * eigenvalues * time) @ energy) / total
 
-    while left(high) > LEFT:
+    while left(high) > ENERGY_LEFT:
         low, high = high, 2 * high
-        if high > LONGEST:
+        if high > MOST_LEARNING_TIME:
             return float("inf")
     while high - low > 1e-9 * high:
         middle = (low + high) / 2
-        low, high = (middle, high) if left(middle) > LEFT else (low, middle)
+        low, high = (middle, high) if left(middle) > ENERGY_LEFT else (low, middle)
     return high
 
 
@@ -575,11 +575,11 @@ def _samples(eigenvalues: np.ndarray, energy: np.ndarray) -> float:
         return samples, samples / (samples - (learnt**2).sum()) * float((1 - learnt) ** 2 @ energy) / total
 
     grid = np.linspace(np.log(10.0), np.log(1e-14), 400)  # the error may rise again before it falls for good
-    first = next((i for i, log_kappa in enumerate(grid) if at(log_kappa)[1] <= LEFT), None)
+    first = next((i for i, log_kappa in enumerate(grid) if at(log_kappa)[1] <= ENERGY_LEFT), None)
     if first is None:
         return float("inf")
     enough, few = grid[first], grid[max(first - 1, 0)]
     while few - enough > 1e-12:
         middle = (enough + few) / 2
-        enough, few = (middle, few) if at(middle)[1] <= LEFT else (enough, middle)
+        enough, few = (middle, few) if at(middle)[1] <= ENERGY_LEFT else (enough, middle)
     return max(1.0, float(at(enough)[0]))

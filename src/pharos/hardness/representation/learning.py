@@ -1,6 +1,6 @@
 """Representation of an MDP's states by a network: which look alike, and how learning at one changes another.
 
-Products with its kernel are those of the kernel itself, the identity, or landmarks and a diagonal (Nyström).
+Products with its kernel use the kernel itself, the identity, or landmarks and a diagonal (Nyström).
 `IdealisedLearner` is Q-learning of a network in expectation, on which `kernel_regret` builds.
 """
 
@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.visitation import Propagation, drawn, standard_occupancy
+from pharos.hardness.visitation import Propagation, drawn_indices, standard_occupancy
 from pharos.mdp import TabularMDP, mdp_within, states_within, uniform_choice, whole_number
 from pharos.regret import regret_scale
 from pharos.solvers import Solution, chain, evaluate_policy, uniform_value, value_iteration
 
 MOST_EXACT = 4096
 """Different observations up to which a kernel is used as it is; beyond, by landmarks."""
-LANDMARKS = 600
+DEFAULT_LANDMARKS = 600
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +31,9 @@ class Representation:
 
     Attributes:
         kernel: (rows (N,), columns (M,)) of states -> (N, M) float32, the network's tangent kernel; positive
-            semidefinite, and symmetric where rows are columns.
+            semidefinite, and symmetric if rows are columns.
         classes: (S,) the number of each state's observation, from 0: states of one number look alike.
-        time_limit: steps of an episode that the agent sees, where the MDP has no horizon; or None.
+        time_limit: steps of an episode that the agent sees, if the MDP has no horizon; or None.
         landmarks: of the approximation beyond MOST_EXACT different observations; 0: none, whatever it takes; 2 or more:
             for all sizes.
         conventions: what it is, JSON-able.
@@ -68,7 +68,7 @@ class Representation:
         return Representation(lambda rows, columns: matrix[np.ix_(rows, columns)], numbers, **options)
 
     def episode(self, mdp: TabularMDP, horizon: int | None, measure: str) -> int:
-        """Steps of an episode: the horizon, else that of the MDP, else the time limit.
+        """Steps of an episode: the horizon, else the MDP's, else the time limit.
 
         Raises:
             UndefinedMeasure: there is none. ParameterError: the MDP has another number of states.
@@ -128,7 +128,7 @@ class Grouped:
 
 MOST_LANCZOS = 60
 ELSEWHERE = 0.1  # of a first vector: the last phase's eigenvector may be one still, and no longer the largest
-FEW = 8  # columns up to which half of a symmetric matrix is read sooner than BLAS has packed all of it
+FEW_COLUMNS = 8  # columns up to which half of a symmetric matrix is read sooner than BLAS has packed all of it
 
 Kernel = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -223,7 +223,7 @@ class Exact(KernelOperator):
     def __call__(self, z: np.ndarray) -> np.ndarray:
         from pharos.kernels import linear_algebra
 
-        if z.shape[1] > FEW:
+        if z.shape[1] > FEW_COLUMNS:
             return self.matrix @ z
         rows = np.ascontiguousarray(z.T, np.float64)
         out = np.empty_like(rows)
@@ -312,8 +312,8 @@ def _sum_of_powers(steps: int) -> np.ndarray:
 
 
 TIES = 1e-6  # of the largest value of a state: actions that close are chosen alike
-MARGIN = 1.05  # of the largest eigenvalue, which is known to 0.1 %
-ACCURACY = 1e-5  # of values, as a share of what is between optimal and uniform play
+STEP_MARGIN = 1.05  # of the largest eigenvalue, which is known to 0.1 %
+SHARE_OF_SPREAD = 1e-5  # of values, as a share of what is between optimal and uniform play
 WORST_GREEDY, WORST_PLAYED = 1.5, 3.0  # a policy's regret counts no more than this
 
 
@@ -328,7 +328,7 @@ class Schedule:
         learning_starts: steps before the first gradient step.
         exploration_initial_eps, exploration_final_eps, exploration_fraction: epsilon falls linearly from one to the
             other over this share of the steps; before `learning_starts` it is 1.
-        gamma: the learner's own discount; that of values is the MDP's.
+        gamma: the learner's own discount; values have the MDP's.
         optimizer: "gradient", descent with the largest step that does not overshoot; or "adam", the same with gradients
             rescaled as by full-matrix Adam at the standard occupancy, see `KernelOperator.preconditioned`.
     """
@@ -390,7 +390,7 @@ class Rollouts:
             raise ParameterError(f"rollouts: clip_range is {self.clip_range!r}; expected a number above 0, or None")
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; without `clip_range` where there is none, as it was before there could be one."""
+        """JSON-able; without `clip_range` if there is none, as it was before there could be one."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -457,11 +457,11 @@ class IdealisedLearner:
         progress: Callable[[str], object] | None = None,
     ):
         """progress: called with a line for each phase; an exception of its own ends the learning."""
-        self.tell = progress or str
+        self.report = progress or str
         self.episode = episode = representation.episode(mdp, horizon, self.measure)
         self.schedule, self.representation = schedule or Schedule(), representation
-        solution = solution or value_iteration(mdp, progress=self._tell_sweep)
-        uniform = uniform_value(mdp, progress=self._tell_sweep)
+        solution = solution or value_iteration(mdp, progress=self._report_sweep)
+        uniform = uniform_value(mdp, progress=self._report_sweep)
         self.optimal = solution.value_at_start
         error = max(solution.error_bound, uniform.error_bound)
         self.spread = regret_scale(self.optimal, uniform.value_at_start, error)
@@ -491,7 +491,7 @@ class IdealisedLearner:
         vector = np.full((len(observations), 1), len(observations) ** -0.5)
         rows = []
         for step in range(0, schedule.steps, schedule.period):
-            self.tell(f"step {step:,} of {schedule.steps:,}")
+            self.report(f"step {step:,} of {schedule.steps:,}")
             period, epsilon = min(schedule.period, schedule.steps - step), schedule.epsilon(step)
             greedy = greedy_policy(values, observations.sets)[observations.groups]
             policy = (1 - epsilon) * greedy + (epsilon / actions if observations.sets is None else epsilon * uniform)
@@ -511,19 +511,19 @@ class IdealisedLearner:
     @cached_property
     def weights(self) -> np.ndarray:
         """(C,) weights of observations at the standard occupancy."""
-        standard = standard_occupancy(self.whole, self.schedule.gamma, self.episode, self.tell)
+        standard = standard_occupancy(self.whole, self.schedule.gamma, self.episode, self.report)
         return self.observations.sums(standard.states[self.numbers])
 
     def operators(self) -> tuple[Iterable[KernelOperator], int | None]:
-        """([the kernel over observations], None); or, where they are too many, (the kernel by landmarks, then by half
+        """([the kernel over observations], None); or, if they are too many, (the kernel by landmarks, then by half
         of them; the number of landmarks), drawn by `weights`."""
         kernel, observed = self.representation.kernel, self.observations.representatives
         landmarks = self.representation.landmarks
         if landmarks is None and len(observed) > MOST_EXACT:
-            landmarks = LANDMARKS
+            landmarks = DEFAULT_LANDMARKS
         if not landmarks or landmarks >= len(observed):
             return [Exact(kernel, observed)], None
-        sample = observed[drawn(self.weights, landmarks)]
+        sample = observed[drawn_indices(self.weights, landmarks)]
         parts = (sample, sample[: landmarks // 2])
         return (Landmarks(kernel, observed, some) for some in parts), landmarks  # one at a time
 
@@ -534,14 +534,14 @@ class IdealisedLearner:
             "episode": self.episode,
             "gamma": float(self.whole.gamma),
             "horizon": self.whole.horizon,
-            "step_size": f"1 / ({MARGIN} largest eigenvalue of K diag({self.step_weights}))",
+            "step_size": f"1 / ({STEP_MARGIN} largest eigenvalue of K diag({self.step_weights}))",
             "clipped": clipped,
             **self.representation.conventions,
         }
 
     @property
     def is_return(self) -> bool:
-        """Whether a value is the expected return of an episode, so that walks tell it."""
+        """Whether a value is the expected return of an episode, so that walks estimate it."""
         return self.mdp.gamma == 1.0 and self.mdp.horizon == self.episode
 
     def regret(self, value: float) -> float:
@@ -558,10 +558,12 @@ class IdealisedLearner:
         if self.is_return:
             return float((self.visits(policy).executed * self.mdp.rewards).sum())
         table = actions if is_pure else self.everywhere(policy)
-        return evaluate_policy(self.mdp, table, ACCURACY * self.spread, progress=self._tell_sweep).value_at_start
+        return evaluate_policy(
+            self.mdp, table, SHARE_OF_SPREAD * self.spread, progress=self._report_sweep
+        ).value_at_start
 
-    def _tell_sweep(self, sweeps: int, bound: float) -> None:
-        self.tell(f"sweep {sweeps} of values, error at most {bound:.2g}")
+    def _report_sweep(self, sweeps: int, bound: float) -> None:
+        self.report(f"sweep {sweeps} of values, error at most {bound:.2g}")
 
     def everywhere(self, policy: np.ndarray) -> np.ndarray:
         """(S, A) probabilities of a policy (N, A), uniform in states outside `states`."""
@@ -573,17 +575,17 @@ class IdealisedLearner:
 def return_on_graph(mdp: TabularMDP, actions: np.ndarray, steps: int) -> float:
     """The expected return of an episode of `steps` steps of actions (S,) on a deterministic MDP: S log2(steps) time.
 
-    Doubling: the return and the end of 2 k steps from each state are those of k steps, twice.
+    Doubling: the return and the end of 2 k steps from each state follow from k steps, twice.
     """
     successor, reward = chain(mdp, actions)
     is_last = np.asarray(mdp.terminal)
     jump = np.append(np.where(is_last | (successor < 0), mdp.num_states, successor), mdp.num_states)
     earned = np.append(np.where(is_last, 0.0, reward), 0.0)
-    place, total = mdp.start_states.astype(np.int64), np.zeros(len(mdp.start_states))
+    index, total = mdp.start_states.astype(np.int64), np.zeros(len(mdp.start_states))
     while steps:
         if steps % 2:
-            total += earned[place]
-            place = jump[place]
+            total += earned[index]
+            index = jump[index]
         earned, jump, steps = earned + earned[jump], jump[jump], steps // 2
     return float(mdp.start_probabilities @ total)
 
@@ -599,8 +601,8 @@ def descent(
     largest = apply.largest_eigenvalue(weights.max(axis=1, keepdims=True), vector)
     before = float((weights * error**2).sum())
     while largest > 0 and before > 0:
-        with np.errstate(over="ignore", invalid="ignore"):  # where the eigenvalue was far too small
-            added = apply.descended(weights, error, 1 / (MARGIN * largest), steps)
+        with np.errstate(over="ignore", invalid="ignore"):  # if the eigenvalue was far too small
+            added = apply.descended(weights, error, 1 / (STEP_MARGIN * largest), steps)
             after = float((weights * (error - added) ** 2).sum())
         if after <= 1.001 * before:  # no step of a stable size makes it larger
             return added
@@ -668,10 +670,10 @@ class OfPolicies(Generic[Answer]):
         self.function, self.known = function, deque[tuple[np.ndarray, Answer]](maxlen=last)
 
     def __call__(self, policy: np.ndarray) -> Answer:
-        place = next((i for i, (other, _) in enumerate(self.known) if np.array_equal(other, policy)), None)
-        answer = self.function(policy) if place is None else self.known[place][1]
-        if place is not None:
-            del self.known[place]
+        index = next((i for i, (other, _) in enumerate(self.known) if np.array_equal(other, policy)), None)
+        answer = self.function(policy) if index is None else self.known[index][1]
+        if index is not None:
+            del self.known[index]
         self.known.append((policy, answer))
         return answer
 

@@ -15,7 +15,7 @@ The neural tangent kernel of a network in closed form:
     K(x, y) = E[ sum over parameters w of d f(x) / d w  d f(y) / d w ],   f one output of the network at initialisation
 
 (Jacot, Gabriel and Hongler, 2018). Learning by small gradient steps changes what the network says of y in proportion to
-K(x, y) times the error at x. The expectation over weights and biases follows layer by layer, those of standard
+K(x, y) times the error at x. The expectation over weights and biases follows layer by layer, which have the standard
 parametrisation: with q the covariance of pre-activations of a layer and T their kernel, n units, v and b the variances
 of a weight and a bias of the next layer,
 
@@ -40,7 +40,7 @@ from pharos.system.threads import in_blocks
 if TYPE_CHECKING:
     import gymnasium
 
-FEATURES = (128, 128)
+EXTRACTOR_LAYERS = (128, 128)
 INITIALISATIONS = ("pytorch", "sb3")
 _FORM = re.compile(r"(?:(?P<mlp>mlp)|cnn(?P<filters>\d+)-?|(?P<nature>nature)-?)(?P<layers>[\dx-]*)(?P<tanh>\+tanh)?")
 _EXPECTED = "mlp128, mlp128x2, mlp256-64, cnn16, cnn16-64x3 or nature, with +tanh where wanted"
@@ -70,7 +70,7 @@ class Network:
         tanh: whether hidden layers after the first have hyperbolic tangents; the first always has ReLUs.
         initialisation: "pytorch", its default: weights and biases uniform in +-1 / sqrt(fan-in), so of variance
             1 / (3 fan-in); that is what DQN has. "sb3", of actor-critics in Stable-Baselines3: orthogonal weights with
-            gain sqrt(2), of the output 1 (that of the value; policies have 0.01), biases 0.
+            gain sqrt(2), of the output 1 (of the value; policies have 0.01), biases 0.
     """
 
     name: str
@@ -102,7 +102,7 @@ class Network:
             raise ParameterError(f"network {network!r} has no filters; expected at least 1, as in cnn16")
         small = (Convolution(filters, 3, padding=1),) if filters else ()
         convolutions = _NATURE if match["nature"] else small
-        return Network(network, convolutions, layers or FEATURES, bool(match["tanh"]), initialisation)
+        return Network(network, convolutions, layers or EXTRACTOR_LAYERS, bool(match["tanh"]), initialisation)
 
     def weight_variances(self, inputs: int, outputs: int, *, is_output: bool = False) -> tuple[float, float]:
         """(of a weight, of a bias) of a layer from `inputs` numbers to `outputs` units."""
@@ -127,7 +127,7 @@ def is_channels_last(shape: Sequence[int]) -> bool:
 
 
 def _layers(text: str) -> tuple[int, ...] | None:
-    """`128x2-64` -> (128, 128, 64); None where it is not of that form."""
+    """`128x2-64` -> (128, 128, 64); None if it is not of that form."""
     layers: list[int] = []
     for part in text.split("-") if text else ():
         match = re.fullmatch(r"([1-9]\d*)(?:x([1-9]\d?))?", part)
@@ -137,8 +137,8 @@ def _layers(text: str) -> tuple[int, ...] | None:
     return tuple(layers)
 
 
-BLOCK = 512  # observations on a side of a block of pairs
-MAPS = 1 << 26  # bytes of the maps of a block after a convolution
+PAIR_BLOCK = 512  # observations on a side of a block of pairs
+MAP_BYTES = 1 << 26  # bytes of the maps of a block after a convolution
 TERMS, NODES = 48, 200  # of a power series of hyperbolic tangents; of a quadrature
 LEAST_VARIANCE = 1e-12  # of a hyperbolic tangent's pre-activations, in the place of 0: the limit in float64
 
@@ -173,7 +173,7 @@ def tangent_kernel(network: Network, x: np.ndarray, y: np.ndarray | None = None)
     first: _Flat | _Convolved
     first = _Convolved(network, x, others) if network.convolutions else _Flat(network, x, others)
     head = _Head(network, first)
-    side = min(BLOCK, max(16, math.isqrt(MAPS // (8 * first.positions))))
+    side = min(PAIR_BLOCK, max(16, math.isqrt(MAP_BYTES // (8 * first.positions))))
     rows, columns = range(0, len(x), side), range(0, len(others), side)
     blocks = [(i, j) for i, j in itertools.product(rows, columns) if y is not None or i <= j]
 
@@ -321,9 +321,9 @@ def _windows(before: tuple[int, ...], after: tuple[int, ...], layer: Convolution
     offsets = np.arange(layer.size)
     rows, columns = (layer.stride * np.arange(n)[:, None] - layer.padding + offsets for n in after)
     is_inside = [(index >= 0) & (index < n) for index, n in zip((rows, columns), before, strict=True)]
-    places = rows[:, None, :, None] * before[1] + columns[None, :, None, :]
+    indices = rows[:, None, :, None] * before[1] + columns[None, :, None, :]
     inside = is_inside[0][:, None, :, None] & is_inside[1][None, :, None, :]
-    return np.where(inside, places, -1).reshape(math.prod(after), -1)
+    return np.where(inside, indices, -1).reshape(math.prod(after), -1)
 
 
 class _Head:
@@ -344,7 +344,7 @@ class _Head:
         self.y = self.x if of_y is of_x else self._variances(of_y)
 
     def _variances(self, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(L, N) of pre-activations; (L, N, M) Hermite coefficients, M = 0 where all units are ReLUs."""
+        """(L, N) of pre-activations; (L, N, M) Hermite coefficients, M = 0 if all units are ReLUs."""
         variances, coefficients = [variance], []
         for layer, kind in enumerate(self.kinds):
             if kind:  # an observation of zeros has slope 1 here; a ReLU, as in PyTorch, none

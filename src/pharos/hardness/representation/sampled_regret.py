@@ -15,7 +15,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.hardness.representation.learning import (
-    MARGIN,
+    STEP_MARGIN,
     WORST_GREEDY,
     Grouped,
     IdealisedLearner,
@@ -95,11 +95,11 @@ class SampledRegret:
     """Regret of the sampled learner by plain descent, by rescaled gradients, and without a kernel.
 
     Attributes:
-        descent: gradients as they are. adam: gradients rescaled as by full-matrix Adam where all observations are
+        descent: gradients as they are. adam: gradients rescaled as by full-matrix Adam if all observations are
             equally frequent. tabular: with the identity in the place of the kernel, on the states themselves.
         observations: different ones that it learns from; states: that can be met and are not terminal.
         landmarks: of the approximation; None: the kernel is exact.
-        estimated_error: half of the landmarks change the value by that much: an estimate, not a bound; 0 where exact.
+        estimated_error: half of the landmarks change the value by that much: an estimate, not a bound; 0 if exact.
         conventions: schedule, sampling, episode, observation and network.
     """
 
@@ -138,7 +138,7 @@ class SampledRegret:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; without the deviation where there is a single walk."""
+        """JSON-able; without the deviation if there is a single walk."""
         deviation = {} if math.isnan(self.deviation) else {"deviation": self.deviation}
         return {
             "value": self.value,
@@ -177,25 +177,26 @@ def sampled_regret(
     `schedule.gradient_steps` gradient steps in each `schedule.period` steps, each on a minibatch B of what it
     remembers, drawn with replacement:
 
-        y_i = r_i + gamma max_a Q'(s'_i, a), without the second term where the episode ended;   Q' of the period's start
+        y_i = r_i + gamma max_a Q'(s'_i, a), without the second term if the episode ended;   Q' of the period's start
         Q(., a) += eta / |B| sum_i [a_i = a] (y_i - Q(s_i, a_i)) K(., s_i)
 
     eta is the largest step that does not overshoot in expectation (`kernel_regret`, with the visits so far), or the
     largest that the minibatch bears, 1 / max_i mean_j [a_i = a_j] |K(s_i, s_j)|, if that is smaller: no learning rate.
     The value of a walk is the mean over 31 evaluations at equal distances of (V* - V of the greedy policy) / (V* - V of
     uniform play). The measure is the mean over walks and over two kernels: K, and the root of K, which is what
-    full-matrix Adam makes of K where all observations are equally frequent.
+    full-matrix Adam makes of K if all observations are equally frequent.
 
     Args:
         representation: the kernel; see `pharos.observations.representation`.
-        schedule: None: that of `Schedule`; its optimizer does not count, as both forms are computed.
-        sampling: None: that of `Sampling`.
-        solution: the optimal values of `mdp`, where they are known.
+        schedule: None: the default of `Schedule`; its optimizer does not count, as both forms are computed.
+        sampling: None: the default of `Sampling`.
+        solution: the optimal values of `mdp`, if they are known.
         horizon: steps of an episode that the learner sees; None: the MDP's, else the time limit.
         progress: called with a line now and then; an exception of its own ends the computation.
     Returns:
-        A SampledRegret. With the identity for a kernel it is tabular Q-learning with a replay memory. Rewards are those
-        of drawn outcomes where the MDP is of an environment, else expected ones. The same seed gives the same number.
+        A SampledRegret. With the identity for a kernel it is tabular Q-learning with a replay memory. Rewards belong to
+        drawn outcomes if the MDP is of an environment, else they are expected ones. The same seed gives the same
+        number.
     Raises:
         UndefinedMeasure: there is neither a horizon nor a time limit; or uniform play is optimal.
         ParameterError: the representation is of other states, or its kernel does not fit into memory.
@@ -275,7 +276,7 @@ class SampledLearner(IdealisedLearner):
         target = tuple(each.copy() for each in learnt)
         size = min(sampling.buffer_size, schedule.steps)
         memory = *(np.zeros(size, np.int64) for _ in range(3)), np.zeros(size)
-        visits, place = np.zeros((count, num_actions)), np.array([-1, -1, 0, 0], np.int64)
+        visits, cursor = np.zeros((count, num_actions)), np.array([-1, -1, 0, 0], np.int64)
         words = np.random.SeedSequence(seed, spawn_key=(2,)).generate_state(2, np.uint64)
         word, noise = words[:1].copy(), (float(sampling.reward_noise), words[1:].copy())
         numbers = (
@@ -289,20 +290,20 @@ class SampledLearner(IdealisedLearner):
         vector, largest_step = np.full((count, 1), count**-0.5), 0.0
         stops = np.unique([*looks, *range(0, schedule.steps, schedule.period)])
         for step, next_stop in zip(stops, [*stops[1:], schedule.steps], strict=True):
-            self.tell(f"step {step:,} of {schedule.steps:,} of a walk")
+            self.report(f"step {step:,} of {schedule.steps:,} of a walk")
             if step in looks:
                 values = np.empty((count, num_actions))
-                kernels.values(kernel, learnt, values)
+                kernels.kernel_values(kernel, learnt, values)
                 yield values
             if step % schedule.period == 0 and step + schedule.period > schedule.learning_starts:
                 for old, new in zip(target, learnt, strict=True):
                     old[:] = new
                 weights = visits.max(axis=1, keepdims=True) / max(step, 1)
                 largest = operator.largest_eigenvalue(weights, vector) if step else 0.0
-                largest_step = 1 / (MARGIN * largest) if largest > 0 else math.inf
+                largest_step = 1 / (STEP_MARGIN * largest) if largest > 0 else math.inf
             kernels.learn(
                 *(self.outcomes, np.asarray(mdp.terminal, np.bool_), group),
                 *(np.asarray(mdp.start_states, np.int64), cumulative, (*chance, *sets)),
-                *(self.episode, kernel, learnt, target, memory, visits, place, word, noise, numbers),
+                *(self.episode, kernel, learnt, target, memory, visits, cursor, word, noise, numbers),
                 *(largest_step, int(next_stop - step)),
             )

@@ -8,7 +8,7 @@ files.py      the tables, and `report`, which writes it all
 """
 
 from pharos.study.report.files import StudyReport, report
-from pharos.study.report.page import number
-from pharos.study.report.results import Results, coefficients, results_of
+from pharos.study.report.page import number_text
+from pharos.study.report.results import Results, coefficients, study_results
 
-__all__ = ["Results", "StudyReport", "coefficients", "number", "report", "results_of"]
+__all__ = ["Results", "StudyReport", "coefficients", "number_text", "report", "study_results"]

@@ -10,8 +10,8 @@ from pharos.plots import save_for_page
 from pharos.study.figures import all_curves, all_figures, tables_of
 from pharos.study.prediction_figures import unseen_figures
 from pharos.study.report.model_sections import doubts, judged, unseen_section
-from pharos.study.report.page import render
-from pharos.study.report.results import Results, coefficients, results_of
+from pharos.study.report.page import render_page
+from pharos.study.report.results import Results, coefficients, study_results
 from pharos.study.report.sections import sections_of
 from pharos.study.specification import Source
 from pharos.study.status import opened
@@ -68,11 +68,11 @@ def report(
     """
     from pharos.study.predictions import PredictedCells
 
-    tell = progress or (lambda _: None)
+    report_progress = progress or (lambda _: None)
     predicted = PredictedCells.of(predictions)
-    study, place = opened(source, folder, trust=trust)
-    results = results_of(study, place, tell)
-    target = Path(out) if out is not None else place / "report"
+    study, directory = opened(source, folder, trust=trust)
+    results = study_results(study, directory, report_progress)
+    target = Path(out) if out is not None else directory / "report"
     target.mkdir(parents=True, exist_ok=True)
     for name in ("figures", "tables"):
         inside(target, name)
@@ -80,12 +80,12 @@ def report(
     figures: dict[str, dict[str, bytes] | None] = {}
     curves = all_curves(results.points, results.profiles)
     for name, draw in all_figures(curves, results.cells, results.models, results.agents).items():
-        tell(f"drawing {name}")
+        report_progress(f"drawing {name}")
         images = figures[name] = save_for_page(draw, target / "figures" / name)
         if images and name in curves:
             images["curves"] = curves[name].to_json().encode()
     # Predictors on classes left out, with their figures and tables
-    tell("leaving out classes")
+    report_progress("leaving out classes")
     judgement, outcomes = judged(results, predicted)
     more = {"outcomes": outcomes}
     if predicted is not None:
@@ -96,12 +96,12 @@ def report(
         more["predictions" if predicted is not None else "unseen_classes"] = judgement
     tables = _write_tables(target / "tables", results, more)
     # The page
-    tell("drawing instances")
+    report_progress("drawing instances")
     sections = sections_of(results, figures)
     if judgement is not None:
         models = next((i for i, each in enumerate(sections) if each.title == MODELS), len(sections) - 2)
         sections.insert(models + 1, unseen_section(judgement, results, predicted, figures))
-    page = render(f"Study {study.name}", study.description, sections)
+    page = render_page(f"Study {study.name}", study.description, sections)
     replace_file(target / "report.html", page)
     image_files = [
         target / "figures" / f"{name}.{kind}" for name, images in figures.items() if images for kind in ("png", "pdf")

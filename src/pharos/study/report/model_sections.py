@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.plots import agent_name, slug
+from pharos.plots import agent_label, slug
 from pharos.study.analysis import PAPER_AGENT, REGRETS, Models, agreement, paper_agreement
 from pharos.study.figures import agents_figure
 from pharos.study.regression import Fit
-from pharos.study.report.page import Figures, ReportTable, Section, image, table
+from pharos.study.report.page import Figures, ReportTable, Section, data_table, figure_image
 from pharos.study.report.results import Results, coefficients
 from pharos.system.wording import in_words, pluralize
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def models_section(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
-    """The models of regret by hardness; None where there are none: `left_out` says why."""
+    """The models of regret by hardness; None if there are none: `left_out` says why."""
     if not results.agents:
         left_out.append("Hardness and regret: tabular agents, which see the state itself, have no models.")
         return None
@@ -38,7 +38,7 @@ def _models_of(models: Models, results: Results, figures: Figures) -> dict[str, 
 
     paper = results.comparison is not None and models.agent == PAPER_AGENT
     what = REGRETS[models.regret]
-    heading = f"{what.capitalize()} of {agent_name(models.agent)}"
+    heading = f"{what.capitalize()} of {agent_label(models.agent)}"
     fits = pd.DataFrame([_line(fit) for fit in models.fits])
     caption = (
         "Ordinary least squares, section 4.3 of the paper: equations 7 (single), 8 (representation) and 9 (class). R² "
@@ -57,13 +57,13 @@ def _models_of(models: Models, results: Results, figures: Figures) -> dict[str, 
     for kind, number in (("single_model", 4), ("representation_models", 5), ("class_models", 6)):
         text = f"Fitted against actual {what}, {kind.replace('_', ' ')}."
         text += f" The paper's figure {number}." if paper else ""
-        images.append(image(figures, f"{kind}_{models.regret.removesuffix('_regret')}{suffix}", text))
+        images.append(figure_image(figures, f"{kind}_{models.regret.removesuffix('_regret')}{suffix}", text))
     return {
         "title": heading,
-        "table": table(fits, caption) if models.fits else None,
+        "table": data_table(fits, caption) if models.fits else None,
         "together": [f"R² of {name}: {value:.2f}" for name, value in values.items() if value is not None],
         "figures": [each for each in images if each is not None],
-        "coefficients": table(coefficients(models), digits=4) if models.fits else None,
+        "coefficients": data_table(coefficients(models), digits=4) if models.fits else None,
         "notes": list(models.notes),
     }
 
@@ -94,16 +94,16 @@ def _predictor(name: str) -> str:
 
 
 def agreement_section(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
-    """The correlation of agents over cells; None where too few are common: `left_out` says so."""
+    """The correlation of agents over cells; None if too few are common: `left_out` says so."""
     lines, images = [], []
     for i, one in enumerate(results.agents):
         for two in results.agents[i + 1 :]:
             for value in ("return", "normalized_regret", "cumulative_regret"):
                 if (pair := agreement(results.cells, value, (one, two))) is not None:
-                    names = f"{agent_name(one)} and {agent_name(two)}, {REGRETS.get(value, value)}"
+                    names = f"{agent_label(one)} and {agent_label(two)}, {REGRETS.get(value, value)}"
                     lines.append(f"{names}: r = {pair[0]:.2f} over {pluralize(pair[1], 'cell')}")
-            caption = f"Normalised regret of {agent_name(two)} against that of {agent_name(one)}."
-            images.append(image(figures, agents_figure(one, two), caption))
+            caption = f"Normalised regret of {agent_label(two)} against that of {agent_label(one)}."
+            images.append(figure_image(figures, agents_figure(one, two), caption))
     if not lines:
         left_out.append(
             "Agreement of agents: there are fewer than three cells that both DQN and PPO have, or two other agents."
@@ -129,7 +129,7 @@ FEW_PERMUTATIONS = 499
 
 
 def judged(results: Results, predictions: "PredictedCells | None") -> "tuple[pd.DataFrame | None, pd.DataFrame]":
-    """(statistics of predictors, or None where there are fewer than two classes; cells with outcomes).
+    """(statistics of predictors, or None if there are fewer than two classes; cells with outcomes).
 
     Raises:
         ParameterError: there are predictions, but of other cells, or of fewer than three classes.
@@ -195,7 +195,7 @@ def winners(judgement: "pd.DataFrame") -> list[str]:
         if best:
             texts = [f"{best[key]['predictor']} (R² {best[key]['r_squared']:.2f})" for key in sorted(best)]
             baseline = f"; of the baselines {texts[1]}" if len(texts) > 1 else ""
-            sentences.append(f"{agent_name(str(agent))}: on classes left out {texts[0]} predicts best{baseline}.")
+            sentences.append(f"{agent_label(str(agent))}: on classes left out {texts[0]} predicts best{baseline}.")
     return sentences
 
 
@@ -235,9 +235,9 @@ def _part(agent: str, outcome: str, rows: "pd.DataFrame", figures: Figures) -> d
             "seeds; of actor-critics the distribution over actions) and of the greedy policy of the idealised learner "
             "(dashed), which was never trained.",
         }
-        images = [image(figures, f"{name}_{slug(agent)}", text) for name, text in texts.items()]
+        images = [figure_image(figures, f"{name}_{slug(agent)}", text) for name, text in texts.items()]
     return {
-        "title": f"{agent_name(agent)}: {OUTCOMES[outcome]}",
+        "title": f"{agent_label(agent)}: {OUTCOMES[outcome]}",
         "tables": [each for each in (_left_out(rows), _within(rows), _mixed(rows)) if each is not None],
         "figures": [each for each in images if each is not None],
     }
@@ -300,12 +300,12 @@ def _mixed(rows: "pd.DataFrame") -> ReportTable | None:
 
 
 def _of_predictors(rows: "pd.DataFrame", columns: Mapping[str, Any], caption: str) -> ReportTable | None:
-    """A row for each predictor; None where there is none."""
+    """A row for each predictor; None if there is none."""
     import pandas as pd
 
     if not len(rows):
         return None
-    return table(
+    return data_table(
         pd.DataFrame({"predictor": [_name(row) for row in rows.to_dict("records")], **columns}), caption, digits=2
     )
 

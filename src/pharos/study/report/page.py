@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Figures = Mapping[str, Mapping[str, bytes] | None]
 # A column of texts up to this long is not broken over lines
-SHORT = 30
+SHORT_TEXT = 30
 
 
 class Section:
@@ -59,7 +59,7 @@ class ReportTable:
 
 @dataclass(frozen=True)
 class Image:
-    """A figure for light and for dark pages, as data URLs; its name is that of its file.
+    """A figure for light and for dark pages, as data URLs; its name is the name of its file.
 
     `curves` has the numbers of its lines, as JSON: the page draws them anew, to be pointed at. Empty for other figures.
     """
@@ -71,7 +71,7 @@ class Image:
     curves: str = ""
 
 
-def render(title: str, description: str, sections: Sequence[Section]) -> str:
+def render_page(title: str, description: str, sections: Sequence[Section]) -> str:
     """The HTML of the page."""
     page = templates("pharos.study.report", "the report of a study")
     script = page.get_template("page.js.j2").render()
@@ -81,8 +81,8 @@ def render(title: str, description: str, sections: Sequence[Section]) -> str:
     )
 
 
-def image(figures: Figures, name: str, caption: str) -> Image | None:
-    """A figure with its caption; None where it was not drawn."""
+def figure_image(figures: Figures, name: str, caption: str) -> Image | None:
+    """A figure with its caption; None if it was not drawn."""
     images = figures.get(name)
     if not images:
         return None
@@ -95,18 +95,18 @@ def data_url(png: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
-def table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> ReportTable:
+def data_table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> ReportTable:
     """A frame as a table: numbers short and to the right, whole ones without digits; empty columns are left out."""
     data = data[[name for name in data.columns if len(data) == 0 or not (data[name] == "").all()]]
     columns, digits_of = [], []
     for name in data.columns:
         is_number = data[name].dtype.kind in "fiu"
         longest = data[name].astype(str).str.len().max() if len(data) else 0
-        kind = "n" if is_number else "s" if longest <= SHORT else "t"
+        kind = "n" if is_number else "s" if longest <= SHORT_TEXT else "t"
         columns.append(Column(in_words(str(name)), kind))
         digits_of.append(0 if is_number and _is_whole(data[name].to_numpy(float)) else digits)
     rows = [
-        [_cell(value, places) for value, places in zip(line, digits_of, strict=True)]
+        [_cell(value, digits) for value, digits in zip(line, digits_of, strict=True)]
         for line in data.itertuples(index=False)
     ]
     return ReportTable(caption, columns, rows)
@@ -123,13 +123,13 @@ def _cell(value: object, digits: int) -> str:
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     if isinstance(value, float | np.floating):
-        return number(float(value), digits)
+        return number_text(float(value), digits)
     if isinstance(value, int | np.integer):
         return f"{value:,}"
     return str(value)
 
 
-def number(value: float, digits: int = 3) -> str:
+def number_text(value: float, digits: int = 3) -> str:
     """A number for people: digits after the point, thousands separated, small and huge ones with a power of ten."""
     if digits > 0 and value != 0 and not 10.0**-digits <= abs(value) < 1e7:
         return f"{value:.{max(1, digits - 1)}e}"

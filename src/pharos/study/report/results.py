@@ -36,8 +36,8 @@ class Results:
         profiles, improvements: performance profiles of agents and observations, and how probable one improves on
             another.
         differences: in normalised regret, of each two agents or observations over all classes.
-        other_winners: tasks on which the highest return is not that of the least regret.
-        comparison, findings: beside the paper; None where the study is not the paper's.
+        other_winners: tasks on which the highest return and the least regret belong to different agents.
+        comparison, findings: beside the paper; None if the study is not the paper's.
     """
 
     study: Specification
@@ -92,7 +92,7 @@ class Results:
         return any(each.fits for each in self.models)
 
 
-def results_of(study: Specification, place: Path, progress: Callable[[str], None] = lambda _: None) -> Results:
+def study_results(study: Specification, directory: Path, progress: Callable[[str], None] = lambda _: None) -> Results:
     """Read the results of a study, and compute the statistics of its report.
 
     Only instances and kinds of chance that have finished runs are measured.
@@ -101,15 +101,15 @@ def results_of(study: Specification, place: Path, progress: Callable[[str], None
         ParameterError: no run is finished.
     """
     progress("reading results")
-    done = finished_runs(study, place)
+    done = finished_runs(study, directory)
     # Tasks with finished runs, their hardness and aliasing
     tasks = set(zip(done.runs["instance"], done.runs["chance"], strict=True))
-    number, seconds = hardness_cost(study, place, tasks)
+    number, seconds = hardness_cost(study, directory, tasks)
     if number:
         progress(f"hardness of {number} instances and kinds of chance: at most {duration(seconds)}, and building")
-    hardness = hardness_table(study, place, progress=progress, tasks=tasks)
+    hardness = hardness_table(study, directory, progress=progress, tasks=tasks)
     sizes = dict(zip(hardness["instance"], hardness["num_states"].astype(float), strict=True))
-    aliasing = aliasing_table(study, place, sizes, progress)
+    aliasing = aliasing_table(study, directory, sizes, progress)
     table = with_aliasing(cells(done.runs, hardness), aliasing)
     # Models of regret, for each agent and kind of regret
     progress("fitting models")
@@ -122,7 +122,7 @@ def results_of(study: Specification, place: Path, progress: Callable[[str], None
     of_the_paper = is_of_the_paper(study)
     return Results(
         study=study,
-        status=status(study, place),
+        status=status(study, directory),
         runs=done.runs,
         points=done.points,
         damaged=done.damaged,
@@ -147,7 +147,7 @@ def _listed(runs: "pd.DataFrame") -> str:
 
 
 def observing_agents(runs: "pd.DataFrame") -> list[str]:
-    """The agents of a study that see observations, those of the paper first."""
+    """The agents of a study that see observations, the paper's first."""
     agents = list(dict.fromkeys(runs.loc[runs["observation"] != TABULAR_OBSERVATION, "agent"]))
     return sorted(agents, key=lambda agent: PAPER_AGENTS.index(agent) if agent in PAPER_AGENTS else len(PAPER_AGENTS))
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from pharos.environments import start_distribution
 from pharos.errors import PharosError
-from pharos.plots import agent_name, slug
+from pharos.plots import agent_label, slug
 from pharos.study.analysis import IMAGE, PAPER_AGENT, VECTOR
-from pharos.study.figures import label, pairs_of, representations_figure, returns_table, wide_returns
+from pharos.study.figures import line_label, pairs_of, representations_figure, returns_table, wide_returns
 from pharos.study.report.model_sections import agreement_section, models_section
-from pharos.study.report.page import Figures, Section, data_url, image, table
+from pharos.study.report.page import Figures, Section, data_table, data_url, figure_image
 from pharos.study.report.results import Results
 from pharos.study.specification import Specification
 from pharos.study.status import duration
@@ -68,7 +68,7 @@ def _summary(results: Results) -> Section:
     if main is not None:
         printed = "; the paper prints 0.09" if results.comparison is not None else ""
         lines.append(
-            f"One linear model of {agent_name(results.models[0].agent)}'s cumulative regret over all classes and "
+            f"One linear model of {agent_label(results.models[0].agent)}'s cumulative regret over all classes and "
             f"representations explains R² = {main.r_squared:.2f} of it ({main.cross_validated_r_squared:.2f} for tasks "
             f"it has not seen){printed}."
         )
@@ -90,7 +90,7 @@ MOST_COMPARED = 6  # agents and observations with a sentence of their own
 def _winner(results: Results) -> list[str]:
     """Sentences on who has the least regret, by how much less than each other one, and how sure that is.
 
-    All are compared on the tasks that all of them have, or, where there is none, each on its own.
+    All are compared on the tasks that all of them have. If there is none, each is averaged over its tasks.
     """
     groups = {
         key: own.groupby(["instance", "chance"])["normalized_regret"].mean().dropna()
@@ -105,8 +105,8 @@ def _winner(results: Results) -> list[str]:
     over = f"the mean over {pluralize(len(shared), 'task')}" if shared else "the mean over its own tasks"
     scale = "0 is optimal from the first episode on, 1 as bad as acting at random"
     if not others:
-        return [f"{label(*first)} has a normalised regret of {means[first]:.2f}, {over} ({scale})."]
-    lines = [f"{label(*first)} has the least normalised regret: {means[first]:.2f}, {over} ({scale})."]
+        return [f"{line_label(*first)} has a normalised regret of {means[first]:.2f}, {over} ({scale})."]
+    lines = [f"{line_label(*first)} has the least normalised regret: {means[first]:.2f}, {over} ({scale})."]
     lines = [lines[0][:1].upper() + lines[0][1:]]
     lines += [_behind(results.differences, first, other, means[other]) for other in others[:MOST_COMPARED]]
     if len(others) > MOST_COMPARED:
@@ -119,10 +119,10 @@ def _behind(differences: "pd.DataFrame", first: tuple[str, str], other: tuple[st
     forward = differences[(differences["ours"] == first) & (differences["theirs"] == other)]
     backward = differences[(differences["ours"] == other) & (differences["theirs"] == first)]
     if len(forward) == len(backward) == 0:
-        return f"{label(*other)}: {regret:.2f}, on other tasks: no comparison."
+        return f"{line_label(*other)}: {regret:.2f}, on other tasks: no comparison."
     row, sign = (forward.iloc[0], -1.0) if len(forward) else (backward.iloc[0], 1.0)
     more, ends = sign * row["difference"], sorted((sign * row["lower"], sign * row["upper"]))
-    text = f"{label(*other)}: {regret:.2f}, {more:.2f} more on {pluralize(int(row['tasks']), 'task')}"
+    text = f"{line_label(*other)}: {regret:.2f}, {more:.2f} more on {pluralize(int(row['tasks']), 'task')}"
     if not np.isfinite(row["p_value"]):
         return f"{text}; a task has one run, so nothing can be said about how sure this is."
     p = "p < 0.001" if row["adjusted"] < 0.001 else f"p = {row['adjusted']:.3f}"
@@ -141,20 +141,20 @@ def _other_winners(results: Results) -> list[str]:
     return [
         f"Returns and regret order them differently in {len(tasks)} of {many}. On {row['instance']} "
         f"(chance: {results.chances[row['instance'], row['chance']]}) "
-        f"{label(*row['most'])} has the highest return ({row['most_return']:.2f}) and a regret of "
-        f"{row['most_regret']:.2f}; {label(*row['least'])} has the least regret ({row['least_regret']:.2f}) and a "
+        f"{line_label(*row['most'])} has the highest return ({row['most_return']:.2f}) and a regret of "
+        f"{row['most_regret']:.2f}; {line_label(*row['least'])} has the least regret ({row['least_regret']:.2f}) and a "
         f"return of {row['least_return']:.2f}. Returns are of episodes played while learning, exploration included; "
         "regret is of the policies that were learnt."
     ]
 
 
 def _estimated(runs: "pd.DataFrame") -> str | None:
-    """Sentences on the regret that is estimated, and how wrong it may be; None where all regret is exact."""
+    """Sentences on the regret that is estimated, and how wrong it may be; None if all regret is exact."""
     estimates = runs[~runs["exact"].astype(bool)]
     if len(estimates) == 0:
         return None
     groups = estimates.groupby(["environment", "agent"], sort=True).size()
-    of = ", ".join(f"{agent_name(agent)} on {in_words(name)} ({count})" for (name, agent), count in groups.items())
+    of = ", ".join(f"{agent_label(agent)} on {in_words(name)} ({count})" for (name, agent), count in groups.items())
     return (
         f"The regret of {pluralize(len(estimates), 'run')} of {len(runs):,} is estimated by playing, because the "
         f"policy reaches too many states for an exact value: {of}. Their normalised regret may be off by up to ± "
@@ -174,7 +174,7 @@ def _findings(results: Results) -> Section | None:
         "Findings of the paper",
         "findings",
         counts=f"{len(decided)} of {len(results.findings)} can be looked at here: {counts}.",
-        table=table(
+        table=data_table(
             decided,
             "What the paper says in words, and the same from these runs. Undecided: not significant at 0.05; no "
             "correction for the number of tests. Every test counts a task once. Power: how probable it is that these "
@@ -197,13 +197,13 @@ def _regret(results: Results, figures: Figures) -> Section:
     return Section(
         "Regret",
         "regret",
-        figure=image(
+        figure=figure_image(
             figures,
             "regret",
             "Cumulative regret by steps (lower is better), the mean over instances and kinds of chance with the 95 % "
             "bootstrap interval over seeds." + (" The paper's figure 2." if results.comparison is not None else ""),
         ),
-        table=table(
+        table=data_table(
             shown[columns],
             "Interquartile mean of the normalised regret (0: optimal from the first episode on; 1: as bad as acting "
             "at random) and its 95 % stratified bootstrap interval. With few seeds such intervals are too narrow; n/a: "
@@ -219,20 +219,20 @@ def _intervals(rows: "pd.DataFrame", digits: int) -> list[str]:
 
 
 def _profiles(results: Results, figures: Figures) -> Section | None:
-    """Profiles and improvements; None where there is but one agent and observation."""
+    """Profiles and improvements; None if there is but one agent and observation."""
     if len(results.improvements) == 0:
         return None
     shown = results.improvements.assign(interval=_intervals(results.improvements, 2)).drop(columns=["lower", "upper"])
     return Section(
         "Profiles",
         "regret",
-        figure=image(
+        figure=figure_image(
             figures,
             "profiles",
             "Performance profiles: the share of runs whose score (1 minus the normalised regret: 1 is optimal, 0 as "
             "bad as acting at random) exceeds what stands below, with 95 % stratified bootstrap bands.",
         ),
-        table=table(
+        table=data_table(
             shown,
             "How probable it is that a run of the first has less regret than one of the second on the same task, the "
             "mean over tasks, with the 95 % stratified bootstrap interval (n/a: a task has one run); 0.5: no "
@@ -252,16 +252,18 @@ def _representations(results: Results, figures: Figures, left_out: list[str]) ->
         harder = (wide[observation] > wide[VECTOR]).groupby(level="environment").agg(["sum", "size"])
         lines = [
             f"{in_words(str(name))}: the {in_words(observation) if observation != IMAGE else 'image'} costs "
-            f"{agent_name(agent)} more regret in {row['sum']} of {row['size']} tasks"
+            f"{agent_label(agent)} more regret in {row['sum']} of {row['size']} tasks"
             for name, row in harder[harder["size"] >= FEWEST_TASKS].iterrows()
         ]
         caption = (
-            f"Normalised regret of {agent_name(agent)} that sees a vector against that of {agent_name(agent)} that "
+            f"Normalised regret of {agent_label(agent)} that sees a vector against that of {agent_label(agent)} that "
             "sees an image, a point for each instance and kind of chance. Below the dotted line the image is harder."
         )
         if results.comparison is not None and agent == PAPER_AGENT:
             caption += " The paper's figure 3."
-        parts.append({"figure": image(figures, representations_figure(agent, observation), caption), "lines": lines})
+        parts.append(
+            {"figure": figure_image(figures, representations_figure(agent, observation), caption), "lines": lines}
+        )
     if not parts:
         left_out.append(
             "Vector against image: there are no cells of DQN with both a vector and an image, nor of another agent."
@@ -283,7 +285,7 @@ def _aliasing(results: Results) -> Section | None:
     shown = shared.assign(share=[f"{100 * share:.1f} %" for share in shared["share"]])
     regrets = results.cells.pivot_table(
         index=["instance", "observation"], columns="agent", values="normalized_regret"
-    ).rename(columns=lambda agent: f"regret of {agent_name(agent)}")
+    ).rename(columns=lambda agent: f"regret of {agent_label(agent)}")
     shown = shown.merge(regrets.reset_index(), on=["instance", "observation"], how="left")
     return Section(
         "States that share an observation",
@@ -291,7 +293,7 @@ def _aliasing(results: Results) -> Section | None:
         text="These observations do not tell every state: an agent that remembers nothing cannot act differently in "
         "states that look alike, and learns from targets that mix them. Regret is measured against the optimal policy "
         "of the states. So where vectors and images are compared, a part of the difference may be this.",
-        table=table(
+        table=data_table(
             shown,
             "Reachable states, different observations among them, the share of states that look like another, and the "
             "normalised regret of agents that see them, the mean over kinds of chance.",
@@ -307,7 +309,7 @@ def _hardness(results: Results) -> Section:
     return Section(
         "Hardness of the instances",
         "hardness",
-        table=table(
+        table=data_table(
             _worded(results, results.hardness),
             "The tabular measures of each instance under each kind of chance, as they enter the models; notes say "
             "where one is of the instance without chance, or stands for a proven interval.",
@@ -327,10 +329,10 @@ def _returns(results: Results) -> Section:
     parts = []
     for environment in dict.fromkeys(results.cells["environment"]):
         wide = wide_returns(results.cells, environment, _return).fillna("")
-        wide.columns = [label(*key) for key in wide]
+        wide.columns = [line_label(*key) for key in wide]
         latex = returns_table(results.cells, environment)
         shown = _worded(results, wide.reset_index())
-        parts.append({"title": in_words(environment), "table": table(shown), "latex": latex})
+        parts.append({"title": in_words(environment), "table": data_table(shown), "latex": latex})
     return Section("Returns", "returns", parts=parts)
 
 
@@ -339,7 +341,7 @@ def _return(row: Mapping[str, Any]) -> str:
 
 
 def _paper_comparison(results: Results) -> Section | None:
-    """Our numbers beside those of the paper; None where no number is in both."""
+    """Our numbers beside the paper's; None if no number is in both."""
     if results.comparison is None:
         return None
     ours = [name for name in results.comparison.regressions.columns if name.startswith("ours_")]
@@ -360,10 +362,10 @@ def _paper_comparison(results: Results) -> Section | None:
     return Section(
         "Beside the paper",
         "beside",
-        regressions=table(fits, caption) if len(fits) else None,
+        regressions=data_table(fits, caption) if len(fits) else None,
         text=text if len(returns) else "",
         title_of_returns=f"All {len(returns)} values",
-        returns=table(returns.drop(columns=["parameters_as_printed"]), digits=2),
+        returns=data_table(returns.drop(columns=["parameters_as_printed"]), digits=2),
     )
 
 
@@ -401,10 +403,12 @@ def _each_instance(results: Results, figures: Figures) -> Section:
             f"Cumulative regret on each instance of {in_words(environment)} under each kind of chance: the mean, its "
             "95 % bootstrap interval, and thin a line for each seed."
         )
-        figure = image(figures, f"regret_by_task_{slug(environment)}", caption)
+        figure = figure_image(figures, f"regret_by_task_{slug(environment)}", caption)
         parts.append({"title": f"{in_words(environment)}, each kind of chance and each seed", "figure": figure})
     text = "Cumulative regret on each instance, all kinds of chance together."
-    return Section("Each instance", "each_instance", figure=image(figures, "regret_by_instance", text), parts=parts)
+    return Section(
+        "Each instance", "each_instance", figure=figure_image(figures, "regret_by_instance", text), parts=parts
+    )
 
 
 def _provenance(results: Results, left_out: Sequence[str]) -> Section:

@@ -1,0 +1,335 @@
+"""Diagnosis of an agent by name, or of a finished run of a benchmark: one answer, in words, numbers and a page.
+
+An agent by name is trained on twelve small worlds, where its values are held against exact ones (`examination.py`). A
+finished run is held against the baseline that it is nearest to, on groups of tasks that one mistake hits, if the others
+are spared. Nothing is trained for it, and no likeness of known faults is told: their table has values.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from pharos.benchmark.comparison import LEAST, WORSE, compare_groups
+from pharos.benchmark.contents import Contents, Source, contents_of, listed, run_warnings
+from pharos.benchmark.diagnosis import ONE_ACTION, groups_of, nearest, policies_of, seeds_sentence
+from pharos.benchmark.doctor import readings
+from pharos.benchmark.examination import NAMES, PROTOCOL, Examination, examine
+from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY
+from pharos.benchmark.profiles import (
+    BROKEN,
+    CREDIBLE,
+    Accuracy,
+    Finding,
+    Judgement,
+    Profile,
+    accuracy,
+    families,
+    judged,
+    kind_of,
+    shipped,
+)
+from pharos.benchmark.scores import run_scores
+from pharos.benchmark.suite import Suite
+from pharos.errors import ParameterError
+from pharos.system.wording import pluralize
+
+LOSS = 0.1  # of score, on a group of tasks or an axis, that is a symptom
+IN_PLAY = 0.05  # of score, that is lost by chance in play
+SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "vector": (
+        "look for a number that never reaches the network (slices, the number of inputs), and at sizes of numbers",
+        ("last_feature_lost",),
+    ),
+    "simple_image": ("divide bytes by 255, once; look at reshapes and the order of axes", ("bytes_not_divided",)),
+    "rewards of several sizes": (
+        "look for rewards that are clipped, scaled or normalised on their way",
+        ("rewards_clipped",),
+    ),
+    "ended by time alone": ("bootstrap where truncated: only terminated ends a return", ("truncation_as_end",)),
+    "exploration": (
+        "look at epsilon or the entropy bonus at the beginning, and at small costs that are clipped",
+        ("never_explores", "entropy_penalised", "rewards_clipped"),
+    ),
+    "estimation": (
+        "look at step sizes, the size of batches, and the size of the replay buffer",
+        ("replay_too_small", "learning_rate_high"),
+    ),
+    "credit": ("look at gamma, lambda and returns of several steps", ("gamma_half",)),
+}
+"""Groups of tasks and axes that one mistake hits: what to try, and the faults that they are a sign of."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Result of `diagnose`.
+
+    Attributes:
+        agent: its label. kind: "dqn", "ppo", or empty if it offers no values.
+        verdict: one sentence.
+        findings: symptoms that are there, signs of the likeliest fault first, then the strongest.
+        likeness: probability of each known fault, "none" among them, the largest first; empty for a finished run.
+        fault: the known fault that is said; None: none of the known ones.
+        strange: whether it is farther from all known faults, and from health, than known ones are.
+        accuracy: how often the likeness was right for agents that the library did not have.
+        scores: by world, or by task of a finished run: 1 optimal and 0 as uniform play, mean of the seeds.
+        readings: all numbers, see `doctor.readings`; empty for a finished run.
+    """
+
+    agent: str
+    kind: str
+    verdict: str
+    findings: tuple[Finding, ...]
+    likeness: Mapping[str, float]
+    fault: str | None
+    strange: bool
+    accuracy: Accuracy
+    scores: Mapping[str, float]
+    readings: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def is_healthy(self) -> bool:
+        """Whether no check has found anything, and no fault is said."""
+        return not self.findings and self.fault is None and not (self.readings and self.score < BROKEN)
+
+    @property
+    def score(self) -> float:
+        """The mean of the scores."""
+        return sum(self.scores.values()) / len(self.scores)
+
+    @property
+    def how_often(self) -> str:
+        """A sentence on how far the likeness can be trusted."""
+        right = self.accuracy
+        if not right.agents:
+            return "The table has one agent with each fault, so nothing is known of how often the likeness is right."
+        return (
+            f"Of {right.agents} agents, each left out of the table in turn, the fault was the likeliest for "
+            f"{right.first:.0%}, among three for {right.three:.0%}; {right.healthy:.0%} of the healthy ones were "
+            f"called healthy. If all agents with a fault were left out, the answer was none of the known ones, or the "
+            f"right family, for {right.unknown:.0%}."
+        )
+
+    @property
+    def library(self) -> list[Profile]:
+        """Known agents that it was held against."""
+        return library_of(self.kind)
+
+    def nearest(self) -> list[tuple[str, float, str]]:
+        """The three likeliest faults: name, "healthy" for none; likeness; in words."""
+        words = meanings(self.kind)
+        three = list(self.likeness.items())[:3]
+        return [("healthy" if name == HEALTHY else name, share, words.get(name, "")) for name, share in three]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The attributes, JSON-able."""
+        entry = {name: value for name, value in vars(self).items() if name not in ("findings", "accuracy")}
+        return {
+            **entry,
+            "healthy": self.is_healthy,
+            "findings": [vars(each) for each in self.findings],
+            "accuracy": vars(self.accuracy),
+        }
+
+    def to_html(self) -> str:
+        """The page as HTML, with a plot beside the nearest known agents; it loads and runs nothing."""
+        from pharos.benchmark.diagnosis_page import diagnosis_page
+
+        return diagnosis_page(self)
+
+    def __str__(self) -> str:
+        """The page, as Markdown."""
+        lines = [f"# Diagnosis of {self.agent}", "", self.verdict, ""]
+        if self.findings:
+            lines += ["## What no healthy agent shows", ""]
+            lines += [f"{k}. {each.wrong}. *Try:* {each.advice}." for k, each in enumerate(self.findings, start=1)]
+            lines.append("")
+        if self.likeness:
+            lines += ["## Nearest known agents", "", "| likeness | fault | |", "|---:|---|---|"]
+            lines += [f"| {share:.2f} | {name} | {text} |" for name, share, text in self.nearest()]
+            lines += ["", self.how_often, ""]
+        lines += ["## Scores", "", f"| {'world' if self.readings else 'task'} | score |", "|---|---:|"]
+        lines += [f"| {name} | {score:.2f} |" for name, score in self.scores.items()]
+        return "\n".join(lines) + "\n"
+
+
+def meanings(kind: str) -> dict[str, str]:
+    """Faults in words; of all kinds where it is empty."""
+    return {name: text for agent, table in FAULTS.items() if kind in ("", agent) for name, text in table.items()}
+
+
+def library_of(kind: str) -> list[Profile]:
+    """Known agents of a kind, of all kinds where it is empty."""
+    return [each for each in shipped() if kind in ("", each.kind)]
+
+
+def diagnose(
+    agent: str | Callable[..., Any] | None = None,
+    *,
+    results: Source | None = None,
+    hyperparameters: Mapping[str, Any] | None = None,
+    worlds: Sequence[str] = NAMES,
+    seeds: Sequence[int] = (0, 1),
+    steps: int = PROTOCOL.steps,
+    timeout: float | None = None,
+    suite: Suite | str | None = None,
+    tell: Callable[[float, str], object] = lambda share, text: None,
+) -> Diagnosis:
+    """Train an agent on twelve small worlds, or take a finished run, and say what is wrong, and what to try.
+
+    Its policies are asked for `q_values(observations)`, (N, A), or `values(observations)`, (N,), if they offer them, as
+    those of Stable-Baselines3 do: these are held against exact ones. Without, only its behaviour is judged.
+
+    Args:
+        agent, hyperparameters, worlds, seeds, steps, timeout, tell: as `examine` takes them. Limits and likeness are
+            those of agents with all worlds, two seeds and 4,000 steps.
+        results: in place of an agent: the folder or file of a finished run of a benchmark, or results read.
+        suite: the one that `results` are of, where that is not shipped.
+    Raises:
+        ParameterError: it is no agent, or it yields no policy; there are no such results; or both are given.
+        PharosError: its code raises something, SystemExit included. TimeLimit: a run took longer than was allowed.
+    Cost: 24 runs of 4,000 steps, in this process; of results, less than a second.
+    """
+    if (agent is None) == (results is None):
+        raise ParameterError(f"agent {agent!r}, results {results!r}; expected one of both")
+    if results is not None:
+        return diagnosis_of_results(contents_of(results, suite=suite))
+    label = agent if isinstance(agent, str) else getattr(agent, "__qualname__", repr(agent))
+    options: dict[str, Any] = {"hyperparameters": hyperparameters, "worlds": worlds, "seeds": seeds, "steps": steps}
+    return diagnosis_of(examine(agent, timeout=timeout, tell=tell, **options), label)  # type: ignore[arg-type]
+
+
+def diagnosis_of(examinations: Sequence[Examination], label: str) -> Diagnosis:
+    """The diagnosis that follows from what was seen."""
+    numbers = readings(examinations)
+    kind = kind_of(numbers)
+    answer = judged(numbers, library_of(kind))
+    scores = {
+        name: 1 - float(np.mean([each.regret for each in examinations if each.name == name]))
+        for name in dict.fromkeys(each.name for each in examinations)
+    }
+    notes: dict[str, list[tuple[str, str]]] = {}
+    for each in examinations:
+        for name, text in each.notes.items():
+            notes.setdefault(name, []).append((f"{each.name}, seed {each.seed}", text))
+    mistakes = [_mistake(name, runs, len(examinations)) for name, runs in notes.items()]
+    return _diagnosis(label, kind, mistakes, answer, accuracy(kind or "dqn"), scores, numbers)
+
+
+def _mistake(kind: str, runs: Sequence[tuple[str, str]], count: int) -> Finding:
+    """A note on the loop of an agent, of some of its runs, as a finding."""
+    (which, text), more = runs[0], f" and {pluralize(len(runs) - 1, 'other run')}" * (len(runs) > 1)
+    wrong, _, advice = text.partition("; expected ")
+    faults = ("seeds_ignored",) if kind == "same seed" else ()
+    return Finding(kind, len(runs) / count, 0.0, f"{which}{more}: {wrong}", advice or "use all steps", 0.0, faults)
+
+
+def _diagnosis(
+    label: str,
+    kind: str,
+    mistakes: Sequence[Finding],
+    answer: Judgement,
+    trusted: Accuracy,
+    scores: Mapping[str, float],
+    numbers: Mapping[str, float],
+) -> Diagnosis:
+    findings = (*mistakes, *answer.findings)
+    entries = findings, answer.shares, answer.fault, answer.is_strange, trusted, scores, numbers
+    diagnosis = Diagnosis(label, kind, "", *entries)
+    return replace(diagnosis, verdict=_verdict(diagnosis))
+
+
+def _verdict(diagnosis: Diagnosis) -> str:
+    fault, shares = diagnosis.fault, diagnosis.likeness
+    like = f"it is most like an agent in which {meanings(diagnosis.kind)[fault]} ({shares[fault]:.2f})" if fault else ""
+    if diagnosis.findings:
+        family, share = next(iter(families(shares).items()))
+        near = f", and nearest to faults of {FAMILIES[family][0]}" if share > CREDIBLE else ""
+        like = like or f"it is like none of the known faults{near}" * bool(shares)
+        return f"Something is wrong: {diagnosis.findings[0].wrong}{'; ' * bool(like)}{like}."
+    if fault:
+        return f"No single number is unlike those of healthy agents, but {like}."
+    if diagnosis.readings and diagnosis.score < BROKEN:
+        return f"It learns little (mean score {diagnosis.score:.2f}), and is like none of the known faults."
+    return f"Nothing is wrong that these {'worlds' if diagnosis.readings else 'results'} and checks can see."
+
+
+# Finished runs --------------------------------------------------------------------------------------------------------
+
+
+def diagnosis_of_results(contents: Contents) -> Diagnosis:
+    """The diagnosis that follows from a finished run, beside the baseline that it is nearest to."""
+    results, kind = contents.agent.results, contents.predictor if contents.predictor in FAULTS else ""
+    scores = {name: float(runs.mean()) for name, runs in run_scores(results).items()}
+    findings = sorted(findings_of(contents), key=lambda each: -each.strength)
+    answer = Judgement(tuple(findings), {}, None, False)
+    mistakes = [
+        Finding("warning", 1.0, 0.0, text.rstrip("."), "mend this first; see the page of `benchmark report`")
+        for text in (*seeds_sentence([contents.agent]), *run_warnings(results))
+        if "first policy came after" not in text
+    ]
+    return _diagnosis(contents.agent.name, kind, mistakes, answer, accuracy(kind or "dqn"), scores, {})
+
+
+def findings_of(contents: Contents) -> list[Finding]:
+    """Symptoms that a finished run shows beside the baseline that it is nearest to; without one, those of its own."""
+    findings = _own_findings(contents)
+    if (near := nearest(contents)) is None:
+        return findings
+    other, comparison = contents.beside[near[0]], contents.comparisons[near[0]]
+    below = [name for name in contents.agent.score.below_random if name not in other.score.below_random]
+    if len(below) * 4 >= len(contents.agent.score.tasks):
+        wrong = (
+            f"worse than random play on {len(below)} of {len(contents.agent.score.tasks)} tasks, as {other.name} is not"
+        )
+        advice = (
+            "look at the action that is executed (an index from 1, an offset), and at the sign of rewards and losses"
+        )
+        share = len(below) / len(contents.agent.score.tasks)
+        findings.append(Finding("below_random", share, 0.25, wrong, advice, 10 * share, ("action_off_by_one",)))
+    axes = {axis: own.score for axis, own in comparison.axes.items() if axis in SIGNS}
+    is_worse = [own.verdict == WORSE and own.interval.value <= -LOSS for own in axes.values()]
+    if comparison.core is not None and comparison.core.verdict == WORSE and len(axes) > 1 and all(is_worse):
+        wrong = f"it falls everywhere: the core and the axes of {listed([*axes])} are below {other.name}'s"
+        advice = "look at the target network, the learning rate, and what is stored"
+        return [*findings, Finding("everywhere", 1.0, 0.0, wrong, advice, 10.0, FAMILIES["updates"][1])]
+    by_seen, by_property = groups_of(contents)
+    groups = {**by_seen, **by_property}
+    core = {name for names in by_seen.values() for name in names}
+    for name, each in compare_groups(contents.agent.results, other.results, groups).items():
+        rest = compare_groups(contents.agent.results, other.results, {"": sorted(core - {*groups[name]})})
+        spared = rest[""].interval.value if rest else 0.0
+        if name in SIGNS and each.verdict == WORSE and spared > each.interval.value / 2:
+            where = f"core tasks with {name}" if name in by_property else f"core tasks seen as {name}"
+            findings += _loss(name, each.interval.value, f"{where}, beside {spared:+.2f} on the others", other.name)
+    for axis, own in axes.items():
+        if own.verdict == WORSE:
+            findings += _loss(axis, own.interval.value, f"the axis of {axis}", other.name)
+    return findings
+
+
+def _loss(name: str, difference: float, where: str, other: str) -> list[Finding]:
+    if difference > -LOSS:
+        return []
+    advice, faults = SIGNS[name]
+    wrong = f"it scores {-difference:.2f} less than {other} on {where}"
+    return [Finding(name, difference, -LOSS, wrong, advice, -difference / LOSS, faults)]
+
+
+def _own_findings(contents: Contents) -> list[Finding]:
+    """Symptoms in what the final policies are like: one action nearly everywhere, noise in play."""
+    facts, runs = policies_of(contents.agent.results), run_scores(contents.agent.results)
+    fixed = [name for name, each in facts.items() if each["one_action"] >= ONE_ACTION]
+    findings = []
+    if facts and 2 * len(fixed) >= len(facts):
+        wrong = f"on {len(fixed)} of {len(facts)} tasks the final policy prefers one action in 90 % of states and more"
+        advice = "look at whether the observation reaches the network, and at the step size"
+        faults = ("learning_rate_high", "bytes_not_divided")
+        findings.append(Finding("one_action", len(fixed) / len(facts), 0.5, wrong, advice, 5.0, faults))
+    noise = [each["greedy_score"] - float(runs[name].mean()) for name, each in facts.items() if "greedy_score" in each]
+    if noise and (loss := sum(noise) / len(facts)) > IN_PLAY:
+        wrong = f"played greedily, the same policies score {loss:.2f} more on {listed([pluralize(len(facts), 'task')])}"
+        advice = "judge the greedy policy of a learner of values; look at the temperature and the entropy bonus"
+        findings.append(Finding("noise", loss, IN_PLAY, wrong, advice, loss / LEAST, ("plays_at_random",)))
+    return findings
