@@ -10,6 +10,7 @@ from patience import PATIENCE
 TESTS = Path(__file__).parents[1]
 LIMIT = re.compile(r"""timeout["']?[=:]\s*[\d.]+|\b(wait|join|alarm)\([1-9][\d.]*\)|deadline=|HealthCheck\.""")
 OWN = {
+    "benchmark/test_profiles.py": ["timeout=0.2"],  # of an agent that hangs, which is what is tested
     "benchmark/test_jax_agents.py": ['timeout": 0.5'],  # as below
     "conftest.py": ["deadline=", "HealthCheck."],
     "study/test_study_execution.py": ["timeout=0.5"],  # of runs that never end, which is what is tested
