@@ -14,7 +14,7 @@ from pharos.benchmark.suite import FOLDER, PAIRS
 
 PROTOCOL = Protocol(steps=10_000, evaluations=10)
 CHOICE, FOUR = "delayed_choice", {"num_actions": 4, "cues": 4}
-WAIT = {"delays": [1, 2, 3, 4, 5], "mapping_seed": 2, "bonus": 1.0}  # the best of five is worth twice any other
+WAIT = {"delays": [1, 2, 3, 4, 5], "mapping_seed": 1, "bonus": 3.0}  # the second of five is worth four of any other
 BASIC = {
     "basic-bandit": {"length": 1, "num_actions": 4, "cues": 1},
     "basic-sight": {"length": 1, **FOUR},
@@ -53,7 +53,7 @@ def main() -> None:
 def ladders_of(v1):
     """Yield axis, unit, quantity, measure and tasks of each ladder."""
     episodes = "log2 of the episodes that random play needs"
-    for axis, cost, words in (("free", 0.0, "nothing"), ("costly", 0.5, "half of the treasure")):
+    for axis, cost, words in (("free", 0.0, "nothing"), ("costly", 0.2, "a fifth of the treasure")):
         sizes = [
             BenchmarkTask(
                 f"sea-{axis}-{size}", "deep_sea", {"size": size, "mapping_seed": 1, "move_cost": cost}, "one_hot"

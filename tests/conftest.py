@@ -41,7 +41,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
 
 INTERPRETED_BELOW = compiling.SMALL_STATES
-INTERPRETED = {"benchmark", "interaction", "training"}
+INTERPRETED = {"agents", "benchmark", "interaction", "training"}
 """Folders whose worlds are interpreted where a user's would be, as their tests are of what comes after. Elsewhere the
 small worlds of tests are of compiled code."""
 

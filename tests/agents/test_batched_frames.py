@@ -100,7 +100,7 @@ def test_dqn_learns_from_the_frames_that_stable_baselines3_keeps(sight, n_steps,
     lane, env, flags = recorded("dqn", task, hyperparameters, total)
     monkeypatch.setattr(lane, "learn_minibatch", lambda: None)
     lane.advance(total)
-    assert flags == {0, batched.DONE, batched.DONE | batched.TIMEOUT}
+    assert flags == {0, batched.ENDED, batched.ENDED | batched.TIMEOUT}
     model = make_model(DQN, env, hyperparameters, seed=0)
     monkeypatch.setattr(model, "train", lambda **_: None)
     model.learn(total)
@@ -137,7 +137,7 @@ def test_ppo_gathers_the_frames_and_values_that_stable_baselines3_gathers(sight,
     ours = updates_of(lane, ("states", "rewards", "kept_values", "begins", "advantages"), monkeypatch)
     theirs = []
     lane.advance(total)
-    assert flags == {0, batched.DONE, batched.DONE | batched.TIMEOUT}
+    assert flags == {0, batched.ENDED, batched.ENDED | batched.TIMEOUT}
     model = make_model(PPO, env, PPO_OPTIONS, seed=0)
     model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in lane.stored(RUN).items()})
     buffer = model.rollout_buffer
@@ -166,7 +166,7 @@ def test_a_run_with_frames_is_the_same_alone_among_others_and_drawn(agent, monke
     assert outcome(together, 5) == alone
     assert all(outcome(together, i) == outcome(backwards, 10 - i) for i in range(11))
     assert len({outcome(together, i) for i in range(11)}) == 11
-    monkeypatch.setattr(lanes, "LARGEST_TABLE", 0)
+    monkeypatch.setattr(lanes, "OBSERVED_BYTES", 0)
     assert outcome(learned(agent, runs[5:6]), 0) == alone
 
 
@@ -204,7 +204,7 @@ def test_what_is_looked_up_is_what_is_drawn(sight, monkeypatch):
     task = task_of(sight)
     runs = runs_of(task, DQN_OPTIONS, 1)
     in_table, drawn = make_batch("dqn", runs).lanes[0], None
-    monkeypatch.setattr(lanes, "LARGEST_TABLE", 0)
+    monkeypatch.setattr(lanes, "OBSERVED_BYTES", 0)
     drawn = make_batch("dqn", runs).lanes[0]
     assert in_table.seen._table is not None and drawn.seen._table is None
     histories = np.random.default_rng(0).integers(0, task.space.num_states, (in_table.width, 7, *in_table.depth))
@@ -263,7 +263,7 @@ def test_policies_of_frames_that_walk_together_are_worth_what_they_are_alone():
 @pytest.mark.long
 @pytest.mark.parametrize(("agent", "chance"), [("dqn", {}), ("dqn", {"random": 0.1}), ("ppo", {})])
 def test_runs_with_frames_are_measured_exactly_kept_and_resumed(agent, chance, tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("pharos.training.results"), "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(importlib.import_module("pharos.training.results"), "RUN_CHECKPOINT_SECONDS", 0.0)
     small = {"dqn": {"learning_starts": 50, "buffer_size": 100}, "ppo": {"n_steps": 32, "n_envs": 2, "batch_size": 32}}
     name, seen = SIGHTS["small"]
     options = {"steps": 400, "evaluation_interval": 100, "hyperparameters": small[agent], "horizon": LIMIT,

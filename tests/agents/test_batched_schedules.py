@@ -58,7 +58,7 @@ class Recorded(VecEnv):
         step = self.steps[self.at]
         self.at += 1
         infos = [{} for _ in self.starts]
-        done = step["flags"] & batched.DONE > 0
+        done = step["flags"] & batched.ENDED > 0
         for e in np.flatnonzero(done):
             infos[e] = {
                 "terminal_observation": OneHots().at(step["next_state"][e]),
@@ -102,7 +102,7 @@ def recorded(lane, steps):
     lane.step = record
     lane.advance(steps)
     flags = np.concatenate([each["flags"] for each in found])
-    assert {0, batched.DONE, batched.DONE | batched.TIMEOUT} == set(flags.tolist())
+    assert {0, batched.ENDED, batched.ENDED | batched.TIMEOUT} == set(flags.tolist())
     return Recorded(starts, found)
 
 
@@ -159,7 +159,7 @@ def assert_same_memory(lane, model):
     assert (buffer.next_observations.argmax(axis=2) == following)[seen].all()
     assert (buffer.actions[..., 0] == action)[seen].all()
     assert (buffer.rewards == reward)[seen].all()
-    assert (buffer.dones == (flags & batched.DONE > 0))[seen].all()
+    assert (buffer.dones == (flags & batched.ENDED > 0))[seen].all()
     assert (buffer.timeouts == (flags & batched.TIMEOUT > 0))[seen].all()
 
 

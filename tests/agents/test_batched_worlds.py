@@ -58,7 +58,7 @@ def test_episodes_are_as_likely_as_the_mdp_says(slippery, chance):
         state, previous = worlds.state.copy(), worlds.previous.copy()
         chosen = rng.integers(0, 2, state.shape)
         worlds.step(step, chosen, counts=True)
-        ended = worlds.flags & kernels.DONE > 0
+        ended = worlds.flags & kernels.ENDED > 0
         np.add.at(starts, worlds.state[ended], 1)
         executed = worlds.previous[~ended]
         np.add.at(met, (state[~ended], executed, worlds.next_state[~ended]), 1)
@@ -96,7 +96,7 @@ def test_what_is_executed_is_in_the_sets_and_as_likely_as_it_should_be():
         alone.step(step, np.concatenate([chosen, chosen]), counts=True)
         # runs without sets are what they are without a neighbour that has some
         assert (worlds.state[20:] == alone.state[20:]).all() and (worlds.previous[20:] == alone.previous[20:]).all()
-        goes_on = worlds.flags[:20] & kernels.DONE == 0
+        goes_on = worlds.flags[:20] & kernels.ENDED == 0
         each = zip(state[:20][goes_on], chosen[goes_on], previous[:20][goes_on], strict=True)
         for key, executed in zip(each, worlds.previous[:20][goes_on], strict=True):
             counts.setdefault(key, np.zeros(3))[executed] += 1
@@ -140,7 +140,7 @@ def test_pay_is_late_and_noisy_as_elsewhere_and_returns_are_of_what_is_earned(sl
         actions = np.tile(rng.integers(0, 2, (8, 5)), (5, 1))
         worlds.step(step, actions, counts=True)
         earned, once, thrice, noisy, both = worlds.reward.reshape(5, 40)
-        ended = (worlds.flags[:8].ravel() & kernels.DONE) > 0
+        ended = (worlds.flags[:8].ravel() & kernels.ENDED) > 0
         for payment, paid in zip(payments, (once, thrice), strict=True):
             assert np.allclose(payment.pay(earned, np.ones(40, np.bool_), ended), paid, rtol=0, atol=1e-12)
         assert np.allclose(noisy - earned, both - thrice, rtol=0, atol=1e-12)  # named by run and step
@@ -163,7 +163,7 @@ def test_returns_are_counted_until_the_end_of_the_training_alone(slippery):
         worlds.step(step, np.full((3, 4), step % 2), counts=counts)
         running += discount * worlds.reward
         discount *= 0.5
-        ended = worlds.flags & kernels.DONE > 0
+        ended = worlds.flags & kernels.ENDED > 0
         if counts:
             episodes += ended.sum(axis=1)
             sums += (running * ended).sum(axis=1)
@@ -202,5 +202,5 @@ def test_observations_that_fit_no_table_change_nothing(monkeypatch, observation)
     task = Task.of(make("frozen_lake/4x4"), observation=observation)
     runs = runs_of(task, DQN, 2, 60)
     in_table = outcomes(runs)
-    monkeypatch.setattr(lanes, "LARGEST_TABLE", 0)
+    monkeypatch.setattr(lanes, "OBSERVED_BYTES", 0)
     assert in_table == outcomes(runs)

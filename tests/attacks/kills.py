@@ -108,7 +108,7 @@ def _prepare(programs: dict[Path, list[list[str]]]) -> None:
     search.CHUNK, search.WIDE = 512, 200  # type: ignore[attr-defined]
     state_space.build.__kwdefaults__["checkpoint_seconds"] = 0.0
     memory.LEAST_MEMORY = 1 << 16
-    results.CHECKPOINT_SECONDS = 0.0
+    results.RUN_CHECKPOINT_SECONDS = 0.0
     os.fsync = lambda _: None  # type: ignore[assignment]  # what is killed loses nothing that is not on the disk yet
     fork = multiprocessing.get_context("fork")
     multiprocessing.get_context = lambda method=None: fork  # type: ignore[assignment]

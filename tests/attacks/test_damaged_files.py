@@ -249,7 +249,7 @@ def test_runs(name, attack, tmp_path):
 
 @pytest.mark.parametrize("name", AGENTS)
 def test_checkpoints(name, attack, tmp_path, monkeypatch):
-    monkeypatch.setattr("pharos.training.results.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("pharos.training.results.RUN_CHECKPOINT_SECONDS", 0.0)
 
     def stop(done, *_):
         if done >= 64:

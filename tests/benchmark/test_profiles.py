@@ -10,7 +10,7 @@ from pharos.benchmark import diagnose, faults
 from pharos.benchmark.agent_diagnosis import diagnosis_of_results, findings_of, meanings
 from pharos.benchmark.contents import contents_of
 from pharos.benchmark.diagnosis_page import profile_rows
-from pharos.benchmark.examination import NAMES
+from pharos.benchmark.examination import NAMES, solved, value_functions
 from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY, batch_of
 from pharos.benchmark.profiles import (
     HEALTHY_ONES,
@@ -28,6 +28,7 @@ from pharos.benchmark.profiles import (
 from pharos.benchmark.results import AgentResults
 from pharos.benchmark.suite import load_suite
 from pharos.errors import TimeLimit
+from pharos.training import PolicyRecorder
 from refusals import failing
 
 
@@ -135,7 +136,7 @@ def test_a_lost_feature_is_said_in_words_and_in_json(tmp_path):
     assert json.dumps(said)
     done = run("diagnose", name, "--steps", 400, "--seeds", 1)
     assert done.exit_code == 0 and "Nearest known agents" in done.stdout
-    assert run("diagnose", "q_learning").exit_code == 2
+    assert run("diagnose", "nope").exit_code == 2
 
 
 def test_a_page_that_cannot_be_written_is_refused_before_anything_is_trained(tmp_path, monkeypatch):
@@ -253,6 +254,7 @@ def test_a_run_of_a_shipped_agent_shows_no_symptom():
         assert readings_of(results) == []
         said = diagnosis_of_results(contents_of(results))
         assert said.kind == name and not said.readings and set(said.scores) == set(half)
+        assert said.is_healthy and said.verdict == "Nothing is wrong that these results and checks can see."
 
 
 def test_groups_of_tasks_that_lose_alone_are_named():
@@ -297,3 +299,30 @@ def test_the_plot_has_the_readings_that_differ_most():
         assert (own - other) * (numbers[name] - faulty) >= 0
         if abs(faulty - healthy) > 1e-9:
             assert own / other == pytest.approx((numbers[name] - healthy) / (faulty - healthy))
+
+
+@pytest.mark.long
+def test_the_table_of_pharos_is_diagnosed_and_its_discount_read_from_its_values():
+    assert diagnose("q_learning").is_healthy
+    short = diagnose("q_learning", hyperparameters={"gamma": 0.5}, worlds=["lake", "umbrella", "road"])
+    assert short.findings[0].reading == "gamma" and 0.4 < 1 - 10 ** -short.readings["gamma"] < 0.6
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["DQN", "PPO"])
+def test_values_of_models_of_stable_baselines3_are_those_of_their_networks(name):
+    import stable_baselines3
+    import torch
+
+    task, _, observations = solved("lake")
+    env = PolicyRecorder(task, steps=64, interval=64, seed=0).env
+    model = getattr(stable_baselines3, name)("MlpPolicy", env, seed=0, device="cpu")
+    q_values, values = value_functions(model)
+    tensor = torch.as_tensor(observations).float()
+    with torch.no_grad():
+        if name == "DQN":
+            assert values is None and np.allclose(q_values(observations), model.q_net(tensor).numpy())
+        else:
+            assert q_values is None and np.allclose(
+                values(observations), model.policy.predict_values(tensor).numpy()[:, 0]
+            )

@@ -32,4 +32,4 @@ def test_minutes_count_tasks_without_a_time_as_the_mean():
 
 def test_no_such_suite_is_one_line():
     said = usage_error("benchmark", "show", "v9")
-    assert "v9" in said and "v1" in said
+    assert "'v9'" in said and "did you mean 'v" in said

@@ -1,5 +1,6 @@
 """Suite v2: its digest, its worlds by rules in plain Python, its theorems, and scores of pairs."""
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -20,7 +21,7 @@ from strategies import examples, small_mdps
 
 DIGESTS = {
     "v1": "50d45f848f991081acf6b8ce6a5c532614ebc2139ea50d148094ea50894b1086",
-    "v2": "1d26d5142bbb012da57e9f688f30b2e7c201c51af7e8ddf2e13466e796b939a5",
+    "v2": "9cd57e21c411a27e01067759e9dec8b8370293dc53163a538b4f545edb1e53ef",
 }
 
 
@@ -41,6 +42,22 @@ def test_ladders_of_v2_rise_and_pairs_are_one_world_in_two_ways():
             assert (first.value_optimal, first.value_uniform) == (second.value_optimal, second.value_uniform)
             assert first.digest != second.digest and (first.level, second.level) == (0, 1)
     assert {ladder.axis for ladder in suite.ladders if ladder.pairs} == {"representation", "hidden"}
+
+
+def test_levels_are_what_the_parameters_say():
+    """Measured before any run, and known without measuring: 2^size dives, lag, copies, powers of 10."""
+    told = {
+        "sea": lambda task: task.parameters["size"],
+        "lag": lambda task: task.parameters["lag"],
+        "copies": lambda task: task.parameters["irrelevant_bits"],
+        "large": lambda task: -math.log10(task.chance.get("scale_rewards", 1.0)),
+        "small": lambda task: math.log10(task.chance.get("scale_rewards", 1.0)),
+    }
+    rungs = [task for ladder in load_suite("v2").ladders if not ladder.pairs for task in ladder.tasks]
+    counted = [task for task in rungs if task.name.partition("-")[0] in told]
+    assert len(counted) == 31
+    for task in counted:
+        assert task.level == pytest.approx(told[task.name.partition("-")[0]](task), abs=1e-9), task.name
 
 
 # Worlds by their rules ----------------------------------------------------------------------------------------------
@@ -170,8 +187,8 @@ def test_rungs_of_the_unit_of_rewards_have_one_mdp_and_other_pay():
         for power, task in enumerate(rungs):
             env = pharos.GymEnv("discounting_chain", **task.parameters, **task.chance)
             env.reset(seed=0)
-            paid = [env.step(2)[1] for _ in range(5)]
-            assert paid == pytest.approx([0, 0, 2 * base**power, 0, 0], rel=1e-12)
+            paid = [env.step(1)[1] for _ in range(5)]
+            assert paid == pytest.approx([0, 4 * base**power, 0, 0, 0], rel=1e-12)
 
 
 # Pairs --------------------------------------------------------------------------------------------------------------

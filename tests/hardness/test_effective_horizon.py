@@ -14,7 +14,7 @@ from naive.horizon import analysis
 from pharos import hardness
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.effective_horizon import LargeHorizon, NodeHorizon, horizon_fields
-from pharos.hardness.steps import TIE
+from pharos.hardness.steps import OPTIMAL_TIE
 from pharos.mdp import (
     TabularMDP,
     mdp_within,
@@ -114,7 +114,7 @@ def test_it_is_what_its_definition_says(mdp, chance, steps):
 @examples(150, deterministic_mdps(max_states=6, max_actions=3), st.integers(1, 7))
 def test_the_compiled_analysis_is_the_other_one(mdp, steps):
     one = horizon_fields(NodeHorizon.of_steps(mdp, steps))
-    other = horizon_fields(LargeHorizon(mdp, steps, TIE))
+    other = horizon_fields(LargeHorizon(mdp, steps, OPTIMAL_TIE))
     assert one.keys() == other.keys()
     for name in one:
         assert one[name] == pytest.approx(other[name], rel=1e-12, abs=1e-12), name
@@ -122,7 +122,7 @@ def test_the_compiled_analysis_is_the_other_one(mdp, steps):
 
 @pytest.mark.long
 def test_the_compiled_analysis_of_key_corridor_is_the_published_one():
-    found = horizon_fields(LargeHorizon(key_corridor(), 100, TIE))
+    found = horizon_fields(LargeHorizon(key_corridor(), 100, OPTIMAL_TIE))
     expected = published("_analyzed")
     assert (found["k_min"], found["effective_planning_window"]) == (expected["min_k"], expected["epw"])
     assert found["ms"] == expected["effective_horizon_results"]["ms"]
@@ -133,7 +133,7 @@ def test_the_compiled_analysis_of_key_corridor_is_the_published_one():
 def test_larger_games_are_analysed_by_the_compiled_one(monkeypatch):
     mdp = pharos.build(pharos.make("frozen_lake/8x8")).mdp(gamma=1.0)
     expected = hardness.effective_horizon(mdp, horizon=30)
-    monkeypatch.setattr(importlib.import_module("pharos.hardness.effective_horizon"), "COMPILED", 0)
+    monkeypatch.setattr(importlib.import_module("pharos.hardness.effective_horizon"), "LARGEST_WRITTEN_TABLE", 0)
     assert hardness.effective_horizon(mdp, horizon=30) == expected
 
 
@@ -206,14 +206,14 @@ def test_states_that_no_episode_meets_do_not_matter(mdp, chance, steps):
     for name in whole:
         assert part[name] == pytest.approx(whole[name], rel=1e-9, abs=1e-12), name
     if not chance and mdp.next_states is not None:
-        whole, part = (horizon_fields(LargeHorizon(each, steps, TIE)) for each in (mdp, mdp_within(mdp, steps)))
+        whole, part = (horizon_fields(LargeHorizon(each, steps, OPTIMAL_TIE)) for each in (mdp, mdp_within(mdp, steps)))
         assert part == whole
 
 
 def test_the_limit_of_memory_is_what_is_free_in_the_container(monkeypatch):
     monkeypatch.setattr("pharos.system.memory.available_memory", lambda: 100)
     with pytest.raises(UndefinedMeasure, match=r"more than 0\.0, 60% of the free memory"):
-        LargeHorizon(TabularMDP.from_arrays([[0, 0]], [[0.0, 1.0]]), 4, TIE)
+        LargeHorizon(TabularMDP.from_arrays([[0, 0]], [[0.0, 1.0]]), 4, OPTIMAL_TIE)
 
 
 @pytest.mark.slow
@@ -233,10 +233,10 @@ def test_actions_that_rounding_or_less_than_the_tie_tolerance_tells_apart_are_bo
     mdp = TabularMDP.from_arrays(
         [[1, 2], [3, 3], [3, 3], [3, 3]], [[0.1, 0.3 - less], [0.2, 0.0], [0.0, 0.0], [0.0, 0.0]]
     )
-    expected = 1 if less < TIE else 2
+    expected = 1 if less < OPTIMAL_TIE else 2
     assert 0.1 + 0.2 > 0.3
     assert horizon_fields(NodeHorizon.of_steps(mdp, 2))["k_min"] == expected
-    assert horizon_fields(LargeHorizon(mdp, 2, TIE))["k_min"] == expected
+    assert horizon_fields(LargeHorizon(mdp, 2, OPTIMAL_TIE))["k_min"] == expected
 
 
 @pytest.mark.parametrize("function", [hardness.effective_horizon, hardness.gorp_bound])

@@ -110,7 +110,7 @@ def test_blocks_give_the_same_kernel_as_one_by_one(name, monkeypatch):
     whole = tangent_kernel(network, x)
     assert (whole == whole.T).all()
     np.testing.assert_allclose(tangent_kernel(network, x[:2], x[2:]), whole[:2, 2:], rtol=1e-6)
-    monkeypatch.setattr("pharos.hardness.representation.networks.BLOCK", 4)
+    monkeypatch.setattr("pharos.hardness.representation.networks.PAIR_BLOCK", 4)
     np.testing.assert_allclose(tangent_kernel(network, x), whole, rtol=1e-6)
     assert np.linalg.eigvalsh(whole.astype(float)).min() > 0
 

@@ -95,8 +95,8 @@ def test_gain_and_bias_of_policies_under_every_chance(mdp, data):
 def test_sweeps_alone_prove_the_same(mdp, kind):
     """Components too large for equations, and many nodes where play may end up."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(average, "ELIMINATED", 0)
-        patch.setattr(average, "MOST_SWEEPS", 3000)
+        patch.setattr(average, "MOST_UNSWEPT_NODES", 0)
+        patch.setattr(average, "MOST_GAIN_SWEEPS", 3000)
         patch.setattr(average.MeanPayoff, "_improve", lambda *_: False)
         patch.setattr(average.MeanPayoff, "_in_rational_numbers", lambda _: False)
         try:

@@ -209,7 +209,7 @@ def test_solving_goes_on_whoever_failed_and_however_many_go_on(size, who, number
     with tempfile.TemporaryDirectory() as folder:
         options = {"horizon": horizon, "checkpoint": folder, "checkpoint_seconds": -1.0}
         with contextlib.suppress(Killed, RankFailed), pytest.MonkeyPatch.context() as patch:
-            patch.setattr(ranked, "_SHARE", 0)
+            patch.setattr(ranked, "_WRITING_SHARE", 0)
             late, fails = out_of_order(seed), fails_at(who % size, number)
             solved(mdp, size, disturb=lambda rank: (fails(rank), late(rank)), **options)
         result = solved(mdp, then, **options)
@@ -222,7 +222,7 @@ def test_solving_goes_on_whoever_failed_and_however_many_go_on(size, who, number
 
 @pytest.mark.long
 def test_a_checkpoint_is_of_one_question(tmp_path, monkeypatch):
-    monkeypatch.setattr(ranked, "_SHARE", 0)
+    monkeypatch.setattr(ranked, "_WRITING_SHARE", 0)
     options = {"checkpoint": tmp_path, "checkpoint_seconds": -1.0}
     with pytest.raises(Killed):
         solved(chain(), 2, disturb=fails_at(0, 20), **options)
@@ -244,7 +244,7 @@ def test_a_checkpoint_is_of_one_question(tmp_path, monkeypatch):
 @pytest.mark.long
 @pytest.mark.parametrize("harm", ["cut", "changed", "empty"])
 def test_a_checkpoint_that_is_not_whole_is_no_checkpoint(harm, tmp_path, monkeypatch):
-    monkeypatch.setattr(ranked, "_SHARE", 0)
+    monkeypatch.setattr(ranked, "_WRITING_SHARE", 0)
     options = {"horizon": 60, "checkpoint": tmp_path, "checkpoint_seconds": -1.0}
     with pytest.raises(Killed):
         solved(chain(), 2, disturb=fails_at(0, 25), **options)
@@ -257,7 +257,7 @@ def test_a_checkpoint_that_is_not_whole_is_no_checkpoint(harm, tmp_path, monkeyp
 
 @pytest.mark.long
 def test_a_full_disk_ends_no_solving(tmp_path, monkeypatch):
-    monkeypatch.setattr(ranked, "_SHARE", 0)
+    monkeypatch.setattr(ranked, "_WRITING_SHARE", 0)
     monkeypatch.setattr(ranked.storage, "replacing", failing(errno.ENOSPC))
     with pytest.warns(UserWarning, match=r"No space left on device; values are not kept any more, solving goes on"):
         result = solved(chain(), 2, checkpoint=tmp_path, checkpoint_seconds=-1.0)

@@ -56,7 +56,7 @@ def build_by_threads(env, folder, size, *, wide=0, rows=64, disturb=lambda rank:
         ranked_table.answer(plan, rank, None)
 
     with pytest.MonkeyPatch.context() as patch, lock_build(folder), reporter(False, env) as report:
-        patch.setattr(ranked_table, "ROWS", rows)
+        patch.setattr(ranked_table, "SUPERSTEP_ROWS", rows)
         patch.setattr(search, "CHUNK", 8 * rows)
         manifest = pharos.state_space.read_manifest(folder)
         with loop(size, answer) as rank:

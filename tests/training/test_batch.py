@@ -28,7 +28,7 @@ from pharos.training import (
     train_many,
     tune,
 )
-from pharos.training.results import COLUMNS
+from pharos.training.results import CURVE_COLUMNS
 from pharos.training.schedule import plan
 from refusals import failing, refusal
 
@@ -38,7 +38,7 @@ _results = importlib.import_module("pharos.training.results")
 @pytest.fixture
 def engine(monkeypatch):
     monkeypatch.setitem(sys.modules, "pharos.agents.batched", fake_engine)
-    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "RUN_CHECKPOINT_SECONDS", 0.0)
     fake_engine.made.clear()
     return fake_engine
 
@@ -64,7 +64,7 @@ def test_each_run_leaves_what_a_run_leaves(engine, tmp_path):
         assert record["status"] == "finished" and record["config"]["engine"] == "batched"
         assert record["config"]["seed"] == seed and record["result"] == result.result
         assert record["batch"]["runs"] == 3 and record["seconds"] == pytest.approx(record["batch"]["seconds"] / 3)
-        assert list(curve.columns) == list(COLUMNS) and curve["step"].tolist() == [0, 10, 20, 30, 40]
+        assert list(curve.columns) == list(CURVE_COLUMNS) and curve["step"].tolist() == [0, 10, 20, 30, 40]
         assert set(record["checksums"]) == {"curve.csv", "agent/model.json", "agent/parameters.pt"}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["seed-0", "seed-1", "seed-2"]
 
@@ -206,7 +206,7 @@ def test_tables_of_many_seeds_are_those_of_single_runs(tmp_path):
 
 
 def test_tables_that_were_killed_go_on_together_to_the_same_bytes(tmp_path, monkeypatch):
-    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "RUN_CHECKPOINT_SECONDS", 0.0)
     options = {"agent": "q_learning", "steps": 4000, "evaluation_interval": 1000, "sticky": 0.25}
     many(tmp_path / "whole", **options)
     with pytest.raises(Killed):
@@ -269,7 +269,7 @@ def test_an_engine_that_lacks_the_agent_is_refused_with_the_one_that_has_it():
 
 @pytest.mark.long
 def test_what_the_engine_itself_has_learnt_is_read_and_resumed(tmp_path, monkeypatch):
-    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "RUN_CHECKPOINT_SECONDS", 0.0)
     small = {"learning_starts": 50, "buffer_size": 500, "target_update_interval": 50}
     options = {"steps": 400, "evaluation_interval": 100, "hyperparameters": small, "random": 0.1}
     many(tmp_path / "whole", seeds=(0, 1, 2), **options)
@@ -342,7 +342,7 @@ def apart(monkeypatch):
     """Policies of every batch are evaluated by two processes."""
     monkeypatch.setattr("pharos.training.batch.evaluates_apart", lambda *_: True)
     monkeypatch.setattr("pharos.training.evaluators.usable_workers", lambda _: 3)
-    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "RUN_CHECKPOINT_SECONDS", 0.0)
 
 
 @pytest.mark.long

@@ -23,7 +23,7 @@ from pharos.training import (
     train,
     train_many,
 )
-from pharos.training.results import AVERAGE_COLUMNS, COLUMNS
+from pharos.training.results import AVERAGE_COLUMNS, CURVE_COLUMNS
 from refusals import refusal
 
 _results = importlib.import_module("pharos.training.results")
@@ -90,17 +90,17 @@ def test_other_columns_are_those_of_a_run_without_the_option(tmp_path):
         train("q_learning", "endless_sea", out=tmp_path / name, p_rand=0.2, **SEA, **options)
     texts = [(tmp_path / name / "curve.csv").read_text() for name in ("plain", "average")]
     plain, average = (list(csv.reader(text.splitlines())) for text in texts)
-    assert [row[: len(COLUMNS)] for row in average] == plain
-    assert average[0] == [*COLUMNS, *AVERAGE_COLUMNS]
+    assert [row[: len(CURVE_COLUMNS)] for row in average] == plain
+    assert average[0] == [*CURVE_COLUMNS, *AVERAGE_COLUMNS]
     assert "objective" not in read_record(tmp_path / "plain")["config"]
     config = read_record(tmp_path / "average")["config"]
     assert config["objective"] == "average"
     assert RunConfig.from_dict(config).to_dict() == config
-    assert list(read_curve(tmp_path / "average").columns) == [*COLUMNS, *AVERAGE_COLUMNS]
+    assert list(read_curve(tmp_path / "average").columns) == [*CURVE_COLUMNS, *AVERAGE_COLUMNS]
 
 
 def test_a_run_that_was_killed_ends_with_the_same_bytes(tmp_path, monkeypatch):
-    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "RUN_CHECKPOINT_SECONDS", 0.0)
     options = {"objective": "average", "random": 0.1, **SEA}
     with pytest.raises(Killed):
         train("q_learning", "endless_sea", out=tmp_path / "run", progress=kill_at(300), **options)

@@ -30,7 +30,9 @@ from pharos.training import results as _results
 from refusals import refusal
 from strategies import examples
 
-ROW = {name: 1 if dtype == "int64" else True if dtype == "bool" else 0.5 for name, dtype in _results.COLUMNS.items()}
+ROW = {
+    name: 1 if dtype == "int64" else True if dtype == "bool" else 0.5 for name, dtype in _results.CURVE_COLUMNS.items()
+}
 values = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats(allow_nan=False) | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
@@ -63,7 +65,7 @@ def test_the_same_rows_give_the_same_bytes_and_come_back(tmp_path):
     curve = read_curve(tmp_path)
     assert curve["step"].tolist() == [0, 1, 2]
     assert curve["mean_return"].isna().all()
-    assert {name: str(dtype) for name, dtype in curve.dtypes.items()} == _results.COLUMNS
+    assert {name: str(dtype) for name, dtype in curve.dtypes.items()} == _results.CURVE_COLUMNS
 
 
 def test_a_record_that_cannot_be_written_leaves_the_old_one(tmp_path):
@@ -96,7 +98,7 @@ def test_a_run_that_fails_says_why_and_can_be_started_again(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("agent", "file"), [("q_learning", "q_learning.npz"), ("dqn", "parameters.pt")])
 def test_a_damaged_checkpoint_is_said_to_be_one(agent, file, tmp_path, monkeypatch):
-    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "RUN_CHECKPOINT_SECONDS", 0.0)
     options = {"steps": 400, "evaluation_interval": 100, "out": tmp_path / "run"}
     with pytest.raises(CallbackError):
         train(agent, "simple_grid/4x4-plain", progress=stop, **options)
@@ -116,7 +118,7 @@ def test_a_damaged_checkpoint_is_said_to_be_one(agent, file, tmp_path, monkeypat
     ],
 )
 def test_one_digit_of_a_checkpoint_is_not_learnt_from(agent, engine, file, tmp_path, monkeypatch):
-    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "RUN_CHECKPOINT_SECONDS", 0.0)
     options = {"steps": 400, "evaluation_interval": 100, "out": tmp_path / "run", "engine": engine}
     with pytest.raises((CallbackError, RuntimeError)):
         train(agent, "simple_grid/4x4-plain", progress=stop, **options)

@@ -23,7 +23,7 @@ from patience import PATIENCE, wait_for
 from pharos.agents.sb3 import Deep, check_hyperparameters
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UnknownName
 from pharos.training import read_curve, read_record, train, train_config
-from pharos.training.results import COLUMNS
+from pharos.training.results import CURVE_COLUMNS
 from pharos.training.task import Task
 from refusals import refusal
 
@@ -34,7 +34,7 @@ SMALL = {"learning_starts": 50, "buffer_size": 1000, "target_update_interval": 5
 
 @pytest.fixture(autouse=True)
 def always_checkpoint(monkeypatch):
-    monkeypatch.setattr(_results, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(_results, "RUN_CHECKPOINT_SECONDS", 0.0)
 
 
 def short(agent, out=None, steps=400, seed=1, progress=None, **options):
@@ -51,7 +51,7 @@ def test_a_run_writes_its_record_and_its_curve(agent, tmp_path):
     assert record["status"] == "finished"
     assert record["config"]["chance"] == {"sticky": 0.25, "random": 0.0}
     assert record["result"]["episodes"] == result.result["episodes"] == curve["episodes"].iloc[-1]
-    assert list(curve.columns) == list(COLUMNS)
+    assert list(curve.columns) == list(CURVE_COLUMNS)
     assert curve["step"].tolist() == [0, 100, 200, 300, 400]
     assert not (tmp_path / "run" / "checkpoint").exists()
     assert not any(path.suffix in (".pkl", ".zip") for path in (tmp_path / "run").rglob("*"))

@@ -121,11 +121,11 @@ def test_the_first_trial_takes_from_the_agent_what_the_table_leaves_out():
 
 @pytest.mark.parametrize("agent", agents())
 def test_every_space_holds_hyperparameters_that_the_agent_has(agent):
-    from pharos.agents.q_learning import DEFAULTS
+    from pharos.agents.q_learning import Q_LEARNING_DEFAULTS
     from pharos.agents.sb3 import algorithm
 
     if agent == "q_learning":
-        assert set(agents()[agent].space) <= set(DEFAULTS)
+        assert set(agents()[agent].space) <= set(Q_LEARNING_DEFAULTS)
     else:
         assert set(agents()[agent].space) <= set(algorithm(agent).__init__.__annotations__)
 

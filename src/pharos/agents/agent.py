@@ -28,7 +28,7 @@ POLICY, NETWORK = "policy.npy", "agent"
 """What was learnt, in the folder of a run: a table, or a folder with a network."""
 TABULAR_OBSERVATION = "index"
 """What tabular agents see."""
-TABLES = 16  # runs of one program that learn tables
+TABLES_AT_ONCE = 16  # runs of one program that learn tables
 # Entries of a configuration that decide about rewards and states, and about observations
 WORLD = ("environment", "parameters", "gamma", "sources")
 OBSERVATIONS = ("environment", "parameters", "observation", "observation_options", "sources")
@@ -333,7 +333,7 @@ class TableBasedAgent(Agent):
         return self.name, run.config.environment
 
     def width(self, run: PlannedRun, device: str) -> int:
-        return TABLES
+        return TABLES_AT_ONCE
 
     def prepare(self, run: LearningRun, device: str, *, is_single: bool) -> Hashable | None:
         if is_single or not is_small_table(run.task.mdp):

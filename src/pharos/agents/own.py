@@ -32,12 +32,12 @@ MADE_WITH = ("observation_space", "action_space", "num_envs", "seed")
 FUNCTIONS = "a function learn(env, steps, seed), or learn(env, params, steps, key) of JAX"
 
 FunctionLearner = Callable[[Sequence[LearningRun], Callable[..., Any]], Any]
-_LEARNERS: dict[str, FunctionLearner] = {}
+_FUNCTION_LEARNERS: dict[str, FunctionLearner] = {}
 
 
 def register_form(form: str, learner: FunctionLearner) -> None:
     """Say who trains the functions of a form; `pharos.training` does, as their policies are evaluated there."""
-    _LEARNERS[form] = learner
+    _FUNCTION_LEARNERS[form] = learner
 
 
 def form_of(name: str, code: object) -> str:
@@ -163,7 +163,7 @@ class OwnAgent(DeepAgent):
                 f"agent {self.name!r} is a function, which has no logs of TensorBoard; leave tensorboard out"
             )
         assert not isinstance(code, str)
-        return _LEARNERS[form](runs, code)
+        return _FUNCTION_LEARNERS[form](runs, code)
 
     def load(self, folder: Path, run: LearningRun) -> PolicyLike:
         if form_of(self.name, run.algorithm) == CLASS:

@@ -12,7 +12,7 @@ from pharos.errors import ParameterError, UnknownName
 from pharos.mdp import TabularMDP
 from pharos.system.arrays import read_only
 
-DEFAULTS: dict[str, Any] = {
+Q_LEARNING_DEFAULTS: dict[str, Any] = {
     "learning_rate": 0.1,
     "visits_exponent": 0.0,
     "gamma": 0.99,
@@ -166,11 +166,11 @@ class QLearning:
 
 
 def checked_options(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """All hyperparameters: DEFAULTS with changes. UnknownName, ParameterError: one is unknown or out of range."""
-    unknown = set(changes) - set(DEFAULTS)
+    """Q_LEARNING_DEFAULTS with changes. UnknownName, ParameterError: one is unknown or out of range."""
+    unknown = set(changes) - set(Q_LEARNING_DEFAULTS)
     if unknown:
-        raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], DEFAULTS)
-    options = {**DEFAULTS, **changes}
+        raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], Q_LEARNING_DEFAULTS)
+    options = {**Q_LEARNING_DEFAULTS, **changes}
     ranges = {
         "learning_rate": (0.0, 1.0),
         "visits_exponent": (0.0, 1.0),
@@ -205,7 +205,7 @@ class QLearningAgent(TableBasedAgent):
     """Q-learning as an agent that has a name."""
 
     def library_default(self, name: str) -> object:
-        return DEFAULTS.get(name)
+        return Q_LEARNING_DEFAULTS.get(name)
 
     def check(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
         checked_options(hyperparameters)
@@ -214,7 +214,7 @@ class QLearningAgent(TableBasedAgent):
         task, chance = run.task, run.task.scaled_chance
         # In another unit of rewards a table learns the same policies, from values and with noise in that unit
         scale = chance.reward_scale
-        initial = {"initial_q": scale * float(run.hyperparameters.get("initial_q", DEFAULTS["initial_q"]))}
+        initial = {"initial_q": scale * float(run.hyperparameters.get("initial_q", Q_LEARNING_DEFAULTS["initial_q"]))}
         return QLearning(
             task.mdp,
             total_steps=run.config.steps,

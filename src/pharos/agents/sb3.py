@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from pharos.agents.batched import Batch, BatchRun
     from pharos.interaction import SB3VecEnv
 
-FEATURES = 128
+EXTRACTED_FEATURES = 128
 LEAST_ONE = ("n_envs", "n_steps", "n_epochs", "batch_size", "buffer_size", "train_freq", "target_update_interval")
 SHARES = ("gamma", "gae_lambda", "tau", "exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
 POSITIVE = ("learning_rate", "clip_range", "max_grad_norm")
@@ -222,7 +222,7 @@ def make_model(
         raise ParameterError(f"agent {_title(agent)!r}: policy_kwargs is {wrong!r}; expected a mapping")
     network = {
         "features_extractor_class": extractor_class(env.observation_space),
-        "net_arch": options.pop("net_arch", [FEATURES]),
+        "net_arch": options.pop("net_arch", [EXTRACTED_FEATURES]),
         **options.pop("policy_kwargs", {}),
     }
     policy = "MultiInputPolicy" if hasattr(env.observation_space, "spaces") else "MlpPolicy"

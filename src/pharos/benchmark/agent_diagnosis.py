@@ -91,8 +91,12 @@ class Diagnosis:
     @property
     def is_healthy(self) -> bool:
         """Whether no check has found anything, and no fault is said."""
-        score = sum(self.scores.values()) / len(self.scores)
-        return not self.findings and self.fault is None and score > BROKEN
+        return not self.findings and self.fault is None and not (self.readings and self.score < BROKEN)
+
+    @property
+    def score(self) -> float:
+        """The mean of the scores."""
+        return sum(self.scores.values()) / len(self.scores)
 
     @property
     def how_often(self) -> str:
@@ -246,9 +250,8 @@ def _verdict(diagnosis: Diagnosis) -> str:
         return f"Something is wrong: {diagnosis.findings[0].wrong}{'; ' * bool(like)}{like}."
     if fault:
         return f"No single number is unlike those of healthy agents, but {like}."
-    score = sum(diagnosis.scores.values()) / len(diagnosis.scores)
-    if score < BROKEN:
-        return f"It learns little (mean score {score:.2f}), and is like none of the known faults."
+    if diagnosis.readings and diagnosis.score < BROKEN:
+        return f"It learns little (mean score {diagnosis.score:.2f}), and is like none of the known faults."
     return f"Nothing is wrong that these {'worlds' if diagnosis.readings else 'results'} and checks can see."
 
 

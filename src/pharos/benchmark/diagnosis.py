@@ -29,9 +29,10 @@ from pharos.benchmark.contents import (
     residual_tasks,
     signed,
 )
+from pharos.benchmark.levels import twins
 from pharos.benchmark.properties import known_properties
 from pharos.benchmark.results import AgentResults, baselines
-from pharos.benchmark.scores import CROSSING, AxisScore, equal_seeds, run_scores
+from pharos.benchmark.scores import CROSSING, AxisScore, ConfidenceInterval, equal_seeds, run_scores
 from pharos.benchmark.suite import BenchmarkTask
 from pharos.system.wording import pluralize
 
@@ -149,6 +150,26 @@ def falls(contents: Contents) -> list[list[str]]:
             for each in contents.beside
         ]
         rows.append([axis, number(own.lowest), number(own.fall), *others])
+    return rows
+
+
+def gaps(contents: Contents) -> list[list[str]]:
+    """Rows on each pair of levels seen and held out that was run: both scores of the agent, and the gap of all agents.
+
+    The gap is regret on held-out levels less that on training levels, by seed.
+    """
+    rows = []
+    runs = [run_scores(each.results) for each in contents.agents]
+    for own_levels, held_out in twins(contents.suite):
+        texts = [
+            signed(ConfidenceInterval.of_mean([own[own_levels.name] - own[held_out.name]]))
+            if {own_levels.name, held_out.name} <= own.keys()
+            else "–"
+            for own in runs
+        ]
+        if texts[0] != "–":
+            scores = (number(contents.agent.score.tasks[each.name]) for each in (own_levels, held_out))
+            rows.append([held_out.axis, str(own_levels.parameters["train"]), *scores, *texts])
     return rows
 
 

@@ -99,12 +99,15 @@ def _dots(names: list[str], rows: list[tuple[float, ...]], agents: list[str]) ->
 
 
 def _scores(diagnosis: Diagnosis) -> Element:
+    if not diagnosis.readings:
+        cells = [[name, f"{score:.2f}"] for name, score in diagnosis.scores.items()]
+        table = element("details", element("summary", "Task by task"), html_table(["task", "score"], cells, [1]))
+        mean = f"{diagnosis.score:.2f} on the average task; 1 is optimal, 0 is uniform play."
+        return section("Scores", mean, table)
     nan = float("nan")
-    rows = {k: (name, ConfidenceInterval(max(score, 0.0), nan, nan)) for k, (name, score) in _places(diagnosis)}
+    rows = {
+        6 * k: (name, ConfidenceInterval(max(score, 0.0), nan, nan))  # all in the first colour
+        for k, (name, score) in enumerate(diagnosis.scores.items())
+    }
     picture = captioned("", bars(rows, "scores"))
     return section("Scores", "1 is optimal, 0 is uniform play; lower ones are drawn as 0.", picture)
-
-
-def _places(diagnosis: Diagnosis) -> list[tuple[int, tuple[str, float]]]:
-    """Scores under keys that all have the first colour."""
-    return [(6 * k, each) for k, each in enumerate(diagnosis.scores.items())]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import CLASS, agents, algorithm, form_of, generator_of, is_known, make_model
+from pharos.agents import CLASS, QLearning, agents, algorithm, form_of, generator_of, is_known, make_model
 from pharos.benchmark.suite import BenchmarkTask, Protocol
 from pharos.errors import ParameterError, TimeLimit, UnknownName
 from pharos.policies import PolicyLike, SB3Model
@@ -249,6 +249,33 @@ class Witness(PolicyRecorder):
         )
 
 
+def table_examination(name: str, seed: int, steps: int, setting: Mapping[str, Any]) -> Examination:
+    """The examination of pharos' own table, `QLearning`, by its counts of visits; it sees states, not numbers."""
+    task, world, _ = solved(name)
+    table = QLearning(task.mdp, total_steps=steps, seed=seed, time_limit=task.time_limit, **setting)
+    ends = [int(steps * (1 - LATE)), int(steps * (1 - LAST)), steps]
+    visits = []
+    for end in ends:
+        visits.append(table.learn(end - table.steps).visits.copy())
+    policy = np.eye(world.rewards.shape[1])[table.policy_table()]
+    return Examination(
+        name,
+        seed,
+        world,
+        visits[2],
+        visits[2] - visits[0],
+        visits[2] - visits[1],
+        np.zeros_like(visits[2]),
+        policy,
+        table.q.copy(),
+        None,
+        np.ones(world.vary.shape),
+        0.0,
+        float(regret(evaluate_agent(policy, task).value, task.reference, normalized_by="uniform")),
+        np.nan,
+    )
+
+
 def value_functions(policy: Any) -> tuple[Callable[[Any], np.ndarray] | None, Callable[[Any], np.ndarray] | None]:
     """Functions of observations to (N, A) values of actions and to (N,) values of states; None if it has none.
 
@@ -290,7 +317,7 @@ def learner_of(agent: str | Callable[..., Any], hyperparameters: Mapping[str, An
         agent: a generator, or a class with act, observe and policy, or `file.py:Name` of one; or the name or class of
             an algorithm of Stable-Baselines3, such as dqn.
     Raises:
-        ParameterError, UnknownName: there is no such agent, or it is one in JAX or a table.
+        ParameterError, UnknownName: there is no such agent, or it is one in JAX.
     """
     setting = dict(hyperparameters or {})
     code: Any = agent
@@ -351,11 +378,16 @@ def examine(
         PharosError: its code raises something, SystemExit included. TimeLimit: a run took longer than was allowed.
     Cost: `len(worlds) * len(seeds)` runs, and values of some hundred states.
     """
-    learn, file = learner_of(agent, hyperparameters), _file_of(agent)
+    has_table = isinstance(agent, str) and agent in agents() and agents()[agent].has_table
+    learn, file = (None, None) if has_table else (learner_of(agent, hyperparameters), _file_of(agent))
+    setting = {**agents()[str(agent)].defaults, **(hyperparameters or {})} if has_table else {}
     examinations: list[Examination] = []
     for name in worlds:
         for seed in seeds:
             tell(len(examinations) / (len(worlds) * len(seeds)), f"{name}, seed {seed}")
+            if learn is None:
+                examinations.append(table_examination(name, seed, steps, setting))
+                continue
             witness = Witness(name, seed, steps)
             witness.budget.give_up = partial(end_process, str(agent), steps)
             try:

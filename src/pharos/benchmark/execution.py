@@ -113,7 +113,8 @@ def run(  # noqa: PLR0913
     suite = suite if isinstance(suite, Suite) else load_suite(suite)
     form = agent_form(agent, suite, hyperparameters)
     protocol = suite.protocol
-    numbers = [int(seed) for seed in (range(protocol.seeds) if seeds is None else seeds)]
+    default = range(suite.quick_seeds if quick else protocol.seeds)
+    numbers = [int(seed) for seed in (default if seeds is None else seeds)]
     numbers = numbers[: suite.quick_seeds if quick else None]
     if not numbers or len(set(numbers)) < len(numbers) or min(numbers) < 0:
         raise ParameterError(f"seeds are {numbers}; expected whole numbers of at least 0, each once")

@@ -54,6 +54,7 @@ from pharos.benchmark.diagnosis import (
     SHIPPED,
     fall_everywhere,
     falls,
+    gaps,
     groups_of,
     is_own,
     lowest_rungs,
@@ -287,6 +288,19 @@ def _policies(contents: Contents) -> Element | None:
     )
 
 
+def _gaps(contents: Contents) -> Element | None:
+    rows = gaps(contents)
+    if not rows:
+        return None
+    heads = ["generator", "training levels", "score on these", "on held-out levels", "gap"]
+    heads += [f"gap of {each.name}" for each in contents.beside]
+    return section(
+        "Levels seen and held out",
+        "The gap is the normalised regret on held-out levels less that on the levels of training, by seed.",
+        html_table(heads, rows, numeric=range(1, len(heads))),
+    )
+
+
 def _groups(contents: Contents) -> Element | None:
     if (near := nearest(contents)) is None:
         return None
@@ -328,12 +342,13 @@ def _plane(contents: Contents) -> Element | None:
         return None
     below = "regret of an idealised table"
     beside = f"extra regret of the idealised {name.upper()}", "over a table (negative: it generalises)"
-    dots = scatter(points, below, beside, "tasks by predicted difficulty, coloured by regret")
     return section(
         "What makes a task hard, and where the agent fails",
         "Each dot is a task, placed by what theory predicts before any run: to the right, even a learner with a table "
         "needs longer; above, a network loses more than a table. The colour is the agent's regret.",
-        captioned("", dots, class_="wide"),
+        captioned(
+            "", scatter(points, below, beside, "tasks by predicted difficulty, coloured by regret"), class_="wide"
+        ),
     )
 
 
@@ -440,6 +455,7 @@ SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
     _ladders,
     _pairs,
     _words,
+    _gaps,
     _policies,
     _core,
     _groups,

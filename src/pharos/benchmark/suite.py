@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from pharos.benchmark import levels
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
 from pharos.mdp import ChanceSetting, TabularMDP
 from pharos.system import storage
@@ -76,7 +77,8 @@ class BenchmarkTask:
 
     Attributes:
         name: unique in its suite, and fit for a file name (`check_name`), since runs are written below it.
-        environment, parameters: as `pharos.make` takes them. observation, observation_options: as `pharos.observe`.
+        environment, parameters: as `pharos.make` takes them; or "levels", with those of `levels_of`.
+        observation, observation_options: as `pharos.observe`.
         chance: the kinds of `ChanceSetting` that are not 0.
         axis: "core", or the axis of its ladder.
         level: on a ladder: the measured quantity, in the ladder's unit; None in the core.
@@ -127,9 +129,12 @@ class BenchmarkTask:
                 f"task {self.name}: gamma is 1 without a horizon, so regret may be infinite, and no score a mean of "
                 f"it; give a horizon, or gamma < 1"
             )
+        if self.environment == levels.LEVELS:
+            world: tuple[Any, ...] = (levels.levels_of(**self.parameters),)
+        else:
+            world = self.environment, self.parameters
         return Task.of(
-            self.environment,
-            self.parameters,
+            *world,
             observation=self.observation,
             observation_options=dict(self.observation_options),
             chance=ChanceSetting.from_dict(self.chance),

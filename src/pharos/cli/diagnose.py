@@ -12,6 +12,7 @@ from pharos.cli.answers import Answer, print_table, progress_bar
 from pharos.cli.options import Count
 from pharos.errors import ParameterError
 from pharos.system import storage
+from pharos.system.wording import pluralize
 
 if TYPE_CHECKING:
     from pharos.benchmark import Diagnosis
@@ -63,19 +64,20 @@ def diagnose(
 
 
 def _print(diagnosis: "Diagnosis") -> None:
-    scores = ", ".join(f"{name} {score:.2f}" for name, score in diagnosis.scores.items())
-    print_table(
-        f"{diagnosis.agent}: {diagnosis.verdict}",
-        ("", "what no healthy agent shows", "what to try"),
-        ((str(number), each.wrong, each.advice) for number, each in enumerate(diagnosis.findings, start=1)),
-    )
-    text = f"Scores, 1 optimal and 0 as uniform play: {scores}"
+    title, rows = f"{diagnosis.agent}: {diagnosis.verdict}", enumerate(diagnosis.findings, start=1)
+    if diagnosis.findings:
+        columns = "", "what no healthy agent shows", "what to try"
+        print_table(title, columns, ((str(number), each.wrong, each.advice) for number, each in rows))
+    else:
+        print(title)
     if not diagnosis.likeness:
-        print(text)
+        tasks = pluralize(len(diagnosis.scores), "task")
+        print(f"Mean score on {tasks}, 1 optimal and 0 as uniform play: {diagnosis.score:.2f}")
         return
+    scores = ", ".join(f"{name} {score:.2f}" for name, score in diagnosis.scores.items())
     print_table(
         "Nearest known agents",
         ("", ">likeness", ""),
         ((name, f"{share:.2f}", words) for name, share, words in diagnosis.nearest()),
-        notes=[diagnosis.how_often, text],
+        notes=[diagnosis.how_often, f"Scores, 1 optimal and 0 as uniform play: {scores}"],
     )

@@ -266,10 +266,10 @@ class _Episodes:
 # Beyond memory --------------------------------------------------------------------------------------------------------
 
 
-_FILE, _RECORD = "bounds.npy", "bounds.json"
-_FORMAT = 1
+_FILE, _BOUNDS_RECORD = "bounds.npy", "bounds.json"
+_BOUNDS_FORMAT = 1
 # Rows of a table that a digest reads in one go.
-_BLOCK = 1 << 20
+_DIGEST_ROWS = 1 << 20
 
 
 class KeptBounds:
@@ -287,14 +287,14 @@ class KeptBounds:
         self._folder, self._graph = folder, graph_digest(graph)
         self._size = graph.num_nodes
         self.dtype: np.dtype | None = None
-        path = folder / _RECORD
+        path = folder / _BOUNDS_RECORD
         if not path.exists():
             return
         record = storage.read_json(path)
-        if not isinstance(record, dict) or record.get("format") != _FORMAT or record.get("graph") != self._graph:
+        if not isinstance(record, dict) or record.get("format") != _BOUNDS_FORMAT or record.get("graph") != self._graph:
             raise FileFormatError(
                 f"{path}: is of another graph, or of another pharos; choose another folder, or delete {_FILE} and "
-                f"{_RECORD} there"
+                f"{_BOUNDS_RECORD} there"
             )
         self.dtype = np.dtype(np.int16 if record.get("bytes") == 2 else np.int32)
 
@@ -303,7 +303,7 @@ class KeptBounds:
 
         The record is written once these are on the disk: after a power failure a file may hold what it held before.
         """
-        path, record = storage.inside(self._folder, _FILE), self._folder / _RECORD
+        path, record = storage.inside(self._folder, _FILE), self._folder / _BOUNDS_RECORD
         try:
             if self.dtype != dtype:
                 record.unlink(missing_ok=True)
@@ -313,7 +313,7 @@ class KeptBounds:
                 bounds[:2] = 0
                 bounds[2:] = np.iinfo(dtype).max
                 storage.sync(path)
-                storage.replace_json(record, {"format": _FORMAT, "graph": self._graph, "bytes": dtype.itemsize})
+                storage.replace_json(record, {"format": _BOUNDS_FORMAT, "graph": self._graph, "bytes": dtype.itemsize})
                 self.dtype = dtype
         except OSError as error:
             raise ParameterError(f"{path}: cannot be used for bounds: {error.strerror}; choose another one") from error
@@ -321,7 +321,7 @@ class KeptBounds:
 
     def remove(self) -> None:
         """Delete the files, once the diameter is known."""
-        for name in (_RECORD, _FILE):
+        for name in (_BOUNDS_RECORD, _FILE):
             (self._folder / name).unlink(missing_ok=True)
 
 
@@ -329,8 +329,8 @@ def graph_digest(graph: Graph) -> str:
     """Digest of all that distances depend on: the table, the states that end, and the state to which these lead."""
     digest = xxhash.xxh3_128(f"{graph.next_states.shape} {graph.start} {graph.has_end}".encode())
     for rows in (graph.next_states, graph.ends):
-        for start in range(0, len(rows), _BLOCK):
-            digest.update(np.ascontiguousarray(rows[start : start + _BLOCK]).data)
+        for start in range(0, len(rows), _DIGEST_ROWS):
+            digest.update(np.ascontiguousarray(rows[start : start + _DIGEST_ROWS]).data)
     return digest.hexdigest()
 
 

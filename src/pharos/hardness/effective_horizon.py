@@ -29,9 +29,9 @@ from pharos.errors import PrecisionError, UndefinedMeasure
 from pharos.hardness.gaps import optimal_solution, solution_within
 from pharos.hardness.gorp import gorp_bound
 from pharos.hardness.interval import fields_of
-from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
+from pharos.hardness.steps import OPTIMAL_TIE, FiniteHorizonValues, check_returns, steps_of
 from pharos.mdp import (
-    STEPS,
+    STEPS_EXPECTED,
     ExpandedMDP,
     TabularMDP,
     mdp_within,
@@ -72,7 +72,7 @@ class LookAhead:
         return f"{self.value:.6g} (k_min {self.k_min}, window {self.effective_planning_window})"
 
 
-COMPILED = 2**26  # bytes of the table of all steps from which on it is not written out
+LARGEST_WRITTEN_TABLE = 2**26  # bytes of the table of all steps from which on it is not written out
 GREEDY_RETURNS = 5
 WRITTEN_OUT = 2**18  # action values, of nodes that each lead to one; of more a compiled kernel is worth loading
 
@@ -136,17 +136,17 @@ def effective_horizon(
     steps = steps_of("effective_horizon", mdp, horizon)
     check_returns("effective_horizon", mdp, steps)
     mdp = mdp_within(mdp, steps)
-    compiled = applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > COMPILED
+    compiled = applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > LARGEST_WRITTEN_TABLE
     report = progress or str
     parts = horizon_fields(
-        LargeHorizon(mdp, steps, TIE, report) if compiled else NodeHorizon.of_steps(mdp, steps, report)
+        LargeHorizon(mdp, steps, OPTIMAL_TIE, report) if compiled else NodeHorizon.of_steps(mdp, steps, report)
     )
     bound = gorp_bound(mdp, horizon=steps, max_k=tight, progress=progress).value if tight else None
     conventions = {
         "horizon": steps,
         "gamma": 1.0,
         "exploration": "uniform",
-        "tie_tolerance": TIE,
+        "tie_tolerance": OPTIMAL_TIE,
         "states": mdp.nodes,
     }
     return EffectiveHorizon(**parts, tight=bound, conventions=conventions)
@@ -242,7 +242,7 @@ class NodeHorizon:
         values = (tree.best.max(axis=2)[0], tree.explored_value[0], tree.worst.min(axis=2)[0])
         nodes.returns = tuple(map(tree.at_start, values))
         nodes.values = [_ActionValues(nodes, value) for value in nodes._after(tree.explored_value)]
-        nodes.compare(zip(tree.best, tree.worst, tree.explored, strict=True), TIE)
+        nodes.compare(zip(tree.best, tree.worst, tree.explored, strict=True), OPTIMAL_TIE)
         return nodes
 
     def compare(self, values: Iterable[Sequence[np.ndarray]], tie: float, slack: float = 0.0) -> None:
@@ -377,7 +377,7 @@ def most_samples(gap: np.ndarray, variance: np.ndarray, log: float) -> tuple[int
 # Large horizon --------------------------------------------------------------------------------------------------------
 
 
-_PARTS = 0.6  # of the memory that is free
+_MEMORY_SHARE = 0.6  # of the memory that is free
 
 
 def applies(mdp: TabularMDP) -> bool:
@@ -403,11 +403,11 @@ class LargeHorizon:
             kind for kind in (np.uint8, np.uint16, np.uint32, np.uint64) if mdp.num_actions <= 8 * kind(0).itemsize
         )
         needed = (16 + bits(0).itemsize) * steps * states
-        if needed > (room := _PARTS * memory.available_memory()):
+        if needed > (room := _MEMORY_SHARE * memory.available_memory()):
             raise UndefinedMeasure(
                 f"effective_horizon: {steps} steps of the {states} states that they can meet need "
                 f"{needed / 2**30:.1f} GiB, more than {room / 2**30:.1f}, "
-                f"{_PARTS:.0%} of the free memory; a smaller horizon or instance would define it"
+                f"{_MEMORY_SHARE:.0%} of the free memory; a smaller horizon or instance would define it"
             )
         table = mdp.dynamics.deterministic_table()
         assert table is not None
@@ -552,7 +552,9 @@ def stationary_effective_horizon(
         raise UndefinedMeasure(
             "stationary_effective_horizon is defined for gamma < 1; see effective_horizon for episodes"
         )
-    limit = mdp.horizon or math.ceil(1 / (1 - mdp.gamma)) if steps is None else whole_number(steps, "steps", STEPS)
+    limit = (
+        mdp.horizon or math.ceil(1 / (1 - mdp.gamma)) if steps is None else whole_number(steps, "steps", STEPS_EXPECTED)
+    )
     endless = mdp if mdp.horizon is None else mdp.with_horizon(None)
     report = progress or str
     nodes, values, error = _nodes_of(endless, solution, tolerance, report)

@@ -39,7 +39,7 @@ from pharos.solvers import Solution, value_iteration
 from pharos.system.memory import large_zeros
 
 # States at once; fixed, so that sums do not depend on the machine, and so few that a block stays in the cache.
-_BLOCK = 1 << 14
+_GAP_BLOCK = 1 << 14
 # Bytes for the values of every step, with a horizon.
 _MEMORY = 8 * 2**30
 
@@ -87,8 +87,8 @@ def weighted_gaps(mdp: TabularMDP, solution: Solution) -> Iterator[GapBlock]:
 def _gaps_of_step(mdp: TabularMDP, step: Step, number: int, everywhere: bool) -> Iterator[GapBlock]:
     """The gaps of one step, in blocks; `everywhere`: states that cannot be reached have a weight, too."""
     chance = mdp.chance
-    for first in range(0, mdp.num_states, _BLOCK):
-        block = slice(first, min(first + _BLOCK, mdp.num_states))
+    for first in range(0, mdp.num_states, _GAP_BLOCK):
+        block = slice(first, min(first + _GAP_BLOCK, mdp.num_states))
         states = np.arange(block.start, block.stop)
         rewards = mdp.reward_table.rows(block)
         next_values = mdp.acting(mdp.dynamics.expected(step.next_x, block), block)
@@ -208,7 +208,7 @@ class TieProof:
 
 
 def _empty_map(size: int, width: int) -> np.ndarray:
-    return np.full((size, 3 if width == 1 else 5), kernels.FREE, np.int64)
+    return np.full((size, 3 if width == 1 else 5), kernels.FREE_KEY, np.int64)
 
 
 def same_outcomes(
@@ -292,7 +292,7 @@ class UnresolvedTies:
 # Of Colosseum.
 REGULARIZER = 0.1
 # Relative width up to which an interval counts as the value.
-NARROW = 1e-6
+VALUE_WIDTH = 1e-6
 # The default tie tolerance is this times the error bound of the values; more than 2, as a gap is known to twice the
 # bound.
 ERRORS_PER_TIE = 2.5
@@ -344,7 +344,7 @@ class Gaps:
     @property
     def is_resolved(self) -> bool:
         """Whether ties are ties, and the sum is known to a relative 1e-6."""
-        return not self.unresolved and self.upper - self.lower <= NARROW * self.upper
+        return not self.unresolved and self.upper - self.lower <= VALUE_WIDTH * self.upper
 
     @property
     def certified_sum(self) -> Certified:
@@ -363,10 +363,10 @@ class Gaps:
         share = self.error / REGULARIZER
         high = self.regularized / (1 - share) * (1 + _ROUNDING) if share < 1 else math.inf
         low = self.regularized / (1 + share) * (1 - _ROUNDING)
-        return Certified(self.regularized, low, high, high - low <= NARROW * high)
+        return Certified(self.regularized, low, high, high - low <= VALUE_WIDTH * high)
 
     def _certified(self, value: float, lower: float, upper: float) -> Certified:
-        exact = not self.unresolved and (lower == upper or upper - lower <= NARROW * upper)
+        exact = not self.unresolved and (lower == upper or upper - lower <= VALUE_WIDTH * upper)
         note = ""
         if self.unresolved:
             note = (

@@ -16,14 +16,14 @@ import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.interval import fields_of
-from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
+from pharos.hardness.steps import OPTIMAL_TIE, FiniteHorizonValues, check_returns, steps_of
 from pharos.mdp import TabularMDP, drawn_actions, require_mdp, whole_number
 from pharos.system.wording import pluralize
 
 METHODS = ("binomial", "bernstein", "exact")
 MOST_SAMPLES, MOST_BINOMIAL = 10**100, 10**6
 MOST_SEQUENCES = 100  # of which `bernstein` compares each with each
-PARTS = 100  # of equal probability, into which BRIDGE cuts distributions
+DISTRIBUTION_PARTS = 100  # of equal probability, into which BRIDGE cuts distributions
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def gorp_bound(
         values,
         failures,
         proven="binomial" not in names or not search.two_valued,
-        conventions={"horizon": steps, "methods": list(names), "precision": 0.01, "tie_tolerance": TIE},
+        conventions={"horizon": steps, "methods": list(names), "precision": 0.01, "tie_tolerance": OPTIMAL_TIE},
     )
 
 
@@ -135,7 +135,7 @@ class GorpRuns:
     @property
     def success_rate(self) -> float:
         """The fraction of runs that found an optimal sequence."""
-        return float((self.returns >= self.optimal_return - TIE).mean())
+        return float((self.returns >= self.optimal_return - OPTIMAL_TIE).mean())
 
     def to_dict(self) -> dict[str, Any]:
         """A summary, JSON-able."""
@@ -379,7 +379,7 @@ def _binomial(m: int, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cells between quantiles, as BRIDGE cuts them: by the normal distribution from m = 30, without outcome 0."""
     from scipy.special import bdtr, ndtri
 
-    levels = np.arange(PARTS + 1) / PARTS
+    levels = np.arange(DISTRIBUTION_PARTS + 1) / DISTRIBUTION_PARTS
     lower, upper = np.empty_like(p), np.empty_like(p)
     for own in np.unique(p):
         if m < 30:

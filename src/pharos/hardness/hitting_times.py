@@ -112,24 +112,24 @@ def added(high: np.ndarray, low: np.ndarray, more: np.ndarray) -> tuple[np.ndarr
 
 
 # Sweeps before a policy is evaluated by a linear solve: as many as cost about as much as one.
-SWEEPS = 40
+SWEEPS_BEFORE_SOLVING = 40
 # Nodes at the same distance from the target up to which they are tried: so many are about the size of a full matrix in
 # the factors. A grid of a million nodes has a thousand, a random graph of ten thousand five thousand.
-WIDEST = 8_000
+MOST_WIDTH = 8_000
 # Sweeps that a linear solve takes as long as: FILL_IN times the cube of that number of nodes, by the outcomes.
 FILL_IN = 1 / 30
 # Seconds of a multiplication of a linear solve on a slow core: one that would outlast the budget is not begun.
 SECONDS_EACH = 2e-9
-# Times half of `SWEEPS` that are made in any case.
-LEAST = 6
+# Times half of `SWEEPS_BEFORE_SOLVING` that are made in any case.
+LEAST_ROUNDS = 6
 # They end closer than the tolerance asks for, nearly as close as a linear solve does.
 CLOSER = 1e-3
 # Nodes up to which linear solves are tried: beyond, their fill-in takes more memory than the MDP.
 SOLVABLE = 60_000
 # Sweeps before the slow mode is looked at, sweeps between two looks, and sweeps between two that raise J by itself.
-PLAIN_SWEEPS, LOOK, RAISE = 8, 4, 12
+PLAIN_SWEEPS, TIME_CHECKS, RAISE = 8, 4, 12
 # Cosine, squared, of the angle between what J gains and what the mode loses, from which on they are one direction.
-ALIGNED = 0.95
+SAME_DIRECTION = 0.95
 # Beyond, no J proves anything in 64-bit floats, and raising it ends.
 HIGHEST = 1e15
 # Stands for infinity in the hitting times of nodes that do not surely reach the target: products with it stay finite.
@@ -140,7 +140,7 @@ RESIDUAL_UNITS = 16
 # Linear solves that do not halve the distance of the bounds, after which one float is too short as well.
 STALLS = 3
 # Newton steps and policies that are tried with two floats a node; each step gains two digits or more, or is the last.
-REFINEMENTS = 12
+MOST_NEWTON_STEPS = 12
 # Linear solves without a proper policy as result, one after the other, after which the bounds stand as they are.
 FAILURES = 3
 
@@ -241,10 +241,10 @@ class HittingTimes:
             self.mode[self.order[:count]] = ~self.goal[self.order[:count]]
         arrays = (*self.arrays, self.goal, self.order, count, j, self.mode)
         change, ff, fg, gg = hitting.sweep_in_place(*arrays)
-        if self.swept % LOOK != LOOK - 1 or not (gg > 0 and math.isfinite(ff) and change > 0):
+        if self.swept % TIME_CHECKS != TIME_CHECKS - 1 or not (gg > 0 and math.isfinite(ff) and change > 0):
             return float(change)
         nodes = self.order[:count]
-        if fg * fg > ALIGNED * ff * gg:
+        if fg * fg > SAME_DIRECTION * ff * gg:
             j[nodes] += fg / gg * self.mode[nodes]
         elif fg > 0 and self.swept - self.raised >= RAISE and math.isinf(self.bounds(j, count).high):
             largest = float(j[nodes].max())
@@ -261,7 +261,7 @@ class HittingTimes:
             if count > SOLVABLE or self._outlasts(count, spending):
                 if bounds.limited:
                     return bounds
-                bounds = self.sweep(j, count, 8 * SWEEPS, enough, spending)
+                bounds = self.sweep(j, count, 8 * SWEEPS_BEFORE_SOLVING, enough, spending)
                 continue
             improved = self._evaluate(count)
             if improved is None:  # the greedy policy may stay away for ever: begin with one that does not
@@ -290,15 +290,16 @@ class HittingTimes:
     ) -> HittingBounds:
         """Bounds after sweeps, as long as at their rate these meet sooner than a linear solve takes, or nearly so.
 
-        The rate is taken over three times `SWEEPS` / 2 sweeps: moves along the slow mode set single ones back.
+        The rate is taken over three times `SWEEPS_BEFORE_SOLVING` / 2 sweeps: moves along the slow mode set single ones
+        back.
         """
-        bounds = self.sweep(j, count, SWEEPS // 2, enough, spending)
+        bounds = self.sweep(j, count, SWEEPS_BEFORE_SOLVING // 2, enough, spending)
         as_long = FILL_IN * int(self._layers(count).max(initial=0)) ** 3 / max(self.support[1].size, 1)
-        left = max(LEAST, int(as_long / (SWEEPS // 2)) - 1)
-        unbounded = max(LEAST // 2, left // 4)  # of these: while nothing is proven, no rate is known
+        left = max(LEAST_ROUNDS, int(as_long / (SWEEPS_BEFORE_SOLVING // 2)) - 1)
+        unbounded = max(LEAST_ROUNDS // 2, left // 4)  # of these: while nothing is proven, no rate is known
         apart, goal = [bounds.apart], CLOSER * tolerance
         while left > 0 and not (bounds.upper <= enough or bounds.limited or bounds.apart <= goal or spending.is_over):
-            bounds = self.sweep(j, count, SWEEPS // 2, enough, spending)
+            bounds = self.sweep(j, count, SWEEPS_BEFORE_SOLVING // 2, enough, spending)
             left -= 1
             apart.append(bounds.apart)
             if math.isinf(bounds.apart):
@@ -315,7 +316,7 @@ class HittingTimes:
     def _outlasts(self, count: int, spending: BudgetClock) -> bool:
         """Whether a linear solve takes more than memory and the time that is left."""
         layers = self._layers(count)
-        return layers.max(initial=0) > WIDEST or multiplications(layers) * SECONDS_EACH > spending.seconds_left
+        return layers.max(initial=0) > MOST_WIDTH or multiplications(layers) * SECONDS_EACH > spending.seconds_left
 
     def _layers(self, count: int) -> np.ndarray:
         """Numbers of nodes at each distance from the target."""
@@ -351,7 +352,7 @@ class HittingTimes:
         becomes J + W."""
         high, low = j.copy(), np.zeros_like(j)
         best, policy = plain.but_limited(), None
-        for _ in range(REFINEMENTS):
+        for _ in range(MOST_NEWTON_STEPS):
             residual, _, _ = self._residuals(high, low, count)
             if policy is None or (policy != self.policy).any():
                 policy, factored = self.policy.copy(), self._factored(count)
@@ -393,7 +394,7 @@ class HittingTimes:
         upper = certified(above, 0.0, 1.0).high
         ceiling = np.nextafter(high + margin, math.inf) * PRODUCT
         ceiling[self.goal] = 0.0
-        for _ in range(REFINEMENTS):
+        for _ in range(MOST_NEWTON_STEPS):
             below_high, below_low = added(high, low, -margin)
             residual, error, (_, below) = self._residuals(below_high, below_low, count)
             if below <= 1e-9 or spending.is_over:

@@ -278,7 +278,7 @@ def _minimal_gap(problem: Problem) -> Certified:
 
 
 # Settings that several measures share
-_VALUES: dict[str, Any] = {"complexity": "estimation", "version": 2, "depends": "values"}
+_VALUE_SETTINGS: dict[str, Any] = {"complexity": "estimation", "version": 2, "depends": "values"}
 _REPRESENTATION: dict[str, Any] = {
     "complexity": "representation",
     "version": 1,
@@ -315,21 +315,21 @@ register(
     lambda problem: problem.gaps.certified_sum,
     definition="sum of 1 / (V*(s) - Q*(s, a)) over reachable s and actions that are not optimal",
     source="Simchowitz and Jamieson (2019); the pharos paper, equation 2",
-    **_VALUES,
+    **_VALUE_SETTINGS,
 )
 register(
     "sum_of_reciprocal_gaps_regularized",
     lambda problem: problem.gaps.certified_regularized,
     definition="sum of 1 / (V*(s) - Q*(s, a) + 0.1) over all s and a",
     source="Conserva and Rauber (2022), as in Colosseum",
-    **_VALUES,
+    **_VALUE_SETTINGS,
 )
 register(
     "minimal_gap",
     _minimal_gap,
     definition="the smallest V*(s) - Q*(s, a) > 0 over reachable s",
     source="Simchowitz and Jamieson (2019)",
-    **_VALUES,
+    **_VALUE_SETTINGS,
 )
 register(
     "environmental_value_norm",
@@ -338,7 +338,7 @@ register(
     ),
     definition="max over s, a of the standard deviation of V*(s') under p(. | s, a)",
     source="Maillard, Mann and Mannor (2014), definition 1",
-    **_VALUES,
+    **_VALUE_SETTINGS,
 )
 register(
     "effective_horizon",
@@ -363,7 +363,7 @@ register(
     lambda problem: action_gap_regularity(problem.mdp, problem.solution),
     definition="smallest c with P(0 < V*(s) - best Q*(s, a) that is not optimal <= t) <= c t for all t, s uniform",
     source="Farahmand (2011), assumption A1",
-    **_VALUES,
+    **_VALUE_SETTINGS,
     on_request=True,
 )
 register(

@@ -261,8 +261,8 @@ def _problem_conventions(problem: Problem) -> dict[str, Any]:
 # hardness.json --------------------------------------------------------------------------------------------------------
 
 
-FILE = "hardness.json"
-FORMAT = 2
+REPORT_FILE = "hardness.json"
+REPORT_FORMAT = 2
 
 # Conventions that the results of a measure depend on, by its `depends`; else all, but for these if it is "all".
 _OF_REPRESENTATIONS = ("representation", "schedule", "rollouts")
@@ -282,7 +282,7 @@ class ResultsFile:
     """
 
     def __init__(self, mdp: TabularMDP, conventions: Mapping[str, Any]):
-        self.path = None if mdp.folder is None else Path(mdp.folder) / FILE
+        self.path = None if mdp.folder is None else Path(mdp.folder) / REPORT_FILE
         self.mdp, self.conventions = mdp, dict(conventions)
         self.error_bound: float | None = None  # the largest of the values behind the results that were read
         self._has_warned = False
@@ -336,7 +336,7 @@ class ResultsFile:
             return
         with contextlib.suppress(OSError):
             results = {**self._read(), entry["key"]: entry}
-            storage.replace_json(self.path, {"format": FORMAT, "results": results}, durable=False)
+            storage.replace_json(self.path, {"format": REPORT_FORMAT, "results": results}, durable=False)
 
     def _key(self, measure: Measure) -> str:
         everything = tuple(sorted(self.conventions))
@@ -367,9 +367,9 @@ class ResultsFile:
             return {}
         try:
             stored = json.loads(text)
-            if stored["format"] < FORMAT:  # of an older pharos, without digests
+            if stored["format"] < REPORT_FORMAT:  # of an older pharos, without digests
                 return {}
-            if stored["format"] == FORMAT and all(isinstance(each, dict) for each in stored["results"].values()):
+            if stored["format"] == REPORT_FORMAT and all(isinstance(each, dict) for each in stored["results"].values()):
                 return dict(stored["results"])
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             pass

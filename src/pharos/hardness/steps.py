@@ -14,7 +14,7 @@ import numpy as np
 
 from pharos.errors import PrecisionError, UndefinedMeasure
 from pharos.mdp import (
-    STEPS,
+    STEPS_EXPECTED,
     ExpandedMDP,
     PolicyTable,
     TabularMDP,
@@ -26,11 +26,11 @@ from pharos.mdp import (
 from pharos.solvers import TablePolicy
 
 # In units of return: an action is optimal if its value is within this of the best (theirs).
-TIE = 1e-4
+OPTIMAL_TIE = 1e-4
 # Bytes that the tables of all steps may take.
 MEMORY = 8 * 2**30
 # Of returns whose squares 64-bit floats hold.
-LARGEST = 1e150
+HUGE_RETURN = 1e150
 
 
 def steps_of(name: str, mdp: TabularMDP, horizon: int | None) -> int:
@@ -38,14 +38,14 @@ def steps_of(name: str, mdp: TabularMDP, horizon: int | None) -> int:
     steps = mdp.horizon if horizon is None else horizon
     if steps is None:
         raise UndefinedMeasure(f"{name} is defined for episodes of T steps: give a horizon")
-    return whole_number(steps, "horizon", STEPS)
+    return whole_number(steps, "horizon", STEPS_EXPECTED)
 
 
 def check_returns(name: str, mdp: TabularMDP, steps: int) -> None:
     """PrecisionError if returns of so many steps may have squares that 64-bit floats do not hold."""
-    if not steps * max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest)) <= LARGEST:
+    if not steps * max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest)) <= HUGE_RETURN:
         raise PrecisionError(
-            f"{name}: returns of {steps} steps may pass {LARGEST:g}, and 64-bit floats do not hold their squares; "
+            f"{name}: returns of {steps} steps may pass {HUGE_RETURN:g}, and 64-bit floats do not hold their squares; "
             f"use smaller rewards"
         )
 
@@ -92,7 +92,7 @@ class FiniteHorizonValues:
                 self.explored[t] = self.backup(self.explored_value[t + 1])
             mean = mean_of_actions(self.explored[t]) if shares is None else (self.explored[t] * shares).sum(axis=1)
             self.explored_value[t] = mean.clip(self.worst[t].min(axis=1), self.best[t].max(axis=1))
-        self.optimal = self.best >= self.best.max(axis=2, keepdims=True) - TIE
+        self.optimal = self.best >= self.best.max(axis=2, keepdims=True) - OPTIMAL_TIE
         self.first = np.zeros(self.num_nodes, np.bool_)
         self.first[[node for node, _ in self.starts]] = True
         everything = np.ones((self.num_nodes, self.num_actions), np.bool_)
@@ -130,7 +130,7 @@ class FiniteHorizonValues:
 # Returns of an episode ------------------------------------------------------------------------------------------------
 
 
-SAME = 1e-9  # returns closer than this are one return
+SAME_RETURN = 1e-9  # returns closer than this are one return
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +213,7 @@ def _backward(mdp: TabularMDP, policy: TablePolicy | None, steps: int) -> tuple[
     for t in range(steps - 1, -1, -1):
         # Returns that are possible from this step on.
         sums = np.sort(np.append((distinct[:, None] + support).ravel(), 0.0))  # ended episodes have return 0
-        returns = sums[np.concatenate([[True], np.diff(sums) > SAME])]
+        returns = sums[np.concatenate([[True], np.diff(sums) > SAME_RETURN])]
         if 8 * states * num_actions * len(returns) * 3 > MEMORY:
             raise UndefinedMeasure(
                 f"return_distribution: {len(returns)} returns are possible in {steps - t} steps from {states} "
@@ -224,7 +224,7 @@ def _backward(mdp: TabularMDP, policy: TablePolicy | None, steps: int) -> tuple[
         after = mdp.dynamics.expected(values)
         for i, reward in enumerate(distinct):
             s, a = np.nonzero(which == i)
-            index = np.searchsorted(returns, reward + support + SAME / 2) - 1
+            index = np.searchsorted(returns, reward + support + SAME_RETURN / 2) - 1
             block = np.zeros((len(s), len(returns)))
             block[:, np.maximum(index, 0)] = after[s, a]
             executed[s, a] = block

@@ -47,7 +47,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pharos.hardness.hitting_times import SWEEPS, HittingTimes
+from pharos.hardness.hitting_times import SWEEPS_BEFORE_SOLVING, HittingTimes
 from pharos.hardness.interval import MORE, BudgetClock, Interval
 from pharos.kernels import hitting
 from pharos.kernels.hitting import UNIT
@@ -66,12 +66,12 @@ SQUARE = 64
 PASSES = 100
 ACCURACY = 1e-4
 # Outcomes below which threads are not worth their start.
-SMALL = 100_000
+FEW_OUTCOMES = 100_000
 # Sweeps over the nodes around a target, at most, and parts of all targets, in the order of their bounds: each part
 # knows the bounds of those before it, and threads share a part, so that results do not depend on their number.
-ROUNDS, PARTS = 30, 64
+WAY_ROUNDS, TARGET_PARTS = 30, 64
 # More than the relative rounding of sums of positive numbers along any way.
-ROUNDING = 1 + 1e-9
+SUM_SLACK = 1 + 1e-9
 
 
 class HubBounds:
@@ -97,7 +97,7 @@ class HubBounds:
         self._num_actions = num_actions
         self._steps = -1, np.empty(0, np.int32)  # a hub, and those from it to each node
         self._fixed = (self._outcomes, owner, weights, mdp.policy_width - 1)
-        self._threads = usable_workers(None) if len(node) > SMALL else 1
+        self._threads = usable_workers(None) if len(node) > FEW_OUTCOMES else 1
         with ThreadPoolExecutor(self._threads) as pool:
             self._find_ways_back(owner, pool)
         self.leak = self._solve(0.0, np.ones(len(first) - 1))
@@ -155,7 +155,7 @@ class HubBounds:
         """(N,) V: upper bounds of the expected steps from the hub to each node, given those from each node to the
         hub."""
         first, _, node, _ = self._outcomes
-        return hitting.times_from(hub, first, node, self._solve(1.0, times), self.leak) * ROUNDING
+        return hitting.times_from(hub, first, node, self._solve(1.0, times), self.leak) * SUM_SLACK
 
     def shortened(
         self, times: np.ndarray, bound: np.ndarray, targets: np.ndarray, size: int, is_over: Callable[[], bool]
@@ -176,7 +176,7 @@ class HubBounds:
                 np.zeros(num_nodes, np.int32),
                 np.empty(size, np.int64),
                 np.empty((4 * size, 2), np.int64),
-                np.empty(hitting.TURNS, np.int64),
+                np.empty(hitting.MOST_TURNS, np.int64),
                 *np.empty((2, size, num_previous + 1)),
             )
             for _ in range(self._threads)
@@ -184,10 +184,10 @@ class HubBounds:
         bound, new = bound.copy(), np.empty(num_nodes)
         graph = (outcomes, owner, self._into, self._steps_from(int(np.argmin(bound))))
         chance = (weights, num_previous, self._num_actions)
-        fixed = (graph, chance, times, bound, new, ROUNDS)
+        fixed = (graph, chance, times, bound, new, WAY_ROUNDS)
         with ThreadPoolExecutor(self._threads) as pool:
             order = targets[np.argsort(bound[targets], kind="stable")]
-            for part in np.array_split(order, min(PARTS, max(len(order), 1))):
+            for part in np.array_split(order, min(TARGET_PARTS, max(len(order), 1))):
                 if is_over():
                     break
                 edges = np.linspace(0, len(part), self._threads + 1).astype(np.int64)
@@ -243,7 +243,7 @@ def _outcome_lists(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarr
 
 # Most targets that threads look at before they learn of a larger hitting time: a target may be looked at in vain that
 # often.
-BATCH = 64
+TARGET_BATCH = 64
 # Nodes times targets from which on one search for each target, to find the most promising, takes minutes.
 MANY = 10**9
 # Targets that are solved before it is judged whether their bounds rule out others.
@@ -254,14 +254,14 @@ RULED_OUT = 40
 # Nodes on the way to a target through which its bound is shortened, and one in how many targets, drawn by their
 # numbers: a few are bounded by long ways, and the others from these by short ones. 0: the ones with the largest bounds,
 # as many as of the long ways.
-WAYS = ((64, 1), (4096, 64), (1024, 16), (256, 1), (4096, 0))
+WAY_STAGES = ((64, 1), (4096, 64), (1024, 16), (256, 1), (4096, 0))
 # Nodes there must be for each node on a way; the share that is left of the median and of the largest of the bounds
 # beyond which no more is tried; and times as long as the ways before take the next ones.
-NODES_EACH, TAKEN, LONGER = 8, 0.95, 5
+NODES_EACH, MOST_LEFT, LONGER = 8, 0.95, 5
 # Mixes the numbers of targets, neighbours among which are alike.
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 # Targets that are solved before that, if there are too many for a look at each, or bounds are so many times apart.
-FIRST, APART = 3, 2.0
+FIRST_TARGETS, APART = 3, 2.0
 # `crude_upper` is a product of up to N rounded factors.
 CRUDE = 1.01
 
@@ -412,7 +412,7 @@ class _Diameter(TargetBounds):
             batch, order = order[: int(min(size, left))], order[int(min(size, left)) :]
             if batch:
                 yield batch
-            size = min(2 * size, BATCH)
+            size = min(2 * size, TARGET_BATCH)
 
     def _widest(self) -> Iterator[list[int]]:
         """A start state, then the targets of the largest upper bounds, two at once, as long as this rules out others.
@@ -424,7 +424,7 @@ class _Diameter(TargetBounds):
         trial, left_before = TRIAL, self.num_open
         while batch and not self.spending.is_over:
             yield batch
-            if self.spending.searches >= FIRST and (self.many or self._upper() > APART * self.lower):
+            if self.spending.searches >= FIRST_TARGETS and (self.many or self._upper() > APART * self.lower):
                 self.shorten()
             if not self.many and self.spending.searches >= trial:
                 if left_before - self.num_open < min(RULED_OUT * TRIAL, left_before / 2):
@@ -493,16 +493,18 @@ def shortened_bounds(
     """
     count = len(away)
     drawn = np.argsort(np.arange(count, dtype=np.uint64) * _MIX, kind="stable")
-    for size, every in WAYS:
+    for size, every in WAY_STAGES:
         if size * NODES_EACH > count:
             continue
-        began, long = spending.seconds, count // WAYS[1][1]
+        began, long = spending.seconds, count // WAY_STAGES[1][1]
         targets = np.sort(drawn[: count // every]) if every else np.argpartition(away, count - long)[count - long :]
         before, away = away, travel.shortened(times, away, targets, size, lambda: spending.is_over)
         yield away
         if spending.is_over or LONGER * (spending.seconds - began) > spending.budget.seconds - spending.seconds:
             return
-        if size > WAYS[0][0] and all(f(away[targets]) > TAKEN * f(before[targets]) for f in (np.median, np.max)):
+        if size > WAY_STAGES[0][0] and all(
+            f(away[targets]) > MOST_LEFT * f(before[targets]) for f in (np.median, np.max)
+        ):
             return
 
 
@@ -588,7 +590,7 @@ class _Eccentricity(TargetBounds):
         if lost is not None and lost[self.nodes].any():
             self.infinite = True
             return None
-        bounds = targets.sweep(j, count, SWEEPS, 0.0, self.spending)
+        bounds = targets.sweep(j, count, SWEEPS_BEFORE_SOLVING, 0.0, self.spending)
         if bounds.at_most(self._mean(j)) * rounding > self.settled_upper:
             bounds = targets.solve(j, count, self.tolerance, 0.0, self.spending)
             mean = self._mean(j)

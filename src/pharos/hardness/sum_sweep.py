@@ -104,7 +104,7 @@ def _leads_to_end(table: Indices, terminal: np.ndarray) -> bool:
 
 
 # Nodes of a layer beyond which layers are not narrow: a set of them no longer fits into a core's cache.
-WIDE = 1024
+WIDE_LAYER = 1024
 
 
 class GraphLayers(NamedTuple):
@@ -178,7 +178,7 @@ class HiddenClock(NamedTuple):
             return None
         layer = away % cycle
         widths = np.bincount(layer, minlength=cycle)
-        if int(widths.max()) > WIDE:
+        if int(widths.max()) > WIDE_LAYER:
             return None
         return HiddenClock(home.copy(), away.copy(), GraphLayers.of(layer, widths, graph.dtype))
 
@@ -228,7 +228,7 @@ _FEW_ORBITS = 64
 # Bytes that searches from many nodes may take.
 _BATCH_MEMORY = 2**31
 COUNTING = 10.0  # seconds for counting the pairs of an infinite diameter, unless a budget is given
-DEFAULTS = (Budget(), Budget(seconds=COMMAND_SECONDS))
+DEFAULT_BUDGETS = (Budget(), Budget(seconds=COMMAND_SECONDS))
 # Table entries that are followed in a second on a slow core, to know how many a budget allows for.
 READS = 10**8
 
@@ -478,7 +478,7 @@ class SumSweep:
         layer = self.away % cycle
         widths = np.bincount(layer, minlength=cycle)
         widest = int(widths.max())
-        if widest > WIDE:
+        if widest > WIDE_LAYER:
             return f"all cycles have multiples of {cycle} steps, but a layer of {widest} states is too wide to follow"
         layers = GraphLayers.of(layer, widths, graph.dtype)
         now, later = (np.empty((widest, -(-widest // 64)), np.uint64) for _ in range(2))
@@ -499,7 +499,7 @@ def _infinite_diameter(graph: Graph, spending: BudgetClock) -> Interval:
     The value is known before any pair is counted, so of the default budget no more than COUNTING seconds go into that.
     """
     size = graph.num_nodes
-    end = spending.seconds + COUNTING if spending.budget in DEFAULTS else math.inf
+    end = spending.seconds + COUNTING if spending.budget in DEFAULT_BUDGETS else math.inf
     words = 8 if 24 * 8 * size <= _BATCH_MEMORY else 1
     origins, front, coming = (np.zeros((size, words), np.uint64) for _ in range(3))
     scratch = (origins, front, coming, graph.queue, np.empty_like(graph.queue))

@@ -23,7 +23,7 @@ from pharos.mdp import (
 from pharos.solvers import Solution
 
 # States at once: values of all their outcomes are in memory.
-_BLOCK = 1 << 16
+_VARIANCE_BLOCK = 1 << 16
 _UNIT = 2.0**-53
 # Relative width up to which an interval counts as the value.
 _NARROW = 1e-6
@@ -66,8 +66,8 @@ def certified_value_norm(
     states, largest = np.flatnonzero((lone | nodes.any(axis=1)) & live), 0.0
     size = float(np.abs(solution.x).max(initial=0.0))
     scale = 2.0 ** math.frexp(size)[1] if 0 < size < math.inf else 1.0  # squares of 1e160 and 1e-170 are no floats
-    for number, block in enumerate(np.array_split(states, max(1, -(-states.size // _BLOCK)))):
-        progress(f"state {number * _BLOCK:,} of {states.size:,}")
+    for number, block in enumerate(np.array_split(states, max(1, -(-states.size // _VARIANCE_BLOCK)))):
+        progress(f"state {number * _VARIANCE_BLOCK:,} of {states.size:,}")
         means, within = _moments(mdp, solution.x, block, scale)
         first = lone[block]
         largest = max(largest, _largest_variance(mdp.chance.first.at(block[first]), means[first], within[first], 0))

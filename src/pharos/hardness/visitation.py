@@ -26,7 +26,7 @@ from pharos.hardness.interval import Interval, fields_of, finite
 from pharos.hardness.steps import steps_of
 from pharos.kernels import occupancy as kernels
 from pharos.mdp import (
-    STEPS,
+    STEPS_EXPECTED,
     Chance,
     ExpandedMDP,
     PolicyStep,
@@ -42,7 +42,7 @@ from pharos.system.compiling import Stopwatch
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-_MEMORY = 8 << 30  # bytes that all steps together may take
+_STEPS_MEMORY = 8 << 30  # bytes that all steps together may take
 _LEAST = 1e-280  # mass that is not worth a step: smaller numbers lose their digits, and take a hundred times longer
 
 
@@ -125,9 +125,10 @@ def occupancy(
     shape = (mdp.num_states, mdp.num_actions)
     if keep_all and walk.horizon is None:
         raise ParameterError("keep_all is for episodes of T steps: give a horizon")
-    if keep_all and 8 * walk.horizon * mdp.num_states * mdp.num_actions > _MEMORY:  # type: ignore[operator]
+    if keep_all and 8 * walk.horizon * mdp.num_states * mdp.num_actions > _STEPS_MEMORY:  # type: ignore[operator]
         raise ParameterError(
-            f"{walk.horizon} steps of {mdp.num_states} states need more than {_MEMORY >> 30} GiB; leave out keep_all"
+            f"{walk.horizon} steps of {mdp.num_states} states need more than {_STEPS_MEMORY >> 30} GiB; "
+            "leave out keep_all"
         )
     if not tolerance > 0:
         raise ParameterError(f"tolerance is {tolerance!r}; expected a number above 0")
@@ -241,7 +242,7 @@ class Propagation:
     """
 
     def __init__(self, mdp: TabularMDP, policy: TablePolicy | None, horizon: int | None):
-        steps = mdp.horizon if horizon is None else whole_number(horizon, "horizon", STEPS)
+        steps = mdp.horizon if horizon is None else whole_number(horizon, "horizon", STEPS_EXPECTED)
         if steps is None and mdp.gamma == 1.0:
             raise UndefinedMeasure(
                 f"{mdp}: visits may be infinite, as gamma is 1 and there is no horizon; give one, or gamma < 1"
@@ -535,7 +536,7 @@ def _occupied(mdp: TabularMDP, steps: int, report: Callable[[str], object]) -> t
 
 
 MOST_NODES = 4096
-ROUNDING = 1e-12  # of a distance, that a tie with epsilon is one
+DISTANCE_ROUNDING = 1e-12  # of a distance, that a tie with epsilon is one
 
 
 @dataclass(frozen=True)
@@ -666,7 +667,7 @@ def _period(chain: "csr_matrix") -> int:
 def _mixing_time(chain: np.ndarray, epsilon: float, report: Callable[[str], object]) -> tuple[int, float]:
     """(t_mix, distance there): squares until it is near enough, then bisection by the squares on the way."""
     size = len(chain)
-    epsilon += ROUNDING
+    epsilon += DISTANCE_ROUNDING
     system = chain.T - np.eye(size)  # of which one equation follows from the others
     system[-1] = 1.0
     stationary = np.linalg.solve(system, np.append(np.zeros(size - 1), 1.0))

@@ -14,7 +14,7 @@ from pharos.state_space import StateSpace
 if TYPE_CHECKING:
     from pharos.interaction.gymnax_env import GymnaxEnv
 
-OBSERVED_STATES = 1 << 14  # states that are observed at once
+EXPORT_BLOCK = 1 << 14  # states that are observed at once
 
 
 def to_gymnax(
@@ -78,8 +78,8 @@ def _observed(
     """(S, ...) observations of all states, and their bounds."""
     observation = observe(env, name, state_space=space, **options)
     blocks = [
-        observation(space.states(slice(first, first + OBSERVED_STATES)))
-        for first in range(0, space.num_states, OBSERVED_STATES)
+        observation(space.states(slice(first, first + EXPORT_BLOCK)))
+        for first in range(0, space.num_states, EXPORT_BLOCK)
     ]
     observations = np.concatenate(blocks)
     if observations.ndim == 1:

@@ -38,8 +38,8 @@ from pharos.system.threads import in_blocks
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
-STEPS_PER_THREAD = 4096  # steps that are worth a thread's while
-LARGEST_TABLE = 1 << 28  # bytes of observations that are computed beforehand
+THREAD_STEPS = 4096  # steps that are worth a thread's while
+TABLE_BYTES = 1 << 28  # bytes of observations that are computed beforehand
 _NO_VECTORS = np.empty((0, 0), np.float32)
 
 
@@ -146,7 +146,7 @@ class RulesStepper(Stepper):
             if fault >= 0:
                 faults.append(fault)
 
-        in_blocks(run, len(self.current), STEPS_PER_THREAD)
+        in_blocks(run, len(self.current), THREAD_STEPS)
         if faults:
             i, component = divmod(min(faults), self.current.shape[1])
             self.simulator.raise_fault(self.current[i], int(batch.executed[i]), component)
@@ -171,7 +171,7 @@ class TableStepper(Stepper):
         self._is_index = context.is_plain and isinstance(context.observation, Index)
         self._table: np.ndarray | None = None
         one = np.prod(context.observation.space.shape or ()) * np.dtype(context.observation.space.dtype).itemsize
-        if context.is_plain and not self._is_index and one * space.num_states <= LARGEST_TABLE:
+        if context.is_plain and not self._is_index and one * space.num_states <= TABLE_BYTES:
             self._table = context.observation(space.states())
 
     def positions(self, states: np.ndarray) -> np.ndarray:
@@ -188,7 +188,7 @@ class TableStepper(Stepper):
         def run(first: int, last: int) -> None:
             walk_table(self._transitions, self._rewards, self._staying, terminal, setting, arrays, first, last)
 
-        in_blocks(run, len(self.current), STEPS_PER_THREAD)
+        in_blocks(run, len(self.current), THREAD_STEPS)
 
     def seen(self, positions: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
         if self._is_index:

@@ -37,9 +37,9 @@ from pharos.kernels.stepping import (
 
 MULTIPLIER_0, MULTIPLIER_1 = 0xD2511F53, 0xCD9E8D57
 WEYL_0, WEYL_1 = 0x9E3779B9, 0xBB67AE85
-ROUNDS = 10
+CIPHER_ROUNDS = 10
 MASK = 0xFFFFFFFF
-UNIT = 2.0**-32
+UINT32_UNIT = 2.0**-32
 
 
 @inlined
@@ -47,7 +47,7 @@ def philox(c0, c1, c2, c3, key):
     """Four words (uint64 below 2^32) of the counter (c0, c1, c2, c3) and a key of 64 bits, its low word first."""
     c0, c1, c2, c3 = uint64(c0), uint64(c1), uint64(c2), uint64(c3)
     k0, k1 = uint64(key) & uint64(MASK), uint64(key) >> uint64(32)
-    for _ in range(ROUNDS):
+    for _ in range(CIPHER_ROUNDS):
         low, high = uint64(MULTIPLIER_0) * c0, uint64(MULTIPLIER_1) * c2
         c0, c1, c2, c3 = (
             (high >> uint64(32)) ^ c1 ^ k0,
@@ -62,7 +62,7 @@ def philox(c0, c1, c2, c3, key):
 @inlined
 def unit(word):
     """A word as a number in (0, 1): the middle of its interval of length 2^-32."""
-    return (np.float64(word) + 0.5) * UNIT
+    return (np.float64(word) + 0.5) * UINT32_UNIT
 
 
 @inlined
@@ -82,7 +82,7 @@ def words(keys, stream, step, out):
 
 
 STEP, EXPLORE, SAMPLE, SHUFFLE, WEIGHTS, ACT = range(6)  # streams of random numbers
-DONE, TIMEOUT = 1, 2  # bits of a transition's flags
+ENDED, TIMEOUT = 1, 2  # bits of a transition's flags
 
 
 @kernel
@@ -231,7 +231,7 @@ def advance(
             elapsed[i, e] += 1
             timeout = not ended and elapsed[i, e] >= limits[i]
             next_states[i, e] = s if t < 0 else t
-            flags[i, e] = (DONE if ended or timeout else 0) | (TIMEOUT if timeout else 0)
+            flags[i, e] = (ENDED if ended or timeout else 0) | (TIMEOUT if timeout else 0)
             reward[i, e] = earned / knobs[i, 3]
             if delay > 0:
                 reward[i, e] = delayed_reward(pending[i, e, :delay], elapsed[i, e] - 1, reward[i, e], ended or timeout)
@@ -302,7 +302,7 @@ def sample_histories(keys, step, draw, next_row, filled, gammas, num_steps, memo
     """`sample` from the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
 
     They are read from the rows before; the first state of an episode stands for those before it. Rows that were never
-    written have the flag DONE.
+    written have the flag ENDED.
     """
     state, next_state, action, reward, flags = memory
     states, next_states, actions, rewards, discounts = batch
@@ -331,9 +331,9 @@ def _steps_from(i, row, e, last, gamma, num_steps, reward, flags):
         at = (row + n) % size
         total += factor * reward[i, at, e]
         factor *= gamma
-        if flags[i, at, e] & DONE or at == last:
+        if flags[i, at, e] & ENDED or at == last:
             break
-    ended = flags[i, at, e] & DONE and not flags[i, at, e] & TIMEOUT
+    ended = flags[i, at, e] & ENDED and not flags[i, at, e] & TIMEOUT
     return at, float32(total), float32(0.0) if ended else float32(factor)
 
 
@@ -344,7 +344,7 @@ def _last_states(i, row, e, state, flags, out):
     for f in range(len(out) - 1, -1, -1):
         out[f] = state[i, row, e]
         before = row - 1 if row > 0 else size - 1
-        if not flags[i, before, e] & DONE:
+        if not flags[i, before, e] & ENDED:
             row = before
 
 

@@ -121,18 +121,18 @@ def longest_path(transitions, live, order):
 # Backups --------------------------------------------------------------------------------------------------------------
 
 
-UNROLLED = 128  # actions
+UNROLLED_ACTIONS = 128  # actions
 # States between the one whose values are fetched and the one that is backed up: memory has that long to answer.
-AHEAD = 32
+FETCHED_AHEAD = 32
 
 
 def actions_of(num_actions: int, unrolled: bool) -> "tuple[int, ...] | np.ndarray":
     """The argument `actions`, A zeros: an array, or, if sweeps are unrolled (`is_unrolled`), a tuple.
 
     The compiler knows a tuple's length and unrolls the loops over actions: sweeps are 3 to 4 times as fast, and each
-    number of actions is compiled by itself (minutes, for more than UNROLLED).
+    number of actions is compiled by itself (minutes, for more than UNROLLED_ACTIONS).
     """
-    return (0,) * num_actions if num_actions <= UNROLLED and unrolled else np.zeros(num_actions, np.int8)
+    return (0,) * num_actions if num_actions <= UNROLLED_ACTIONS and unrolled else np.zeros(num_actions, np.int8)
 
 
 def reward_at(table, palette, s, a):
@@ -245,8 +245,8 @@ def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, action
     """v[s] = (1 - uniform) q(s, choice) + uniform mean_a q(s, a), in place, for indices [start, stop) of the order."""
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
-        if i >= start + AHEAD:
-            fetch_values(transitions, v, actions, state_at(order, i - AHEAD))
+        if i >= start + FETCHED_AHEAD:
+            fetch_values(transitions, v, actions, state_at(order, i - FETCHED_AHEAD))
         s = state_at(order, i)
         value = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
         change = max(change, abs(value - v[uint64(s)]))
@@ -261,8 +261,8 @@ def optimal_backup(transitions, table, palette, gamma, uniform, choice, v, out, 
     for i in range(len(runs)):
         stop = runs[i, 1]
         for s in range(runs[i, 0], stop):
-            if s + AHEAD < stop:
-                fetch_values(transitions, v, actions, s + AHEAD)
+            if s + FETCHED_AHEAD < stop:
+                fetch_values(transitions, v, actions, s + FETCHED_AHEAD)
             out[uint64(s)] = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
 
 
@@ -326,8 +326,8 @@ def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions
     chosen_weight, previous_weight, uniform_weight = weights[0], weights[1], weights[2]
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
-        if i >= start + AHEAD:
-            fetch_values(transitions, v, actions, state_at(order, i - AHEAD))
+        if i >= start + FETCHED_AHEAD:
+            fetch_values(transitions, v, actions, state_at(order, i - FETCHED_AHEAD))
         s = state_at(order, i)
         best, total = _sticky_values(transitions, table, palette, gamma, weights, choice, v, actions, q, s)
         shared = chosen_weight * best + uniform_weight * total / set_size(weights, s, actions)
@@ -348,8 +348,8 @@ def sticky_backup(transitions, table, palette, gamma, weights, choice, v, out, a
     for i in range(len(runs)):
         stop = runs[i, 1]
         for s in range(runs[i, 0], stop):
-            if s + AHEAD < stop:
-                fetch_values(transitions, v, actions, s + AHEAD)
+            if s + FETCHED_AHEAD < stop:
+                fetch_values(transitions, v, actions, s + FETCHED_AHEAD)
             best, total = _sticky_values(transitions, table, palette, gamma, weights, choice, v, actions, q, s)
             shared = chosen_weight * best + uniform_weight * total / set_size(weights, s, actions)
             for b in range(len(actions)):

@@ -21,7 +21,7 @@ from numba import types
 from pharos.kernels.interpreted import interpreted_first, overload
 from pharos.kernels.kernel_cache import kernel
 
-ROUNDING = 2.0**-44  # more than sums lose
+SUM_LOSS = 2.0**-44  # more than sums lose
 SPLITTER = 2.0**27 + 1  # times a float, it splits it into halves of 26 bits
 
 
@@ -97,7 +97,7 @@ def improve(first, node, weight, rows, rewards, backward, v, policy):
                 total += weight[k] * v[node[k]]
                 leaving += weight[k]
             value = total / leaving
-            if value - v[n] > ROUNDING * (abs(value) + abs(v[n]) + abs(rewards[row]) / leaving):
+            if value - v[n] > SUM_LOSS * (abs(value) + abs(v[n]) + abs(rewards[row]) / leaving):
                 v[n], policy[n] = value, row
                 count += 1
     return count

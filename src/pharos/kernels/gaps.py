@@ -112,7 +112,7 @@ def _add_exactly(sums, k, value):
 # Ties -----------------------------------------------------------------------------------------------------------------
 
 
-FREE = -1  # the bits of a NaN, which no value is
+FREE_KEY = -1  # the bits of a NaN, which no value is
 
 
 @interpreted_first("gap")
@@ -158,7 +158,7 @@ def extend(values, rewards, next_values, gap, counted, begin, entries, filled):
 def refill(old_entries, entries):
     """Copy a map into a larger one."""
     for i in range(len(old_entries)):
-        if old_entries[i, 0] != FREE:
+        if old_entries[i, 0] != FREE_KEY:
             index = _entry_of(old_entries[i, 0], entries)
             for k in range(entries.shape[1]):
                 entries[index, k] = old_entries[i, k]
@@ -168,7 +168,7 @@ def refill(old_entries, entries):
 def _put(key, reward, next_value, other_reward, other_next_value, entries):
     """Enter a key with its row; returns 1 if the key is new, 0 if it has this row, -1 if it has another."""
     index = _entry_of(key, entries)
-    is_new = entries[index, 0] == FREE
+    is_new = entries[index, 0] == FREE_KEY
     if is_new:
         entries[index, 0], entries[index, 1], entries[index, 2] = key, reward, next_value
     elif entries[index, 1] != reward or entries[index, 2] != next_value:
@@ -192,6 +192,6 @@ def _entry_of(key, entries):
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     mask = len(entries) - 1
     index = np.int64(z ^ (z >> np.uint64(31))) & mask
-    while entries[index, 0] != FREE and entries[index, 0] != key:
+    while entries[index, 0] != FREE_KEY and entries[index, 0] != key:
         index = (index + 1) & mask
     return index

@@ -286,9 +286,9 @@ def proper_policy(first, node, weight, num_actions, goal, order, count, sure, po
 # Ways back ------------------------------------------------------------------------------------------------------------
 
 
-NONE = 255  # steps of a way back if there is none nearby
+NO_WAY = 255  # steps of a way back if there is none nearby
 # More than the rounding error of a sum of probabilities.
-ROUNDING = 1e-12
+MASS_ROUNDING = 1e-12
 # The distance from 1 to the next float.
 EPSILON = 2.0**-52
 
@@ -335,7 +335,7 @@ def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
     levels[y] = 1
     queue[0] = y
     head, tail = 0, 1
-    while head < tail and tail < ball and levels[queue[head]] < NONE:
+    while head < tail and tail < ball and levels[queue[head]] < NO_WAY:
         n = queue[head]
         head += 1
         for k in range(into_first[n], into_first[n + 1]):
@@ -355,9 +355,9 @@ def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
 def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball, levels, queue, via):
     """Shortest ways back to node[i], for outcomes i into nodes low..high, from the other outcomes of its state.
 
-    If `way` is None: steps[square[i] + j] = length of the way from outcome j of the state to node[i]; NONE where the
+    If `way` is None: steps[square[i] + j] = length of the way from outcome j of the state to node[i]; NO_WAY where the
     `ball` nodes nearest to node[i] do not include it. Else way[start[i]] on = the outcomes along the ways whose length
-    is not NONE, one way after another. levels (N,) uint8 is zero before and after.
+    is not NO_WAY, one way after another. levels (N,) uint8 is zero before and after.
     """
     first, _, node, _ = outcomes
     into_first, into_outcome = into
@@ -373,8 +373,8 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
             for j in range(first[x + 1] - first[x]):
                 n = node[first[x] + j]
                 if way is None:
-                    steps[square[i] + j] = levels[n] - 1 if levels[n] > 0 else NONE
-                elif steps[square[i] + j] != NONE:
+                    steps[square[i] + j] = levels[n] - 1 if levels[n] > 0 else NO_WAY
+                elif steps[square[i] + j] != NO_WAY:
                     while n != y:
                         way[at] = via[n]
                         at += 1
@@ -389,7 +389,7 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
 def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, length):
     """Drop the longest ways back until the expected steps on the way back are at most `limit`, for every outcome.
 
-    steps: NONE if dropped; length[i] becomes the sum of the lengths of the ways that are left. Returns the largest
+    steps: NO_WAY if dropped; length[i] becomes the sum of the lengths of the ways that are left. Returns the largest
     expected number of steps.
     """
     first, action, node, prob = outcomes
@@ -403,7 +403,7 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
             for previous in range(-1, num_previous):
                 total = 0.0
                 for j in range(low, high):
-                    if steps[square[i] + j - low] != NONE:
+                    if steps[square[i] + j - low] != NO_WAY:
                         chance = prob[j] * _execution(action[j], action[i], previous, weights)
                         total += chance * steps[square[i] + j - low]
                 worst = max(worst, total)
@@ -413,14 +413,14 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
             # too many: drop all ways of the greatest length, and try again
             farthest = 0
             for j in range(low, high):
-                if steps[square[i] + j - low] != NONE:
+                if steps[square[i] + j - low] != NO_WAY:
                     farthest = max(farthest, steps[square[i] + j - low])
             for j in range(low, high):
                 if steps[square[i] + j - low] == farthest:
-                    steps[square[i] + j - low] = NONE
+                    steps[square[i] + j - low] = NO_WAY
         if square[i] >= 0:
             for j in range(low, high):
-                if steps[square[i] + j - low] != NONE:
+                if steps[square[i] + j - low] != NO_WAY:
                     length[i] += steps[square[i] + j - low]
     return largest
 
@@ -460,7 +460,7 @@ def attempt_costs(
             at = start[i]
             for j in range(low, high):
                 chance = prob[j] * _execution(action[j], action[i], previous, weights)
-                if square[i] >= 0 and steps[square[i] + j - low] != NONE:
+                if square[i] >= 0 and steps[square[i] + j - low] != NO_WAY:
                     back = 0.0
                     for _ in range(steps[square[i] + j - low]):
                         back += value[way[at]]
@@ -493,7 +493,7 @@ def times_from(hub, first, node, cost, leak):
         done[x] = True
         for i in range(first[x], first[x + 1]):
             y = node[i]
-            remainder = 1 - leak[i] - ROUNDING
+            remainder = 1 - leak[i] - MASS_ROUNDING
             if not done[y] and remainder > 0:
                 candidate = (time + cost[i]) / remainder
                 if candidate < bound[y]:
@@ -509,11 +509,11 @@ def times_from(hub, first, node, cost, leak):
 CROWD = 64
 # Turns that a lost step costs among the nodes on the way to a target, and turns that are kept: ways that lose more
 # steps at once are not gone.
-DETOUR, TURNS = 2, 32
+DETOUR, MOST_TURNS = 2, 32
 # No way from the hub leads to a node.
-LOST = 1 << 30
+NEVER = 1 << 30
 # Part of a bound that a sweep must gain for another one to follow.
-GAIN = 1e-3
+LEAST_GAIN = 1e-3
 # More than the relative rounding of costs and leaks after all sweeps: some units in the last place for each update.
 UPDATES = 1 + 1e-9
 
@@ -584,12 +584,12 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
                     if gain > 0:
                         cost[i, then], leak[i, then] = c, left
                         gained = max(gained, gain)
-            if gained <= GAIN * guess:
+            if gained <= LEAST_GAIN * guess:
                 break
         # the best node x to come from, with the rounding of all sums on top
         least = bound[z]
         for i in range(1, size):
-            remainder = 1 - leak[i].max() * UPDATES - ROUNDING
+            remainder = 1 - leak[i].max() * UPDATES - MASS_ROUNDING
             if remainder > 0:
                 least = min(least, (bound[queue[i]] + cost[i].max() * UPDATES) / remainder * (1 + 8 * EPSILON))
         new[z] = least
@@ -604,7 +604,7 @@ def _around(z, owner, into, steps, index, scratch):
     queue[:size]: the nodes, as many as the queue holds; index[n]: the index of n in it, plus one; -1 while it waits. A
     node of which z is k steps away, and that lies on a way from the hub to z that is s steps longer than the shortest
     one, comes k + DETOUR s-th: its steps to z count, and those lost. A queue of buckets: `turns` has the first node of
-    each of the next TURNS turns, `pushed` are (node, the next of its turn).
+    each of the next MOST_TURNS turns, `pushed` are (node, the next of its turn).
     """
     queue, pushed, turns = scratch
     into_first, into_outcome = into
@@ -612,15 +612,15 @@ def _around(z, owner, into, steps, index, scratch):
     pushed[0, 0], pushed[0, 1], turns[0] = z, -1, 0
     index[z] = -1
     size, count, turn, idle = 0, 1, 0, 0
-    while idle <= TURNS and size < len(queue):
-        # the next node of this turn; the search ends after TURNS turns without any
-        at = turns[turn % TURNS]
+    while idle <= MOST_TURNS and size < len(queue):
+        # the next node of this turn; the search ends after MOST_TURNS turns without any
+        at = turns[turn % MOST_TURNS]
         if at < 0:
             turn += 1
             idle += 1
             continue
         idle = 0
-        turns[turn % TURNS] = pushed[at, 1]
+        turns[turn % MOST_TURNS] = pushed[at, 1]
         n = pushed[at, 0]
         queue[size] = n
         size += 1
@@ -631,8 +631,8 @@ def _around(z, owner, into, steps, index, scratch):
         for k in range(into_first[n], into_first[n + 1]):
             x = owner[into_outcome[k]]
             lost = 1 + steps[x] - steps[n]
-            if index[x] == 0 and 0 <= lost < (TURNS - 1) // DETOUR and count < len(pushed):
-                then = (turn + 1 + DETOUR * lost) % TURNS
+            if index[x] == 0 and 0 <= lost < (MOST_TURNS - 1) // DETOUR and count < len(pushed):
+                then = (turn + 1 + DETOUR * lost) % MOST_TURNS
                 pushed[count, 0], pushed[count, 1] = x, turns[then]
                 turns[then] = count
                 index[x] = -1
@@ -641,9 +641,9 @@ def _around(z, owner, into, steps, index, scratch):
 
 
 def steps_from(hub, first, node):
-    """(N,) int32: the fewest steps in which outcomes lead from the hub to each node, LOST if none do."""
+    """(N,) int32: the fewest steps in which outcomes lead from the hub to each node, NEVER if none do."""
     steps, is_hub = np.empty(len(first) - 1, np.int32), np.zeros(len(first) - 1, np.bool_)
     is_hub[hub] = True
     backward_order(first, node, is_hub, np.empty(len(first) - 1, np.int64), steps)
-    steps[steps < 0] = LOST
+    steps[steps < 0] = NEVER
     return steps

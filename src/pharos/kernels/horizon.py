@@ -139,7 +139,7 @@ def step_along(next_states, rewards, after, optimal, variance, log, near, nodes,
 # Tails ----------------------------------------------------------------------------------------------------------------
 
 
-PARTS = 100
+MASS_PARTS = 100
 
 
 @kernel
@@ -176,11 +176,11 @@ def bernstein(means, widths, m, lower, upper):
         lower[row] = 0.0
         upper[row] = 0.0
         for a in range(n):
-            for part in range(PARTS):
+            for part in range(MASS_PARTS):
                 # the part of mean a, and the chance of each other mean to be below it
-                high = means[row, a] + _quantile(1 - (part + 1) / PARTS, m, widths[row, a], variances[a])
-                low = means[row, a] - _quantile(part / PARTS, m, widths[row, a], variances[a])
-                least = most = 1 / PARTS
+                high = means[row, a] + _quantile(1 - (part + 1) / MASS_PARTS, m, widths[row, a], variances[a])
+                low = means[row, a] - _quantile(part / MASS_PARTS, m, widths[row, a], variances[a])
+                least = most = 1 / MASS_PARTS
                 for b in range(n):
                     if b != a:
                         most *= _below(means[row, b] - high, m, widths[row, b], variances[b])

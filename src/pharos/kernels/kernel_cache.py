@@ -33,8 +33,8 @@ DIGEST_BYTES = 32
 UNUSED_DAYS = 30
 """Days after which the kernels of other texts, which no process has asked for since, are deleted."""
 
-_HERE = Path(__file__).parent
-_TEXTS = (*sorted(_HERE.glob("*.py")), _HERE.parent / "system" / "arrays.py")
+_KERNELS = Path(__file__).parent
+_TEXTS = (*sorted(_KERNELS.glob("*.py")), _KERNELS.parent / "system" / "arrays.py")
 
 
 class Codegen(Protocol):

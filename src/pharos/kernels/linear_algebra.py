@@ -96,7 +96,7 @@ def entries_of_factor(first, columns, limit, starts=None, rows=None):
 # Kernels of rank M ----------------------------------------------------------------------------------------------------
 
 
-ROWS = 256  # sums over so many rows are float32, sums of these float64
+FLOAT32_ROWS = 256  # sums over so many rows are float32, sums of these float64
 
 
 @kernel(fastmath={"reassoc", "contract", "nsz"})
@@ -104,10 +104,10 @@ def project(features, z, out):
     """out (A, M) float64 = (F' z)', z (C, A) float32."""
     part = np.zeros(out.shape, np.float32)
     out[:] = 0.0
-    # float32 sums of ROWS rows, added up as float64
-    for first in range(0, len(features), ROWS):
+    # float32 sums of FLOAT32_ROWS rows, added up as float64
+    for first in range(0, len(features), FLOAT32_ROWS):
         part[:] = 0.0
-        for s in range(first, min(first + ROWS, len(features))):
+        for s in range(first, min(first + FLOAT32_ROWS, len(features))):
             for a in range(z.shape[1]):
                 value = z[s, a]
                 for m in range(features.shape[1]):
@@ -124,9 +124,9 @@ def step(features, diagonal, weights, rate, projected, now, past, out):
     """
     part = np.zeros(out.shape, np.float32)
     out[:] = 0.0
-    for first in range(0, len(features), ROWS):
+    for first in range(0, len(features), FLOAT32_ROWS):
         part[:] = 0.0
-        for s in range(first, min(first + ROWS, len(features))):
+        for s in range(first, min(first + FLOAT32_ROWS, len(features))):
             for a in range(now.shape[1]):
                 # entry (s, a) of K (weights now), and the new term
                 total = np.float32(0.0)

@@ -108,7 +108,7 @@ PackedIndices._numba_type_ = property(_type_of)  # type: ignore[attr-defined]
 # Transitions ----------------------------------------------------------------------------------------------------------
 
 
-UNROLLED = 4  # the largest K for which loops over outcomes are unrolled
+UNROLLED_OUTCOMES = 4  # the largest K for which loops over outcomes are unrolled
 UNROLLED_FROM = 100_000
 """States from which sweeps are compiled for each number of actions and outcomes; fewer are swept sooner than that."""
 
@@ -121,7 +121,7 @@ def is_unrolled(num_states):
 
 def each_of(num_outcomes, unrolled):
     """The last entry of `transitions`, for sweeps: a tuple of K zeros if K is small and sweeps are unrolled, else K."""
-    return (0,) * num_outcomes if num_outcomes <= UNROLLED and unrolled else num_outcomes
+    return (0,) * num_outcomes if num_outcomes <= UNROLLED_OUTCOMES and unrolled else num_outcomes
 
 
 def _is_lazy(transitions):

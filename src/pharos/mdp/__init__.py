@@ -32,7 +32,7 @@ if TYPE_CHECKING:
         random_actions,
         sticky_actions,
     )
-    from pharos.mdp.arguments import STEPS, check_horizon, require_mdp, whole_number
+    from pharos.mdp.arguments import STEPS_EXPECTED, check_horizon, require_mdp, whole_number
     from pharos.mdp.bisimulation import Minimization, minimize
     from pharos.mdp.dynamics import (
         BellmanEquation,

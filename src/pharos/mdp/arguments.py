@@ -77,7 +77,7 @@ def checked_next_states(next_states: object) -> np.ndarray:
     return np.ascontiguousarray(table, np.int32 if len(table) < 2**31 else np.int64)
 
 
-STEPS = "a whole number of steps, at least 1"
+STEPS_EXPECTED = "a whole number of steps, at least 1"
 
 
 def whole_number(
@@ -98,7 +98,7 @@ def check_gamma(gamma: object) -> None:
 def check_horizon(horizon: object) -> None:
     """ParameterError unless it is a number of steps, or None."""
     if horizon is not None:
-        whole_number(horizon, "horizon", f"{STEPS} and below 2^31, or None", most=2**31 - 1)
+        whole_number(horizon, "horizon", f"{STEPS_EXPECTED} and below 2^31, or None", most=2**31 - 1)
 
 
 def terminal_states(terminal: npt.ArrayLike | None, default: np.ndarray, allowed: np.ndarray) -> np.ndarray:

@@ -178,9 +178,9 @@ COMPARISONS = {
     ">": np.greater,
     ">=": np.greater_equal,
 }
-DEEPEST, LONGEST = 40, 10_000
+MOST_PARENTHESES, MOST_CHARACTERS = 40, 10_000
 """Parentheses within each other, and characters, of an expression."""
-LARGEST = 2**62
+LARGEST_NUMBER = 2**62
 """What numbers of an expression stay below, in size: so nothing overflows."""
 
 
@@ -282,8 +282,8 @@ class Parser:
             return self._named(word)
         if word == "(":
             self.depth += 1
-            if self.depth > DEEPEST:
-                raise self._error(f"{self.depth} parentheses within each other", f"at most {DEEPEST}")
+            if self.depth > MOST_PARENTHESES:
+                raise self._error(f"{self.depth} parentheses within each other", f"at most {MOST_PARENTHESES}")
             inner = self._either()
             self.depth -= 1
             if not self._takes(")"):
@@ -298,8 +298,8 @@ class Parser:
             if column.dtype == np.bool_:
                 return Term(column, 0, word)
             size = max(abs(int(column.min(initial=0))), abs(int(column.max(initial=0))))
-            if size > LARGEST:
-                raise self._error(f"{word}, whose values are up to {size}", f"at most {LARGEST}")
+            if size > LARGEST_NUMBER:
+                raise self._error(f"{word}, whose values are up to {size}", f"at most {LARGEST_NUMBER}")
             return Term(column.astype(np.int64), size, word)
         if word in self.names.labels:
             return Term(self.names.labels[word], 0, word)
@@ -325,16 +325,18 @@ class Parser:
     def _computed(self, operation: np.ufunc, left: Term, right: Term, size: int, sign: str) -> Term:
         text = f"{left.text}{sign}{right.text}"
         a, b = self._numbers(left), self._numbers(right)
-        if size > LARGEST:
-            raise self._error(f"{capped(text, 60)!r}, which may be as large as {size:.3g}", f"at most {LARGEST:.3g}")
+        if size > LARGEST_NUMBER:
+            raise self._error(
+                f"{capped(text, 60)!r}, which may be as large as {size:.3g}", f"at most {LARGEST_NUMBER:.3g}"
+            )
         return Term(operation(a, b), size, text)
 
     # Words ----------------------------------------------------------------------------------------------------------
 
     def _tokens(self) -> list[tuple[str, str]]:
         text, index, tokens = self.text.rstrip(), 0, []
-        if len(text) > LONGEST:
-            raise ParameterError(f"expression of {len(text):,} characters; expected at most {LONGEST:,}")
+        if len(text) > MOST_CHARACTERS:
+            raise ParameterError(f"expression of {len(text):,} characters; expected at most {MOST_CHARACTERS:,}")
         while index < len(text):
             match = TOKEN.match(text, index)
             if match is None:
@@ -344,7 +346,7 @@ class Parser:
             kind = ("name", "number", "label", "sign")[match.lastindex - 1]  # type: ignore[operator]
             word = match[match.lastindex]  # type: ignore[index]
             if kind == "number" and len(word) > 18:
-                raise self._error(capped(word, 40), f"numbers of at most {LARGEST:.3g}")
+                raise self._error(capped(word, 40), f"numbers of at most {LARGEST_NUMBER:.3g}")
             tokens.append((kind, word))
             index = match.end()
         return tokens

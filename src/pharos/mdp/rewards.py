@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
 
-_BLOCK = 1 << 16
+_REWARD_BLOCK = 1 << 16
 # Entries of a palette that each reward is compared with, before it is searched for.
-_FEW = 4
+_FEW_ENTRIES = 4
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class Rewards:
         """Make rewards of (S, A) numbers; ParameterError if one is NaN or infinite."""
         rewards = np.asarray(rewards, np.float64)
         collector = RewardsCollector((rewards.shape[0], rewards.shape[1]))
-        for start in range(0, len(rewards), _BLOCK):
-            block = rewards[start : start + _BLOCK]
+        for start in range(0, len(rewards), _REWARD_BLOCK):
+            block = rewards[start : start + _REWARD_BLOCK]
             if not np.isfinite(block).all():
                 s, a = map(int, np.argwhere(~np.isfinite(block))[0])
                 raise ParameterError(
@@ -105,8 +105,8 @@ class Rewards:
         terms is rounded up to three times (1 - p, the product, the sum), which `rounding` counts.
         """
         collector, largest = RewardsCollector(self.shape), -1.0  # no two rewards that differ
-        for start in range(0, len(self.table), _BLOCK):
-            own, theirs = (each.rows(slice(start, start + _BLOCK)) for each in (self, other))
+        for start in range(0, len(self.table), _REWARD_BLOCK):
+            own, theirs = (each.rows(slice(start, start + _REWARD_BLOCK)) for each in (self, other))
             terms = (1.0 - p) * own, p * theirs
             collector.add(start, np.clip(sum(terms), np.minimum(own, theirs), np.maximum(own, theirs)))
             sizes = np.abs(terms[0]) + np.abs(terms[1])
@@ -201,7 +201,7 @@ class RewardsCollector:
         """Enter a block whose rewards are all among the first few of the palette; return whether they are."""
         assert self._codes is not None
         codes, left = np.zeros(block.shape, np.uint8), block.size
-        for code, reward in enumerate(self._palette[:_FEW]):
+        for code, reward in enumerate(self._palette[:_FEW_ENTRIES]):
             equal = block == reward
             left -= int(np.count_nonzero(equal))
             codes += equal.view(np.uint8) * np.uint8(code)
@@ -276,7 +276,7 @@ def means_of(terms: np.ndarray) -> Rewards:
 # Rewards of stored transitions ----------------------------------------------------------------------------------------
 
 
-_ROWS = 1 << 16
+_RECORDED_ROWS = 1 << 16
 # (first state, rewards (N, A), the largest absolute reward of an outcome that was averaged)
 Blocks = Iterator[tuple[int, np.ndarray, float]]
 
@@ -337,8 +337,8 @@ def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "
     rules, num_actions = rules_of(env).rewards_of(space.num_states), space.num_actions
 
     def blocks() -> Blocks:
-        for start in range(0, space.num_states, _ROWS):
-            stop = min(start + _ROWS, space.num_states)
+        for start in range(0, space.num_states, _RECORDED_ROWS):
+            stop = min(start + _RECORDED_ROWS, space.num_states)
             states, terminal, count = space.packed_states[start:stop], space.terminal[start:stop], stop - start
             own = np.repeat(np.arange(count), num_actions)
             if space.has_chance:
@@ -384,8 +384,8 @@ def rewards_of_outcomes(space: "StateSpace") -> np.ndarray:
     assert space.environment is not None
     rules = rules_of(space.environment).rewards_of(space.num_states)
     blocks = [np.empty(0)]
-    for start in range(0, space.num_states, _ROWS):
-        stop = min(start + _ROWS, space.num_states)
+    for start in range(0, space.num_states, _RECORDED_ROWS):
+        stop = min(start + _RECORDED_ROWS, space.num_states)
         which, successors, _ = space.dynamics.entries_of(np.arange(start, stop))
         number = np.arange(len(which)) - np.searchsorted(which, which)  # of each outcome within its row
         rewards = np.zeros(len(which))
@@ -482,12 +482,12 @@ def _blocks(
 
     rules = rules_of(env).rewards_of(space.num_states)
     end = space.num_states if last is None else last
-    starts = range(first, end, _ROWS)
+    starts = range(first, end, _RECORDED_ROWS)
     states, terminal = space.packed_states, space.terminal
     successors, dynamics = None if space.has_chance else space.successors, space.dynamics
 
     def block(start: int) -> tuple[np.ndarray, float]:
-        stop, largest = min(start + _ROWS, end), np.zeros(1)
+        stop, largest = min(start + _RECORDED_ROWS, end), np.zeros(1)
         if successors is not None:
             return rules.block(states, successors, terminal, start, stop), 0.0
         outcomes = dynamics.entries_of(np.arange(start, stop))

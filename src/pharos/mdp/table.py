@@ -216,7 +216,7 @@ class Lazy(Dynamics):
 # The share of a dense table that may be padding before successors are kept one row after another.
 MOST_PADDING = 0.3
 # Vectors of probabilities that codes of one and of two bytes tell apart.
-FEW, MANY = 1 << 8, 1 << 16
+ONE_BYTE_CODES, MOST_CODES = 1 << 8, 1 << 16
 
 
 def checked_outcomes(
@@ -266,7 +266,11 @@ def checked_outcomes(
 
 
 def compact_outcomes(
-    successors: np.ndarray, probabilities: np.ndarray, *, most_padding: float = MOST_PADDING, most_vectors: int = MANY
+    successors: np.ndarray,
+    probabilities: np.ndarray,
+    *,
+    most_padding: float = MOST_PADDING,
+    most_vectors: int = MOST_CODES,
 ) -> dict[str, Any]:
     """Arguments of an `OutcomeTable`, from (S, A, K) arrays: the possible outcomes alone, in their order."""
     num_states, num_actions, _ = successors.shape
@@ -307,11 +311,11 @@ def _palette(vectors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray | N
         return numbers, None
     palette = np.empty((count, vectors.shape[1]))
     palette[numbers] = vectors
-    return numbers.astype(np.uint8 if count <= FEW else np.uint16), palette
+    return numbers.astype(np.uint8 if count <= ONE_BYTE_CODES else np.uint16), palette
 
 
 # Executions whose outcomes NumPy lists sooner than a kernel is compiled.
-_FEW = 1 << 14
+_FEW_EXECUTIONS = 1 << 14
 # Outcomes, at most, that are copied for kernels.
 _COPIED = 1 << 20
 
@@ -441,7 +445,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
     def entries(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         states, actions = np.asarray(states, np.int64), np.asarray(actions, np.int64)
         rows = states * self.num_actions + actions
-        if len(rows) < _FEW:
+        if len(rows) < _FEW_EXECUTIONS:
             return self.possible(rows)
         size = int((self.begins(rows + 1) - self.begins(rows)).sum())
         columns = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size)

@@ -12,7 +12,7 @@ from pharos.observations.observation import Observation
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
-BLOCK = 4096
+CLASS_BLOCK = 4096
 MOST_HISTORIES = 1_000_000
 
 AliasingCallback = Callable[[int, str], None]
@@ -124,10 +124,10 @@ def _class_numbers(
     import xxhash
 
     digests = np.empty(count, "V16")
-    for start in range(0, count, BLOCK):
+    for start in range(0, count, CLASS_BLOCK):
         if progress is not None:
             progress(start, name)
-        observations = observations_of(slice(start, min(start + BLOCK, count)))
+        observations = observations_of(slice(start, min(start + CLASS_BLOCK, count)))
         rows = np.ascontiguousarray(observations).reshape(len(observations), -1).view(np.uint8)
         digests[start : start + len(rows)] = [xxhash.xxh3_128_digest(row.data) for row in rows]
     halves = digests.view(np.uint64).reshape(-1, 2)

@@ -253,7 +253,7 @@ def _paint(planes: np.ndarray, shades: np.ndarray, covering: bool, out: np.ndarr
         target[shade > 0] = shade[shade > 0]
 
 
-LARGEST = 1024  # pixels on a side
+MOST_PIXELS = 1024  # pixels on a side
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601, as in Pillow and OpenCV
 
 
@@ -325,13 +325,13 @@ class ComplexImage(Frames):
     def _checked_size(self, size: object) -> tuple[int, int]:
         try:
             height, width = size if isinstance(size, Iterable) else ()
-            valid = all(int(n) == n and 1 <= n <= LARGEST for n in (height, width))
+            valid = all(int(n) == n and 1 <= n <= MOST_PIXELS for n in (height, width))
         except (TypeError, ValueError):
             valid = False
         if not valid:
             raise ParameterError(
                 f"complex_image of {self.env}: size is {size!r}; "
-                f"expected 'natural' or (height, width) of 1 to {LARGEST} pixels"
+                f"expected 'natural' or (height, width) of 1 to {MOST_PIXELS} pixels"
             )
         return int(height), int(width)
 

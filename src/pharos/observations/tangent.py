@@ -25,7 +25,7 @@ from pharos.system import sources
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
-SAMPLE = 4096  # states whose observations the digest is of
+DIGEST_STATES = 4096  # states whose observations the digest is of
 
 
 def network_inputs(observation: Observation, states: np.ndarray) -> np.ndarray:
@@ -171,8 +171,8 @@ def representation(
 
 
 def _inputs_digest(inputs: Callable[[np.ndarray], np.ndarray], num_states: int) -> str:
-    """Digest of the network's input in up to SAMPLE states all over the space."""
+    """Digest of the network's input in up to DIGEST_STATES states all over the space."""
     import xxhash
 
-    states = np.unique(np.linspace(0, num_states - 1, min(SAMPLE, num_states)).astype(np.int64))
+    states = np.unique(np.linspace(0, num_states - 1, min(DIGEST_STATES, num_states)).astype(np.int64))
     return xxhash.xxh3_128_hexdigest(np.ascontiguousarray(inputs(states)).data)

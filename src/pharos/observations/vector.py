@@ -193,9 +193,9 @@ class Number(Observation):
 
 
 SPARE = 8  # bits beyond those that write the state
-ROUNDS = 6
+HASH_ROUNDS = 6
 MOST_BITS = 1 << 16
-SEED = "an integer of at least 0"
+SEED_EXPECTED = "an integer of at least 0"
 FRACTION = 40  # bits of the number that decides whether a state is in the share of `mixed`
 
 
@@ -224,13 +224,13 @@ class Hash(Observation):
         expected = f"an integer from {enough}, which write the state, to {MOST_BITS}"
         count = needed + SPARE if bits is None else bits
         count = whole_number(count, f"hash of {env.name}: bits", expected, enough, MOST_BITS)
-        whole_number(seed, f"hash of {env.name}: seed", SEED, least=0)
+        whole_number(seed, f"hash of {env.name}: seed", SEED_EXPECTED, least=0)
         self.name = "hash"
         self.env = env
         self.names = tuple(f"bit {i}" for i in range(count))
         self.space = MultiBinary(count)
         self._low, self._lengths = components.low, lengths
-        self._keys = np.random.SeedSequence(seed).generate_state(ROUNDS, np.uint64)
+        self._keys = np.random.SeedSequence(seed).generate_state(HASH_ROUNDS, np.uint64)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         from pharos.kernels.observation_kernels import scramble
@@ -262,7 +262,7 @@ class Mixed(Observation):
 
         if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 1:
             raise ParameterError(f"mixed of {env.name}: share is {share!r}; expected a number from 0 to 1")
-        whole_number(seed, f"mixed of {env.name}: seed", SEED, least=0)
+        whole_number(seed, f"mixed of {env.name}: seed", SEED_EXPECTED, least=0)
         components = env.components
         if not (components.size > 1).any():
             raise ParameterError(f"mixed of {env.name}: no component has two values; expected states that differ")

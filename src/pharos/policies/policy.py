@@ -104,7 +104,7 @@ def masks_for(policy: PolicyLike, mdp: TabularMDP, masks: "MasksLike | None") ->
 
 
 # Observations in one query of a policy.
-BATCH = 4096
+QUERY_BATCH = 4096
 SINGLE, HALF = 1.1e-4, 1e-2  # by which a sum of probabilities may miss 1, of 32 bits and of 16
 SOME = 1024  # rows that stand for all if these are too many for an exact value
 
@@ -234,8 +234,8 @@ class QueriedPolicy:
                 more = max(count, 2 * len(self._rows)) - len(self._rows)
                 self._rows = np.concatenate([self._rows, np.empty(more, np.int64)])
                 self._answers = np.concatenate([self._answers, np.empty((more, self.num_actions))])
-            for start in range(0, unknown.size, BATCH):
-                block = unknown[start : start + BATCH]
+            for start in range(0, unknown.size, QUERY_BATCH):
+                block = unknown[start : start + QUERY_BATCH]
                 part = slice(self._count + start, self._count + start + len(block))
                 self._rows[part], self._answers[part] = block, self._query(block)
             self._index[unknown] = np.arange(self._count, count) + 1
@@ -306,7 +306,7 @@ class QueriedPolicy:
         rows, is_whole = reach()
         if not is_whole:
             return False if always or (self._query(rows[:: len(rows) // SOME + 1]) > 0).all() else None
-        blocks = [self._query(rows[start : start + BATCH]) for start in range(0, len(rows), BATCH)]
+        blocks = [self._query(rows[start : start + QUERY_BATCH]) for start in range(0, len(rows), QUERY_BATCH)]
         probabilities = np.concatenate(blocks)
         if not always and not (probabilities > 0).all():
             return None

@@ -43,7 +43,7 @@ from pharos.solvers import Solution
 from pharos.system.arrays import as_index_array
 
 # Histories whose frames are drawn at once
-BATCH = 512
+HISTORY_BATCH = 512
 
 
 class QueriedHistories(PolicyAnswers):
@@ -121,8 +121,8 @@ class QueriedHistories(PolicyAnswers):
     def _query(self, rows: np.ndarray) -> np.ndarray:
         answers = []
         context: Any = self.observer.observe
-        for start in range(0, len(rows), BATCH):
-            histories = np.array([self._histories[row] for row in rows[start : start + BATCH]], np.int64)
+        for start in range(0, len(rows), HISTORY_BATCH):
+            histories = np.array([self._histories[row] for row in rows[start : start + HISTORY_BATCH]], np.int64)
             count, frames = histories.shape
             states = self.observer.space.states(histories.ravel()).reshape(count, frames, -1)
             observations = context.observation.of_histories(states)

@@ -36,8 +36,8 @@ from pharos.kernels.hitting import UNIT
 from pharos.mdp import BEST, WORST, PolicyTable, Selection, TabularMDP, end_components, require_mdp, stand_ins
 from pharos.solvers.chains import Chain
 from pharos.solvers.goals import (
-    ELIMINATED,
-    MARGIN,
+    BOUND_MARGIN,
+    MOST_UNSWEPT_NODES,
     Choices,
     GoalProblem,
     WrittenOut,
@@ -52,13 +52,13 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 # Sweeps before policies are improved, and in all; the damping, which makes chains aperiodic.
-FIRST_SWEEPS, MOST_SWEEPS, DAMPING = 32, 100_000, 0.5
+FIRST_SWEEPS, MOST_GAIN_SWEEPS, DAMPING = 32, 100_000, 0.5
 # Outcomes that all sweeps of one component may read, some ten seconds.
 MOST_READ = 3e9
 # Damped steps after which the likeliest node of a class is the one to come back to.
 HOMING = 32
 # Improvements of a policy, at most.
-MOST_IMPROVEMENTS = 200
+MOST_GAIN_IMPROVEMENTS = 200
 POLICIES = ("optimal", "worst")
 """Names of the policies that are found."""
 
@@ -217,7 +217,7 @@ def _gains(
         choices = _inner(nodes, rows[order[ends[k] : ends[k + 1]]])
         mean = MeanPayoff(choices)
         mean.solve(tolerance)
-        gains[k], error[k] = (mean.upper + mean.lower) / 2, (mean.upper - mean.lower) / 2 * MARGIN
+        gains[k], error[k] = (mean.upper + mean.lower) / 2, (mean.upper - mean.lower) / 2 * BOUND_MARGIN
         error[k] += 2 * UNIT * abs(gains[k])
         if not error[k] <= tolerance and not any(nodes.mdp.residual):
             raise _precision_error(nodes.mdp, 2 * tolerance)
@@ -270,7 +270,7 @@ class MeanPayoff:
         if self._is_met(sweeps.h, tolerance) or self._improve(tolerance) or self._in_rational_numbers():
             return
         is_settled = False
-        most = min(MOST_SWEEPS, MOST_READ / (self.choices.matrix.nnz + len(self.choices.owner)))
+        most = min(MOST_GAIN_SWEEPS, MOST_READ / (self.choices.matrix.nnz + len(self.choices.owner)))
         while not (self._is_met(sweeps.h, tolerance) or is_settled or sweeps.count >= most):
             is_settled = sweeps.go_on(sweeps.count, tolerance)
         self._bound(sweeps.h)
@@ -295,7 +295,7 @@ class MeanPayoff:
     def _improve(self, tolerance: float) -> bool:
         """Policy iteration from the policy so far; whether the bounds are near enough."""
         policy, choices = self.policy, self.choices
-        for _ in range(MOST_IMPROVEMENTS):
+        for _ in range(MOST_GAIN_IMPROVEMENTS):
             policy, class_of = self._towards_one_class(policy)
             h = _solved(choices, policy, class_of, np.ones(len(policy), np.bool_))[0]
             if not np.isfinite(h).all():
@@ -319,7 +319,7 @@ class MeanPayoff:
         if rows is None:
             return False
         policy = self.policy
-        for _ in range(MOST_IMPROVEMENTS):
+        for _ in range(MOST_GAIN_IMPROVEMENTS):
             policy, class_of = self._towards_one_class(policy)
             result = best_mean(self.choices, rows, policy, class_of)
             if result is None:
@@ -425,7 +425,7 @@ class Sums:
         if not ((off + more + rounding <= 0).all() and (w >= 0).all()):
             v, w = self._rational(b, error)
         x, room = np.zeros(self.num_nodes + 1), np.zeros(self.num_nodes + 1)
-        x[self.nodes], room[self.nodes] = v[:-1], w[:-1] * MARGIN
+        x[self.nodes], room[self.nodes] = v[:-1], w[:-1] * BOUND_MARGIN
         return x, room
 
     def _rational(self, b: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -500,12 +500,12 @@ def _ends(
         return v, error, staying
     nothing = np.zeros(len(nodes.rewards))
     problem = GoalProblem.collapsed(nodes, component, inside, stops, nothing, nothing, staying)
-    if problem.choices.num_nodes > ELIMINATED:
+    if problem.choices.num_nodes > MOST_UNSWEPT_NODES:
         v, error, choices = _swept_ends(problem, tolerance)
     else:
         goals = problem.solve(tolerance)
         v, error, choices = goals.v, goals.error, goals.policy
-    return v, np.where(live, (error + room) * MARGIN, 0.0), choices
+    return v, np.where(live, (error + room) * BOUND_MARGIN, 0.0), choices
 
 
 def _swept_ends(problem: GoalProblem, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -518,7 +518,7 @@ def _swept_ends(problem: GoalProblem, tolerance: float) -> tuple[np.ndarray, np.
     largest = float(np.abs(choices.rewards).max(initial=0.0))
     step = (choices.terms + 24) * UNIT * largest + choices.deviation * 2 * largest
     lower, upper = (np.append(np.full(choices.num_nodes, each), 0.0) for each in (-largest, largest))
-    for sweep in range(int(min(MOST_SWEEPS, MOST_READ / (2 * choices.matrix.nnz)))):
+    for sweep in range(int(min(MOST_GAIN_SWEEPS, MOST_READ / (2 * choices.matrix.nnz)))):
         for bound, side in ((lower, -1.0), (upper, 1.0)):
             values = (choices.rewards + choices.matrix @ bound) / leaving
             moved = np.maximum.reduceat(values, choices.rows[:-1]) + side * step
@@ -528,7 +528,7 @@ def _swept_ends(problem: GoalProblem, tolerance: float) -> tuple[np.ndarray, np.
     else:
         raise _precision_error(problem.mdp, tolerance)
     best = best_rows(choices, (choices.rewards + choices.matrix @ lower) / leaving)
-    middle, half = (upper + lower) / 2, (upper - lower) / 2 * MARGIN
+    middle, half = (upper + lower) / 2, (upper - lower) / 2 * BOUND_MARGIN
     of_nodes = problem.node_of[:-2]
     return problem.sign * middle[of_nodes], half[of_nodes], problem.unfolded(choices.origin[best])
 
@@ -586,7 +586,7 @@ def _bias(mdp: TabularMDP, select: PolicyTable) -> StateBounds:
     low, high = np.full(len(home), np.inf), np.full(len(home), -np.inf)
     np.minimum.at(low, class_of[is_recurrent], (total - slack - choices.error)[is_recurrent])
     np.maximum.at(high, class_of[is_recurrent], (total + slack + choices.error)[is_recurrent])
-    gains, room = (low + high) / 2, (high - low) / 2 * MARGIN + 2 * UNIT * np.abs(low)
+    gains, room = (low + high) / 2, (high - low) / 2 * BOUND_MARGIN + 2 * UNIT * np.abs(low)
     g, g_error = np.zeros(len(members) + 1), np.zeros(len(members) + 1)
     g[:-1][is_recurrent], g_error[:-1][is_recurrent] = gains[class_of[is_recurrent]], room[class_of[is_recurrent]]
     # h of the classes, and its stationary mean: of one round from the home of each
@@ -601,7 +601,7 @@ def _bias(mdp: TabularMDP, select: PolicyTable) -> StateBounds:
     length, length_error = 1 + again @ steps, again @ steps_error + unit * (1 + again @ steps)
     mean = again @ round_of / length
     mean_error = again @ round_error + unit * (again @ np.abs(round_of)) + np.abs(mean) * length_error
-    mean_error = mean_error / (length - length_error) * MARGIN + 4 * UNIT * np.abs(mean)
+    mean_error = mean_error / (length - length_error) * BOUND_MARGIN + 4 * UNIT * np.abs(mean)
     h[:-1][is_recurrent] -= mean[class_of[is_recurrent]]
     h_error[:-1][is_recurrent] += (mean_error + 4 * UNIT * np.abs(mean))[class_of[is_recurrent]] + unit * np.abs(
         h[:-1][is_recurrent]

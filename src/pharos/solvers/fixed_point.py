@@ -57,9 +57,9 @@ Numbers = TypeVar("Numbers", float, np.ndarray)
 # Half a unit in the last place of 32 bits, for numbers from 1 to 2, and for the smallest ones.
 _UNIT32, _LEAST32 = 2.0**-24, 2.0**-150
 # Entries of x that are looked at in one go.
-_BLOCK = 1 << 20
+_LARGEST_BLOCK = 1 << 20
 # Rounding of the computation of a bound itself, and products of rounding errors.
-MARGIN = 1 + 2.0**-40
+ROUNDING_MARGIN = 1 + 2.0**-40
 
 
 class FixedPoint(NamedTuple):
@@ -168,7 +168,7 @@ class Backup(Generic[M]):
 
     def bound(self, change: float, rounding: float) -> float:
         """The largest error of values that a sweep has changed by at most `change`: (rho d + e) / (1 - rho)."""
-        return (self.factor * change + rounding) / (1 - self.factor) * MARGIN
+        return (self.factor * change + rounding) / (1 - self.factor) * ROUNDING_MARGIN
 
 
 def fixed_point(
@@ -225,7 +225,7 @@ def _in_single(backup: Backup[TabularMDP], convergence: Convergence, x: np.ndarr
             result = fixed_point(double, tolerance, convergence.progress)
             with np.errstate(over="ignore"):
                 x[:] = result.x
-            bound = (result.bound + backup.stored(largest_of(result.x))) * MARGIN
+            bound = (result.bound + backup.stored(largest_of(result.x))) * ROUNDING_MARGIN
             if not bound <= tolerance:
                 raise precision_error(backup.mdp, bound, tolerance, is_single=True)
             return FixedPoint(x, bound, convergence.sweeps + result.sweeps)
@@ -270,7 +270,7 @@ def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np
         bound = (float(residual) + rounding) / (1 - mdp.gamma)
     if not math.isfinite(bound):
         raise precision_error(mdp, bound, 0.0)
-    return bound * MARGIN
+    return bound * ROUNDING_MARGIN
 
 
 def within_residual(mdp: TabularMDP, bound: float, x: np.ndarray) -> float:
@@ -282,15 +282,15 @@ def within_residual(mdp: TabularMDP, bound: float, x: np.ndarray) -> float:
         return bound
     order = None if mdp.gamma < 1 else mdp.order()
     steps = 1 / (1 - mdp.gamma) if order is None else order.longest + 1
-    return (bound + steps * mdp.residual.deviation(mdp.gamma, largest_of(x) + bound)) * MARGIN
+    return (bound + steps * mdp.residual.deviation(mdp.gamma, largest_of(x) + bound)) * ROUNDING_MARGIN
 
 
 def largest_of(x: np.ndarray) -> float:
     """max |x|; NaN if an entry is NaN."""
     flat = x.reshape(-1)  # one long row: faster
     largest = 0.0
-    for start in range(0, flat.size, _BLOCK):  # each is read once, which counts if x is in a file
-        block = flat[start : start + _BLOCK]
+    for start in range(0, flat.size, _LARGEST_BLOCK):  # each is read once, which counts if x is in a file
+        block = flat[start : start + _LARGEST_BLOCK]
         largest = float(np.maximum(largest, np.maximum(block.max(), -block.min())))
     return largest
 
@@ -309,7 +309,7 @@ def _in_one_pass(
     with np.errstate(over="ignore", invalid="ignore"):
         mdp.dynamics.sweep_once(backup.equation, x, order)
         series = min(backups, 1 / (1 - rho)) if rho < 1 else backups * np.float64(rho) ** order.longest
-        bound = float(backup.rounding(backup.size(largest_of(x))) * series * MARGIN)
+        bound = float(backup.rounding(backup.size(largest_of(x))) * series * ROUNDING_MARGIN)
     if progress is not None:
         progress(1, bound)
     if not bound <= tolerance:
@@ -326,28 +326,28 @@ def bound_of_steps(mdp: TabularMDP, horizon: int, bound: float, largest: float) 
     Raises:
         PrecisionError: values are too large for 64-bit floats.
     """
-    if not math.isfinite(bound * MARGIN + largest):
+    if not math.isfinite(bound * ROUNDING_MARGIN + largest):
         raise PrecisionError(
             f"{mdp}: the values of {horizon} steps pass 1.8e308, the largest 64-bit float; use smaller rewards"
         )
-    return bound * MARGIN
+    return bound * ROUNDING_MARGIN
 
 
 # Components -----------------------------------------------------------------------------------------------------------
 
 
 # Sweeps before the attempt, and how many must be left: finding components takes as long as some tens of them.
-FIRST_ATTEMPT, LEFT = 32, 100
+SWEEPS_BEFORE, LEAST_SWEEPS_LEFT = 32, 100
 # Operations that must be left: fewer take less time than compiling.
 WORTH = 5e8
 # States under sticky actions that are swept in one call, at least.
-LEAST = 512
+LEAST_PART = 512
 # Sweeps over all states that an attempt may cost, at most: near gamma = 1 the number of sweeps left has no limit.
 MOST = 4096
 # Bytes of a state that an attempt takes, at most.
-BYTES = 48
+STATE_BYTES = 48
 # The share of the change that the tolerance allows which a component may have left.
-SHARE = 0.25
+COMPONENT_SHARE = 0.25
 
 
 class ComponentSolver:
@@ -365,10 +365,10 @@ class ComponentSolver:
             return False
         before, self._change = self._change, change
         gamma = self.mdp.gamma
-        if sweeps < FIRST_ATTEMPT or gamma == 0.0 or not self._is_known:
+        if sweeps < SWEEPS_BEFORE or gamma == 0.0 or not self._is_known:
             return False
         self._left = sweeps_left(change, shrinking(change, before, sweeps, gamma), tolerance, gamma)
-        return self._left > LEFT and operations(self.mdp, self._left) > WORTH and self._fits
+        return self._left > LEAST_SWEEPS_LEFT and operations(self.mdp, self._left) > WORTH and self._fits
 
     def improve(self, x: np.ndarray, tolerance: float) -> bool:
         """Settle the components of x (S + 1, W) one after another; return whether that was tried.
@@ -377,10 +377,10 @@ class ComponentSolver:
         component is swept once.
         """
         mdp, self._is_tried = self.mdp, True
-        components = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST if mdp.is_sticky else 1)
+        components = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST_PART if mdp.is_sticky else 1)
         if components.largest > mdp.num_states // 2:
             return False
-        target = SHARE * tolerance * (1 - mdp.gamma)
+        target = COMPONENT_SHARE * tolerance * (1 - mdp.gamma)
         with np.errstate(over="ignore", invalid="ignore"):
             most = min(0.5 * self._left, MOST) * mdp.num_states
             mdp.dynamics.settle_components(self.equation, x, components, target, SETTLED, most)
@@ -396,5 +396,5 @@ class ComponentSolver:
     @property
     def _fits(self) -> bool:
         """Whether memory has room for what an attempt takes, and for the transitions, which are read out of order."""
-        each = BYTES + 4 * self.mdp.num_actions
+        each = STATE_BYTES + 4 * self.mdp.num_actions
         return each * self.mdp.num_states <= available_memory()

@@ -50,7 +50,7 @@ from pharos.mdp import (
     stand_ins,
 )
 from pharos.solvers.chains import Chain, mean_changes
-from pharos.solvers.policy_iteration import BLOCK
+from pharos.solvers.policy_iteration import GREEDY_BLOCK
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -62,19 +62,19 @@ MOST_IMPROVEMENTS = 1000
 # Improvements after which sweeps look further ahead, and how many.
 SWEPT, SWEEPS = 50, 100
 # Solutions of the same policy's equations, each with the rounding of the one before.
-SETTLED = 4
+SETTLING_SOLUTIONS = 4
 # Tolerances within which values may be for every MDP within the residual of one.
 WIDER = 1e6
 # Units of a number in its last place that may be rounding.
 NOISE = 64
 # More than what sums of numbers too small for a float lose.
-SMALLEST = 2.0**-1000
+UNDERFLOW_SLACK = 2.0**-1000
 # Nodes of the largest MDP that is not swept first.
-ELIMINATED = 20_000
+MOST_UNSWEPT_NODES = 20_000
 # Sweeps of paths before their steps are looked at for a cycle.
-LOOK = 8
+LOOK_AHEAD = 8
 # More than the rounding of the computation of a bound itself.
-MARGIN = 1 + 2.0**-30
+BOUND_MARGIN = 1 + 2.0**-30
 
 
 class Choices(NamedTuple):
@@ -106,7 +106,7 @@ class Choices(NamedTuple):
         """((R,) T_a v - v, by how much each may be off) of v (M + 1,), floats or pairs of them."""
         rewards = self.rewards if rewards is None else rewards
         total, size, off = mean_changes(self.matrix, self.owner, v)
-        slack = (self.terms + 24) * UNIT * (np.abs(rewards) + size) + off + SMALLEST
+        slack = (self.terms + 24) * UNIT * (np.abs(rewards) + size) + off + UNDERFLOW_SLACK
         if self.deviation:
             slack += self.deviation * 2 * float(np.abs(v).max(initial=0.0))
         return rewards + total, slack
@@ -162,7 +162,7 @@ def _goals(
 ) -> Goals:
     if mdp.is_deterministic and not isinstance(select, PolicyTable):
         return longest_paths(mdp, select)
-    if mdp.num_states * mdp.width > ELIMINATED and not any(mdp.residual):
+    if mdp.num_states * mdp.width > MOST_UNSWEPT_NODES and not any(mdp.residual):
         goals = swept_goals(mdp, select, tolerance, progress)
         if goals is not None:
             return goals
@@ -596,7 +596,7 @@ def _errors(
     above = None if below is None else _room(choices, policy, chain, total + slack, slack, tolerance)
     if below is None or above is None:
         raise Undecided(policy)
-    return np.maximum(below, above) * MARGIN
+    return np.maximum(below, above) * BOUND_MARGIN
 
 
 def _room(
@@ -607,7 +607,7 @@ def _room(
     w is what a policy collects that is paid so much, and its slack more, improved from a proper one (M,) whose chain is
     given. Each row is paid its own rounding, not the rounding of another choice of its node.
     """
-    least = NOISE * chain.unit * tolerance + SMALLEST  # more than rounding of w takes away
+    least = NOISE * chain.unit * tolerance + UNDERFLOW_SLACK  # more than rounding of w takes away
     extra, zeros, settled = np.zeros(len(off)), np.zeros(len(off)), 0
     for improvements in range(MOST_IMPROVEMENTS):
         payment = off + slack + 2 * extra + least
@@ -624,7 +624,7 @@ def _room(
         extra = np.maximum(extra, rounding)
         if np.array_equal(changed, rows):
             settled += 1
-            if settled > SETTLED:
+            if settled > SETTLING_SOLUTIONS:
                 return None
             continue
         if not _is_proper(choices, changed):
@@ -686,7 +686,7 @@ def _pays(choices: Choices, policy: np.ndarray, nodes: np.ndarray) -> bool:
 
 
 # Whole numbers that 64 bits hold, and those that floats hold.
-WHOLE, EXACT = 2**62, 2**53
+WHOLE, FLOAT_INTEGERS = 2**62, 2**53
 
 
 def longest_paths(mdp: TabularMDP, select: Selection) -> Goals:
@@ -714,7 +714,7 @@ def longest_paths(mdp: TabularMDP, select: Selection) -> Goals:
     sweeps = 0
     while lengthen(table, whole, terminal, v, is_reached, action):
         sweeps += 1
-        if sweeps & (sweeps - 1) == 0 and sweeps > LOOK:
+        if sweeps & (sweeps - 1) == 0 and sweeps > LOOK_AHEAD:
             state = int(bellman.cycle_of(table, action, mark))
             if state >= 0:
                 pairs = [(state, int(action[state]))]
@@ -727,7 +727,7 @@ def longest_paths(mdp: TabularMDP, select: Selection) -> Goals:
     action[stays] = free.pairs[stays].argmax(axis=1)
     largest = max(int(np.abs(v).max()), 1) + max(map(abs, numbers))
     values = sign * np.ldexp(v[:-1].astype(np.float64), -shift)
-    is_exact = largest < EXACT
+    is_exact = largest < FLOAT_INTEGERS
     return Goals(values, np.zeros(len(values)) if is_exact else 2 * UNIT * np.abs(values), action, sweeps, is_exact)
 
 
@@ -773,7 +773,7 @@ def swept_goals(
             attempt = sweeps + max(8, sweeps // 16)
             continue
         largest = largest_of(x) + tolerance
-        step = (backup.rounding(largest) + (backup.operations + 16) * UNIT * largest) * MARGIN
+        step = (backup.rounding(largest) + (backup.operations + 16) * UNIT * largest) * BOUND_MARGIN
         bounds = []
         for side in (1.0, -1.0):
             settled = _monotone(mdp, select, x, over, side, PART * tolerance, step)
@@ -781,7 +781,7 @@ def swept_goals(
             bounds.append(settled[0])
         upper, lower = bounds
         if upper is not None and lower is not None:
-            v, error = (upper + lower) / 2, float((upper - lower).max()) / 2 * MARGIN
+            v, error = (upper + lower) / 2, float((upper - lower).max()) / 2 * BOUND_MARGIN
             if progress is not None:
                 progress(sweeps, error)
             nodes = mdp.num_states * mdp.width
@@ -824,8 +824,8 @@ def _greedy(mdp: TabularMDP, select: Selection, x: np.ndarray) -> np.ndarray:
     if isinstance(select, PolicyTable):
         return np.zeros(mdp.num_states * mdp.width, np.int64)
     actions = np.empty(mdp.num_states, np.int64)
-    for start in range(0, mdp.num_states, BLOCK):
-        states = slice(start, min(start + BLOCK, mdp.num_states))
+    for start in range(0, mdp.num_states, GREEDY_BLOCK):
+        states = slice(start, min(start + GREEDY_BLOCK, mdp.num_states))
         actions[states] = select.policy(mdp.reward_table.rows(states) + mdp.dynamics.expected(x, states)).table
     return np.repeat(actions, mdp.width)
 

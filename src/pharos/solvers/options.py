@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from pharos.errors import ParameterError
-from pharos.mdp import STEPS, whole_number
+from pharos.mdp import STEPS_EXPECTED, whole_number
 
 if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
@@ -58,7 +58,7 @@ class Solving:
         if not (isinstance(tolerance, int | float | np.floating) and np.isfinite(tolerance) and tolerance > 0):
             raise ParameterError(f"tolerance is {tolerance!r}; expected a positive number, in units of return")
         if self.horizon is not None:
-            object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", STEPS))
+            object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", STEPS_EXPECTED))
         object.__setattr__(self, "dtype", _dtype_name(self.dtype))
         whole_number(self.threads, "threads")
         if self.dtype == "float32" and (self.horizon is not None or self.is_distributed):

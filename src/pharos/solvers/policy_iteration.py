@@ -39,11 +39,11 @@ if TYPE_CHECKING:
 
 
 # Unknowns of the largest dense system, and of the largest that is eliminated whatever it fills in.
-DENSE, ELIMINATED = 400, 3000
+DENSE, MOST_ELIMINATED = 400, 3000
 # Steps of BiCGSTAB; by how much each call shrinks the residual; calls, each for the residual of the one before.
-MOST_STEPS, SHRINKAGE, CALLS = 500, 1e-8, 4
+MOST_BICGSTAB_STEPS, SHRINKAGE, CALLS = 500, 1e-8, 4
 # Entries of one factor, and multiplications: 250 MB and some seconds at most.
-MOST_FILLED, MOST_MULTIPLICATIONS = 10_000_000, 5e9
+MOST_ATTEMPT_FILLED, MOST_ATTEMPT_MULTIPLICATIONS = 10_000_000, 5e9
 
 
 def solution_of_system(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -51,7 +51,7 @@ def solution_of_system(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -
     try:
         if len(right) <= DENSE:
             return np.linalg.solve(system.toarray(), right)
-        if len(right) <= ELIMINATED:
+        if len(right) <= MOST_ELIMINATED:
             return _eliminated(system, right)
         return _large(system, right, x)
     except (np.linalg.LinAlgError, RuntimeError):
@@ -86,7 +86,7 @@ def iterated(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarr
     """The x of system x = right, by BiCGSTAB, repeated on the residual as far as rounding allows; NaN if divergent."""
     residual = right - system @ x
     for call in range(CALLS):
-        step, left, _ = bicgstab(lambda y: system @ y, residual, SHRINKAGE, MOST_STEPS)
+        step, left, _ = bicgstab(lambda y: system @ y, residual, SHRINKAGE, MOST_BICGSTAB_STEPS)
         if call == 0 and not left <= SHRINKAGE:
             return np.full(len(right), np.nan)
         after = right - system @ (x + step)
@@ -153,8 +153,8 @@ def fills_little(matrix: "csr_matrix") -> bool:
     from pharos.kernels import linear_algebra
 
     both = (abs(matrix) + abs(matrix).T).tocsr()
-    entries = linear_algebra.entries_of_factor(both.indptr, both.indices, MOST_FILLED).astype(float)
-    return bool(entries.sum() <= MOST_FILLED and entries @ entries <= MOST_MULTIPLICATIONS)
+    entries = linear_algebra.entries_of_factor(both.indptr, both.indices, MOST_ATTEMPT_FILLED).astype(float)
+    return bool(entries.sum() <= MOST_ATTEMPT_FILLED and entries @ entries <= MOST_ATTEMPT_MULTIPLICATIONS)
 
 
 # Policy iteration -----------------------------------------------------------------------------------------------------
@@ -167,14 +167,14 @@ FIRST_ATTEMPT, FIRST_INEXACT = 64, 256
 # at once. (Nodes are states, or pairs with a previous action.)
 MOST_ENTRIES, DIRECTLY = 2_000_000, 3000
 # States whose greedy actions are worked out in one go.
-BLOCK = 1 << 16
+GREEDY_BLOCK = 1 << 16
 # Improvements of one attempt.
-MOST_IMPROVEMENTS = 60
+MOST_ATTEMPT_IMPROVEMENTS = 60
 # Inexact: improvements of one attempt, sweeps after each, by how much each shrinks the residual of its policy, and in
 # how many steps at most.
-MOST_INEXACT, SWEEPS_AFTER, FORCING, STEPS = 500, 20, 0.1, 100
+MOST_INEXACT, SWEEPS_AFTER, FORCING, MOST_OPERATOR_STEPS = 500, 20, 0.1, 100
 # Bytes of a node that an attempt takes, at most, and bytes that there always are.
-BYTES, SMALL = 80, 1 << 28
+NODE_BYTES, LEAST_BYTES = 80, 1 << 28
 # Operations of policy iteration by sparse systems, for each node.
 SPARSE = 50_000.0
 
@@ -217,7 +217,7 @@ class PolicyIteration:
     @property
     def _fits(self) -> bool:
         """Whether memory has room for what an attempt takes, some ten vectors of values."""
-        return BYTES * self.nodes <= max(SMALL, available_memory())
+        return NODE_BYTES * self.nodes <= max(LEAST_BYTES, available_memory())
 
     @property
     def is_direct(self) -> bool:
@@ -247,7 +247,7 @@ class PolicyIteration:
 
     def _improve_exactly(self, x: np.ndarray) -> None:
         policy = self._greedy(x)
-        for _ in range(MOST_IMPROVEMENTS):
+        for _ in range(MOST_ATTEMPT_IMPROVEMENTS):
             self.tick()
             before = x.copy()
             self._evaluate(x, policy)
@@ -326,7 +326,7 @@ class PolicyIteration:
             linear_algebra.subtract_from(y, image)
             return image
 
-        step, _, applications = bicgstab(times, right, FORCING, STEPS)
+        step, _, applications = bicgstab(times, right, FORCING, MOST_OPERATOR_STEPS)
         x[:-1] += step.reshape(x[:-1].shape)
         return applications + 2.0
 
@@ -335,8 +335,8 @@ class PolicyIteration:
         if isinstance(self.select, PolicyTable):
             return self.select
         mdp, actions = self.mdp, np.empty(self.mdp.num_states, np.int64)
-        for start in range(0, mdp.num_states, BLOCK):
-            states = slice(start, min(start + BLOCK, mdp.num_states))
+        for start in range(0, mdp.num_states, GREEDY_BLOCK):
+            states = slice(start, min(start + GREEDY_BLOCK, mdp.num_states))
             q = mdp.reward_table.rows(states) + mdp.gamma * mdp.acting(mdp.dynamics.expected(x, states), states)
             sets = None if mdp.available is None else mdp.available[states]
             actions[states] = available_choices(self.select.policy(q).table, sets)

@@ -47,8 +47,8 @@ from pharos.system.workers import usable_workers
 # Values so far --------------------------------------------------------------------------------------------------------
 
 
-SECONDS = 60.0
-_SHARE = 20  # of the time of solving, at most one part in so many is spent on writing
+WRITE_SECONDS = 60.0
+_WRITING_SHARE = 20  # of the time of solving, at most one part in so many is spent on writing
 _HEADER = 5  # float64: sweeps, two numbers, rows, columns
 _DIGEST = 32  # characters of a digest; two follow, of the header and of the values
 
@@ -63,7 +63,7 @@ class SolverCheckpoint:
         numbers: those that `keep` was given beside the values.
     """
 
-    def __init__(self, folder: Path | None, question: str, seconds: float = SECONDS):
+    def __init__(self, folder: Path | None, question: str, seconds: float = WRITE_SECONDS):
         """
         folder: None to keep nothing. question: the setting of the solve, but for the MDP and the selection of actions.
         """
@@ -111,7 +111,7 @@ class SolverCheckpoint:
                     stacklevel=2,
                 )
         now = time.monotonic()
-        self._next = now + max(self._seconds, _SHARE * (now - began))
+        self._next = now + max(self._seconds, _WRITING_SHARE * (now - began))
 
     def finish(self, backup: "RankedBackup") -> None:
         """Remove the file, as the question is answered."""
@@ -143,11 +143,11 @@ class SolverCheckpoint:
 # Sweeps of ranks ------------------------------------------------------------------------------------------------------
 
 
-_ROWS = 1 << 20  # of values that a rank sends to the first in one exchange
-_BLOCK = 1 << 16  # states whose fingerprint is taken in one go
+_EXCHANGED_ROWS = 1 << 20  # of values that a rank sends to the first in one exchange
+_FINGERPRINT_BLOCK = 1 << 16  # states whose fingerprint is taken in one go
 _GAP = 64  # states between two runs of those that others read, from which on they are two
-_LOOKS = 8  # how often in a sweep of a large range messages are looked after
-_MIX = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # of splitmix64
+_MESSAGE_CHECKS = 8  # how often in a sweep of a large range messages are looked after
+_SPLITMIX = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # of splitmix64
 
 
 class RankedBackup:
@@ -171,7 +171,7 @@ class RankedBackup:
         vars(backup).update(zip(names, numbers.tolist(), strict=True))
         self._halo = Halo(rank, self.part.halo, self.cuts)
         self.first = runs_of(self._halo.is_boundary(len(self.part)), _GAP)
-        pieces = min(_LOOKS, 1 + (len(self.part) >> 16)) if rank.needs_progress else 1
+        pieces = min(_MESSAGE_CHECKS, 1 + (len(self.part) >> 16)) if rank.needs_progress else 1
         self._rest = shares_of(runs_between(self.first, len(self.part)), pieces)
         self._high = shares_of(np.array([[self._halo.low, len(self.part)]]), pieces)[::-1]
         self.x = self.part.zeros()
@@ -221,8 +221,8 @@ class RankedBackup:
         is_first = self.rank.rank == 0
         whole = np.zeros((self.mdp.num_states + 1 if is_first else 0, x.shape[1]))
         own = x[: len(self.part)]
-        for first in range(0, int(np.diff(self.cuts).max()), _ROWS):
-            for start, rows in zip(self.cuts, self.rank.gather(own[first : first + _ROWS]), strict=False):
+        for first in range(0, int(np.diff(self.cuts).max()), _EXCHANGED_ROWS):
+            for start, rows in zip(self.cuts, self.rank.gather(own[first : first + _EXCHANGED_ROWS]), strict=False):
                 if is_first:
                     whole[start + first : start + first + len(rows)] = rows
         return whole if is_first else None
@@ -241,8 +241,8 @@ class RankedBackup:
         numbers = np.concatenate([np.arange(part.start, part.stop), part.halo])
         x[:-1] = (_mixed_numbers(numbers)[:, None] >> np.uint64(12)) * 2.0**-52
         total = 0
-        for start in range(0, len(part), _BLOCK):
-            states = slice(start, min(start + _BLOCK, len(part)))
+        for start in range(0, len(part), _FINGERPRINT_BLOCK):
+            states = slice(start, min(start + _FINGERPRINT_BLOCK, len(part)))
             q = equation.rewards.rows(states) + equation.gamma * part.dynamics.expected(x, states)
             for kind, values in enumerate((q, equation.value(q, states))):
                 bits = np.ascontiguousarray(values).view(np.uint64).reshape(len(values), -1)
@@ -263,9 +263,9 @@ def _larger(one: float, other: float) -> float:
 def _mixed_numbers(numbers: np.ndarray) -> np.ndarray:
     """Whole numbers as uint64, mixed by splitmix64."""
     with np.errstate(over="ignore"):
-        z = numbers.astype(np.uint64) + np.uint64(_MIX[0])
-        z = (z ^ (z >> np.uint64(30))) * np.uint64(_MIX[1])
-        z = (z ^ (z >> np.uint64(27))) * np.uint64(_MIX[2])
+        z = numbers.astype(np.uint64) + np.uint64(_SPLITMIX[0])
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(_SPLITMIX[1])
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(_SPLITMIX[2])
     return z ^ (z >> np.uint64(31))
 
 
@@ -334,7 +334,7 @@ def shared_solution(
     mdp: TabularMDP,
     select: Selection,
     solving: Solving,
-    checkpoint_seconds: float = SECONDS,
+    checkpoint_seconds: float = WRITE_SECONDS,
 ) -> Solution:
     """Solution of an MDP under a selection of actions, by several processes; under MPI the others get None.
 

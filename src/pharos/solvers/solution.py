@@ -9,7 +9,7 @@ import numpy as np
 from pharos.mdp import Selection, TabularMDP, available_choices
 
 # States whose greedy actions are worked out in one go.
-_BLOCK = 1 << 20
+_GREEDY_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +96,8 @@ class Solution:
         if policy_table is not None:
             return policy_table
         actions = np.empty(self.mdp.num_states, np.int64)
-        for start in range(0, self.mdp.num_states, _BLOCK):
-            block = slice(start, min(start + _BLOCK, self.mdp.num_states))
+        for start in range(0, self.mdp.num_states, _GREEDY_BLOCK):
+            block = slice(start, min(start + _GREEDY_BLOCK, self.mdp.num_states))
             greedy = self.select.policy(self.q_of(block)).table
             sets = None if self.mdp.available is None else self.mdp.available[block]
             actions[block] = available_choices(greedy, sets)

@@ -26,7 +26,7 @@ from pharos.mdp import (
 )
 from pharos.solvers.convergence import precision_error
 from pharos.solvers.fixed_point import (
-    MARGIN,
+    ROUNDING_MARGIN,
     Backup,
     backward_induction,
     chain_bound,
@@ -42,7 +42,7 @@ from pharos.system.memory import kept_array
 from pharos.system.records import takes
 
 # Rows of values in a file that are read in one go.
-_ROWS = 1 << 22
+_FILE_ROWS = 1 << 22
 # Between two copies of values to their file.
 _SECONDS = 600.0
 
@@ -145,7 +145,7 @@ def _until_the_end(mdp: TabularMDP, select: Selection, solving: Solving, watch: 
     x[:-1] = goals.v.reshape(mdp.num_states, mdp.width)
     largest = float(np.abs(goals.v).max(initial=0.0))
     rounding = 0.0 if goals.is_exact and not backup.is_single else backup.rounding(largest)
-    bound = (float(goals.error.max(initial=0.0)) + rounding) * MARGIN
+    bound = (float(goals.error.max(initial=0.0)) + rounding) * ROUNDING_MARGIN
     if not bound <= solving.tolerance and not any(mdp.residual):
         raise precision_error(mdp, bound, solving.tolerance, backup.is_single)
     if solving.values is not None:
@@ -167,8 +167,8 @@ def _kept_values(path: str | os.PathLike, shape: tuple[int, int], dtype: DTypeLi
         the file cannot be made.
     """
     x = kept_array(path, shape, dtype)
-    for start in range(0, len(x), _ROWS):
-        block = x[start : start + _ROWS]
+    for start in range(0, len(x), _FILE_ROWS):
+        block = x[start : start + _FILE_ROWS]
         if not np.isfinite(block).all():
             block[~np.isfinite(block)] = 0.0
     x[-1] = 0.0
@@ -281,7 +281,7 @@ def evaluate_parts(
     starts = mdp.start_states[np.argsort(part[mdp.start_states], kind="stable")].reshape(len(begins), -1)
     solution = Solution(mdp, 0.0, 0, 0.0, mdp.horizon, select, x, before)
     values = [solution.value_from(states, start_probabilities) for states in starts]
-    return list(zip(values, (bounds * MARGIN).tolist(), strict=True))
+    return list(zip(values, (bounds * ROUNDING_MARGIN).tolist(), strict=True))
 
 
 @require_mdp

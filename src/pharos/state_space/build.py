@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceLocked, StateSpaceMismatch
-from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, Plan, lock_build, read_manifest
+from pharos.state_space.manifest import ARRAYS, MANIFEST, PART_NAMES, Plan, lock_build, read_manifest
 from pharos.state_space.progress import BuildCallback, reporter
 from pharos.state_space.store import StateSpace, load
 from pharos.state_space.stored import SHARDS, check_files
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from pharos.ranks import Rank
     from pharos.state_space.search import Options
 
-OUR_FILES = (*ARRAYS, *PARTS.values(), SHARDS, MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
-CHECKPOINT_SECONDS = 15.0
+OUR_FILES = (*ARRAYS, *PART_NAMES.values(), SHARDS, MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
+BUILD_CHECKPOINT_SECONDS = 15.0
 Hold = Callable[[Path], contextlib.AbstractContextManager[object]]  # of a folder, for one builder
 
 
@@ -41,7 +41,7 @@ def build(
     workers: int | None = None,
     processes: int | str = 1,
     progress: BuildCallback | bool | None = None,
-    checkpoint_seconds: float = CHECKPOINT_SECONDS,
+    checkpoint_seconds: float = BUILD_CHECKPOINT_SECONDS,
     wait: bool | None = None,
 ) -> StateSpace:
     """Enumerate the states of `env` that can be reached from its start states, and their transitions.

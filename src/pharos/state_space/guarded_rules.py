@@ -14,7 +14,7 @@ from pharos.errors import RuleError
 SUM_TOLERANCE = 1e-9
 """Largest difference from 1 of the sum of the probabilities of an action's outcomes."""
 
-SAME = "expected the same answer to the same question"
+SAME_ANSWER = "expected the same answer to the same question"
 
 
 class _StateWritten(Exception):
@@ -94,18 +94,18 @@ class InterpretedCheck:
     def repeat(self, state: State) -> None:
         """Call the rules in a state again, after calls in other states: rules have no memory."""
         if self._is_terminal(state) != self.terminal[state]:
-            raise RuleError(f"{self.where('is_terminal', state)} now says {not self.terminal[state]}; {SAME}")
+            raise RuleError(f"{self.where('is_terminal', state)} now says {not self.terminal[state]}; {SAME_ANSWER}")
         if self.terminal[state]:
             return
         if self.env.has_sets and self._set(state) != self.sets[state]:
-            raise RuleError(f"{self.where('is_available', state)} now says other actions than before; {SAME}")
+            raise RuleError(f"{self.where('is_available', state)} now says other actions than before; {SAME_ANSWER}")
         for action in range(self.env.num_actions):
             for outcome, probability in enumerate(self._probabilities(state, action)):
                 before = self.probabilities.get((state, action, outcome), 0.0)
                 if probability != before:
                     raise RuleError(
                         f"{self.where('probability', state, action, outcome)} is now {probability}, "
-                        f"before {before}; {SAME}"
+                        f"before {before}; {SAME_ANSWER}"
                     )
         for action, outcome in self.branches(state):
             branch = state, action, outcome
@@ -113,12 +113,13 @@ class InterpretedCheck:
             if successor != self.transitions[branch]:
                 was = self.text(self.transitions[branch])
                 raise RuleError(
-                    f"{self.where('transition', *branch)} now leads to {self.text(successor)}, before to {was}; {SAME}"
+                    f"{self.where('transition', *branch)} now leads to {self.text(successor)}, "
+                    f"before to {was}; {SAME_ANSWER}"
                 )
             reward = self._reward(state, action, successor, outcome)
             if reward != self.rewards[branch]:
                 raise RuleError(
-                    f"{self.where('reward', *branch)} is now {reward}, before {self.rewards[branch]}; {SAME}"
+                    f"{self.where('reward', *branch)} is now {reward}, before {self.rewards[branch]}; {SAME_ANSWER}"
                 )
 
     def drawing(self, state: State) -> None:
@@ -138,7 +139,7 @@ class InterpretedCheck:
             self._call(where, getattr(self.env, rule), _ReadOnly(state), planes)
             drawn.append(planes.array)
         if (drawn[0] != drawn[1]).any():
-            raise RuleError(f"{where} draws two different things; {SAME}")
+            raise RuleError(f"{where} draws two different things; {SAME_ANSWER}")
         for plane, (name, layer) in zip(drawn[0], layers.items(), strict=True):
             num_values = len(layer.glyph) if isinstance(layer.glyph, tuple) else 1
             if plane.max() > num_values:
@@ -153,7 +154,7 @@ class InterpretedCheck:
         if not all(isinstance(answer, bool | np.bool_) for answer in answers):
             raise RuleError(f"{where} says {answers[0]!r}; expected True or False")
         if answers[0] != answers[1]:
-            raise RuleError(f"{where} says {answers[0]}, then {answers[1]}; {SAME}")
+            raise RuleError(f"{where} says {answers[0]}, then {answers[1]}; {SAME_ANSWER}")
         return bool(answers[0])
 
     def _set(self, state: State) -> tuple[bool, ...]:
@@ -191,7 +192,7 @@ class InterpretedCheck:
             if not isinstance(answer, numbers.Real | np.bool_) or not 0 <= float(answer) <= 1 + SUM_TOLERANCE:
                 raise RuleError(f"{where} is {answer!r}; expected a number from 0 to 1")
         if answers[0] != answers[1]:
-            raise RuleError(f"{where} is {answers[0]}, then {answers[1]}; {SAME}")
+            raise RuleError(f"{where} is {answers[0]}, then {answers[1]}; {SAME_ANSWER}")
         return float(answers[0])
 
     def _check_age(self, state: State, action: int, outcome: int, successor: State) -> None:
@@ -210,7 +211,7 @@ class InterpretedCheck:
             if not isinstance(answers[0], numbers.Integral | np.bool_):
                 raise RuleError(f"{where} is {answers[0]!r}; expected an integer")
             if answers[0] != answers[1]:
-                raise RuleError(f"{where} is {answers[0]}, then {answers[1]}; {SAME}")
+                raise RuleError(f"{where} is {answers[0]}, then {answers[1]}; {SAME_ANSWER}")
             self.ages[state] = int(answers[0])
         return self.ages[state]
 
@@ -225,7 +226,7 @@ class InterpretedCheck:
                 raise RuleError(f"{where} returns {returned!r}; expected nothing: write the new state into `out`")
             results.append(self._checked(where, out))
         if results[0] != results[1]:
-            raise RuleError(f"{where} leads to {self.text(results[0])}, then to {self.text(results[1])}; {SAME}")
+            raise RuleError(f"{where} leads to {self.text(results[0])}, then to {self.text(results[1])}; {SAME_ANSWER}")
         return results[0]
 
     def _checked(self, where: str, out: list) -> State:
@@ -252,7 +253,7 @@ class InterpretedCheck:
             if not isinstance(answer, numbers.Real | np.bool_) or not math.isfinite(answer):
                 raise RuleError(f"{where} is {answer!r}; expected a finite number")
         if answers[0] != answers[1]:
-            raise RuleError(f"{where} is {answers[0]}, then {answers[1]}; {SAME}")
+            raise RuleError(f"{where} is {answers[0]}, then {answers[1]}; {SAME_ANSWER}")
         return float(answers[0])
 
     def _call(self, where: str, rule: Callable, *arguments) -> Any:

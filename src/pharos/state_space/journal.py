@@ -33,7 +33,7 @@ from pharos.state_space.manifest import (
     MOST_CODES,
     OFFSETS,
     PALETTE,
-    PARTS,
+    PART_NAMES,
     PROBABILITIES,
     STATES,
     SUCCESSORS,
@@ -49,7 +49,7 @@ from pharos.state_space.stored import check_outcome_rules, check_rules, states_t
 from pharos.state_space.table import BranchBlock
 from pharos.system.arrays import OutcomesOfState, as_stored, dtype_of, from_stored
 
-BLOCK_BYTES = 1 << 22  # of a file that are copied at a time
+COPIED_BYTES = 1 << 22  # of a file that are copied at a time
 
 
 @dataclass
@@ -116,7 +116,7 @@ class Journal:
         """Open the files, at the start states or at the last checkpoint; returns the position of the search."""
         arrays = manifest["arrays"] if manifest else {}
         names = self._names(arrays)
-        for name in {*ARRAYS, *PARTS.values()} - set(names):
+        for name in {*ARRAYS, *PART_NAMES.values()} - set(names):
             (self.path / name).unlink(missing_ok=True)  # left by a process that was killed while it replaced some files
         for name in names:
             self._files[name] = GrowingFile(self.path / name, arrays.get(name))
@@ -271,10 +271,10 @@ def number_blocks(file: GrowingFile, dtype: np.dtype, entries: int | None = None
     """Blocks of the numbers in a file: pairs (index of the first one, array), in order.
 
     Args:
-        entries: of a block, at most; None for BLOCK_BYTES.
+        entries: of a block, at most; None for COPIED_BYTES.
     """
     size = file.bytes // dtype.itemsize
-    block_size = entries or max(1, BLOCK_BYTES // dtype.itemsize)
+    block_size = entries or max(1, COPIED_BYTES // dtype.itemsize)
     for first in range(0, size, block_size):
         shape = (min(block_size, size - first),)
         yield first, np.memmap(file.path, dtype, "r", offset=first * dtype.itemsize, shape=shape)
@@ -332,9 +332,9 @@ class OutcomeParts:
             rows = min(step, self.rows - row)
             codes = None
             if self.palette is None:
-                counts = np.diff(np.fromfile(self.folder / PARTS[OFFSETS], "<i8", rows + 1, offset=8 * row))
+                counts = np.diff(np.fromfile(self.folder / PART_NAMES[OFFSETS], "<i8", rows + 1, offset=8 * row))
             else:
-                codes = np.fromfile(self.folder / PARTS[CODES], "<u2", rows, offset=2 * row)
+                codes = np.fromfile(self.folder / PART_NAMES[CODES], "<u2", rows, offset=2 * row)
                 counts = sizes[codes]
             yield row, first, codes, counts
             first += int(counts.sum())
@@ -343,7 +343,7 @@ class OutcomeParts:
         entries = int(counts.sum())
         dtype = dtype_of(INDEX_TYPES[self.indices])
         first_byte = first * dtype.itemsize
-        stored = np.fromfile(self.folder / PARTS[self.indices], dtype, entries, offset=first_byte)
+        stored = np.fromfile(self.folder / PART_NAMES[self.indices], dtype, entries, offset=first_byte)
         successors = np.asarray(from_stored(stored))
         return JournalRows(row, first, counts, codes, successors)
 
@@ -351,7 +351,7 @@ class OutcomeParts:
         """Bits (N,) uint64 of the probabilities of the outcomes of some rows."""
         if self.palette is None:
             entries = len(part.successors)
-            return np.fromfile(self.folder / PARTS[PROBABILITIES], "<u8", entries, offset=8 * part.first)
+            return np.fromfile(self.folder / PART_NAMES[PROBABILITIES], "<u8", entries, offset=8 * part.first)
         assert part.codes is not None
         vectors = self.palette[part.codes]
         return vectors[vectors != 0]
@@ -370,7 +370,7 @@ class OutcomeParts:
         """
         most = self.most()
         successors, index_type = self.indices, INDEX_TYPES[self.indices]
-        num_entries = written[PARTS[successors]]["bytes"] // dtype_of(index_type).itemsize
+        num_entries = written[PART_NAMES[successors]]["bytes"] // dtype_of(index_type).itemsize
         # form of the rows: padded to K, or with offsets; palette and codes, or probabilities
         is_dense = MOST_PADDING[1] * (self.rows * most - num_entries) <= MOST_PADDING[0] * self.rows * most
         dtypes = {successors: index_type}
@@ -383,7 +383,7 @@ class OutcomeParts:
         # files of the build that have this form already are linked, the others written anew
         stay = {successors, OFFSETS, PROBABILITIES} if not is_dense else set()
         stay |= {CODES} if dtypes.get(CODES) == "<u2" else set()
-        stay &= {name for name in dtypes if PARTS[name] in written}
+        stay &= {name for name in dtypes if PART_NAMES[name] in written}
         files: dict[str, GrowingFile] = {}
         try:
             for name in dtypes.keys() - stay:
@@ -395,9 +395,9 @@ class OutcomeParts:
             for file in files.values():
                 file.close()
         for name in stay:
-            _link(self.folder / PARTS[name], self.folder / name)
+            _link(self.folder / PART_NAMES[name], self.folder / name)
         return {
-            name: {"dtype": dtype, **files[name].entry()} if name in files else written[PARTS[name]]
+            name: {"dtype": dtype, **files[name].entry()} if name in files else written[PART_NAMES[name]]
             for name, dtype in dtypes.items()
         }, most
 
@@ -477,25 +477,25 @@ class OutcomeJournal(Journal):
         self._failure: BaseException | None = None
 
     def _names(self, arrays: dict[str, Any]) -> tuple[str, ...]:
-        self._indices = successors_name(arrays, PARTS)
-        if PARTS[PROBABILITIES] in arrays:
+        self._indices = successors_name(arrays, PART_NAMES)
+        if PART_NAMES[PROBABILITIES] in arrays:
             self.palette = None
         return tuple(self._dtypes())
 
     @property
     def _successors_name(self) -> str:
-        return PARTS[self._indices]
+        return PART_NAMES[self._indices]
 
     def _dtypes(self) -> dict[str, str]:
         dtypes = {STATES: "<u8", self._successors_name: INDEX_TYPES[self._indices]}
         if self.palette is None:
-            return {**dtypes, PARTS[OFFSETS]: "<i8", PARTS[PROBABILITIES]: "<f8", TERMINAL: "|u1"}
-        return {**dtypes, PARTS[CODES]: "<u2", PARTS[PALETTE]: "<f8", TERMINAL: "|u1"}
+            return {**dtypes, PART_NAMES[OFFSETS]: "<i8", PART_NAMES[PROBABILITIES]: "<f8", TERMINAL: "|u1"}
+        return {**dtypes, PART_NAMES[CODES]: "<u2", PART_NAMES[PALETTE]: "<f8", TERMINAL: "|u1"}
 
     def _check_rules(self, position: Position) -> None:
         """Load the palette of the build; StateSpaceMismatch if stored outcomes come from other rules."""
         if self.palette is not None:
-            vectors = np.fromfile(self.path / PARTS[PALETTE], "<u8").reshape(-1, self._most)
+            vectors = np.fromfile(self.path / PART_NAMES[PALETTE], "<u8").reshape(-1, self._most)
             self._vectors = len(vectors)
             self.palette = np.zeros((max(len(self.palette), self._vectors), self._most), np.uint64)
             self.palette[: self._vectors] = vectors
@@ -537,13 +537,13 @@ class OutcomeJournal(Journal):
         files = self._files
         files[STATES].append(states)
         if codes is None:
-            before = files[PARTS[PROBABILITIES]].bytes // 8
-            files[PARTS[OFFSETS]].append(before + np.cumsum(counts))
-            files[PARTS[PROBABILITIES]].append(probability_bits[:size])
+            before = files[PART_NAMES[PROBABILITIES]].bytes // 8
+            files[PART_NAMES[OFFSETS]].append(before + np.cumsum(counts))
+            files[PART_NAMES[PROBABILITIES]].append(probability_bits[:size])
         else:
             assert self.palette is not None
-            files[PARTS[CODES]].append(codes)
-            files[PARTS[PALETTE]].append(self.palette[num_vectors : self._vectors])
+            files[PART_NAMES[CODES]].append(codes)
+            files[PART_NAMES[PALETTE]].append(self.palette[num_vectors : self._vectors])
         self._append_successors(successors[:size])
         files[TERMINAL].append(np.packbits(block.terminal, bitorder="little"))
         self._written = self._entries(at)
@@ -577,8 +577,10 @@ class OutcomeJournal(Journal):
         self._vectors = num_vectors
         parts = self._parts(self._written["num_expanded"])
         for name in (OFFSETS, PROBABILITIES):
-            self._files[PARTS[name]] = GrowingFile(self.path / PARTS[name])  # closed with the others, come what may
-        offsets, probabilities = (self._files[PARTS[name]] for name in (OFFSETS, PROBABILITIES))
+            self._files[PART_NAMES[name]] = GrowingFile(
+                self.path / PART_NAMES[name]
+            )  # closed with the others, come what may
+        offsets, probabilities = (self._files[PART_NAMES[name]] for name in (OFFSETS, PROBABILITIES))
         offsets.append(np.zeros(1, np.int64))
         for part in parts.parts():
             offsets.append(part.first + np.cumsum(part.counts))
@@ -588,7 +590,7 @@ class OutcomeJournal(Journal):
         self._written = {**self._written, "arrays": arrays}
         self.commit(complete=False)
         for name in (CODES, PALETTE):
-            self._drop(PARTS[name])
+            self._drop(PART_NAMES[name])
 
     # The end ----------------------------------------------------------------------------------------------------------
 
@@ -613,6 +615,6 @@ class OutcomeJournal(Journal):
 
 def remove_parts(folder: Path) -> None:
     """Remove the files of a build in progress that are left if a process completed it and was killed then."""
-    for name in PARTS.values():
+    for name in PART_NAMES.values():
         with contextlib.suppress(OSError):
             (folder / name).unlink(missing_ok=True)

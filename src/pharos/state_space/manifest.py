@@ -25,7 +25,7 @@ from pharos.rules import Layout, fingerprint_of_rules, layout_of
 from pharos.system import storage
 from pharos.system.arrays import INT40
 
-FORMAT, FORMAT_VERSION = "pharos state space", 1
+SPACE_FORMAT, FORMAT_VERSION = "pharos state space", 1
 OUTCOMES_VERSION = 2
 """Format version of folders of environments with chance."""
 
@@ -49,7 +49,7 @@ OFFSETS, CODES, PALETTE, PROBABILITIES = "offsets.bin", "codes.bin", "palette.bi
 ARRAYS = (STATES, *INDEX_TYPES, TERMINAL, OFFSETS, CODES, PALETTE, PROBABILITIES)
 """The files of arrays that a folder may hold."""
 
-PARTS = {name: f"building-{name}" for name in (*INDEX_TYPES, OFFSETS, CODES, PALETTE, PROBABILITIES)}
+PART_NAMES = {name: f"building-{name}" for name in (*INDEX_TYPES, OFFSETS, CODES, PALETTE, PROBABILITIES)}
 """With chance: the file that a build writes in place of each of these until it ends."""
 
 MOST_CODES = 1 << 16
@@ -58,7 +58,7 @@ MOST_CODES = 1 << 16
 CHECKSUM_BYTES = 1 << 24
 """A checksum covers this many bytes of a file."""
 
-AGAIN = "delete the folder and build again"
+BUILD_AGAIN = "delete the folder and build again"
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
@@ -70,7 +70,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     """
     path = folder / MANIFEST
     try:
-        manifest = storage.read_json(path, StateSpaceCorrupted, AGAIN)
+        manifest = storage.read_json(path, StateSpaceCorrupted, BUILD_AGAIN)
     except FileNotFoundError:
         return None
     if isinstance(manifest, dict) and manifest.get("format") == IMPORTED_FORMAT:
@@ -80,7 +80,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
             f"pharos.importers.load reads it"
         )
     try:
-        if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        if not isinstance(manifest, dict) or manifest.get("format") != SPACE_FORMAT:
             raise ValueError("it is not the manifest of a pharos state space")
         if manifest["format_version"] not in (FORMAT_VERSION, OUTCOMES_VERSION, INT40_VERSION):
             raise StateSpaceMismatch(
@@ -92,7 +92,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
         _check_space(manifest)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise StateSpaceCorrupted(f"{path}: {reason}; {AGAIN}") from None
+        raise StateSpaceCorrupted(f"{path}: {reason}; {BUILD_AGAIN}") from None
     return manifest
 
 
@@ -100,7 +100,7 @@ def successors_name(arrays: dict[str, Any], parts: dict[str, str] | None = None)
     """Name of the file of successors, which depends on the width of the indices.
 
     Args:
-        parts: PARTS, if the arrays belong to an unfinished build with chance.
+        parts: PART_NAMES, if the arrays belong to an unfinished build with chance.
     """
     names = parts or {name: name for name in INDEX_TYPES}
     return next((name for name in (SUCCESSORS40, SUCCESSORS64) if names[name] in arrays), SUCCESSORS)
@@ -126,7 +126,7 @@ def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
         if length is None or length < entry["bytes"] or (manifest["complete"] and length != entry["bytes"]):
             raise StateSpaceCorrupted(
                 f"{path}: expected {entry['bytes']} bytes, found {'no such file' if length is None else length}: "
-                f"the file was truncated or replaced; {AGAIN}"
+                f"the file was truncated or replaced; {BUILD_AGAIN}"
             )
 
 
@@ -187,7 +187,7 @@ def _check_start(manifest: dict[str, Any]) -> None:
 def _check_arrays(manifest: dict[str, Any]) -> None:
     """Raise a ValueError unless types and lengths of arrays follow from the numbers of states, actions and outcomes."""
     arrays, states = manifest["arrays"], manifest["num_states"]
-    has_40_bits = bool({SUCCESSORS40, PARTS[SUCCESSORS40]} & set(arrays))
+    has_40_bits = bool({SUCCESSORS40, PART_NAMES[SUCCESSORS40]} & set(arrays))
     if has_40_bits != (manifest["format_version"] == INT40_VERSION):
         raise ValueError(f"arrays are {', '.join(arrays)}, which are not those of version {manifest['format_version']}")
     if has_chance(manifest):
@@ -240,12 +240,20 @@ def _expected_outcomes(manifest: dict[str, Any]) -> dict[str, tuple[str, int]]:
 def _check_parts(arrays: dict[str, Any]) -> None:
     """Raise a ValueError unless the arrays are the files of an unfinished build with chance."""
     names = set(arrays) - {STATES, TERMINAL}
-    successors = PARTS[successors_name(arrays, PARTS)]
-    spelled_out = {PARTS[OFFSETS], PARTS[PROBABILITIES]}
-    if {STATES, TERMINAL} - set(arrays) or names - {successors} not in ({PARTS[CODES], PARTS[PALETTE]}, spelled_out):
+    successors = PART_NAMES[successors_name(arrays, PART_NAMES)]
+    spelled_out = {PART_NAMES[OFFSETS], PART_NAMES[PROBABILITIES]}
+    if {STATES, TERMINAL} - set(arrays) or names - {successors} not in (
+        {PART_NAMES[CODES], PART_NAMES[PALETTE]},
+        spelled_out,
+    ):
         raise ValueError(f"arrays are {', '.join(arrays)}, which are not those of a build that goes on")
-    dtypes = {STATES: "<u8", TERMINAL: "|u1", **{PARTS[name]: dtype for name, dtype in INDEX_TYPES.items()}}
-    dtypes |= {PARTS[OFFSETS]: "<i8", PARTS[CODES]: "<u2", PARTS[PALETTE]: "<f8", PARTS[PROBABILITIES]: "<f8"}
+    dtypes = {STATES: "<u8", TERMINAL: "|u1", **{PART_NAMES[name]: dtype for name, dtype in INDEX_TYPES.items()}}
+    dtypes |= {
+        PART_NAMES[OFFSETS]: "<i8",
+        PART_NAMES[CODES]: "<u2",
+        PART_NAMES[PALETTE]: "<f8",
+        PART_NAMES[PROBABILITIES]: "<f8",
+    }
     for name, entry in arrays.items():
         size = _checked_size(name, entry)
         if entry["dtype"] != dtypes[name] or size % _width(dtypes[name]):
@@ -378,7 +386,7 @@ class GrowingFile:
         self._sent = self.bytes
         if self.entry()["checksums"] != committed["checksums"] or self.bytes != committed["bytes"]:
             raise StateSpaceCorrupted(
-                f"{self.path}: does not match the checksums of its last checkpoint: it was changed; {AGAIN}"
+                f"{self.path}: does not match the checksums of its last checkpoint: it was changed; {BUILD_AGAIN}"
             )
 
     def append(self, rows: np.ndarray) -> None:

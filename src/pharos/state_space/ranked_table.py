@@ -37,17 +37,17 @@ from pharos.state_space.search import Options, Search
 from pharos.state_space.table import BranchBlock, MemoryTable
 from pharos.system.memory import huge_pages
 
-ROWS = 1 << 16  # of a rank in a superstep, at most
-SUCCESSORS = 1 << 20  # of a rank's rows, at most
+SUPERSTEP_ROWS = 1 << 16  # of a rank in a superstep, at most
+SUPERSTEP_SUCCESSORS = 1 << 20  # of a rank's rows, at most
 _END, _TAKE, _EXPAND = range(3)
-_HEADER = np.zeros(4, np.int64)
+_COUNTS_HEADER = np.zeros(4, np.int64)
 _INT32 = np.dtype(np.int32)
 _NOTHING = np.full(1 << 16, -1, np.int32)  # a table that holds nothing, in which the slot of a state is its bucket
 
 
 def rows_of_rank(plan: Plan) -> int:
     """Number of rows that a rank expands in a superstep, at most: a multiple of 8."""
-    return min(ROWS, max(8, SUCCESSORS // plan.branches // 8 * 8))
+    return min(SUPERSTEP_ROWS, max(8, SUPERSTEP_SUCCESSORS // plan.branches // 8 * 8))
 
 
 class Owner:
@@ -145,7 +145,7 @@ class RankedTable:
 
     def _send_header(self, *header: int) -> None:
         """Announce a step to the other ranks."""
-        self.rank.broadcast(np.array(header, np.int64), _HEADER)
+        self.rank.broadcast(np.array(header, np.int64), _COUNTS_HEADER)
 
     # The others -------------------------------------------------------------------------------------------------------
 
@@ -153,7 +153,7 @@ class RankedTable:
         """Run the steps that rank 0 announces, until the end."""
         no_states = np.empty((0, self.num_words), np.uint64)
         while True:
-            step, first, rows, count = map(int, self.rank.broadcast(None, _HEADER))
+            step, first, rows, count = map(int, self.rank.broadcast(None, _COUNTS_HEADER))
             if step == _END:
                 return
             if step == _TAKE:
@@ -232,7 +232,7 @@ class RankedTable:
 
 def end(rank: Rank) -> None:
     """Announce the end of the search to the other ranks."""
-    rank.broadcast(np.array([_END, 0, 0, 0], np.int64), _HEADER)
+    rank.broadcast(np.array([_END, 0, 0, 0], np.int64), _COUNTS_HEADER)
 
 
 def answer(plan: Plan, rank: Rank, memory: int | None) -> None:
@@ -262,7 +262,7 @@ def rank_of_build(plan: Plan, memory: int | None) -> Iterator[Rank]:
 # Ranked search --------------------------------------------------------------------------------------------------------
 
 
-WIDE = 10_000
+WORTH_RANKS = 10_000
 """A frontier of this many states is worth sharing between processes."""
 
 
@@ -270,7 +270,13 @@ class RankedSearch(Search):
     """The search of rank 0; the other ranks run `answer`."""
 
     def __init__(
-        self, plan: Plan, journal: Journal, options: Options, report: BuildCallback, rank: Rank, wide: int = WIDE
+        self,
+        plan: Plan,
+        journal: Journal,
+        options: Options,
+        report: BuildCallback,
+        rank: Rank,
+        wide: int = WORTH_RANKS,
     ):
         super().__init__(plan, journal, options, report)
         self.threads = 1

@@ -34,9 +34,9 @@ CHUNK_OUTCOMES = 1 << 21
 # Pieces of a chunk: threads expand one while the one before is numbered.
 PIECES = 4
 # A frontier of this many states is worth sharing between threads.
-WIDE = 1 << 13
+WIDE_FOR_THREADS = 1 << 13
 # States that one thread expands before it looks at the width of the frontier again.
-NARROW = 2048
+NARROW_LEVEL_STATES = 2048
 # Number of states from which on a table drops those that a class with an age has left behind; ages computed at a time.
 WORTH_FORGETTING = 1 << 16
 FORGETTING_BLOCK = 1 << 18
@@ -165,7 +165,7 @@ class Search:
                     position.first -= (position.first - base) % 8  # what is appended has whole bytes of terminal bits
                     break
             # expand by one thread or by several, as wide as the frontier is now
-            is_wide = self.threads > 1 and min(last, position.count) - position.first >= WIDE
+            is_wide = self.threads > 1 and min(last, position.count) - position.first >= WIDE_FOR_THREADS
             if self._ahead or is_wide:
                 self._expand_wide(pool, block, base)
             else:
@@ -194,7 +194,7 @@ class Search:
     def _expand_narrow(self, block: BranchBlock, base: int, last: int) -> None:
         """Expand by one thread; with several threads it looks at the width of the frontier again after a while."""
         position, table = self.position, self.table
-        stop = min(last, max(position.first + NARROW, position.count)) if self.threads > 1 else last
+        stop = min(last, max(position.first + NARROW_LEVEL_STATES, position.count)) if self.threads > 1 else last
         progress = position.progress()
         self.rules.explore(table.states, *block, table.slots, base, stop, table.room, progress)
         position.take(progress)
@@ -212,7 +212,7 @@ class Search:
         rows = piece.stop - piece.first
         row = piece.first - base
         # let them expand the next one
-        if position.count - piece.stop >= WIDE:
+        if position.count - piece.stop >= WIDE_FOR_THREADS:
             next_row = (row + rows) % self.chunk
             self._ahead = self._expand_ahead(pool, piece.stop, next_row, reserved=rows * self.branches)
         # number the successors of this one meanwhile
@@ -351,7 +351,7 @@ class Search:
         self, pool: ThreadPoolExecutor, states: np.ndarray, keys: np.ndarray, indices: np.ndarray, block: BranchBlock
     ) -> None:
         """Write the successors of states to keys; to indices -1 - bucket, or in terminal states their own row."""
-        threads = self.threads if len(states) >= WIDE else 1
+        threads = self.threads if len(states) >= WIDE_FOR_THREADS else 1
         cuts = [len(states) * i // threads for i in range(threads + 1)]
         arrays = (0, keys, indices, block.terminal, block.probabilities, _NOTHING)
         if threads == 1:

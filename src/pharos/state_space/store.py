@@ -21,7 +21,7 @@ from pharos.errors import (
 )
 from pharos.rules import Layout, pack_states, rules_of, unpack_states
 from pharos.state_space.manifest import (
-    AGAIN,
+    BUILD_AGAIN,
     CHECKSUM_BYTES,
     MANIFEST,
     STATES,
@@ -51,8 +51,8 @@ from pharos.system.arrays import Indices, OutcomeRows, dtype_of, from_stored
 if TYPE_CHECKING:
     from pharos.mdp import Dynamics, TabularMDP
 
-LONGEST = 500  # characters of what a manifest says, in a message
-_BLOCK = 1 << 16  # states whose ages are asked for at a time
+MOST_QUOTED = 500  # characters of what a manifest says, in a message
+_AGE_BLOCK = 1 << 16  # states whose ages are asked for at a time
 
 
 # States whose sets of actions are worked out in one go.
@@ -145,8 +145,8 @@ class StateSpace:
             raise StateSpaceError(f"{self}: {self.manifest['environment']} declares no age of states")
         ages = np.empty(self.num_states, np.int64)
         rule = rules_of(self.environment).ages
-        for start in range(0, self.num_states, _BLOCK):
-            stop = min(start + _BLOCK, self.num_states)
+        for start in range(0, self.num_states, _AGE_BLOCK):
+            stop = min(start + _AGE_BLOCK, self.num_states)
             ages[start:stop] = rule.block(self.packed_states, start, stop)
         ages.flags.writeable = False
         return ages
@@ -338,7 +338,7 @@ class StateSpace:
                 if xxhash.xxh3_128_hexdigest(block) != expected:
                     raise StateSpaceCorrupted(
                         f"{self.folder / name}: block {number} (bytes {number * CHECKSUM_BYTES} on) does not match "
-                        f"its checksum: the file was changed after it was written; {AGAIN}"
+                        f"its checksum: the file was changed after it was written; {BUILD_AGAIN}"
                     )
 
     def _map(self, name: str, dtype: str | np.dtype, shape: tuple[int, ...]) -> np.ndarray:
@@ -409,12 +409,12 @@ def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | Non
     except Exception as error:  # whatever a class does with parameters that are none of its own
         raise StateSpaceMismatch(
             f"{folder}: its parameters are not those of this pharos' {manifest['environment']}: "
-            f"{' '.join(str(error).split())[:LONGEST]}; build again"
+            f"{' '.join(str(error).split())[:MOST_QUOTED]}; build again"
         ) from error
     for key in ("rules_version", "parameters", "actions", "outcomes", "layout", "start"):
         if identity.get(key) != manifest.get(key):
             raise StateSpaceMismatch(
-                f"{folder}: {key} of {env.name} is {str(manifest.get(key))[:LONGEST]} in the folder and "
+                f"{folder}: {key} of {env.name} is {str(manifest.get(key))[:MOST_QUOTED]} in the folder and "
                 f"{identity.get(key)} in this pharos; build again"
             )
     return env

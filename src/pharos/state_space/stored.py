@@ -23,7 +23,7 @@ from pharos.environments import Environment
 from pharos.errors import ParameterError, StateSpaceCorrupted, StateSpaceError, StateSpaceMismatch
 from pharos.rules import Layout, unpack_states
 from pharos.state_space.manifest import (
-    AGAIN,
+    BUILD_AGAIN,
     CODES,
     OFFSETS,
     PALETTE,
@@ -209,11 +209,11 @@ def check_successors(path: Path, successors: Indices, terminal_bits: np.ndarray,
         leaving = (block[ended] != start + ended[:, None]).any(axis=1)
         if leaving.any():
             raise StateSpaceCorrupted(
-                f"{path}: terminal state {start + int(ended[leaving.argmax()])} leads to another state; {AGAIN}"
+                f"{path}: terminal state {start + int(ended[leaving.argmax()])} leads to another state; {BUILD_AGAIN}"
             )
     if terminal != num_terminal:
         raise StateSpaceCorrupted(
-            f"{path.with_name(TERMINAL)}: marks {terminal} terminal states; expected {num_terminal}; {AGAIN}"
+            f"{path.with_name(TERMINAL)}: marks {terminal} terminal states; expected {num_terminal}; {BUILD_AGAIN}"
         )
 
 
@@ -223,7 +223,7 @@ def _check_range(path: Path, block: np.ndarray, num_states: int, numbers: Sequen
         row, action = map(int, np.argwhere((block < 0) | (block >= num_states))[0])
         raise StateSpaceCorrupted(
             f"{path}: action {action} leads from state {numbers[row]} to state {block[row, action]}; "
-            f"expected 0 to {num_states - 1}; {AGAIN}"
+            f"expected 0 to {num_states - 1}; {BUILD_AGAIN}"
         )
 
 
@@ -241,7 +241,7 @@ def check_states(path: Path, layout: Layout, states: np.ndarray) -> None:
             if int(field.max()) >= int(layout.size[i]):
                 raise StateSpaceCorrupted(
                     f"{path}: component {i} of state {start + int(field.argmax())} is {int(field.max())}; "
-                    f"expected less than {int(layout.size[i])}; {AGAIN}"
+                    f"expected less than {int(layout.size[i])}; {BUILD_AGAIN}"
                 )
 
 
@@ -303,7 +303,7 @@ def check_outcomes(folder: Path, manifest: dict[str, Any], stored: OutcomeRows, 
 
 def _corrupted(folder: Path, manifest: dict[str, Any], error: WrongOutcomes) -> StateSpaceCorrupted:
     names = {"successors": successors_name(manifest["arrays"]), "terminal": TERMINAL}
-    return StateSpaceCorrupted(f"{folder / names.get(error.name, f'{error.name}.bin')}: {error}; {AGAIN}")
+    return StateSpaceCorrupted(f"{folder / names.get(error.name, f'{error.name}.bin')}: {error}; {BUILD_AGAIN}")
 
 
 def outcomes_to_check(

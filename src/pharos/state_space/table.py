@@ -238,7 +238,7 @@ def rows_of_chunk(memory: int, num_words: int, branches: int, has_chance: bool =
 
 
 DISK_LOAD = 0.7  # the table on disk grows beyond this share of used slots
-LEAST = 1 << 16  # slots of the smallest table
+LEAST_SLOTS = 1 << 16  # slots of the smallest table
 _AROUND = 1 << 19  # bytes that the system may bring along with a page (large folios)
 
 
@@ -254,7 +254,7 @@ class DiskTable:
         at a time.
         """
         self.folder, self.num_words, self.window = folder, num_words, window
-        slots = LEAST
+        slots = LEAST_SLOTS
         while slots * DISK_LOAD < states:
             slots *= 2
         self._open(slots)

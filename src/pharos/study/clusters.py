@@ -18,7 +18,7 @@ from pharos.study.specification import Source, specification
 from pharos.system.records import takes
 from pharos.system.wording import in_one_line
 from pharos.system.workers import Workers
-from pharos.training import ATTEMPTS, ExecutionOptions
+from pharos.training import GROUP_ATTEMPTS, ExecutionOptions
 
 
 @takes(ExecutionOptions, workers=1)
@@ -138,7 +138,7 @@ class RayTasks(Workers):
     def start(
         self, key: str, function: Callable[..., object], arguments: Sequence[Any], definitions: Sequence[object] = ()
     ) -> None:
-        remote = self.ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_attempt)
+        remote = self.ray.remote(num_cpus=1, max_retries=GROUP_ATTEMPTS - 1)(_attempt)
         self.tasks[remote.remote(*arguments)] = key
 
     def events(self, seconds: float | None = None) -> Iterator[tuple[str, Any]]:

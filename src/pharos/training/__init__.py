@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     )
     from pharos.training.curve import GAIN_TOLERANCE, Curve, Evaluation, RegretCurve, evaluate_agent
     from pharos.training.execution import (
-        ATTEMPTS,
+        GROUP_ATTEMPTS,
         Execution,
         TrainingProgress,
         Work,
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     )
     from pharos.training.runs import train, train_config, train_many
     from pharos.training.schedule import Shapes, dealt, halves, lanes, plan
-    from pharos.training.task import CELL, RunConfig, Task, TaskValues, run_id
+    from pharos.training.task import CELL, HELD_OUT, RunConfig, Task, TaskValues, run_id
     from pharos.training.tuning import TuningResult, tune
 
 __all__ = [

@@ -42,24 +42,24 @@ from pharos.system.workers import Terminated
 from pharos.training.curve import Curve, Evaluation, evaluate_agent, policy_facts
 from pharos.training.task import Task
 
-BLOCK = 4096  # observations that a policy is asked about at once
-LARGEST = 100_000  # states that it is asked about in advance
-LONGEST = 500  # letters of an agent's error
+RECORDER_BLOCK = 4096  # observations that a policy is asked about at once
+MOST_STATES_ASKED = 100_000  # states that it is asked about in advance
+MOST_LETTERS = 500  # letters of an agent's error
 KEPT = 1 << 28  # bytes of observations that are kept between snapshots
-TOLERANCE = 1e-9  # of normalised regret: as far from uniform play a policy without a step may be, by rounding
+UNIFORM_TOLERANCE = 1e-9  # of normalised regret: as far from uniform play a policy without a step may be, by rounding
 IGNORED = 1000
 """Steps beyond the budget, or policies in a row without a step, after which an agent is ended that goes on."""
 OFTEN = 10
 """A slip that happens more often than this in a run is noted."""
-SHARE = 0.01
+MOST_UNNOTED = 0.01
 """Of steps after the end of an episode that is not noted."""
-SAME = 1e-3
+SAME_PROBABILITY = 1e-3
 """Probabilities that differ by less are the same: a network may round in another way."""
 NETWORK_POLICY = "network(torch.as_tensor(seen)).argmax(dim=1).numpy()"
 CHECKED = 3
 """First policies of a run that are asked again."""
-AGAIN, FEW = 8, 128
-"""Up to AGAIN times, as long as the answers together are FEW: a policy that samples seldom would answer the same by
+MOST_QUERIES, FEW_ANSWERS = 8, 128
+"""Up to MOST_QUERIES times, up to FEW_ANSWERS in all: a policy that samples seldom would answer the same by
 chance if there are few observations."""
 INFO = ("action_mask", "prob")
 """Entries of `info` that Gymnasium's own environments give as well; others say what an agent is to find out."""
@@ -247,7 +247,7 @@ class Snapshots:
         if isinstance(policy, SB3Model):
             policy = deep_policy(policy)
         has_no_table = isinstance(policy, np.ndarray | RecurrentPolicy)
-        if has_no_table or task.observer.frames > 1 or task.mdp.num_states > LARGEST:
+        if has_no_table or task.observer.frames > 1 or task.mdp.num_states > MOST_STATES_ASKED:
             return evaluate_agent(policy, task)
         answers = PolicyAnswers(policy, task.mdp, task.observer)
         if task.observer.observe.observation.irrelevant:
@@ -258,7 +258,7 @@ class Snapshots:
             tables.append(_answer(answers, policy, observations, count))
             if len(tables) == 1 and self._num_checked < CHECKED:
                 self._num_checked += 1
-                for _ in range(min(max(1, FEW // count), AGAIN)):
+                for _ in range(min(max(1, FEW_ANSWERS // count), MOST_QUERIES)):
                     _check_same_answers(tables[0], _answer(answers, policy, observations, count))
         return np.concatenate(tables)
 
@@ -268,8 +268,8 @@ class Snapshots:
             yield from self._kept
             return
         blocks, size = [], 0
-        for first in range(0, self.task.mdp.num_states, BLOCK):
-            states = np.arange(first, min(first + BLOCK, self.task.mdp.num_states))
+        for first in range(0, self.task.mdp.num_states, RECORDER_BLOCK):
+            states = np.arange(first, min(first + RECORDER_BLOCK, self.task.mdp.num_states))
             context = self.task.observer.space.states(states), np.full(len(states), -1), np.zeros(len(states), np.int64)
             block = len(states), self.task.observer.observe(*context)
             size += getattr(block[1], "nbytes", KEPT)
@@ -298,7 +298,7 @@ def _answer(answers: PolicyAnswers, policy: PolicyLike, observations: Any, count
 
 def _check_same_answers(table: np.ndarray, again: np.ndarray) -> None:
     """Raise ParameterError for a policy whose second answer is another one than the first."""
-    differ = np.abs(table - again).max(axis=1) > SAME
+    differ = np.abs(table - again).max(axis=1) > SAME_PROBABILITY
     if differ.any():
         raise ParameterError(
             f"the policy was asked twice, and answered otherwise for {differ.sum():,} of {len(table):,} observations; "
@@ -392,7 +392,7 @@ class PolicyRecorder:
     def check_steps(self, curve: Curve) -> None:
         """Raise ParameterError if a curve ends elsewhere than it begins, and no step was counted."""
         first, last = (curve.rows[index]["normalized_regret"] for index in (0, -1))
-        if not self.budget.steps and abs(last - first) > TOLERANCE:
+        if not self.budget.steps and abs(last - first) > UNIFORM_TOLERANCE:
             raise not_stepped(self.budget.limit)
 
     def notes(self) -> dict[str, str]:
@@ -410,7 +410,7 @@ class PolicyRecorder:
                 f"its first policy came after {self._first_step:,} of {budget.limit:,} steps: {random} of {points} "
                 f"evaluations are random play; expected one about every {budget.interval:,} steps"
             )
-        if budget.after_end > SHARE * budget.steps:
+        if budget.after_end > MOST_UNNOTED * budget.steps:
             notes["steps after an end"] = (
                 f"{budget.after_end / budget.steps:.0%} of {budget.steps:,} steps came after the end of an episode; "
                 f"expected reset() after a step that is terminated or truncated"
@@ -473,7 +473,7 @@ def errors_in_one_line(agent: str, file: str | None) -> Iterator[None]:
     except BaseException as error:
         if not (line := line_in(error, file)):
             raise
-        text = capped(in_one_line(error).rstrip(": "), LONGEST)
+        text = capped(in_one_line(error).rstrip(": "), MOST_LETTERS)
         raise PharosError(f"agent {agent} raised {text}{line}") from error
 
 

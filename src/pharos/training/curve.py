@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from pharos.training.prepared import PreparedRun
 
 
-BLOCK = 4096  # observations that policies are asked about at once
+CURVE_BLOCK = 4096  # observations that policies are asked about at once
 CERTAIN, TIE = 0.999, 1e-9  # probability of a certain choice; difference of equal ones
 
 
@@ -81,7 +81,7 @@ def evaluate_agent(
     limits: dict[str, Any] = {"deterministic": deterministic, "masks": masks, "max_states": max_states}
     value = policy_value(
         agent,
-        task.mdp,
+        task.measured,
         lambda: task.observer,
         lambda: task.return_range,
         episodes=episodes,
@@ -107,7 +107,7 @@ def joint_values(batch: Learner, runs: "Sequence[PreparedRun]") -> dict[int, Eva
     tasks = defaultdict(list)
     for i in joint:
         run = runs[i]
-        if i not in values and is_small_table(run.task.mdp) and _frames(run) == 1:
+        if i not in values and is_small_table(run.task.measured) and _frames(run) == 1:
             tasks[id(run.task)].append(i)
     for indices in tasks.values():
         if len(indices) > 1:
@@ -144,12 +144,12 @@ def _values_of_tables(batch: Learner, task: Task, indices: Sequence[int]) -> dic
     """Values by index, each policy queried once in every state. One that gives no probabilities is left out."""
     actions = batch.greedy_actions(indices)
     if actions is not None:
-        return dict(zip(actions, table_values(task.mdp, list(actions.values())), strict=True))
-    mdp, observer = task.mdp, task.observer
+        return dict(zip(actions, table_values(task.measured, list(actions.values())), strict=True))
+    mdp, observer = task.measured, task.observer
     answers = {i: PolicyAnswers(batch.policy(i), mdp, observer) for i in indices}
     tables: dict[int, list[np.ndarray]] = {i: [] for i in indices}
-    for first in range(0, mdp.num_states, BLOCK):
-        states = np.arange(first, min(first + BLOCK, mdp.num_states))
+    for first in range(0, mdp.num_states, CURVE_BLOCK):
+        states = np.arange(first, min(first + CURVE_BLOCK, mdp.num_states))
         context = observer.space.states(states), np.full(len(states), -1), np.zeros(len(states), np.int64)
         observations = observer.observe(*context)
         for i in list(tables):

@@ -27,10 +27,10 @@ from pharos.training.results import TrainingResult
 from pharos.training.schedule import halves, plan
 from pharos.training.task import RunConfig, TaskValues
 
-ATTEMPTS = 3
+GROUP_ATTEMPTS = 3
 """How often a group is begun whose process is killed, before it is halved, or fails."""
 BUSY_SECONDS = 0.5
-WAITING_SECONDS = 1.0
+PROCESS_WAITING_SECONDS = 1.0
 # How often in a row the process that forks workers is begun again
 LOST_SERVERS = 10
 
@@ -56,7 +56,7 @@ class Execution(Generic[R]):
         workers: most processes at a time.
         checkpoints: folder for checkpoints of programs of several runs; None: none are written.
         timeout: seconds for each run, after which it has failed.
-        attempts: ATTEMPTS; 1 for a pool that begins again itself.
+        attempts: GROUP_ATTEMPTS; 1 for a pool that begins again itself.
     Attributes:
         waiting: (the earliest time to begin, runs). running: key of the process -> (runs, when it began).
         lost_servers: how often in a row the process that forks workers was gone.
@@ -76,7 +76,7 @@ class Execution(Generic[R]):
         workers: float,
         checkpoints: Path | None,
         timeout: float | None = None,
-        attempts: int = ATTEMPTS,
+        attempts: int = GROUP_ATTEMPTS,
     ):
         self.waiting = deque((0.0, list(group)) for group in groups)
         self.running: dict[str, tuple[list[R], float]] = {}
@@ -195,7 +195,7 @@ class Execution(Generic[R]):
             time.sleep(BUSY_SECONDS)
             return
         has_room = self.waiting and len(self.running) < self.num_workers
-        for key, event in self.pool.events(BUSY_SECONDS if has_room else WAITING_SECONDS):
+        for key, event in self.pool.events(BUSY_SECONDS if has_room else PROCESS_WAITING_SECONDS):
             if isinstance(event, tuple):
                 self.receive(key, event)
             else:

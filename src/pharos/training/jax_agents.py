@@ -25,7 +25,7 @@ from pharos.policies import PolicyAnswers
 from pharos.training.curve import Curve, evaluate_agent
 from pharos.training.task import Task
 
-BLOCK = 4096  # observations that are made at once
+TABLE_BLOCK = 4096  # observations that are made at once
 
 LearnCompiled = Callable[..., tuple[Callable[..., Any], Any]]
 """learn(env, params, steps, key) -> (apply, snapshots)."""
@@ -59,7 +59,7 @@ def compiled_curves(
         raise ParameterError(f"agents in JAX learn from tables, which have no {', '.join(lacking)}; leave it out")
     # The task as an environment of gymnax, with the observations of all states
     count = task.mdp.num_states
-    blocks = [np.arange(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
+    blocks = [np.arange(first, min(first + TABLE_BLOCK, count)) for first in range(0, count, TABLE_BLOCK)]
     observations = np.concatenate([context.observation(task.space.states(block)) for block in blocks])
     env = to_gymnax(
         task.mdp, observations, time_limit=task.env.max_episode_steps, reward_noise=task.chance.reward_noise

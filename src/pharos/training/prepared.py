@@ -14,12 +14,12 @@ from pharos.mdp import TabularMDP
 from pharos.state_space import StateSpace
 from pharos.system.wording import in_one_line
 from pharos.training.curve import Curve
-from pharos.training.results import FORMAT, versions, write_record
+from pharos.training.results import RECORD_FORMAT, versions, write_record
 from pharos.training.task import RunConfig, Task, TaskValues
 
 T = TypeVar("T")
 # Entries of a configuration that decide about the task
-TASK = (
+TASK_ENTRIES = (
     *("environment", "parameters", "chance", "observation", "observation_options", "gamma", "horizon", "objective"),
     "sources",
 )
@@ -61,11 +61,11 @@ class TaskCache:
 
     def task(self, config: RunConfig) -> Task:
         """The task of a run, the same object for all runs on it; tasks share spaces and rewards."""
-        return self.shared("task", config, TASK, lambda: self._task(config))
+        return self.shared("task", config, TASK_ENTRIES, lambda: self._task(config))
 
     def adopt(self, config: RunConfig, task: Task) -> None:
         """Keep a task that exists already as the task of a run."""
-        self.shared("task", config, TASK, lambda: task)
+        self.shared("task", config, TASK_ENTRIES, lambda: task)
 
     def _task(self, config: RunConfig) -> Task:
         values = self.values(config) if self.values is not None else None
@@ -157,7 +157,7 @@ class PreparedRun:
         if self.folder is None:
             return
         config = self.config
-        record = {"format": FORMAT, "id": config.id, "config": config.to_dict(), "versions": versions()}
+        record = {"format": RECORD_FORMAT, "id": config.id, "config": config.to_dict(), "versions": versions()}
         if (rules := class_called(config.environment)) is not None:
             record["rules_version"] = rules.version
         record |= {"status": status, "hyperparameters": self.hyperparameters, **entries}

@@ -33,15 +33,15 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-FORMAT = 1
+RECORD_FORMAT = 1
 RECORD, CURVE, EARLIER_CURVE = "run.json", "curve.csv", "curve.parquet"
-AGAIN = "delete the folder and execute the run again"
+RUN_AGAIN = "delete the folder and execute the run again"
 ANEW = "delete the folder to start anew"
-CHECKPOINT_SECONDS = 10.0
+RUN_CHECKPOINT_SECONDS = 10.0
 # Writing checkpoints takes at most this share of the time
 SHARE_OF_TIME = 0.05
 _ID = re.compile(r"[0-9a-f]{16}")
-COLUMNS = {
+CURVE_COLUMNS = {
     "step": "int64",
     "episodes": "int64",
     "value": "float64",
@@ -57,7 +57,7 @@ COLUMNS = {
 """Columns of curve.csv, a row for each evaluation. docs/agents.md defines them."""
 AVERAGE_COLUMNS = dict.fromkeys(("gain_lower", "gain_upper", "average_regret_lower", "average_regret_upper"), "float64")
 """Further columns of runs that measure the average reward a step in the long run."""
-ALL_COLUMNS = COLUMNS | AVERAGE_COLUMNS
+ALL_COLUMNS = CURVE_COLUMNS | AVERAGE_COLUMNS
 _TYPES: dict[str, Callable[[Any], Any]] = {"int64": int, "float64": float, "bool": bool}
 _TRUTHS = {"True": True, "False": False}
 
@@ -98,7 +98,9 @@ def write_curve(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """
     lines = io.StringIO(newline="")
     writer = csv.writer(lines, lineterminator="\n")
-    columns = {name: dtype for name, dtype in ALL_COLUMNS.items() if name in COLUMNS or (rows and name in rows[0])}
+    columns = {
+        name: dtype for name, dtype in ALL_COLUMNS.items() if name in CURVE_COLUMNS or (rows and name in rows[0])
+    }
     writer.writerow(columns)
     writer.writerows([repr(_TYPES[dtype](row[name])) for name, dtype in columns.items()] for row in rows)
     storage.replace_file(folder / CURVE, lines.getvalue())
@@ -121,13 +123,17 @@ def read_record(folder: str | os.PathLike) -> dict[str, Any]:
     """
     path = Path(folder) / RECORD
     try:
-        record = storage.read_json(path, ResultCorrupted, AGAIN)
+        record = storage.read_json(path, ResultCorrupted, RUN_AGAIN)
     except FileNotFoundError:
         raise FileFormatError(f"{path}: no such file; expected the folder of a run") from None
-    if not isinstance(record, dict) or record.get("format") != FORMAT or not isinstance(record.get("config"), dict):
-        raise FileFormatError(f"{path}: is not the record of a run in format {FORMAT}")
+    if (
+        not isinstance(record, dict)
+        or record.get("format") != RECORD_FORMAT
+        or not isinstance(record.get("config"), dict)
+    ):
+        raise FileFormatError(f"{path}: is not the record of a run in format {RECORD_FORMAT}")
     if not storage.is_intact(record):
-        raise ResultCorrupted(f"{path}: was changed after it was written; {AGAIN}")
+        raise ResultCorrupted(f"{path}: was changed after it was written; {RUN_AGAIN}")
     id, name = run_id(record["config"]), path.absolute().parent.name
     if (
         storage.DIGEST in record and "id" in record
@@ -135,14 +141,14 @@ def read_record(folder: str | os.PathLike) -> dict[str, Any]:
         id = record["id"]
     elif record.get("id", id) != id:
         raise ResultCorrupted(
-            f"{path}: says that it is run {record['id']}, but its configuration is that of run {id}; {AGAIN}"
+            f"{path}: says that it is run {record['id']}, but its configuration is that of run {id}; {RUN_AGAIN}"
         )
     if _ID.fullmatch(name) and name != id:
         raise ResultCorrupted(f"{path}: holds run {id}, in the folder of run {name}; move it back, or delete it")
     return record
 
 
-def read_curve(folder: str | os.PathLike, *, columns: Iterable[str] = tuple(COLUMNS)) -> "pd.DataFrame":
+def read_curve(folder: str | os.PathLike, *, columns: Iterable[str] = tuple(CURVE_COLUMNS)) -> "pd.DataFrame":
     """Return the evaluations of a run, a row each; see `read_curve_table`."""
     curve = _read_curve(Path(folder), columns)
     if isinstance(curve, dict):
@@ -152,7 +158,7 @@ def read_curve(folder: str | os.PathLike, *, columns: Iterable[str] = tuple(COLU
     return curve.to_pandas()
 
 
-def read_curve_table(folder: str | os.PathLike, columns: Iterable[str] = tuple(COLUMNS)) -> "pa.Table":
+def read_curve_table(folder: str | os.PathLike, columns: Iterable[str] = tuple(CURVE_COLUMNS)) -> "pa.Table":
     """Return the evaluations of a run, a row each, as an Arrow table.
 
     Args:
@@ -169,7 +175,7 @@ def read_curve_table(folder: str | os.PathLike, columns: Iterable[str] = tuple(C
     return curve
 
 
-def read_rows(folder: str | os.PathLike, columns: Iterable[str] = tuple(COLUMNS)) -> list[dict[str, Any]]:
+def read_rows(folder: str | os.PathLike, columns: Iterable[str] = tuple(CURVE_COLUMNS)) -> list[dict[str, Any]]:
     """Return the evaluations of a run, a dictionary each, as `read_curve_table`; curve.csv needs no pyarrow."""
     curve = _read_curve(Path(folder), columns)
     if isinstance(curve, dict):
@@ -218,14 +224,14 @@ def _read_text(path: Path) -> dict[str, np.ndarray]:
         raise FileFormatError(f"{path}: no such file; expected the folder of a finished run") from None
     except (OSError, ValueError, KeyError, csv.Error) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ResultCorrupted(f"{path}: cannot be read, it was cut short or changed: {reason}; {AGAIN}") from None
+        raise ResultCorrupted(f"{path}: cannot be read, it was cut short or changed: {reason}; {RUN_AGAIN}") from None
 
 
 def _check_digest(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     if (path.parent / RECORD).exists():
         expected = _expected_checksums(path.parent).get(path.name)
         if expected is not None and _digest_of_columns(columns) != expected:
-            raise ResultCorrupted(f"{path}: does not match its checksum in {RECORD}; {AGAIN}")
+            raise ResultCorrupted(f"{path}: does not match its checksum in {RECORD}; {RUN_AGAIN}")
 
 
 def check_agent_files(folder: Path) -> None:
@@ -240,9 +246,9 @@ def check_agent_files(folder: Path) -> None:
         try:
             digest = storage.digest_of_file(folder / name)
         except OSError as error:
-            raise ResultCorrupted(f"{folder / name}: cannot be read: {error.strerror}; {AGAIN}") from None
+            raise ResultCorrupted(f"{folder / name}: cannot be read: {error.strerror}; {RUN_AGAIN}") from None
         if digest != expected:
-            raise ResultCorrupted(f"{folder / name}: was changed after it was written; {AGAIN}")
+            raise ResultCorrupted(f"{folder / name}: was changed after it was written; {RUN_AGAIN}")
 
 
 def write_table(path: Path, table: "pa.Table", *, follow: bool = False) -> None:
@@ -253,7 +259,7 @@ def write_table(path: Path, table: "pa.Table", *, follow: bool = False) -> None:
         pq.write_table(table, file, compression="zstd", write_page_checksum=True)
 
 
-def read_table(path: Path, advice: str = AGAIN) -> "pa.Table":
+def read_table(path: Path, advice: str = RUN_AGAIN) -> "pa.Table":
     """Read a Parquet file, and compare its pages with their checksums.
 
     Raises:
@@ -325,7 +331,7 @@ def _checksums(folder: Path) -> dict[str, str]:
 def _expected_checksums(folder: Path) -> dict[str, str]:
     checksums = read_record(folder).get("checksums", {})
     if not isinstance(checksums, dict):
-        raise ResultCorrupted(f"{folder / RECORD}: its checksums are none; {AGAIN}")
+        raise ResultCorrupted(f"{folder / RECORD}: its checksums are none; {RUN_AGAIN}")
     return checksums
 
 
@@ -444,7 +450,7 @@ class Checkpoint:
         sync(self.folder.parent)
         shutil.rmtree(old, ignore_errors=True)
         now = time.monotonic()
-        self._next = now + max(CHECKPOINT_SECONDS, (now - began) / SHARE_OF_TIME if CHECKPOINT_SECONDS else 0.0)
+        self._next = now + max(RUN_CHECKPOINT_SECONDS, (now - began) / SHARE_OF_TIME if RUN_CHECKPOINT_SECONDS else 0.0)
 
     def restore(self, learner: Learner) -> tuple[list[Any], float] | None:
         """(rows of the curve, seconds spent) of the last checkpoint, from which the learner goes on; or None.

@@ -33,7 +33,10 @@ from pharos.system.records import flat, parse_record
 from pharos.system.sources import Source, is_reference, resolve, untrusted_code
 from pharos.training.options import ENGINES, OBJECTIVES, Horizon, TrainingOptions
 
-TAIL = 1e-9  # part of a discounted return that is not looked at
+RETURN_TAIL = 1e-9  # part of a discounted return that is not looked at
+HELD_OUT = 2.0**-1000
+"""Probability of start states in which no episode begins, as no random number is so small: they are held out. If a task
+has some, values and regret are those of episodes that begin there, each state as likely."""
 
 
 @dataclass(frozen=True)
@@ -175,6 +178,15 @@ class Task:
         return self.chance.of(self._mdp_without_chance)
 
     @cached_property
+    def measured(self) -> TabularMDP:
+        """The tabular MDP with the start states that values are of: those that are held out, where there are any."""
+        is_held_out = self.mdp.start_probabilities <= HELD_OUT
+        if not is_held_out.any():
+            return self.mdp
+        starts = self.mdp.start_states[is_held_out]
+        return replace(self.mdp, start_states=starts, start_probabilities=np.full(len(starts), 1.0 / len(starts)))
+
+    @cached_property
     def _reaches(self) -> dict[tuple[int, int], ReachableRows]:
         return {}
 
@@ -182,7 +194,7 @@ class Task:
         """Rows that policies of positive probability reach, remembered; see `pharos.policies.reachable_rows`."""
         key = max_rows, steps
         if key not in self._reaches:
-            self._reaches[key] = reachable_rows(self.mdp, *key, sees_previous_action=self.previous_action)
+            self._reaches[key] = reachable_rows(self.measured, *key, sees_previous_action=self.previous_action)
         return self._reaches[key]
 
     @property
@@ -192,17 +204,17 @@ class Task:
     @cached_property
     def optimal(self) -> Solution:
         """Optimal values."""
-        return value_iteration(self.mdp)
+        return value_iteration(self.measured)
 
     @cached_property
     def uniform(self) -> Solution:
         """Values of the uniformly random policy."""
-        return uniform_value(self.mdp)
+        return uniform_value(self.measured)
 
     @cached_property
     def worst(self) -> Solution:
         """Values of the worst policy."""
-        return worst_value(self.mdp)
+        return worst_value(self.measured)
 
     @property
     def reference(self) -> ReferenceValues:
@@ -211,7 +223,7 @@ class Task:
 
     @cached_property
     def _solved_reference(self) -> ReferenceValues:
-        mdp = self._episodes(self.mdp)
+        mdp = self._episodes(self.measured)
         best = value_iteration(mdp)
         values, error = [float(best.value_at_start)], best.error_bound
         for solve in (uniform_value, worst_value):
@@ -275,7 +287,7 @@ def _range_of_returns(mdp: TabularMDP) -> tuple[float, float]:
     largest = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
     steps, rest = mdp.horizon, 0.0
     if steps is None:  # what is left out of a discounted return is less than rest
-        steps = max(1, math.ceil(math.log(TAIL) / math.log(mdp.gamma))) if mdp.gamma > 0 else 1
+        steps = max(1, math.ceil(math.log(RETURN_TAIL) / math.log(mdp.gamma))) if mdp.gamma > 0 else 1
         rest = largest * mdp.gamma**steps / (1 - mdp.gamma)
     rest += 1e-12 * largest * steps  # rounding
     ends, rewards, terminal = [], mdp.rewards, np.asarray(mdp.terminal)
@@ -296,7 +308,7 @@ def _range_of_returns(mdp: TabularMDP) -> tuple[float, float]:
 
 CELL = ["environment", "instance", "chance", "agent", "observation"]  # columns that tell the cells of a study
 # In the order of run.json
-KEYS = (
+CONFIG_KEYS = (
     *("environment", "parameters", "chance", "observation", "observation_options", "agent", "hyperparameters", "steps"),
     *("seed", "gamma", "horizon", "objective", "evaluation_interval", "engine", "sources"),
 )
@@ -408,7 +420,7 @@ class RunConfig(TrainingOptions):
             del entry["sources"]
         if self.objective is None:
             del entry["objective"]
-        ordered = {name: entry[name] for name in KEYS if name in entry}
+        ordered = {name: entry[name] for name in CONFIG_KEYS if name in entry}
         return {name: dict(value) if isinstance(value, Mapping) else value for name, value in ordered.items()}
 
     @property

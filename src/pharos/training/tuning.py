@@ -43,10 +43,10 @@ from pharos.training.task import RunConfig, Task, run_id
 if TYPE_CHECKING:
     import optuna
 
-EVALUATIONS = 20  # of a run
+RUN_EVALUATIONS = 20  # of a run
 JOURNAL = "journal.log"
 _STATUS = {"COMPLETE": "finished", "PRUNED": "given up"}
-_AGAIN = "delete the folder and search again"
+_SEARCH_AGAIN = "delete the folder and search again"
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ class _Search:
     def score(self, trial: "optuna.Trial", pruned: type[Exception]) -> float:
         """The mean normalised regret of evaluations after the first, over all runs; `pruned` is raised on the way."""
         hyperparameters = {**self.table, **self.proposal(trial)}
-        interval = max(1, self.steps // EVALUATIONS)
+        interval = max(1, self.steps // RUN_EVALUATIONS)
         configs: list[RunConfig] = []
         regrets: list[float] = []
         # A run for each task and seed
@@ -401,9 +401,9 @@ def _earlier_trials(optuna: ModuleType, search: _Search, folder: Path) -> list[d
     """
     file, journal = folder / "tuning.json", folder / JOURNAL
     try:
-        stored = storage.read_json(file, advice=_AGAIN)
+        stored = storage.read_json(file, advice=_SEARCH_AGAIN)
         if not storage.is_intact(stored):
-            raise FileFormatError(f"{file}: was changed after it was written; {_AGAIN}")
+            raise FileFormatError(f"{file}: was changed after it was written; {_SEARCH_AGAIN}")
         before, now = stored["config"], search.config
         different = [key for key in {**now, **before} if before.get(key) != now.get(key)]
         trials = [trial for trial in stored["trials"] if trial["status"] in _STATUS.values()]
@@ -424,7 +424,7 @@ def _earlier_trials(optuna: ModuleType, search: _Search, folder: Path) -> list[d
         return [_record(trial) for trial in old.trials if trial.state.name in _STATUS]
     except Exception as error:  # Optuna trusts what it reads
         message = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise FileFormatError(f"{journal}: is not as Optuna wrote it ({message}); {_AGAIN}") from error
+        raise FileFormatError(f"{journal}: is not as Optuna wrote it ({message}); {_SEARCH_AGAIN}") from error
 
 
 def _write(folder: Path, search: _Search, trials: Sequence[dict[str, Any]]) -> None:

@@ -47,7 +47,7 @@ class Replay:
             np.zeros(shape, np.int32),
             np.zeros(shape, np.uint8),
             np.zeros(shape, np.float32),
-            np.full(shape, kernels.DONE, np.uint8),  # so that nothing comes before what is written first
+            np.full(shape, kernels.ENDED, np.uint8),  # so that nothing comes before what is written first
         )
         kinds, depth = [torch.int64] * 3 + [torch.float32] * 2, (frames,) if frames > 1 else ()
         shapes = [(width, batch_size, *depth)] * 2 + [(width, batch_size)] * 3

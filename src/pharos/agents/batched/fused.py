@@ -6,7 +6,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-BLOCK = 1024  # parameters of a program
+PROGRAM_PARAMETERS = 1024  # parameters of a program
 
 
 @triton.jit
@@ -34,4 +34,4 @@ def step_of_adam(parameters, gradients, means, squares, plans, length, size: tl.
 def adam_on_gpu(state: Sequence[Tensor], plans: Tensor) -> None:
     """A step for each run whose step is not 0; state: (parameters, gradients, means, squares) (W, P), plans (W, 5)."""
     width, length = state[0].shape
-    step_of_adam[(width, triton.cdiv(length, BLOCK))](*state, plans, length, BLOCK)
+    step_of_adam[(width, triton.cdiv(length, PROGRAM_PARAMETERS))](*state, plans, length, PROGRAM_PARAMETERS)

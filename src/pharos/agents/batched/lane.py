@@ -15,7 +15,7 @@ import torch
 
 from pharos.agents.batched.arithmetic import CompiledArithmetic, CudaGraph, PinnedBuffer, TensorArithmetic, is_gpu, wait
 from pharos.agents.batched.networks import (
-    MASK,
+    PIXEL_MASK,
     BatchedNetwork,
     Values,
     aligned_zeros,
@@ -24,10 +24,17 @@ from pharos.agents.batched.networks import (
     pad,
     parameter_names,
 )
-from pharos.agents.batched.runs import BLOCK, BatchRun, ObservationSource, as_networks_see, is_small, resolved
+from pharos.agents.batched.runs import (
+    OBSERVED_AT_ONCE,
+    BatchRun,
+    ObservationSource,
+    as_networks_see,
+    is_small,
+    resolved,
+)
 from pharos.kernels import batched as kernels
 
-LARGEST_TABLE = 1 << 28  # bytes of observations as networks take them, on the processor
+OBSERVED_BYTES = 1 << 28  # bytes of observations as networks take them, on the processor
 SHARE_OF_DEVICE = 0.5  # of a GPU's free memory that a table may take
 
 
@@ -55,8 +62,8 @@ class NetworkView:
     def in_blocks(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yield (first state, single frames) of all states in blocks."""
         look = self.source.at if self.frames == 1 else self.source.frame
-        for first in range(0, self.source.num_states, BLOCK):
-            yield first, look(np.arange(first, min(first + BLOCK, self.source.num_states)))
+        for first in range(0, self.source.num_states, OBSERVED_AT_ONCE):
+            yield first, look(np.arange(first, min(first + OBSERVED_AT_ONCE, self.source.num_states)))
 
 
 class ObservationTable:
@@ -92,7 +99,7 @@ class ObservationTable:
         kind = torch.uint8 if self.is_image else torch.float32
         self._table: torch.Tensor | None = None
         length = self.size // self.frames
-        if self._ends[-1] * length * kind.itemsize > LARGEST_TABLE:
+        if self._ends[-1] * length * kind.itemsize > OBSERVED_BYTES:
             return
         self._table = torch.empty((int(self._ends[-1]), length), dtype=kind)
         for view, begin in zip(self.views, self._ends, strict=False):
@@ -322,7 +329,7 @@ class Lane(Generic[Net]):
     def views(self, rows: torch.Tensor) -> Values:
         """name -> (W, ...) view of parameters (W, P), with the mask of observations if there is one."""
         views = self.network.parameters.views(rows)
-        return views if self.seen.mask is None else {**views, MASK: self.seen.mask}
+        return views if self.seen.mask is None else {**views, PIXEL_MASK: self.seen.mask}
 
     def observed(self, states: PinnedBuffer) -> torch.Tensor:
         """(W, B, size) float32 observations of states (W, B, *depth), in a buffer reused for this B."""
@@ -559,7 +566,7 @@ class BatchedEpisodes:
             )  # fmt: skip
         if self.depth:
             self.next_history[..., :-1], self.next_history[..., -1] = self.history[..., 1:], self.next_state
-            ended = (self.flags & kernels.DONE) > 0
+            ended = (self.flags & kernels.ENDED) > 0
             self.history[:] = np.where(ended[..., None], self.state[..., None], self.next_history)
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -19,10 +19,10 @@ from pharos.agents.batched.runs import is_small
 from pharos.kernels import patches
 from pharos.kernels.batched import linear_row
 
-ALIGNED = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
+ALIGNED_FLOATS = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
 RELU, TANH, NONE = "relu", "tanh", "none"
-ROWS = "all parameters"
-MASK = "which pixels there are"
+ALL_PARAMETERS = "all parameters"
+PIXEL_MASK = "which pixels there are"
 KERNEL, FILTERS = 3, patches.FILTERS  # of the small convolution
 FEATURES = 128
 
@@ -79,21 +79,21 @@ class Parameters:
     ) -> None:
         """Append a parameter."""
         self.shapes.append(Shape(name, shape, self.length, fan_in, stored, own))
-        self.length += -(-self.shapes[-1].size // ALIGNED) * ALIGNED
+        self.length += -(-self.shapes[-1].size // ALIGNED_FLOATS) * ALIGNED_FLOATS
 
     def views(self, rows: Tensor) -> Values:
-        """name -> (W, ...) view of (W, P); all of it under the name ROWS."""
+        """name -> (W, ...) view of (W, P); all of it under the name ALL_PARAMETERS."""
         views = {
             each.name: rows[:, each.offset : each.offset + each.size].view(len(rows), *each.shape)
             for each in self.shapes
         }
-        return {**views, ROWS: rows}
+        return {**views, ALL_PARAMETERS: rows}
 
 
 def aligned_zeros(width: int, *shape: int, device: str | torch.device | None = None) -> Tensor:
     """(W, ...) float32 zeros; each run begins at a multiple of 64 bytes, so that its position changes no result."""
     size = math.prod(shape)
-    rows = torch.zeros((width, -(-size // ALIGNED) * ALIGNED), device=device)
+    rows = torch.zeros((width, -(-size // ALIGNED_FLOATS) * ALIGNED_FLOATS), device=device)
     return rows[:, :size].view(width, *shape)
 
 
@@ -172,7 +172,7 @@ class LinearLayer(NetworkLayer):
         y, _ = self._buffers(x)
         if x.shape[1] == 1 and x.device.type == "cpu" and self.activation != TANH:
             # to act once is to read all weights; weights of inputs that a ReLU made 0 need not be
-            rows = values[ROWS].numpy()
+            rows = values[ALL_PARAMETERS].numpy()
             weight, bias = self._offsets
             linear_row(rows, weight, bias, x[:, 0].numpy(), self.activation == RELU, y[:, 0].numpy())
             return y
@@ -217,8 +217,8 @@ class PatchConvolutionLayer(NetworkLayer):
         weights = values[f"{self.name}.weight"] * (1 / 255)
         torch.baddbmm(values[f"{self.name}.bias"], self._rows(x), weights, out=self._rows(y))
         self._activate(y)
-        if MASK in values:
-            y.view(*y.shape[:2], self.pixels, self.filters).mul_(values[MASK][:, None, :, None])
+        if PIXEL_MASK in values:
+            y.view(*y.shape[:2], self.pixels, self.filters).mul_(values[PIXEL_MASK][:, None, :, None])
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
@@ -338,13 +338,15 @@ class PictureLayers(NetworkLayer):
                 np.empty((width, pixels, number), np.int32),
             )
         memory, pictures = self._memories[width, number], flat_view(x).numpy()
-        patches.forward(values[ROWS].numpy(), self._offsets, self.shape, self.indices, pictures, y.numpy(), memory)
+        patches.forward(
+            values[ALL_PARAMETERS].numpy(), self._offsets, self.shape, self.indices, pictures, y.numpy(), memory
+        )
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
         """See `NetworkLayer`; there is no gradient of the input."""
         dy = self._before_activation(dy, self._buffers(x)[0])
-        rows, written = values[ROWS].numpy(), gradients[ROWS].numpy()
+        rows, written = values[ALL_PARAMETERS].numpy(), gradients[ALL_PARAMETERS].numpy()
         memory, pictures = self._memories[x.shape[0], x.shape[1]], flat_view(x).numpy()
         patches.backward(rows, written, self._offsets, self.shape, self.indices, pictures, dy.numpy(), memory)
 

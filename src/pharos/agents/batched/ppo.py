@@ -11,7 +11,7 @@ from pharos.agents.batched.networks import ActorCritics
 from pharos.agents.batched.runs import BatchRun
 from pharos.kernels import batched as kernels
 
-WEIGHTS = ("clip_range", "ent_coef", "vf_coef")
+LOSS_WEIGHTS = ("clip_range", "ent_coef", "vf_coef")
 
 
 class PPOLane(Lane[ActorCritics]):
@@ -43,8 +43,8 @@ class PPOLane(Lane[ActorCritics]):
         self._order = np.zeros((width, shape[1] * shape[2]), np.int64)
         self._valued = PinnedBuffer((width, self.copies, 1), torch.float32, device)
         self.divergence = PinnedBuffer((width,), torch.float64, device)
-        self.weights = tuple(PinnedBuffer((width,), torch.float64, device) for _ in WEIGHTS)
-        for buffer, name in zip(self.weights, WEIGHTS, strict=True):
+        self.weights = tuple(PinnedBuffer((width,), torch.float64, device) for _ in LOSS_WEIGHTS)
+        for buffer, name in zip(self.weights, LOSS_WEIGHTS, strict=True):
             buffer.array[:] = self.own[name]
             buffer.send()
         self._minibatch_updates: dict[int, MinibatchUpdate] = {}
@@ -76,7 +76,7 @@ class PPOLane(Lane[ActorCritics]):
         self.log_probabilities[:, t], self.kept_values[:, t] = self._log_p, self._valued.array[..., 0]
         self.rewards[:, t], self.begins[:, t] = worlds.reward, self.begin
         self.timeouts[:, t] = worlds.flags & kernels.TIMEOUT
-        self.begin[:] = worlds.flags & kernels.DONE
+        self.begin[:] = worlds.flags & kernels.ENDED
         self.steps += self.copies
         self.calls += 1
         self.collected = (t + 1) % self.states.shape[1]

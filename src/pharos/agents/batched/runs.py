@@ -80,7 +80,7 @@ ONLY: dict[str, Any] = {
 }
 NATURE = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in sb3.py
 MOST_REMEMBERED = 1 << 14  # states whose target values are kept
-BLOCK = 4096  # states that are observed at once
+OBSERVED_AT_ONCE = 4096  # states that are observed at once
 
 
 class ObservationSource:

@@ -23,7 +23,7 @@ import numpy as np
 
 from pharos.errors import UndefinedMeasure
 from pharos.hardness.representation.learning import (
-    MARGIN,
+    STEP_MARGIN,
     WORST_GREEDY,
     WORST_PLAYED,
     Grouped,
@@ -273,7 +273,7 @@ class PolicyLearner(IdealisedLearner):
             gain = visits * standardised(returns - v[:, None], visits)
             if largest > 0:
                 pull, up = observations.sums(gain), observations.sums(np.maximum(gain, 0.0))
-                rate = 1 / (MARGIN * largest)
+                rate = 1 / (STEP_MARGIN * largest)
                 logits = ascended(observations.masked(logits), pull, up, apply, rate, self.rollouts)
         return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))
 
@@ -330,10 +330,10 @@ def standardised(advantages: np.ndarray, visits: np.ndarray) -> np.ndarray:
 
 
 MOST_EIGENVALUES = 2000  # observations whose kernel is decomposed; of more, as many are drawn
-LEFT = 0.1  # the share of energy, or of variance, that may be left
-LONGEST = 1e14  # gradient-flow time that is looked at
+ENERGY_LEFT = 0.1  # the share of energy, or of variance, that may be left
+MOST_LEARNING_TIME = 1e14  # gradient-flow time that is looked at
 RIDGE = 1e-6  # of the trace, in regressions
-FLOOR = 1e-9  # of the largest eigenvalue: what float32 kernels tell of an eigenvalue
+LEAST_EIGENVALUE = 1e-9  # of the largest eigenvalue: what float32 kernels tell of an eigenvalue
 
 
 @dataclass(frozen=True, eq=False)
@@ -520,7 +520,7 @@ def _spectral(
     value = of(MOST_EIGENVALUES)
     count = min(MOST_EIGENVALUES, len(observations))
     error = 0.0 if count == len(observations) else abs(float(np.log(value / of(count // 2))))
-    conventions = {"left": LEFT, "gamma": (schedule or Schedule()).gamma, **representation.conventions}
+    conventions = {"left": ENERGY_LEFT, "gamma": (schedule or Schedule()).gamma, **representation.conventions}
     return Spectral(name, value, count, len(observations), error, conventions)
 
 
@@ -540,7 +540,7 @@ def _spectrum(kernel: np.ndarray, values: np.ndarray, weights: np.ndarray) -> tu
     root = np.sqrt(weights)
     eigenvalues, vectors = np.linalg.eigh(root[:, None] * kernel * root)
     energy = ((vectors.T @ (root[:, None] * values)) ** 2).sum(axis=1)
-    return np.maximum(eigenvalues, FLOOR * eigenvalues[-1]), energy
+    return np.maximum(eigenvalues, LEAST_EIGENVALUE * eigenvalues[-1]), energy
 
 
 def _learning_time(eigenvalues: np.ndarray, energy: np.ndarray) -> float:
@@ -552,13 +552,13 @@ def _learning_time(eigenvalues: np.ndarray, energy: np.ndarray) -> float:
     def left(time: float) -> float:
         return float(np.exp(-2 * eigenvalues * time) @ energy) / total
 
-    while left(high) > LEFT:
+    while left(high) > ENERGY_LEFT:
         low, high = high, 2 * high
-        if high > LONGEST:
+        if high > MOST_LEARNING_TIME:
             return float("inf")
     while high - low > 1e-9 * high:
         middle = (low + high) / 2
-        low, high = (middle, high) if left(middle) > LEFT else (low, middle)
+        low, high = (middle, high) if left(middle) > ENERGY_LEFT else (low, middle)
     return high
 
 
@@ -575,11 +575,11 @@ def _samples(eigenvalues: np.ndarray, energy: np.ndarray) -> float:
         return samples, samples / (samples - (learnt**2).sum()) * float((1 - learnt) ** 2 @ energy) / total
 
     grid = np.linspace(np.log(10.0), np.log(1e-14), 400)  # the error may rise again before it falls for good
-    first = next((i for i, log_kappa in enumerate(grid) if at(log_kappa)[1] <= LEFT), None)
+    first = next((i for i, log_kappa in enumerate(grid) if at(log_kappa)[1] <= ENERGY_LEFT), None)
     if first is None:
         return float("inf")
     enough, few = grid[first], grid[max(first - 1, 0)]
     while few - enough > 1e-12:
         middle = (enough + few) / 2
-        enough, few = (middle, few) if at(middle)[1] <= LEFT else (enough, middle)
+        enough, few = (middle, few) if at(middle)[1] <= ENERGY_LEFT else (enough, middle)
     return max(1.0, float(at(enough)[0]))

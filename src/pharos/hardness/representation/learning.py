@@ -22,7 +22,7 @@ from pharos.solvers import Solution, chain, evaluate_policy, uniform_value, valu
 
 MOST_EXACT = 4096
 """Different observations up to which a kernel is used as it is; beyond, by landmarks."""
-LANDMARKS = 600
+DEFAULT_LANDMARKS = 600
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,7 @@ class Grouped:
 
 MOST_LANCZOS = 60
 ELSEWHERE = 0.1  # of a first vector: the last phase's eigenvector may be one still, and no longer the largest
-FEW = 8  # columns up to which half of a symmetric matrix is read sooner than BLAS has packed all of it
+FEW_COLUMNS = 8  # columns up to which half of a symmetric matrix is read sooner than BLAS has packed all of it
 
 Kernel = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -223,7 +223,7 @@ class Exact(KernelOperator):
     def __call__(self, z: np.ndarray) -> np.ndarray:
         from pharos.kernels import linear_algebra
 
-        if z.shape[1] > FEW:
+        if z.shape[1] > FEW_COLUMNS:
             return self.matrix @ z
         rows = np.ascontiguousarray(z.T, np.float64)
         out = np.empty_like(rows)
@@ -312,8 +312,8 @@ def _sum_of_powers(steps: int) -> np.ndarray:
 
 
 TIES = 1e-6  # of the largest value of a state: actions that close are chosen alike
-MARGIN = 1.05  # of the largest eigenvalue, which is known to 0.1 %
-ACCURACY = 1e-5  # of values, as a share of what is between optimal and uniform play
+STEP_MARGIN = 1.05  # of the largest eigenvalue, which is known to 0.1 %
+SHARE_OF_SPREAD = 1e-5  # of values, as a share of what is between optimal and uniform play
 WORST_GREEDY, WORST_PLAYED = 1.5, 3.0  # a policy's regret counts no more than this
 
 
@@ -520,7 +520,7 @@ class IdealisedLearner:
         kernel, observed = self.representation.kernel, self.observations.representatives
         landmarks = self.representation.landmarks
         if landmarks is None and len(observed) > MOST_EXACT:
-            landmarks = LANDMARKS
+            landmarks = DEFAULT_LANDMARKS
         if not landmarks or landmarks >= len(observed):
             return [Exact(kernel, observed)], None
         sample = observed[drawn_indices(self.weights, landmarks)]
@@ -534,7 +534,7 @@ class IdealisedLearner:
             "episode": self.episode,
             "gamma": float(self.whole.gamma),
             "horizon": self.whole.horizon,
-            "step_size": f"1 / ({MARGIN} largest eigenvalue of K diag({self.step_weights}))",
+            "step_size": f"1 / ({STEP_MARGIN} largest eigenvalue of K diag({self.step_weights}))",
             "clipped": clipped,
             **self.representation.conventions,
         }
@@ -558,7 +558,9 @@ class IdealisedLearner:
         if self.is_return:
             return float((self.visits(policy).executed * self.mdp.rewards).sum())
         table = actions if is_pure else self.everywhere(policy)
-        return evaluate_policy(self.mdp, table, ACCURACY * self.spread, progress=self._report_sweep).value_at_start
+        return evaluate_policy(
+            self.mdp, table, SHARE_OF_SPREAD * self.spread, progress=self._report_sweep
+        ).value_at_start
 
     def _report_sweep(self, sweeps: int, bound: float) -> None:
         self.report(f"sweep {sweeps} of values, error at most {bound:.2g}")
@@ -600,7 +602,7 @@ def descent(
     before = float((weights * error**2).sum())
     while largest > 0 and before > 0:
         with np.errstate(over="ignore", invalid="ignore"):  # if the eigenvalue was far too small
-            added = apply.descended(weights, error, 1 / (MARGIN * largest), steps)
+            added = apply.descended(weights, error, 1 / (STEP_MARGIN * largest), steps)
             after = float((weights * (error - added) ** 2).sum())
         if after <= 1.001 * before:  # no step of a stable size makes it larger
             return added

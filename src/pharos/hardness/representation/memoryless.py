@@ -19,9 +19,9 @@ from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP, executed_actions, lacking
 from pharos.solvers import Solution, evaluate_policy, value_iteration
 
-TOLERANCE = 1e-7
+LOSS_WIDTH = 1e-7
 # Improvements of one policy, and steps of its occupancy
-MOST_IMPROVEMENTS, MOST_STEPS = 20, 400
+MOST_MEMORYLESS_IMPROVEMENTS, MOST_STEPS = 20, 400
 # States times actions of relaxed problems: larger ones get one bound from above, the optimum
 MOST_ENTRIES = 2_000_000
 
@@ -63,13 +63,13 @@ def memoryless_loss(
         raise ParameterError(
             f"{mdp}: under sticky actions a policy without memory does not know the state; leave them out"
         )
-    optimal = optimal or value_iteration(mdp, TOLERANCE)
+    optimal = optimal or value_iteration(mdp, LOSS_WIDTH)
     search = _PolicySearch(mdp, np.asarray(classes), time.monotonic() + budget)
     lower, upper = search.bounds(optimal)
     best, error = float(optimal.value_at_start), optimal.error_bound
     lower_loss = max(0.0, best - error - upper)
     upper_loss = max(lower_loss, best + error - lower)
-    return MemorylessLoss(lower_loss, upper_loss, upper_loss - lower_loss <= 10 * (TOLERANCE + error), search.solved)
+    return MemorylessLoss(lower_loss, upper_loss, upper_loss - lower_loss <= 10 * (LOSS_WIDTH + error), search.solved)
 
 
 class _PolicySearch:
@@ -107,21 +107,21 @@ class _PolicySearch:
         while heap:
             bound, _, fixed, conflict = heapq.heappop(heap)
             upper = -bound
-            if upper <= lower + TOLERANCE:
+            if upper <= lower + LOSS_WIDTH:
                 return lower, max(lower, upper)
             if conflict < 0 or not self.is_small or time.monotonic() > self.deadline:
                 return lower, upper
             for action in np.flatnonzero(self.sets[conflict]):
                 child = fixed.copy()
                 child[conflict] = action
-                solution = value_iteration(self.relaxed(child), TOLERANCE)
+                solution = value_iteration(self.relaxed(child), LOSS_WIDTH)
                 self.solved += 1
                 above = min(upper, solution.value_at_start + solution.error_bound)
-                if above > lower + TOLERANCE:
+                if above > lower + LOSS_WIDTH:
                     value, next_conflict = self.rounded(solution, child)
                     lower = max(lower, value)
                     heapq.heappush(heap, (-above, next(order), child, next_conflict))
-        return lower, lower + TOLERANCE
+        return lower, lower + LOSS_WIDTH
 
     def relaxed(self, fixed: np.ndarray) -> TabularMDP:
         """The MDP in which all actions act as the fixed one in states whose observation has one."""
@@ -165,8 +165,8 @@ class _PolicySearch:
         lost = self.lost(solution.q, weights, actions, fixed)
         conflict = int(lost.argmax()) if lost.max() > 0 else -1
         value, policies = -np.inf, set()
-        for _ in range(MOST_IMPROVEMENTS):
-            evaluated = evaluate_policy(self.mdp, actions[self.classes], TOLERANCE)
+        for _ in range(MOST_MEMORYLESS_IMPROVEMENTS):
+            evaluated = evaluate_policy(self.mdp, actions[self.classes], LOSS_WIDTH)
             self.solved += 1
             value = max(value, evaluated.value_at_start - evaluated.error_bound)
             policies.add(actions.tobytes())

@@ -40,7 +40,7 @@ from pharos.system.threads import in_blocks
 if TYPE_CHECKING:
     import gymnasium
 
-FEATURES = (128, 128)
+EXTRACTOR_LAYERS = (128, 128)
 INITIALISATIONS = ("pytorch", "sb3")
 _FORM = re.compile(r"(?:(?P<mlp>mlp)|cnn(?P<filters>\d+)-?|(?P<nature>nature)-?)(?P<layers>[\dx-]*)(?P<tanh>\+tanh)?")
 _EXPECTED = "mlp128, mlp128x2, mlp256-64, cnn16, cnn16-64x3 or nature, with +tanh where wanted"
@@ -102,7 +102,7 @@ class Network:
             raise ParameterError(f"network {network!r} has no filters; expected at least 1, as in cnn16")
         small = (Convolution(filters, 3, padding=1),) if filters else ()
         convolutions = _NATURE if match["nature"] else small
-        return Network(network, convolutions, layers or FEATURES, bool(match["tanh"]), initialisation)
+        return Network(network, convolutions, layers or EXTRACTOR_LAYERS, bool(match["tanh"]), initialisation)
 
     def weight_variances(self, inputs: int, outputs: int, *, is_output: bool = False) -> tuple[float, float]:
         """(of a weight, of a bias) of a layer from `inputs` numbers to `outputs` units."""
@@ -137,8 +137,8 @@ def _layers(text: str) -> tuple[int, ...] | None:
     return tuple(layers)
 
 
-BLOCK = 512  # observations on a side of a block of pairs
-MAPS = 1 << 26  # bytes of the maps of a block after a convolution
+PAIR_BLOCK = 512  # observations on a side of a block of pairs
+MAP_BYTES = 1 << 26  # bytes of the maps of a block after a convolution
 TERMS, NODES = 48, 200  # of a power series of hyperbolic tangents; of a quadrature
 LEAST_VARIANCE = 1e-12  # of a hyperbolic tangent's pre-activations, in the place of 0: the limit in float64
 
@@ -173,7 +173,7 @@ def tangent_kernel(network: Network, x: np.ndarray, y: np.ndarray | None = None)
     first: _Flat | _Convolved
     first = _Convolved(network, x, others) if network.convolutions else _Flat(network, x, others)
     head = _Head(network, first)
-    side = min(BLOCK, max(16, math.isqrt(MAPS // (8 * first.positions))))
+    side = min(PAIR_BLOCK, max(16, math.isqrt(MAP_BYTES // (8 * first.positions))))
     rows, columns = range(0, len(x), side), range(0, len(others), side)
     blocks = [(i, j) for i, j in itertools.product(rows, columns) if y is not None or i <= j]
 

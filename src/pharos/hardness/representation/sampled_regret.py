@@ -15,7 +15,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.hardness.representation.learning import (
-    MARGIN,
+    STEP_MARGIN,
     WORST_GREEDY,
     Grouped,
     IdealisedLearner,
@@ -300,7 +300,7 @@ class SampledLearner(IdealisedLearner):
                     old[:] = new
                 weights = visits.max(axis=1, keepdims=True) / max(step, 1)
                 largest = operator.largest_eigenvalue(weights, vector) if step else 0.0
-                largest_step = 1 / (MARGIN * largest) if largest > 0 else math.inf
+                largest_step = 1 / (STEP_MARGIN * largest) if largest > 0 else math.inf
             kernels.learn(
                 *(self.outcomes, np.asarray(mdp.terminal, np.bool_), group),
                 *(np.asarray(mdp.start_states, np.int64), cumulative, (*chance, *sets)),

@@ -1,0 +1,102 @@
+"""Worlds of many levels: learnt on some, measured on others."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pharos
+from pharos import benchmark
+from pharos.benchmark import BenchmarkTask, Ladder, Protocol, Suite, frozen, load_suite
+from pharos.benchmark.contents import contents_of
+from pharos.benchmark.levels import FIRST_HELD_OUT, LEVELS, levels_of, overlap, twins
+from pharos.benchmark.page import page
+from pharos.benchmark.suite import digest_of_suite
+from pharos.interaction import GymEnv
+from pharos.training import Task, evaluate_agent
+
+PROTOCOL = Protocol(steps=2000, evaluations=2, seeds=2)
+OPTIONS = {"size": 4}
+
+
+@pytest.fixture(scope="module")
+def suite():
+    seen = BenchmarkTask(
+        "seen", LEVELS, {"world": "frozen_lake", "options": OPTIONS, "train": 2, "held_out": 0}, "recorded"
+    )
+    held_out = replace(seen, name="held-out", parameters={**seen.parameters, "held_out": 3}, axis="lake", level=1.0)
+    seen, held_out = frozen(seen, PROTOCOL), frozen(held_out, PROTOCOL)
+    whole = Suite("small", PROTOCOL, (seen,), (Ladder("lake", "halvings", "levels", (held_out,)),))
+    return replace(whole, digest=digest_of_suite(whole))
+
+
+def lakes(first, number):
+    return [pharos.make("frozen_lake", **OPTIONS, seed=seed) for seed in range(first, first + number)]
+
+
+def test_values_are_means_over_the_levels_that_are_measured(suite):
+    """Levels one by one, each solved as a world of its own."""
+    for task, worlds in zip(suite.tasks, (lakes(0, 2), lakes(FIRST_HELD_OUT, 3)), strict=True):
+        references = [Task(env).reference for env in worlds]
+        assert task.value_optimal == pytest.approx(np.mean([each.optimal for each in references]))
+        assert task.value_uniform == pytest.approx(np.mean([each.uniform for each in references]))
+
+
+def test_episodes_begin_in_training_levels_alone_and_show_the_level(suite):
+    task = suite.task("held-out").training_task(PROTOCOL)
+    shown = {pharos.observe(env, "simple_image")(np.array([env.initial_state()]))[0].tobytes() for env in lakes(0, 2)}
+    env = GymEnv(task.env, **task.interaction)
+    seen = {env.reset(seed=seed)[0].transpose(2, 1, 0).tobytes() for seed in range(50)}
+    assert seen == shown and env.observation_space.dtype == np.uint8
+
+
+def test_whoever_knows_the_training_levels_by_heart_has_no_regret_there_alone(suite):
+    """Optimal actions in the states of training levels, found by discounting, and to the left for ever elsewhere."""
+    task = suite.task("held-out").training_task(PROTOCOL)
+    plain = task.space.mdp(gamma=0.9)
+    actions = np.asarray(pharos.value_iteration(plain).policy)
+    is_own, frontier = np.zeros(plain.num_states, bool), plain.start_states[plain.start_probabilities > 0.1]
+    while len(frontier):
+        is_own[frontier] = True
+        following = np.unique(np.asarray(task.space.successors)[frontier])
+        frontier = following[~is_own[following]]
+    assert 0 < is_own.sum() < len(is_own)
+    by_heart = np.where(is_own, actions, 0)
+    assert evaluate_agent(actions, task).value == pytest.approx(task.reference.optimal)
+    assert evaluate_agent(by_heart, task).value == 0.0
+    assert pharos.evaluate_policy(task.mdp, by_heart).value_at_start == pytest.approx(1.0)
+
+
+def test_overlap_is_the_share_of_what_held_out_levels_show():
+    """Counted by hand: pictures of all states of each level that are not terminal."""
+
+    def pictures(envs):
+        out = set()
+        for env in envs:
+            space = pharos.build(env)
+            rows = pharos.observe(env, "simple_image")(space.states()[~np.asarray(space.mdp().terminal, bool)])
+            out |= {row.tobytes() for row in rows}
+        return out
+
+    own, theirs = pictures(lakes(0, 2)), pictures(lakes(FIRST_HELD_OUT, 3))
+    assert overlap(levels_of("frozen_lake", OPTIONS, train=2, held_out=3)) == len(own & theirs) / len(theirs)
+
+
+def test_a_run_has_both_scores_and_the_page_their_gap(suite, tmp_path):
+    assert [(seen.name, other.name) for seen, other in twins(suite)] == [("seen", "held-out")]
+    outcome = benchmark.run("q_learning", suite, out=tmp_path)
+    assert not outcome.missing
+    text = page(contents_of(outcome.results, beside=[], suite=suite))
+    scores = {name: 1 - curve.mean(axis=1) for name, curve in outcome.results.curves.items()}
+    gap = np.mean(np.clip(scores["seen"], 0, 1) - np.clip(scores["held-out"], 0, 1))
+    assert "Levels seen and held out" in text and f"{gap:+.2f}" in text
+
+
+def test_levels_is_four_generators_with_three_numbers_of_levels():
+    suite = load_suite("levels")
+    assert [ladder.axis for ladder in suite.ladders] == ["lake", "door_key", "rooms", "sokoban"]
+    for ladder in suite.ladders:
+        assert [task.parameters["train"] for task in ladder.tasks] == [512, 64, 8]
+        assert [task.level for task in ladder.tasks] == [0.0, 3.0, 6.0]
+        assert {task.parameters["held_out"] for task in ladder.tasks} == {100}
+    assert len(twins(suite)) == len(suite.core) == 12
