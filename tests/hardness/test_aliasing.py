@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import pharos
 from command_line import answer, usage_error
+from patience import PATIENCE
 from pharos.errors import ParameterError
 from pharos.observations import aliasing, memoryless_loss, observation_classes, observe
 from refusals import refusal
@@ -80,7 +81,7 @@ def test_the_loss_is_that_of_the_best_of_all_policies(seed):
         pharos.evaluate_policy(mdp, np.array(policy)[classes], 1e-9) for policy in itertools.product((0, 1), repeat=3)
     )
     expected = pharos.value_iteration(mdp, 1e-9).value_at_start - max(each.value_at_start for each in every)
-    loss = memoryless_loss(mdp, classes)
+    loss = memoryless_loss(mdp, classes, budget=PATIENCE)
     assert loss.exact
     assert loss.lower - 2e-9 <= expected <= loss.upper + 2e-9
     hurried = memoryless_loss(mdp, classes, budget=0)
@@ -111,7 +112,7 @@ def test_the_loss_within_sets_is_that_of_the_best_policy_that_takes_what_is_avai
 
     best = value(lambda _, q: max(q, key=q.get))
     loss = best - max(value(lambda s, _, p=policy: p[classes[s]]) for policy in itertools.product(*common))
-    result = memoryless_loss(mdp, classes)
+    result = memoryless_loss(mdp, classes, budget=PATIENCE)
     assert result.exact
     assert result.lower - 1e-6 <= loss <= result.upper + 1e-6
 
@@ -122,9 +123,9 @@ def test_two_rooms_that_look_alike_cost_half_of_the_prizes():
     successors[0], probabilities[0] = (1, 2), 0.5
     probabilities[1:, :, 0] = 1.0
     mdp = pharos.TabularMDP.from_outcomes(successors, probabilities, [[0, 0], [4, 0], [0, 2]], gamma=0.5)
-    loss = memoryless_loss(mdp, np.array([0, 1, 1]))
+    loss = memoryless_loss(mdp, np.array([0, 1, 1]), budget=PATIENCE)
     assert loss.exact
     assert loss.lower <= 0.5 * 0.5 * 2 <= loss.upper
-    assert memoryless_loss(mdp, np.arange(3)).upper <= 1e-6
+    assert memoryless_loss(mdp, np.arange(3), budget=PATIENCE).upper <= 1e-6
     with pytest.raises(ParameterError, match="under sticky actions a policy without memory does not know the state"):
         memoryless_loss(pharos.sticky_actions(mdp, 0.25), np.array([0, 1, 1]))

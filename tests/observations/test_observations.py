@@ -8,6 +8,7 @@ from gymnasium import spaces
 from hypothesis import strategies as st
 
 import pharos
+from patience import PATIENCE
 from pharos import observations
 from pharos.errors import ParameterError, UnknownName
 from refusals import refusal
@@ -142,5 +143,5 @@ def test_without_memory_a_chain_whose_bit_is_seen_first_is_a_guess():
     space = pharos.build(pharos.make("memory_chain", memory_length=3), progress=False)
     once = observations.observe(space.environment, "one_hot", seen_first="bits")
     classes = observations.observation_classes(space, once)
-    loss = observations.memoryless_loss(space.mdp(gamma=1.0), classes)
+    loss = observations.memoryless_loss(space.mdp(gamma=1.0), classes, budget=PATIENCE)
     assert loss.lower == pytest.approx(1) == loss.upper

@@ -342,13 +342,12 @@ def _plane(contents: Contents) -> Element | None:
         return None
     below = "regret of an idealised table"
     beside = f"extra regret of the idealised {name.upper()}", "over a table (negative: it generalises)"
+    dots = scatter(points, below, beside, "tasks by predicted difficulty, coloured by regret")
     return section(
         "What makes a task hard, and where the agent fails",
         "Each dot is a task, placed by what theory predicts before any run: to the right, even a learner with a table "
         "needs longer; above, a network loses more than a table. The colour is the agent's regret.",
-        captioned(
-            "", scatter(points, below, beside, "tasks by predicted difficulty, coloured by regret"), class_="wide"
-        ),
+        captioned("", dots, class_="wide"),
     )
 
 
