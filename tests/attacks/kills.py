@@ -105,7 +105,7 @@ def _prepare(programs: dict[Path, list[list[str]]]) -> None:
     from pharos.training import results
 
     search = importlib.import_module("pharos.state_space.search")
-    search.CHUNK, search.WIDE = 512, 200  # type: ignore[attr-defined]
+    search.CHUNK, search.WIDE_FOR_THREADS = 512, 200  # type: ignore[attr-defined]
     state_space.build.__kwdefaults__["checkpoint_seconds"] = 0.0
     memory.LEAST_MEMORY = 1 << 16
     results.RUN_CHECKPOINT_SECONDS = 0.0

@@ -28,7 +28,7 @@ from pharos.system import compiling
 compiling.SMALL_STATES = 0
 from pharos.kernels import bellman
 v = np.zeros(3)
-bellman.chain_values(np.array([1, -1]), np.ones(2), 0.5, v, np.zeros(2, np.int64))
+bellman.solve_chain(np.array([1, -1]), np.ones(2), 0.5, v, np.zeros(2, np.int64))
 print(json.dumps([v.tolist(), compiling.seconds()]))
 """
 

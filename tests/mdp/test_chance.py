@@ -74,7 +74,7 @@ def undisturbed(tmp_path_factory) -> dict[str, bytes]:
 @pytest.fixture
 def small_blocks(monkeypatch):
     monkeypatch.setattr(search, "CHUNK", 256)
-    monkeypatch.setattr(search, "WIDE", 50)
+    monkeypatch.setattr(search, "WIDE_FOR_THREADS", 50)
 
 
 @pytest.mark.long
@@ -200,7 +200,7 @@ WRONG = (
 @pytest.mark.parametrize(("broken", "expected"), WRONG)
 def test_a_rule_that_breaks_the_contract_is_named_with_its_outcome(broken, expected, engine, tmp_path, monkeypatch):
     if engine == "threads":
-        monkeypatch.setattr(search, "WIDE", 1)
+        monkeypatch.setattr(search, "WIDE_FOR_THREADS", 1)
     elif engine != "compiled":
         monkeypatch.setattr(rules, "compiled_or_none", lambda *_: None)
     env = Dice(broken=broken)

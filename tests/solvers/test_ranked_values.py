@@ -287,7 +287,7 @@ from pharos.mdp import BEST
 from pharos.solvers import Solving, ranked
 from test_ranked_values import chain
 folder, last, sweeps, first = pathlib.Path(sys.argv[1]), int(sys.argv[2]), [], []
-sweep, ranked._SHARE = ranked.RankedBackup.plain_sweep, 0
+sweep, ranked._WRITING_SHARE = ranked.RankedBackup.plain_sweep, 0
 def dies(backup):
     sweeps.append(0)
     if backup.rank.rank == 2 and len(sweeps) == last:

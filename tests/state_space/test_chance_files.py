@@ -38,7 +38,7 @@ FOLDERS = {
 @pytest.fixture
 def small_blocks(monkeypatch):
     monkeypatch.setattr(search, "CHUNK", 256)
-    monkeypatch.setattr(search, "WIDE", 50)
+    monkeypatch.setattr(search, "WIDE_FOR_THREADS", 50)
 
 
 @pytest.fixture(params=FOLDERS)

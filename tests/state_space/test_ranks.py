@@ -385,7 +385,7 @@ import os, signal
 from pharos.cli import main
 from pharos import ranks
 from pharos.state_space import ranked_table
-ranked_table.RankedSearch.__init__.__defaults__, ranked_table.ROWS = (0,), 64
+ranked_table.RankedSearch.__init__.__defaults__, ranked_table.SUPERSTEP_ROWS = (0,), 64
 exchange, exchanges = ranks._Mpi.exchange, []
 def dies(rank, parts):
     exchanges.append(0)

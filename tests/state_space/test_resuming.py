@@ -42,7 +42,7 @@ def small_blocks(monkeypatch):
     """Blocks so small that a build of 27,692 states goes through every path: narrow, wide, table growing,
     checkpoints."""
     monkeypatch.setattr(search, "CHUNK", 512)
-    monkeypatch.setattr(search, "WIDE", 200)
+    monkeypatch.setattr(search, "WIDE_FOR_THREADS", 200)
 
 
 def build(env, folder, **options) -> pharos.StateSpace:
@@ -86,7 +86,7 @@ def undisturbed(tmp_path_factory) -> dict[str, Path]:
 @pytest.mark.parametrize(("chunk", "wide"), ((64, 8), (512, 100), (1 << 16, 1 << 13)))
 def test_files_do_not_depend_on_threads_or_blocks(env, workers, chunk, wide, tmp_path, undisturbed, monkeypatch):
     monkeypatch.setattr(search, "CHUNK", chunk)
-    monkeypatch.setattr(search, "WIDE", wide)
+    monkeypatch.setattr(search, "WIDE_FOR_THREADS", wide)
     build(env, tmp_path / "space", workers=workers, checkpoint_seconds=0.01)
     assert_same_files(tmp_path / "space", undisturbed[env.name])
 
@@ -268,7 +268,7 @@ def wall(tmp_path_factory) -> pharos.StateSpace:
 def test_files_do_not_depend_on_where_the_table_is(
     env, workers, wide, tmp_path, undisturbed, little_memory, monkeypatch
 ):
-    monkeypatch.setattr(search, "WIDE", wide)
+    monkeypatch.setattr(search, "WIDE_FOR_THREADS", wide)
     build(env, tmp_path / "space", workers=workers, checkpoint_seconds=0.01)
     assert_same_files(tmp_path / "space", undisturbed[env.name])
 
@@ -470,7 +470,7 @@ def test_beyond_32_bit_indices_only_the_width_of_the_successors_changes(widened,
 @pytest.mark.parametrize("limit", (3000, 25_000, 28_000))  # beyond 24,000 the table grows as well
 def test_indices_widen_while_threads_are_a_piece_ahead(limit, tmp_path, undisturbed, monkeypatch):
     monkeypatch.setattr(search, "CHUNK", 512)
-    monkeypatch.setattr(search, "WIDE", 16)
+    monkeypatch.setattr(search, "WIDE_FOR_THREADS", 16)
     monkeypatch.setattr(search, "INT32_STATES", limit)
     widen, ahead = search.Search._widen_indices, []
 

@@ -440,7 +440,7 @@ class DividesByZero(Walk):
 def test_a_rule_that_breaks_the_contract_is_named_with_state_and_action(
     env, expected, workers, wide, folder, monkeypatch
 ):
-    monkeypatch.setattr(search, "WIDE", wide)
+    monkeypatch.setattr(search, "WIDE_FOR_THREADS", wide)
     assert expected in refusal(RuleError, build, env, folder, workers=workers)
 
 

@@ -50,7 +50,7 @@ class DelayedChoice(Environment):
         "time": Layer(("x", "t"), ((120, 120, 130), (66, 72, 200)), shape="ball"),
         "bits": Layer(("0", "1"), ((170, 170, 178), (150, 90, 190)), shape="lettered"),
     }
-    look = Look(color="#44AA99")
+    look = Look(color="#E377C2")
     instances = {"length-8": {"lag": 7}, "copies-16": {"irrelevant_bits": 4}, "noisy": {"cue_error": 0.25}}
     hyperparameters = {"q_learning": {"default": {"gamma": 1.0}}, "dqn": {"default": {"gamma": 1.0}}}  # by hand
 
