@@ -174,7 +174,7 @@ def diagnose(
     steps: int = PROTOCOL.steps,
     timeout: float | None = None,
     suite: Suite | str | None = None,
-    tell: Callable[[float, str], object] = lambda share, text: None,
+    progress: Callable[[float, str], object] = lambda share, text: None,
 ) -> Diagnosis:
     """Train an agent on twelve small worlds, or take a finished run, and say what is wrong, and what to try.
 
@@ -182,8 +182,8 @@ def diagnose(
     those of Stable-Baselines3 do: these are held against exact ones. Without, only its behaviour is judged.
 
     Args:
-        agent, hyperparameters, worlds, seeds, steps, timeout, tell: as `examine` takes them. Limits and likeness are
-            those of agents with all worlds, two seeds and 4,000 steps.
+        agent, hyperparameters, worlds, seeds, steps, timeout, progress: as `examine` takes them. Limits and likeness
+            come from agents with all worlds, two seeds and 4,000 steps.
         results: in place of an agent: the folder or file of a finished run of a benchmark, or results read.
         suite: the one that `results` are of, where that is not shipped.
     Raises:
@@ -197,7 +197,7 @@ def diagnose(
         return diagnosis_of_results(contents_of(results, suite=suite))
     label = agent if isinstance(agent, str) else getattr(agent, "__qualname__", repr(agent))
     options: dict[str, Any] = {"hyperparameters": hyperparameters, "worlds": worlds, "seeds": seeds, "steps": steps}
-    return diagnosis_of(examine(agent, timeout=timeout, tell=tell, **options), label)  # type: ignore[arg-type]
+    return diagnosis_of(examine(agent, timeout=timeout, progress=progress, **options), label)  # type: ignore[arg-type]
 
 
 def diagnosis_of(examinations: Sequence[Examination], label: str) -> Diagnosis:

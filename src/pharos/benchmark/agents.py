@@ -76,8 +76,8 @@ WARM = ("torch", "stable_baselines3")
 LINGER_SECONDS = 10.0  # that a process may take to end when its run has
 LONGEST = 500  # letters of an agent's error
 
-Tell = Callable[[float, str], None]
-"""tell(share of the steps that are done, text)."""
+OnProgress = Callable[[float, str], None]
+"""on_progress(share of the steps that are done, text)."""
 Send = Callable[[tuple[Path, str | OSError | None]], None]
 """send((folder of a run that has ended, None, an error message, or the OSError of writing))."""
 
@@ -89,13 +89,13 @@ class RunSettings:
     Attributes:
         workers: processes at once.
         checkpoints: folder of checkpoints of the batched engine.
-        tell: called with the progress.
+        on_progress: called with the progress.
         timeout: seconds after which a run that has its process is ended; None: never.
     """
 
     workers: int
     checkpoints: Path
-    tell: Tell
+    on_progress: OnProgress
     timeout: float | None = None
 
 
@@ -250,7 +250,7 @@ class TrainedForm(Form):
 
         def progress(now: Any) -> None:
             failures = f", {now.failed} failed" if now.failed else ""
-            settings.tell(now.done / now.total, f"{now.finished} of {len(jobs)} runs{failures}")
+            settings.on_progress(now.done / now.total, f"{now.finished} of {len(jobs)} runs{failures}")
 
         stored = {config.id: job.task.stored_values for config, job in zip(configs, jobs, strict=True)}
         tasks = TaskCache(lambda config: stored[config.id], trust=True)  # the user has named the code
@@ -533,7 +533,13 @@ class Apart(Execution[Job]):
         fail: Callable[[Job, str], object],
         settings: RunSettings,
     ):
-        self.form, self.body, self.arguments, self.on_failure, self.tell = form, body, arguments, fail, settings.tell
+        self.form, self.body, self.arguments, self.on_failure, self.on_progress = (
+            form,
+            body,
+            arguments,
+            fail,
+            settings.on_progress,
+        )
         self.total = sum(len(group) for group in groups)
         groups = [group for group in groups if not all(map(is_finished, group))]
         self.left = sum(len(group) for group in groups)
@@ -570,7 +576,9 @@ class Apart(Execution[Job]):
     def look(self) -> None:
         """Report, and kill processes whose runs have ended and which do not end themselves."""
         failed, done = sum(self.failed.values()), self.total - self.left + len(self.failed)
-        self.tell(done / self.total, f"{done - failed} of {self.total} runs{f', {failed} failed' * (failed > 0)}")
+        self.on_progress(
+            done / self.total, f"{done - failed} of {self.total} runs{f', {failed} failed' * (failed > 0)}"
+        )
         for key in self.running.keys() & self.sent.keys():
             if time.monotonic() - self.sent[key] > LINGER_SECONDS and self.pool is not None:
                 self.pool.kill(key)

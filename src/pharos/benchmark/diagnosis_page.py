@@ -93,8 +93,8 @@ def _dots(names: list[str], rows: list[tuple[float, ...]], agents: list[str]) ->
     for k, (name, row) in enumerate(zip(names, rows, strict=True)):
         y = top + step * k + step / 2
         shapes += [line(left, y, right, y, "grid"), label(left - 8, y + 4, name.replace("_", " "), "end")]
-        for place, x in reversed(list(enumerate(row))):
-            shapes.append(marker(across(x), y, place, f"{agents[place]}, {name}: {x:+.1f} deviations"))
+        for series, x in reversed(list(enumerate(row))):
+            shapes.append(marker(across(x), y, series, f"{agents[series]}, {name}: {x:+.1f} deviations"))
     return drawing(560, bottom + 20, "deviations from healthy agents", *shapes)
 
 

@@ -205,10 +205,10 @@ class Witness(PolicyRecorder):
         reaction = np.zeros(len(self.world.vary))
         deviation = float(first.std(axis=0).mean()) + 1e-12
         rows = self.observations.reshape(len(self.observations), -1)
-        for place in np.flatnonzero(self.world.vary):
+        for column in np.flatnonzero(self.world.vary):
             other = rows.copy()
-            other[:, place] = rows[order, place]
-            reaction[place] = np.abs(ask(other.reshape(self.observations.shape)) - first).mean() / deviation
+            other[:, column] = rows[order, column]
+            reaction[column] = np.abs(ask(other.reshape(self.observations.shape)) - first).mean() / deviation
         return (first if q_values else None), (values(self.observations) if values else None), reaction, wavering
 
     def examination(self) -> Examination:
@@ -364,7 +364,7 @@ def examine(
     seeds: Sequence[int] = (0, 1),
     steps: int = PROTOCOL.steps,
     timeout: float | None = None,
-    tell: Callable[[float, str], object] = lambda share, text: None,
+    progress: Callable[[float, str], object] = lambda share, text: None,
 ) -> list[Examination]:
     """Train an agent on small worlds, in this process, and write down all that there is to see.
 
@@ -372,7 +372,7 @@ def examine(
         agent, hyperparameters: as `learner_of` takes them.
         worlds: of NAMES. seeds: of the runs of each. steps: of each run.
         timeout: seconds after which a run is ended; None: never. Counted in the main thread alone, not on Windows.
-        tell: called with the share that is done, and a text.
+        progress: called with the share that is done, and a text.
     Raises:
         ParameterError: it is no agent, or it yields no policy.
         PharosError: its code raises something, SystemExit included. TimeLimit: a run took longer than was allowed.
@@ -384,7 +384,7 @@ def examine(
     examinations: list[Examination] = []
     for name in worlds:
         for seed in seeds:
-            tell(len(examinations) / (len(worlds) * len(seeds)), f"{name}, seed {seed}")
+            progress(len(examinations) / (len(worlds) * len(seeds)), f"{name}, seed {seed}")
             if learn is None:
                 examinations.append(table_examination(name, seed, steps, setting))
                 continue

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from pharos.agents import COMPILED
-from pharos.benchmark.agents import Form, Job, RunSettings, Tell, agent_form
+from pharos.benchmark.agents import Form, Job, OnProgress, RunSettings, agent_form
 from pharos.benchmark.results import FILE, AgentResults
 from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, equal_seeds, score
 from pharos.benchmark.suite import CORE, EARLIER, BenchmarkTask, Suite, load_suite
@@ -81,7 +81,7 @@ def run(  # noqa: PLR0913
     hyperparameters: Mapping[str, Any] | None = None,
     workers: int | None = None,
     timeout: float | None = None,
-    progress: Tell | None = None,
+    progress: OnProgress | None = None,
 ) -> Outcome:
     """Run an agent on the tasks of a suite, with one setting for all of them.
 

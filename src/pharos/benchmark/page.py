@@ -225,9 +225,9 @@ def _core(contents: Contents) -> Element | None:
     names = {task.name for task in contents.suite.core}
     if (near := nearest(contents)) is None:
         return None
-    place, distance, same = near
-    other = contents.beside[place]
-    differences = {name: each for name, each in contents.comparisons[place].tasks.items() if name in names}
+    index, distance, same = near
+    other = contents.beside[index]
+    differences = {name: each for name, each in contents.comparisons[index].tasks.items() if name in names}
     rows: list[list[str | Element]] = []
     for name, each in sorted(differences.items(), key=lambda item: item[1].interval.value):
         scores = (f"{agent.score.tasks[name].value:.2f}" for agent in (contents.agent, other))

@@ -55,7 +55,7 @@ def diagnose(
                 seeds=range(seeds),
                 steps=steps,
                 timeout=timeout,
-                tell=lambda done, text: show(int(1000 * done), text),
+                progress=lambda done, text: show(int(1000 * done), text),
             )
         if out is not None and page is not None:
             page.write((diagnosis.to_html() if out.suffix in HTML else str(diagnosis)).encode(errors="replace"))

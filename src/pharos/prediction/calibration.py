@@ -87,8 +87,8 @@ class Published:
         order = np.argsort(errors, kind="stable")
         cumulative = np.cumsum((1 / (counts[number] * len(names)))[order])
         aim = min(1.0, level * (len(names) + 1) / len(names))
-        place = min(int(np.searchsorted(cumulative, aim - 1e-12)), len(errors) - 1)
-        return float(errors[order][place])
+        index = min(int(np.searchsorted(cumulative, aim - 1e-12)), len(errors) - 1)
+        return float(errors[order][index])
 
     def coverage(self, level: float = LEVEL) -> float:
         """The share of cells within the interval of the other classes, a mean over classes that are left out."""
