@@ -10,7 +10,7 @@ from scipy import stats
 
 from naive import benchmark as naive
 from pharos.benchmark import score
-from pharos.benchmark.scores import ConfidenceInterval, frontier
+from pharos.benchmark.scores import ConfidenceInterval, equal_seeds, frontier
 from pharos.errors import ParameterError
 from small_benchmark import CORE, LEVELS, RUNGS, constant, drawn, results, small_suite
 from strategies import examples
@@ -164,3 +164,12 @@ def test_results_of_another_suite_are_refused_by_name():
 def test_what_is_not_a_number_is_refused():
     with pytest.raises(ParameterError, match="core-a"):
         drawn(worse=math.nan)
+
+
+def test_equal_curves_count_only_where_something_is_learnt_step_by_step():
+    """A world that every sound agent solves before its first policy says nothing about seeds."""
+    at_once = np.array([[1.0, 0.0, 0.0], [1.0, 1e-12, 0.0], [1.0, 0.0, 0.0]])
+    slowly = np.array([[1.0, 0.5, 0.0]] * 3)
+    assert not equal_seeds({"bandit": at_once[[0, 2]]}) and not equal_seeds({"fixed": np.full((3, 3), 0.3)})
+    assert equal_seeds({"bandit": at_once, "lake": slowly}).startswith("all seeds have the same curve on 1 of 1 task,")
+    assert not equal_seeds({"lake": slowly + np.array([[0.0], [0.1], [0.2]]) * [0, 1, 1]})

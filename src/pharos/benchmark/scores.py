@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from pharos.benchmark.suite import Ladder, Suite
 
 CROSSING = 0.5  # normalised regret at the frontier
+SOLVED = 1e-6  # normalised regret of a policy that counts as optimal
 
 
 @dataclass(frozen=True)
@@ -235,8 +236,11 @@ def check_suite(results: "AgentResults", suite: "Suite", whose: str = "") -> Non
 
 
 def equal_seeds(curves: Mapping[str, np.ndarray]) -> str:
-    """A sentence if all seeds have equal curves on more than a third of the tasks on which any run learns, else ""."""
-    several = [curve for curve in curves.values() if len(curve) > 1 and (curve != curve[:1, :1]).any()]
+    """A sentence if all seeds have equal curves on more than a third of the tasks on which any run learns, else "".
+
+    A task does not count if all runs go from the first regret to 0 at once: sound runs have equal curves there.
+    """
+    several = [curve for curve in curves.values() if len(curve) > 1 and _shows_learning(curve)]
     equal = sum((curve == curve[0]).all() for curve in several)
     if not several or equal <= len(several) / 3:
         return ""
@@ -244,6 +248,11 @@ def equal_seeds(curves: Mapping[str, np.ndarray]) -> str:
         f"all seeds have the same curve on {equal} of {pluralize(len(several), 'task')}, so intervals over seeds say "
         f"nothing; expected learn to use its seed: random numbers, weights, the first reset"
     )
+
+
+def _shows_learning(curve: np.ndarray) -> bool:
+    """Whether a run (seeds, evaluations) has a regret besides the first one and 0."""
+    return bool(((curve != curve[:1, :1]) & (np.abs(curve) > SOLVED)).any())
 
 
 def has_equal_seeds(results: "AgentResults") -> bool:
