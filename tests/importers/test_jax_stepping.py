@@ -22,6 +22,11 @@ def test_without_jax_it_says_which_extra_brings_it(monkeypatch):
         importers.jax_stepping(step, reset, 2)
 
 
+def test_functions_of_jax_without_their_prefix_are_refused():
+    with pytest.raises(ParameterError, match=r"functions of JAX; expected jax: before what makes them"):
+        importers.stepping(lambda: importers.JaxFunctions(step, reset, 2))
+
+
 @pytest.fixture
 def jax():
     return pytest.importorskip("jax")
