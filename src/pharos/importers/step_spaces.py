@@ -30,7 +30,9 @@ def listed_actions_of(
         from pharos.importers.jax_stepping import JaxFunctions
 
         if isinstance(env, JaxFunctions):
-            raise ParameterError(f"{name}: functions of JAX; expected jax: before what makes them, as in jax:file.py:make")
+            raise ParameterError(
+                f"{name}: functions of JAX; expected jax: before what makes them, as in jax:file.py:make"
+            )
         raise ParameterError(
             f"{name}: its actions are {capped(space)}; expected a discrete space or a product of such, or actions=, a "
             f"list of what step takes"
