@@ -193,12 +193,8 @@ def said_of(cells, resamples):
 SHARES = (0.05, 0.1, 0.25, 0.5, 1.0)
 
 
-def pilots(file, write=False):
-    """A pilot beside the measure on the second sealed set: one seed, cut after a share of its steps, for the others.
-
-    R2 of classes left out after a line through the cells of the others, of the mean regret of three other seeds: by the
-    pilot's mean regret so far alone, and by a plane through it and the measure.
-    """
+def pilot_cells(file):
+    """Cells of the second sealed set: the prediction, one seed's regret so far by share, and that of the others."""
     frame, curves = pd.read_csv(file), pd.read_parquet(STUDIES / "sealed-2" / "curves.parquet")
     curves = curves[curves["part"].str[0].isin(["a", "b", "c"])]
     spread = curves["value_optimal"] - curves["value_uniform"]
@@ -207,19 +203,36 @@ def pilots(file, write=False):
     so_far = {f"{part:.0%}": regret[:, share <= part + 1e-9].mean(axis=1) for part in SHARES}
     cells = curves[[*CELL, "seed"]].assign(**so_far)
     others = cells[cells["seed"] > 0].groupby(CELL)["100%"].mean().rename("others").reset_index()
-    cells = cells[cells["seed"] == 0].merge(others, on=CELL).merge(frame[frame["study"] == "sealed-2"], on=CELL)
-    kept = cells[[*CELL, "predicted", "others"]].assign(**{str(share): cells[f"{share:.0%}"] for share in PILOTS})
-    if write:
-        kept.round(6).to_csv(PILOT_FILE, index=False, lineterminator="\n")
+    return cells[cells["seed"] == 0].merge(others, on=CELL).merge(frame[frame["study"] == "sealed-2"], on=CELL)
+
+
+def r_squared_of_pilots(file):
+    """Yield (agent, words, R2 of classes left out by SHARES): pilots, pilots with the measure, and the measure alone.
+
+    After a line or a plane through the cells of the other classes, of the mean regret of three other seeds.
+    """
+    cells, names = pilot_cells(file), [f"{share:.0%}" for share in SHARES]
     for agent in primary_predictors():
         of_agent = cells[cells["agent"] == agent]
         y, classes = of_agent["others"].to_numpy(), np.unique(of_agent["environment"], return_inverse=True)[1]
         counts = np.ones((1, classes.max() + 1), int)
-        for words, more in (("a pilot", []), ("a pilot and the measure", ["predicted"])):
-            r_squared = [held_out(of_agent[[name, *more]].to_numpy(), y, classes, counts)[0][0] for name in so_far]
-            print(f"| {agent.upper()} | {words} | {' | '.join(f'{each:.2f}' for each in r_squared)} |")
-        alone = held_out(of_agent[["predicted"]].to_numpy(), y, classes, counts)[0][0]
-        print(f"| {agent.upper()} | the measure alone | {' | '.join([f'{alone:.2f}'] + ['' for _ in SHARES[1:]])} |")
+        for words, columns in (
+            ("a pilot", [[name] for name in names]),
+            ("a pilot and the measure", [[name, "predicted"] for name in names]),
+            ("the measure alone", [["predicted"]]),
+        ):
+            yield agent, words, [float(held_out(of_agent[x].to_numpy(), y, classes, counts)[0][0]) for x in columns]
+
+
+def pilots(file, write=False):
+    """A pilot beside the measure on the second sealed set: one seed, cut after a share of its steps, for the others."""
+    if write:
+        cells = pilot_cells(file)
+        kept = cells[[*CELL, "predicted", "others"]].assign(**{str(share): cells[f"{share:.0%}"] for share in PILOTS})
+        kept.round(6).to_csv(PILOT_FILE, index=False, lineterminator="\n")
+    for agent, words, values in r_squared_of_pilots(file):
+        texts = [f"{value:.2f}" for value in values] + [""] * (len(SHARES) - len(values))
+        print(f"| {agent.upper()} | {words} | {' | '.join(texts)} |")
 
 
 def draw(file, picture):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import pharos
+from benchmark_modules import benchmark
 from pharos.agents import primary_predictors
 from pharos.errors import ParameterError
 from pharos.prediction import pilot
@@ -75,3 +76,26 @@ def test_other_shares_and_networks_have_no_calibration():
         pharos.predict("river_swim", pilot=0.2)
     with pytest.raises(ParameterError, match="expected no networks"):
         pharos.predict("river_swim", pilot=0.1, networks=["mlp8"])
+
+
+def test_the_share_at_equal_cost_is_that_at_which_both_cost_the_same():
+    costs = benchmark("pilot_cost")
+    row = {"begin": "2", "thousand_steps": "0.5", "evaluation": "0.25", "measure_30000": "7.5", "measure_600000": "1"}
+    share = costs.share_at_equal_cost(row, 30_000)
+    assert 2 + share * (0.5 * 30 + 0.25 * 30) == pytest.approx(7.5)
+    assert costs.share_at_equal_cost(row, 600_000) == 0  # less than it takes to begin
+    assert costs.share_at_equal_cost({**row, "measure_30000": "47"}, 30_000) == pytest.approx(2)
+
+
+def test_the_score_of_a_pilot_lies_between_those_of_its_neighbours():
+    costs, pilots = benchmark("pilot_cost"), {0.1: 0.2, 0.5: 0.8, 1.0: 0.9}
+    assert [costs.r_squared_at(share, pilots) for share in pilots] == [0.2, 0.8, 0.9]
+    assert costs.r_squared_at(0.2, pilots) == pytest.approx(0.35)
+    assert costs.r_squared_at(0.01, pilots) == 0.2 and costs.r_squared_at(3, pilots) == 0.9
+
+
+def test_scores_of_pilots_are_those_of_the_page():
+    cells = benchmark("prediction_cells")
+    for agent, words, values in cells.r_squared_of_pilots(cells.FILE):
+        texts = [f"{value:.2f}" for value in values] + [""] * (len(cells.SHARES) - len(values))
+        assert f"| {agent.upper()} | {words} | {' | '.join(texts)} |" in PAGE
