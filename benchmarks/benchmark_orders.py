@@ -81,10 +81,14 @@ def order(scores: Scores) -> str:
     return text
 
 
-def row(title: str, count: int, scores: Scores, beside: Scores | None) -> str:
-    """One line of a table: scores, their order, and its rank correlations with another one."""
+def row(title: str, count: int, scores: Scores, beside: Scores | None = None) -> str:
+    """One line of a table: scores, their order, and rank correlations with the scores `beside`.
+
+    Args:
+        count: of tasks or states; 0 is left out.
+    """
     values = [f"{scores[name]:.2f}" for name in AGENTS]
-    cells = [title, str(count), *values, order(scores)]
+    cells = [title, f"{count:,}" if count else "", *values, order(scores)]
     if beside is not None:
         own, other = ([each[name] for name in AGENTS] for each in (scores, beside))
         cells += [f"{kendalltau(own, other).statistic:.2f}", f"{spearman(np.array(own), np.array(other)):.2f}"]
@@ -137,13 +141,14 @@ def print_larger(folder: Path, workers: int | None) -> None:
     for name in AGENTS:
         outcome = benchmark.run(name, suite, out=folder / name, seeds=SEEDS, workers=workers)
         runs[name] = run_scores(outcome.results)
-    print(header(["world", "states", *AGENTS.values(), "order", "Kendall", "Spearman"]))
     scores = {task.name: {name: float(own[task.name].mean()) for name, own in runs.items()} for task in suite.tasks}
-    for name, task in zip(LARGER, suite.tasks, strict=True):
-        for each, values, beside in ((v1.task(name), small[name], None), (task, scores[task.name], small[name])):
-            print(row(each.name, each.training_task(v1.protocol).space.num_states, values, beside))
-    print(row("small, mean", len(LARGER), mean_of(small[name] for name in LARGER), None))
-    print(row("larger, mean", len(LARGER), mean_of(scores.values()), mean_of(small[name] for name in LARGER)))
+    print(header(["world", "states", *AGENTS.values(), "order"]))
+    for (name, sizes), task in zip(LARGER.items(), suite.tasks, strict=True):
+        larger = ", ".join(f"{key} {size}" for key, size in sizes.items())
+        for title, each, values in ((name, v1.task(name), small[name]), (larger, task, scores[task.name])):
+            print(row(title, each.training_task(v1.protocol).space.num_states, values))
+    for title, rows in (("mean", [small[name] for name in LARGER]), ("mean, larger", scores.values())):
+        print(row(title, 0, mean_of(rows)))
 
 
 if __name__ == "__main__":
