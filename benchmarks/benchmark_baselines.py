@@ -5,6 +5,7 @@ Ten seeds of named agents (A2C five), 2 to 6 s of one core a run; three of those
 python benchmarks/benchmark_baselines.py --out DIR                  all of them; what is finished in DIR stays
 python benchmarks/benchmark_baselines.py --out DIR --only dqn       one of them
 python benchmarks/benchmark_baselines.py --out DIR --suite v2 --seeds 3 --only dqn    of another suite, with fewer seeds
+python benchmarks/benchmark_baselines.py --out DIR --suite levels --seeds 2 --only ppo --tasks lake    of some tasks
 
 A baseline, src/pharos/benchmark/baselines/SUITE/NAME.safetensors, is results.safetensors of `pharos benchmark run`, and
 nothing else: `pharos benchmark run --agent dqn --set double=true --name double_dqn --out DIR/double_dqn` gives that of
@@ -51,6 +52,7 @@ def main() -> None:
     parser.add_argument("--only", action="append", help="name of a baseline; several times for more")
     parser.add_argument("--suite", default="v1")
     parser.add_argument("--seeds", type=int, help="at most; those of the protocol, a2c, qrdqn and recurrent_ppo fewer")
+    parser.add_argument("--tasks", action="append", help="axis or task; several times for more; all when not given")
     parser.add_argument("--workers", type=int)
     options = parser.parse_args()
     suite = benchmark.load_suite(options.suite)
@@ -67,7 +69,7 @@ def main() -> None:
                 agent,
                 suite,
                 out=out,
-                tasks=[axis for axis in axes if axis not in LEFT_OUT.get(name, ())],
+                tasks=options.tasks or [axis for axis in axes if axis not in LEFT_OUT.get(name, ())],
                 seeds=range(min(most, FEWER_SEEDS.get(name, most))),
                 name=name,
                 hyperparameters=hyperparameters,

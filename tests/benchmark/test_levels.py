@@ -1,13 +1,15 @@
 """Worlds of many levels: learnt on some, measured on others."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pharos
 from pharos import benchmark
-from pharos.benchmark import BenchmarkTask, Ladder, Protocol, Suite, frozen, load_suite
+from pharos.benchmark import BenchmarkTask, Ladder, Protocol, Suite, baselines, frozen, load_suite, read_results, score
 from pharos.benchmark.contents import contents_of
 from pharos.benchmark.levels import FIRST_HELD_OUT, LEVELS, levels_of, overlap, twins
 from pharos.benchmark.page import page
@@ -17,6 +19,7 @@ from pharos.training import Task, evaluate_agent
 
 PROTOCOL = Protocol(steps=2000, evaluations=2, seeds=2)
 OPTIONS = {"size": 4}
+EVIDENCE = (Path(__file__).parents[2] / "docs" / "evidence" / "benchmark.md").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -100,3 +103,38 @@ def test_levels_is_four_generators_with_three_numbers_of_levels():
         assert [task.level for task in ladder.tasks] == [0.0, 3.0, 6.0]
         assert {task.parameters["held_out"] for task in ladder.tasks} == {100}
     assert len(twins(suite)) == len(suite.core) == 12
+
+
+def test_its_baselines_are_of_it_and_score_as_the_evidence_says():
+    suite = load_suite("levels")
+    titles = {"q_learning": "Q-learning", "ppo": "PPO"}
+    assert set(baselines("levels")) == set(titles)
+    for name, title in titles.items():
+        results = read_results(f"levels/{name}")
+        scores = score(results, suite).tasks
+        assert results.digest == suite.digest and results.record["agent"] == name
+        rows = re.findall(
+            rf"^\| {title} \({len(results.seeds)} seeds\), (\d+) (\S+) \| (.*) \|$", EVIDENCE, re.MULTILINE
+        )
+        assert len(rows) == 6
+        for number, half, cells in rows:
+            for ladder, cell in zip(suite.ladders, cells.split(" | "), strict=True):
+                task = f"{ladder.axis}-{number}-{half}"
+                assert cell == (f"{scores[task].value:.2f}" if task in scores else "")
+
+
+@pytest.mark.long
+def test_the_shipped_table_plays_its_first_action_on_held_out_lakes_and_learns_the_others_again(tmp_path):
+    """Held out: the value of constant play, lake by lake. Seen: one seed trained again."""
+    suite, curves = load_suite("levels"), read_results("levels/q_learning").curves
+    values = []
+    for env in [pharos.make("frozen_lake", size=6, seed=FIRST_HELD_OUT + index) for index in range(100)]:
+        task = Task(env)
+        constant = np.zeros(task.space.num_states, int)
+        uniform, optimal = task.reference.uniform, task.reference.optimal
+        values.append((evaluate_agent(constant, task).value, uniform, optimal))
+    own, uniform, optimal = np.mean(values, axis=0)
+    for number in (8, 64, 512):
+        assert curves[f"lake-{number}-held-out"] == pytest.approx((optimal - own) / (optimal - uniform), abs=1e-9)
+    again = benchmark.run("q_learning", suite, out=tmp_path, seeds=[0], tasks=["lake-8-seen"])
+    np.testing.assert_allclose(again.results.curves["lake-8-seen"][0], curves["lake-8-seen"][0], atol=1e-9)

@@ -101,7 +101,7 @@ class AgentResults:
 
 
 def baselines(suite: str = "v1") -> tuple[str, ...]:
-    """Names of the results that are shipped for a suite; each is the results file of a run with ten seeds."""
+    """Names of the results that are shipped for a suite; each is the results file of a run, and says its seeds."""
     return tuple(sorted(file.stem for file in (BASELINES / suite).glob("*.safetensors")))
 
 
