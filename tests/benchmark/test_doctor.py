@@ -1,5 +1,7 @@
 """Readings of values against tables whose equation is known, solved state by state in plain Python."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,12 +11,14 @@ from pharos.benchmark.doctor import (
     RIGHT,
     contrast,
     cut_shares,
+    on_policy,
     optimal,
     readings,
     residuals,
     reward_slope,
     same_runs,
     steps_to_end,
+    targets,
 )
 from pharos.benchmark.examination import Examination, WorldArrays
 
@@ -132,6 +136,35 @@ def test_values_of_a_policy_are_told_from_those_that_run_on_into_the_next_episod
         each = examination(here, v=(policy * q).sum(axis=1), policy=policy, cuts=0)
         assert (contrast(each, "to_next_episode", GAMMA, GAMMA) < 0) == is_wrong
         assert residuals(each)[name].min() < 1e-6
+
+
+def test_values_of_what_was_played_obey_the_equation_of_a_learner_on_policy_alone():
+    here, none = world(1), np.zeros((STATES, ACTIONS))
+    steps = examination(here, q=none)
+    frequency = steps.visits / np.maximum(steps.visits.sum(axis=1, keepdims=True), 1)
+    q = solve(here, RIGHT, GAMMA, none, policy=frequency, at_terminal=0.0)
+    each = examination(here, q=q)
+    place = GAMMAS.index(GAMMA)
+    assert residuals(on_policy(each))[RIGHT][place] < 1e-6 < 0.05 < residuals(each)[RIGHT].min()
+    numbers, played = readings([each]), readings([on_policy(each)])
+    assert numbers["on_policy"] == played["consistency"] == pytest.approx(np.log10(0.02), abs=1e-3)
+    assert played["gamma"] == pytest.approx(-np.log10(1 - GAMMA)) and played["truth"] > 0.999
+    assert abs(played["slope"]) < 1e-3 and abs(played["size"]) < 1e-3
+    greedy = examination(here, q=optimal(here, GAMMA))
+    assert residuals(greedy)[RIGHT][place] < 1e-6 < 0.05 < residuals(on_policy(greedy))[RIGHT].min()
+
+
+def test_values_of_states_that_the_agent_has_left_are_no_sign_of_an_end_at_the_time_limit():
+    here = replace(world(1), rewards=np.abs(world(1).rewards))
+    policy = np.eye(ACTIONS)[np.zeros(STATES, int)]
+    v, has_left = (policy * optimal(here, GAMMA, policy)).sum(axis=1), np.arange(STATES) >= 5
+    v[has_left] *= 0.2  # of an earlier policy; the others are backed up from them
+    for _ in range(300):
+        v = np.where(has_left, v, targets(examination(here, v=v, policy=policy), GAMMA)[RIGHT])
+    each = examination(here, v=v, policy=policy)
+    late = each.visits * ~has_left[:, None]
+    assert cut_shares(each, GAMMA)[0] > 0.45
+    assert cut_shares(each, GAMMA, late) == pytest.approx((0, 0), abs=1e-6)
 
 
 def test_values_with_the_time_limit_as_an_end_are_all_of_the_way():

@@ -19,6 +19,7 @@ from pharos.benchmark.profiles import (
     accuracy,
     failed,
     families,
+    is_on_policy,
     judged,
     kind_of,
     likeness,
@@ -80,7 +81,28 @@ def test_only_what_no_healthy_agent_shows_is_a_symptom():
             numbers = dict(healthy[0].readings)
             for step, is_wrong in ((-0.01, False), (0.01, True)):
                 numbers[symptom.reading] = edge + sign * step
+                numbers |= {symptom.also: sign * 9.0} if symptom.also else {}
                 assert (symptom in _symptoms(failed(numbers, known))) == is_wrong
+
+
+def test_a_symptom_of_values_that_lag_is_one_in_lately_visited_states_alone():
+    for kind in FAULTS:
+        known = [each for each in shipped() if each.kind == kind]
+        healthy = next(each.readings for each in known if each.fault == HEALTHY)
+        for symptom in (each for each in SYMPTOMS if each.also):
+            far = 9.0 if symptom.is_high else -9.0
+            for also, is_wrong in ((far, True), (0.0, False), (None, False)):
+                numbers = {**healthy, symptom.reading: far, symptom.also: also}
+                numbers = {name: value for name, value in numbers.items() if value is not None}
+                assert (symptom in _symptoms(failed(numbers, known))) == is_wrong, (kind, symptom.reading, also)
+
+
+def test_a_learner_is_on_policy_if_the_largest_next_value_explains_less_than_what_was_played():
+    known = [each for each in shipped() if each.kind == "dqn"]
+    limit = max(max(each.readings["consistency"] for each in known if each.fault == HEALTHY) + 0.1, -0.4)
+    for largest, played, is_so in ((0.01, -0.01, True), (-0.01, -0.3, False), (0.3, 0.01, False)):
+        assert is_on_policy({"consistency": limit + largest, "on_policy": limit + played}, known) == is_so
+    assert not is_on_policy({"consistency": 0.0}, known) and not is_on_policy({}, known)
 
 
 def _symptoms(findings):
@@ -299,6 +321,99 @@ def test_the_plot_has_the_readings_that_differ_most():
         assert (own - other) * (numbers[name] - faulty) >= 0
         if abs(faulty - healthy) > 1e-9:
             assert own / other == pytest.approx((numbers[name] - healthy) / (faulty - healthy))
+
+
+class Rows:
+    """A table by observations, (size,) each, of zeros where there is none."""
+
+    def __init__(self, rows, size):
+        self.table, self.size = {key: row.copy() for key, row in rows.items()}, size
+
+    def rows(self, observations):
+        return np.array([self.table.get(each.tobytes(), np.zeros(self.size)) for each in np.array(observations)])
+
+
+class ByValues(Rows):
+    """Greedy policy of values of actions."""
+
+    def q_values(self, observations):
+        return self.rows(observations)
+
+    def __call__(self, observations):
+        return self.rows(observations).argmax(axis=1)
+
+
+class ByPreferences(Rows):
+    """Policy of preferences; last in each row is the value of the state."""
+
+    def values(self, observations):
+        return self.rows(observations)[:, -1]
+
+    def __call__(self, observations):
+        return faults.action_probabilities(self.rows(observations)[:, :-1])
+
+
+def sarsa(env, steps, seed, *, gamma=0.97, ends_at_limit=False):
+    """SARSA (Sutton and Barto, 2018, section 6.4) with a table; epsilon falls from 1 to 0.5."""
+    rng, num_actions, q = np.random.default_rng(seed), int(env.action_space.n), {}
+
+    def begin(observation, step):
+        row = q.setdefault(observation.tobytes(), np.zeros(num_actions))
+        explores = rng.random() < max(0.5, 1 - step / (0.5 * steps))
+        return row, int(rng.integers(num_actions) if explores else rng.choice(np.flatnonzero(row == row.max())))
+
+    row, action = begin(env.reset(seed=seed)[0], 0)
+    for step in range(steps):
+        observation, reward, terminated, truncated, _ = env.step(action)
+        after, next_action = begin(observation, step)
+        ended = terminated or (truncated and ends_at_limit)
+        row[action] += 0.2 * (reward + (0 if ended else gamma * after[next_action]) - row[action])
+        row, action = begin(env.reset()[0], step) if terminated or truncated else (after, next_action)
+        if (step + 1) % (steps // 10) == 0:
+            yield ByValues(q, num_actions)
+
+
+@pytest.mark.long
+def test_sarsa_is_healthy_and_its_faults_are_seen():
+    worlds = ["cliff-vector", "road", "still"]
+    healthy = diagnose(sarsa, worlds=worlds)
+    assert healthy.is_healthy and healthy.on_policy and healthy.to_dict()["on_policy"]
+    assert healthy.verdict.startswith("Nothing is wrong") and "as of SARSA" in healthy.verdict
+    for setting, reading in (({"gamma": 0.5}, "gamma"), ({"ends_at_limit": True}, "cut_share")):
+        wrong = diagnose(sarsa, worlds=worlds, hyperparameters=setting)
+        assert reading in {each.reading for each in wrong.findings}, (setting, wrong.verdict)
+
+
+def critic(env, steps, seed, *, ends_at_limit=False):
+    """Actor and critic of one step with a table (section 13.5); where it no longer is, values are of older policies."""
+    rng, size, table = np.random.default_rng(seed), int(env.action_space.n) + 1, {}
+
+    def row_of(observation):
+        return table.setdefault(observation.tobytes(), np.zeros(size))
+
+    row = row_of(env.reset(seed=seed)[0])
+    for step in range(steps):
+        chances = faults.action_probabilities(row[None, :-1])[0]
+        action = int(rng.choice(size - 1, p=chances))
+        observation, reward, terminated, truncated, _ = env.step(action)
+        ended = terminated or (truncated and ends_at_limit)
+        error = reward + (0 if ended else 0.97 * row_of(observation)[-1]) - row[-1]
+        row[-1] += 0.2 * error
+        surprise = np.log(chances + 1e-12)
+        pull = np.eye(size - 1)[action] - chances
+        pull = error * pull - 0.01 * chances * (surprise - chances @ surprise)
+        row[:-1] = np.clip(row[:-1] + 0.3 * pull, -50, 50)
+        row = row_of(env.reset()[0]) if terminated or truncated else row_of(observation)
+        if (step + 1) % (steps // 10) == 0:
+            yield ByPreferences(table, size)
+
+
+@pytest.mark.long
+def test_values_that_lag_are_told_from_an_end_at_the_time_limit():
+    worlds = ["cliff-vector", "road", "still"]
+    healthy, wrong = (diagnose(critic, worlds=worlds, hyperparameters={"ends_at_limit": x}) for x in (False, True))
+    assert healthy.is_healthy and not healthy.on_policy and healthy.readings["cut_share"] > 0.7
+    assert "cut_share" in {each.reading for each in wrong.findings}
 
 
 @pytest.mark.long

@@ -14,7 +14,7 @@ import numpy as np
 from pharos.benchmark.comparison import LEAST, WORSE, compare_groups
 from pharos.benchmark.contents import Contents, Source, contents_of, listed, run_warnings
 from pharos.benchmark.diagnosis import ONE_ACTION, groups_of, nearest, policies_of, seeds_sentence
-from pharos.benchmark.doctor import readings
+from pharos.benchmark.doctor import on_policy, readings
 from pharos.benchmark.examination import NAMES, PROTOCOL, Examination, examine
 from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY
 from pharos.benchmark.profiles import (
@@ -26,6 +26,7 @@ from pharos.benchmark.profiles import (
     Profile,
     accuracy,
     families,
+    is_on_policy,
     judged,
     kind_of,
     shipped,
@@ -35,6 +36,10 @@ from pharos.benchmark.suite import Suite
 from pharos.errors import ParameterError
 from pharos.system.wording import pluralize
 
+EXPLORER = (
+    "Its values are those of the policy that explores, as of SARSA. If it ought to take the largest next value, this "
+    "is a fault."
+)
 LOSS = 0.1  # of score, on a group of tasks or an axis, that is a symptom
 IN_PLAY = 0.05  # of score, that is lost by chance in play
 SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
@@ -75,6 +80,8 @@ class Diagnosis:
         accuracy: how often the likeness was right for agents that the library did not have.
         scores: by world, or by task of a finished run: 1 optimal and 0 as uniform play, mean of the seeds.
         readings: all numbers, see `doctor.readings`; empty for a finished run.
+        on_policy: whether its values are those of the policy that explores, as of SARSA; then `readings` are by what
+            was played, not by the largest next value. It is no fault of a learner on-policy.
     """
 
     agent: str
@@ -87,6 +94,7 @@ class Diagnosis:
     accuracy: Accuracy
     scores: Mapping[str, float]
     readings: Mapping[str, float] = field(default_factory=dict)
+    on_policy: bool = False
 
     @property
     def is_healthy(self) -> bool:
@@ -204,7 +212,12 @@ def diagnosis_of(examinations: Sequence[Examination], label: str) -> Diagnosis:
     """The diagnosis that follows from what was seen."""
     numbers = readings(examinations)
     kind = kind_of(numbers)
-    answer = judged(numbers, library_of(kind))
+    answer, is_explorer = judged(numbers, library_of(kind)), False
+    if is_on_policy(numbers, library_of(kind)):
+        played = readings([on_policy(each) for each in examinations])
+        other = judged(played, library_of(kind))
+        is_explorer = {each.reading for each in other.findings} < {each.reading for each in answer.findings}
+        numbers, answer = (played, other) if is_explorer else (numbers, answer)
     scores = {
         name: 1 - float(np.mean([each.regret for each in examinations if each.name == name]))
         for name in dict.fromkeys(each.name for each in examinations)
@@ -214,7 +227,7 @@ def diagnosis_of(examinations: Sequence[Examination], label: str) -> Diagnosis:
         for name, text in each.notes.items():
             notes.setdefault(name, []).append((f"{each.name}, seed {each.seed}", text))
     mistakes = [_mistake(name, runs, len(examinations)) for name, runs in notes.items()]
-    return _diagnosis(label, kind, mistakes, answer, accuracy(kind or "dqn"), scores, numbers)
+    return _diagnosis(label, kind, mistakes, answer, accuracy(kind or "dqn"), scores, numbers, is_explorer)
 
 
 def _mistake(kind: str, runs: Sequence[tuple[str, str]], count: int) -> Finding:
@@ -233,11 +246,12 @@ def _diagnosis(
     trusted: Accuracy,
     scores: Mapping[str, float],
     numbers: Mapping[str, float],
+    is_explorer: bool = False,
 ) -> Diagnosis:
     findings = (*mistakes, *answer.findings)
-    entries = findings, answer.shares, answer.fault, answer.is_strange, trusted, scores, numbers
+    entries = findings, answer.shares, answer.fault, answer.is_strange, trusted, scores, numbers, is_explorer
     diagnosis = Diagnosis(label, kind, "", *entries)
-    return replace(diagnosis, verdict=_verdict(diagnosis))
+    return replace(diagnosis, verdict=_verdict(diagnosis) + f" {EXPLORER}" * is_explorer)
 
 
 def _verdict(diagnosis: Diagnosis) -> str:

@@ -6,10 +6,15 @@ of an episode, with clipped rewards, with another discount. `residuals` says how
 of the deviation of the backup, and the discount that fits best is part of the answer. All is arithmetic on small
 arrays.
 
-Source: Sutton and Barto (2018), sections 3.6 and 11.4 (Bellman residuals); the equations of faults are ours.
+A learner of the values of the policy that explores, such as SARSA, obeys Q(s, a) = r(s, a) + gamma E sum mu(a'|s')
+Q(s', a') in place of it, with mu as it was played. `on_policy` has the same readings for it.
+
+Source: Sutton and Barto (2018), sections 3.6, 6.4 (SARSA) and 11.4 (Bellman residuals); the equations of faults are
+ours.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -43,9 +48,8 @@ def targets(examination: Examination, gamma: float) -> dict[str, np.ndarray]:
     Returns:
         Arrays of the shape of `q`, or of `v`; those equations alone that the world tells from the right one.
     """
-    world, values = examination.world, answers_of(examination)
+    world, values, v = examination.world, answers_of(examination), state_values(examination)
     q = values if values.ndim == 2 else None
-    v = values.max(axis=1) if q is not None else values
     live = np.where(world.terminal, 0.0, v)
     visits = np.maximum(examination.visits, 1)
     moves, rewards = world.transitions, world.rewards
@@ -119,6 +123,26 @@ def answers_of(examination: Examination) -> np.ndarray:
     return np.nan_to_num(np.clip(values, -1e12, 1e12), nan=1e12)
 
 
+def state_values(examination: Examination) -> np.ndarray:
+    """(S,) values of states as they enter a backup: answers, or the largest value, or the mean of what comes onward."""
+    values, onward = answers_of(examination), examination.onward
+    if values.ndim == 1:
+        return values
+    return values.max(axis=1) if onward is None else (onward * values).sum(axis=1)
+
+
+def on_policy(examination: Examination) -> Examination:
+    """The same for a learner on-policy: next actions count as often as they were played in all of the run, as pairs
+    are weighed by it. Where it never was, the largest value does.
+    """
+    assert examination.q is not None
+    visits, greedy = examination.visits, answers_of(examination).argmax(axis=1)
+    sums = visits.sum(axis=1, keepdims=True)
+    return replace(
+        examination, onward=np.where(sums > 0, visits / np.maximum(sums, 1), np.eye(visits.shape[1])[greedy])
+    )
+
+
 def residuals(examination: Examination, visits: np.ndarray | None = None) -> dict[str, np.ndarray]:
     """Distances from each of the equations that the world tells apart, (len(GAMMAS),) by name.
 
@@ -139,14 +163,20 @@ def least_scale(world: WorldArrays) -> float:
     return 0.05 * float(np.abs(world.rewards).max())
 
 
-def contrast(examination: Examination, name: str, gamma: float, right_gamma: float) -> float:
+def contrast(
+    examination: Examination, name: str, gamma: float, right_gamma: float, visits: np.ndarray | None = None
+) -> float:
     """log10 of the distance from an equation, less the distance from the right one, where both differ: negative if the
     values obey this one. Each with its own discount. NaN: they differ nowhere where it was.
+
+    Args:
+        visits: (S, A), of the pairs that count; None: all of the run.
     """
     other, right = targets(examination, gamma), targets(examination, right_gamma)[RIGHT]
     if name not in other:
         return float("nan")
-    weights, values = weights_of(examination, examination.visits), answers_of(examination)
+    weights = weights_of(examination, examination.visits if visits is None else visits)
+    values = answers_of(examination)
     parts = weights * (np.abs(other[name] - other[RIGHT]) > 0.02 * _scale(other[RIGHT], weights))
     if parts.sum() < 1e-3:
         return float("nan")
@@ -163,16 +193,19 @@ def _scale(target: np.ndarray, weights: np.ndarray) -> float:
     return max(deviation(target, weights), 0.05 * float(np.abs(target[weights > 0]).max(initial=0)), 1e-9)
 
 
-def cut_shares(examination: Examination, gamma: float) -> tuple[float, float]:
+def cut_shares(examination: Examination, gamma: float, visits: np.ndarray | None = None) -> tuple[float, float]:
     """Shares of the way from the right equation, 0, to the equation in which the time limit is an end, 1: by
     projection, and by regression beside the next values and a constant, which a slow target network does not move.
 
     NaN if the time limit ends less than one in CUTS steps.
+
+    Args:
+        visits: (S, A), of the pairs that count; None: all of the run.
     """
     if examination.cuts.sum() * CUTS < examination.visits.sum():
         return float("nan"), float("nan")
     backups, values = targets(examination, gamma), answers_of(examination)
-    right, weights = backups[RIGHT], weights_of(examination, examination.visits)
+    right, weights = backups[RIGHT], weights_of(examination, examination.visits if visits is None else visits)
     way, error = backups["cut_is_end"] - right, values - right
     length = float((weights * way**2).sum())
     if length < 1e-12:
@@ -181,6 +214,15 @@ def cut_shares(examination: Examination, gamma: float) -> tuple[float, float]:
     columns = np.stack([way.ravel(), right.ravel(), np.ones(way.size)], axis=1) * roots[:, None]
     partial = np.linalg.lstsq(columns, error.ravel() * roots, rcond=None)[0][0]
     return tuple(float(np.clip(x, -2, 3)) for x in ((weights * way * error).sum() / length, partial))  # type: ignore[return-value]
+
+
+def exact_values(examination: Examination, gamma: float) -> np.ndarray:
+    """Exact values of what it learns, of the shape of its answers: of the optimal policy, of the one that is played
+    onward, or, of states, of its own.
+    """
+    if examination.q is not None:
+        return optimal(examination.world, gamma, examination.onward)
+    return (examination.policy * optimal(examination.world, gamma, examination.policy)).sum(axis=1)
 
 
 def optimal(world: WorldArrays, gamma: float, policy: np.ndarray | None = None, sweeps: int = 2000) -> np.ndarray:
@@ -205,6 +247,9 @@ def readings(examinations: Sequence[Examination]) -> dict[str, float]:
     log10 of the residual; of each other equation the residual less the right one's, negative if it fits better;
     `cut_share` and `cut_partial`, see `cut_shares`; `image` and `image_size`, the residual and `size` if it sees
     images less the same for others;
+    `cut_partial_late` and `itself_late`, the same in states that it visited in the last fifth alone: values elsewhere
+    lag behind, as if the time limit were an end, or what comes after the state itself;
+    `on_policy`, `consistency` if the next actions count as they were played, see `on_policy`;
     `slope`, log10 of the factor with which rewards enter; `size`, log10 of the deviation of the values relative to
     exact ones; `truth`, their correlation with exact ones, and `truth_unvisited` elsewhere; `bias`, their mean error in
     deviations; `ends`, values of terminal states in deviations; `deaf`, the share of numbers of observations that
@@ -231,12 +276,17 @@ def _of_values(examinations: Sequence[Examination]) -> dict[str, float]:
     place = int(right.argmin())
     gamma = GAMMAS[place]
     numbers = {"gamma": -np.log10(1 - gamma), "consistency": float(right[place])}
+    if all(each.q is not None for each in examinations):
+        played = [np.log10(residuals(on_policy(each))[RIGHT] + FLOOR) for each in examinations]
+        numbers["on_policy"] = float(np.mean(played, axis=0).min())
     for name in EQUATIONS:
         applicable = [table for table in logs if name in table]
         if name != RIGHT and applicable:
             own = GAMMAS[int(np.mean([table.get(name, table[RIGHT]) for table in logs], axis=0).argmin())]
-            contrasts = [contrast(each, name, own, gamma) for each in examinations]
-            numbers[name] = float(np.nanmean(contrasts)) if np.isfinite(contrasts).any() else np.nan
+            numbers[name] = _mean_contrast(contrast(each, name, own, gamma) for each in examinations)
+            if name == "itself":
+                late = (contrast(each, name, own, gamma, each.late) for each in examinations)
+                numbers["itself_late"] = _mean_contrast(late)
     is_image = np.array([each.name.endswith("image") for each in examinations])
     if 0 < is_image.sum() < len(is_image):
         at_best = np.array([table[RIGHT][place] for table in logs])
@@ -251,14 +301,17 @@ def _of_values(examinations: Sequence[Examination]) -> dict[str, float]:
     return numbers | {name: float(np.mean(column)) for name, column in columns.items()}
 
 
+def _mean_contrast(contrasts: Iterable[float]) -> float:
+    """Mean of those that are numbers; NaN if none is."""
+    rows = [each for each in contrasts if np.isfinite(each)]
+    return float(np.mean(rows)) if rows else np.nan
+
+
 def _of_one(examination: Examination, gamma: float) -> dict[str, float]:
     """Readings of the values of one run."""
     world, values = examination.world, answers_of(examination)
     weights = weights_of(examination, examination.visits)
-    exact = optimal(world, gamma)
-    own = optimal(world, gamma, examination.policy)
-    if examination.q is None:
-        exact = own = (examination.policy * own).sum(axis=1)
+    exact = exact_values(examination, gamma)
     is_live = np.broadcast_to((~world.terminal).reshape(-1, *[1] * (values.ndim - 1)), values.shape)
     is_new = is_live & (weights == 0)
     scale = max(deviation(exact, weights), 1e-6 + 0.05 * float(np.abs(world.rewards).max()))
@@ -280,7 +333,9 @@ def _of_one(examination: Examination, gamma: float) -> dict[str, float]:
     numbers["forgets"] = np.log10(late + FLOOR) - np.log10(residuals(examination)[RIGHT][GAMMAS.index(gamma)] + FLOOR)
     numbers["slope"] = np.clip(reward_slope(examination, gamma), -3, 3)
     numbers["cut_share"], numbers["cut_partial"] = cut_shares(examination, gamma)
+    _, numbers["cut_partial_late"] = cut_shares(examination, gamma, examination.late)
     if examination.q is not None:
+        own = optimal(world, gamma, examination.policy)
         numbers["own"] = np.log10(
             (distance(values, own, weights, 1e-6) + FLOOR) / (distance(values, exact, weights, 1e-6) + FLOOR)
         )
@@ -298,9 +353,7 @@ def _of_one(examination: Examination, gamma: float) -> dict[str, float]:
 def _size(examination: Examination, gamma: float) -> float:
     """log10 of the deviation of values relative to exact ones, of the optimal policy or of the agent's own."""
     world, weights = examination.world, weights_of(examination, examination.visits)
-    exact = optimal(world, gamma, None if examination.q is not None else examination.policy)
-    if examination.q is None:
-        exact = (examination.policy * exact).sum(axis=1)
+    exact = exact_values(examination, gamma)
     least = 1e-6 + least_scale(world)
     return float(
         np.clip(
@@ -331,7 +384,7 @@ def reward_slope(examination: Examination, gamma: float) -> float:
     NaN if rewards do not differ in states that it visited; -3 if the slope is not positive.
     """
     values, world = answers_of(examination), examination.world
-    live = np.where(world.terminal, 0.0, values.max(axis=1) if values.ndim == 2 else values)
+    live = np.where(world.terminal, 0.0, state_values(examination))
     onward, rewards = gamma * (world.transitions @ live), world.rewards
     if values.ndim == 1:
         onward, rewards = (examination.policy * onward).sum(axis=1), (examination.policy * rewards).sum(axis=1)

@@ -94,6 +94,7 @@ class Examination:
         wavering: largest change of its answers if it is asked again, in another order.
         regret: of the last policy, 0 optimal and 1 as uniform play; late_regret: of the returns of the last fifth.
         notes: sentences on what looks like a mistake of its loop, by kind.
+        onward: (S, A) probabilities of the next action whose value counts in a backup; None: the largest value does.
     """
 
     name: str
@@ -111,6 +112,7 @@ class Examination:
     regret: float
     late_regret: float
     notes: Mapping[str, str] = field(default_factory=dict)
+    onward: np.ndarray | None = None
 
 
 @cache

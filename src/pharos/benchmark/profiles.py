@@ -29,6 +29,7 @@ LEAST_MARGIN = 0.3  # of a symptom's margin, that is added to the deviation of h
 CREDIBLE = 0.6  # likeness from which a fault is said
 HEALTHY_ONES = 3.0  # times as many agents that are healthy as agents with any one fault, before anything is seen
 FARTHEST = 1.45  # mean squared deviation from the nearest fault up to which an agent is like a known one
+ASIDE = ("on_policy", "cut_partial_late", "itself_late")  # readings that are no part of the likeness
 BROKEN = 0.5  # mean regret of an agent of which no check and no fault says what is wrong
 
 
@@ -42,6 +43,8 @@ class Symptom:
         wrong: sentence, with {value} for `show(reading)`. advice: what to look at.
         faults: of the library that it is a sign of, the most likely first.
         kind: of agents that it is a symptom of; empty: of all.
+        also: another reading that has to be beyond its limit as well, with the same margin and `beyond`: of lately
+            visited states, as values that lag behind elsewhere look like it; empty: none.
     """
 
     reading: str
@@ -53,6 +56,19 @@ class Symptom:
     faults: tuple[str, ...] = ()
     show: Callable[[float], str] = "{:.2f}".format
     kind: str = ""
+    also: str = ""
+
+    def limit(self, healthy: Sequence[Mapping[str, float]], reading: str = "") -> float:
+        """The limit by the readings of healthy agents, of its own reading or another one; no limit if they lack it."""
+        sign, name = 1 if self.is_high else -1, reading or self.reading
+        values = [sign * each[name] for each in healthy if name in each]
+        return sign * (max(max(values) + self.margin, sign * self.beyond) if values else np.inf)
+
+    def is_there(self, numbers: Mapping[str, float], healthy: Sequence[Mapping[str, float]]) -> bool:
+        """Whether the readings of an agent are beyond the limits of healthy ones."""
+        sign = 1 if self.is_high else -1
+        names = [self.reading, self.also] if self.also else [self.reading]
+        return all(sign * numbers.get(name, -sign * np.inf) > sign * self.limit(healthy, name) for name in names)
 
 
 def _factor(value: float) -> str:
@@ -153,6 +169,7 @@ SYMPTOMS = (
         "bootstrap where truncated: only terminated ends a return",
         ("truncation_as_end",),
         _percent,
+        also="cut_partial_late",
     ),
     Symptom(
         "signs",
@@ -183,6 +200,7 @@ SYMPTOMS = (
         "look for an observation that is overwritten before it is stored; copy the array",
         ("next_is_observation",),
         _factor,
+        also="itself_late",
     ),
     Symptom(
         "mean",
@@ -338,6 +356,18 @@ def kind_of(numbers: Mapping[str, float]) -> str:
     return "dqn" if "own" in numbers else "ppo"
 
 
+def is_on_policy(numbers: Mapping[str, float], library: Sequence[Profile]) -> bool:
+    """Whether values are farther from their backup with the largest next value than those of any healthy agent, but
+    not from their backup with the next actions as they were played: those of a learner on-policy, such as SARSA.
+    """
+    limit = next(each for each in SYMPTOMS if each.reading == "consistency").limit(_healthy(library))
+    return numbers.get("on_policy", np.inf) <= limit < numbers.get("consistency", -np.inf)
+
+
+def _healthy(library: Sequence[Profile]) -> list[Mapping[str, float]]:
+    return [each.readings for each in library if each.fault == HEALTHY]
+
+
 @dataclass(frozen=True, eq=False)
 class Deviations:
     """Distances of an agent from each fault of a library, F, in each of n readings.
@@ -357,7 +387,7 @@ class Deviations:
 
 def deviations(numbers: Mapping[str, float], library: Sequence[Profile]) -> Deviations:
     """The deviations of an agent's readings from those of a library."""
-    names = [name for name in numbers if all(name in each.readings for each in library)]
+    names = [name for name in numbers if name not in ASIDE and all(name in each.readings for each in library)]
     rows = np.array([[each.readings[name] for name in names] for each in library])
     faults = sorted({each.fault for each in library})
     members = np.array([[each.fault == fault for each in library] for fault in faults])
@@ -472,15 +502,11 @@ def failed(numbers: Mapping[str, float], library: Sequence[Profile]) -> list[Fin
     Args:
         numbers: readings of an agent. library: profiles, of which the healthy ones set limits.
     """
-    healthy = [each.readings for each in library if each.fault == HEALTHY]
-    findings = []
+    healthy, findings = _healthy(library), []
     for symptom in SYMPTOMS:
-        values = [each[symptom.reading] for each in healthy if symptom.reading in each]
-        if symptom.reading not in numbers or not values or symptom.kind not in ("", kind_of(numbers)):
-            continue
-        value, sign = numbers[symptom.reading], 1 if symptom.is_high else -1
-        limit = sign * max(*(sign * each + symptom.margin for each in values), sign * symptom.beyond)
-        if sign * value > sign * limit:
+        if symptom.kind in ("", kind_of(numbers)) and symptom.is_there(numbers, healthy):
+            value, limit = numbers[symptom.reading], symptom.limit(healthy)
+            values = [each[symptom.reading] for each in healthy if symptom.reading in each]
             wrong = symptom.wrong.format(value=symptom.show(value))
             strength = abs(value - limit) / (float(np.std(values)) + LEAST_MARGIN * symptom.margin)
             findings.append(Finding(symptom.reading, value, limit, wrong, symptom.advice, strength, symptom.faults))
