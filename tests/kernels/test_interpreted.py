@@ -61,7 +61,10 @@ def compiled_kernels():
     return [
         name
         for name, each in found.items()
-        if isinstance(each, CPUDispatcher) and "_compile_for_args" in vars(each) and each.signatures
+        if isinstance(each, CPUDispatcher)
+        and "_compile_for_args" in vars(each)
+        and each.signatures
+        and not each.targetoptions.get("no_cpython_wrapper")  # what kernels alone call
     ]
 
 
