@@ -109,6 +109,18 @@ def test_files_say_what_is_stored_and_what_is_quick(suite, tmp_path):
     file.write_text(text.replace("seeds: 1\n", "runs: 1\n"))
     with pytest.raises(FileFormatError, match=r"quick is .*; expected tasks and seeds"):
         load_suite(file)
+    for was, now, words in (
+        ("    worst: 0.0\n", "    worst: .nan\n", "stored is .*; expected finite numbers"),
+        ("    states: 10\n", f"    states: {10**400}\n", "stored is .*; expected finite numbers"),
+        ("seeds: 1\n", "seeds: 0\n", "quick has 0 seeds; expected 1 to 1,000"),
+        ("seeds: 1\n", "seeds: true\n", "quick has True seeds; expected 1 to 1,000"),
+        ("  - other\n", "  - nobody\n", r"quick has the tasks \['nobody'\]; expected names of its tasks and axes"),
+        ("  - other\n", "  - 1\n", r"quick has the tasks \[1\]; expected names of its tasks and axes"),
+    ):
+        assert was in text
+        file.write_text(text.replace(was, now, 1))
+        with pytest.raises(FileFormatError, match=words):
+            load_suite(file)
     assert "stored" not in (Path(benchmark.__file__).parent / "suites/v1.yaml").read_text()
 
 

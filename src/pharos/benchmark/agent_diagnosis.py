@@ -163,12 +163,12 @@ class Diagnosis:
 
 
 def meanings(kind: str) -> dict[str, str]:
-    """Faults in words; of all kinds where it is empty."""
+    """Faults in words; of all kinds if it is empty."""
     return {name: text for agent, table in FAULTS.items() if kind in ("", agent) for name, text in table.items()}
 
 
 def library_of(kind: str) -> list[Profile]:
-    """Known agents of a kind, of all kinds where it is empty."""
+    """Known agents of a kind, of all kinds if it is empty."""
     return [each for each in shipped() if kind in ("", each.kind)]
 
 
@@ -187,13 +187,13 @@ def diagnose(
     """Train an agent on twelve small worlds, or take a finished run, and say what is wrong, and what to try.
 
     Its policies are asked for `q_values(observations)`, (N, A), or `values(observations)`, (N,), if they offer them, as
-    those of Stable-Baselines3 do: these are held against exact ones. Without, only its behaviour is judged.
+    policies of Stable-Baselines3 do: these are held against exact ones. Without, only its behaviour is judged.
 
     Args:
         agent, hyperparameters, worlds, seeds, steps, timeout, progress: as `examine` takes them. Limits and likeness
             come from agents with all worlds, two seeds and 4,000 steps.
         results: in place of an agent: the folder or file of a finished run of a benchmark, or results read.
-        suite: the one that `results` are of, where that is not shipped.
+        suite: the suite of `results`, if it is not shipped.
     Raises:
         ParameterError: it is no agent, or it yields no policy; there are no such results; or both are given.
         PharosError: its code raises something, SystemExit included. TimeLimit: a run took longer than was allowed.

@@ -61,8 +61,8 @@ def _write(folder: Path, world: str, options: dict[str, Any], train: int, held_o
     seeds = [*range(train), *range(FIRST_HELD_OUT, FIRST_HELD_OUT + held_out)]
     for seed in seeds:
         env = make(world, **options, seed=seed)
-        with tempfile.TemporaryDirectory() as place:
-            space = build(env, place, progress=False)
+        with tempfile.TemporaryDirectory() as directory:
+            space = build(env, directory, progress=False)
             mdp, states = space.mdp(gamma=1.0), space.states()
             successors.append(np.asarray(space.successors, np.int64) + first)
             rewards.append(np.asarray(mdp.rewards, np.float64))

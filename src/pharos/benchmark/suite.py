@@ -44,7 +44,8 @@ BITS = 40
 SAMPLED = 4096
 """States of a large task whose rewards and observations enter its digest."""
 STORED = ("states", "worst", "lowest", "highest", "error_bound")
-QUICK = 3  # seeds
+HUGE = 1e300  # stored values are less
+QUICK, MOST_QUICK = 3, 1000  # seeds
 TOLERANCE = 1e-6
 """Of values, relative to V* less that of uniform play: solvers may sum in another order."""
 
@@ -113,6 +114,8 @@ class BenchmarkTask:
         check_name(self.name, "the name of a task")
         if self.stored and {*self.stored} != {*STORED}:
             raise ParameterError(f"task {self.name}: stored has {', '.join(self.stored)}; expected {', '.join(STORED)}")
+        if not all(abs(value) < HUGE for value in self.stored.values()):
+            raise ParameterError(f"task {self.name}: stored is {str(self.stored)[:120]}; expected finite numbers")
 
     @property
     def stored_values(self) -> TaskValues | None:
@@ -174,7 +177,7 @@ class Ladder:
     Attributes:
         axis: such as "exploration". unit: of the levels, such as "bits". quantity: what a level is, in words.
         tasks: with increasing levels; of pairs first and second in turn, with levels 0 and 1.
-        measure: by which `benchmarks/benchmark_select.py` finds the levels; "pairs" where tasks are pairs.
+        measure: by which `benchmarks/benchmark_select.py` finds the levels; "pairs" if tasks are pairs.
     """
 
     axis: str
@@ -298,7 +301,7 @@ def suite_of(entry: object, whose: str) -> Suite:
     if not isinstance(settings, dict) or not all(isinstance(each, dict) for each in settings.values()):
         raise FileFormatError(f"{whose}: hyperparameters are {str(settings)[:60]}; expected some of each baseline")
     quick = entry.get("quick", {})
-    if not isinstance(quick, dict) or not ({*quick} <= {"tasks", "seeds"} and isinstance(quick.get("seeds", 1), int)):
+    if not isinstance(quick, dict) or not {*quick} <= {"tasks", "seeds"}:
         raise FileFormatError(f"{whose}: quick is {str(quick)[:60]}; expected tasks and seeds")
     suite = Suite(
         str(entry["name"]),
@@ -311,6 +314,12 @@ def suite_of(entry: object, whose: str) -> Suite:
     )
     if len(suite._by_name) < len(suite.tasks):
         raise FileFormatError(f"{whose}: two tasks have the same name; expected a name of its own for each")
+    names = {CORE, *suite._by_name, *(ladder.axis for ladder in ladders)}
+    tasks, seeds = quick.get("tasks", [CORE]), quick.get("seeds", QUICK)
+    if not isinstance(tasks, list) or not tasks or not all(isinstance(each, str) and each in names for each in tasks):
+        raise FileFormatError(f"{whose}: quick has the tasks {str(tasks)[:60]}; expected names of its tasks and axes")
+    if type(seeds) is not int or not 1 <= seeds <= MOST_QUICK:
+        raise FileFormatError(f"{whose}: quick has {str(seeds)[:20]} seeds; expected 1 to {MOST_QUICK:,}")
     try:
         digest = digest_of_suite(suite)
     except (TypeError, ValueError, RecursionError):
