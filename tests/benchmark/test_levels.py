@@ -37,6 +37,18 @@ def lakes(first, number):
     return [pharos.make("frozen_lake", **OPTIONS, seed=seed) for seed in range(first, first + number)]
 
 
+def test_levels_that_are_damaged_in_the_cache_are_written_anew(tmp_path, monkeypatch):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    whole = levels_of("frozen_lake", OPTIONS, train=2)
+    folder = Path(whole.parameters["folder"])
+    rewards = np.load(folder / "rewards.npy")
+    for name in ("rewards.npy", "next_states.npy", "manifest.json"):
+        (folder / name).write_bytes((folder / name).read_bytes()[:40])
+        again = levels_of("frozen_lake", OPTIONS, train=2)
+        assert again.parameters == whole.parameters
+        assert (np.load(folder / "rewards.npy") == rewards).all() and Task(again).reference.optimal > 0
+
+
 def test_values_are_means_over_the_levels_that_are_measured(suite):
     """Levels one by one, each solved as a world of its own."""
     for task, worlds in zip(suite.tasks, (lakes(0, 2), lakes(FIRST_HELD_OUT, 3)), strict=True):

@@ -8,6 +8,7 @@ held-out levels they are those of the levels that it learns on.
 """
 
 import json
+import shutil
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.environments import Environment, make
+from pharos.errors import FileFormatError
 from pharos.mdp import TabularMDP
 from pharos.observations import observe
 from pharos.state_space import build
@@ -47,9 +49,19 @@ def levels_of(world: str, options: Mapping[str, Any], *, train: int, held_out: i
     """
     key = [world, make(world, **options, seed=0).version, dict(options), train, held_out, mdp_files.VERSION]
     folder = storage.cache_directory() / LEVELS / storage.digest_of_json(key)
-    if not mdp_files.is_folder(folder):
+    if not _is_whole(folder):
+        if not (folder / storage.LOCK).exists():  # nobody is writing it
+            shutil.rmtree(folder, ignore_errors=True)
         _write(folder, world, dict(options), train, held_out)
     return make("imported", folder=str(folder))
+
+
+def _is_whole(folder: Path) -> bool:
+    """Whether a folder has the levels, undamaged; else they are written anew."""
+    try:
+        return mdp_files.is_folder(folder) and bool(mdp_files.read_arrays(folder, mdp_files.read_mdp_manifest(folder)))
+    except (FileFormatError, ValueError):
+        return False
 
 
 def _write(folder: Path, world: str, options: dict[str, Any], train: int, held_out: int) -> None:

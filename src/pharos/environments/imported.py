@@ -225,6 +225,8 @@ class ImportedWorld(Environment):
     def _arrays(self) -> dict[str, np.ndarray]:
         try:
             return mdp_files.read_arrays(self.folder, self.manifest)
+        except FileFormatError:
+            raise
         except (KeyError, ValueError) as error:
             raise FileFormatError(
                 f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.REIMPORT}"
