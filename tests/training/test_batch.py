@@ -28,6 +28,7 @@ from pharos.training import (
     train_many,
     tune,
 )
+from pharos.training.execution import Training
 from pharos.training.results import CURVE_COLUMNS
 from pharos.training.schedule import plan
 from refusals import failing, refusal
@@ -325,6 +326,23 @@ def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
     with pytest.raises(AllRunsFailed, match="all 3 runs failed") as lacking:
         many(tmp_path / "bad", workers=2, **bad)
     assert all(isinstance(end, FailedRun) and "optimize_memory_usage" in end.error for end in lacking.value.outcome)
+
+
+def test_progress_never_goes_back_while_runs_of_a_group_end_one_by_one():
+    done = []
+    runs = [config(seed=seed) for seed in range(3)]
+    training = Training(runs, None, [[0, 1], [2]], None, lambda now: done.append(now.done), TaskCache())
+    ended = FailedRun(runs[0].to_dict(), None, PharosError("ended"))
+    for key, *message in [
+        ("pair", "rows", 80, {}),
+        ("pair", "end", 0, ended),
+        ("alone", "rows", 20, {}),
+        ("pair", "end", 1, ended),
+        ("alone", "rows", 40, {}),
+        ("alone", "end", 2, ended),
+    ]:
+        training.receive(key, tuple(message))
+    assert done == [80, 100, 120]
 
 
 @pytest.mark.long

@@ -393,11 +393,12 @@ class Training(Execution[PreparedRun]):
             self.steps[key], rows = content
             self._report(rows)
             return
-        self.steps[key] = 0
         if kind == "end":
-            index, self.results[index] = content
+            index, self.results[index] = content  # its steps are counted there, those of its group's others stay here
+            self.steps[key] = max(0, self.steps.get(key, 0) - self.runs[index].config.steps)
         else:
             indices, reason = content
+            self.steps[key] = 0
             self.halve(key, [self.runs[index] for index in indices], reason)
 
     def fail(self, run: PreparedRun, reason: str) -> None:
