@@ -16,7 +16,7 @@ PARTICIPLES |= {"paid", "reached", "said", "seeing", "seen", "taken", "together"
 
 # Keywords and fields that callers write, and rules, whose variables are part of the fingerprint of their state spaces.
 LICENSED = {
-    "agents/hyperparameters.py": {"given"},
+    "agents/registry.py": {"given"},
     "benchmark/verification.py": {"found"},
     "environments/base.py": {"likely"},
     "environments/imported.py": {"likely", "paid"},

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.agents import agent_called, agents, algorithm, extractor_class, make_model
+from pharos.agents import LIBRARIES, agent_called, agents, algorithm, extractor_class, make_model
 from pharos.benchmark.entry import POLICY, Entry
 from pharos.environments import BUILT_IN
 from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, UntrustedCode
@@ -26,7 +26,6 @@ from pharos.training import RunConfig, Task, TaskValues
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
-LIBRARIES = ("stable_baselines3", "sb3_contrib")
 LARGEST_OBSERVATION = 1 << 21
 NETWORK_OPTIONS = ("net_arch", "normalize_images", "ortho_init", "features_extractor_kwargs")
 """What `policy_kwargs` of an entry may say."""
