@@ -36,6 +36,7 @@ from pharos.agents.own import (
 from pharos.agents.q_learning import QLearning
 from pharos.agents.registry import agent_called, primary_predictors
 from pharos.agents.sb3 import (
+    AGENT_LIBRARIES,
     algorithm,
     check_hyperparameters,
     extractor_class,

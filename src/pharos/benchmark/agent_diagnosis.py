@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from pharos.benchmark.comparison import LEAST, WORSE, compare_groups
+from pharos.benchmark.comparison import LEAST_DIFFERENCE, WORSE, compare_groups
 from pharos.benchmark.contents import Contents, Source, contents_of, listed, run_warnings
 from pharos.benchmark.diagnosis import ONE_ACTION, groups_of, nearest, policies_of, seeds_sentence
 from pharos.benchmark.doctor import on_policy, readings
-from pharos.benchmark.examination import NAMES, PROTOCOL, Examination, examine
+from pharos.benchmark.examination import EXAMINATION_PROTOCOL, NAMES, Examination, examine
 from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY
 from pharos.benchmark.profiles import (
     BROKEN,
@@ -42,7 +42,7 @@ EXPLORER = (
 )
 LOSS = 0.1  # of score, on a group of tasks or an axis, that is a symptom
 IN_PLAY = 0.05  # of score, that is lost by chance in play
-SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "vector": (
         "look for a number that never reaches the network (slices, the number of inputs), and at sizes of numbers",
         ("last_feature_lost",),
@@ -179,7 +179,7 @@ def diagnose(
     hyperparameters: Mapping[str, Any] | None = None,
     worlds: Sequence[str] = NAMES,
     seeds: Sequence[int] = (0, 1),
-    steps: int = PROTOCOL.steps,
+    steps: int = EXAMINATION_PROTOCOL.steps,
     timeout: float | None = None,
     suite: Suite | str | None = None,
     progress: Callable[[float, str], object] = lambda share, text: None,
@@ -302,7 +302,7 @@ def findings_of(contents: Contents) -> list[Finding]:
         )
         share = len(below) / len(contents.agent.score.tasks)
         findings.append(Finding("below_random", share, 0.25, wrong, advice, 10 * share, ("action_off_by_one",)))
-    axes = {axis: own.score for axis, own in comparison.axes.items() if axis in SIGNS}
+    axes = {axis: own.score for axis, own in comparison.axes.items() if axis in LOSS_SIGNS}
     is_worse = [own.verdict == WORSE and own.interval.value <= -LOSS for own in axes.values()]
     if comparison.core is not None and comparison.core.verdict == WORSE and len(axes) > 1 and all(is_worse):
         wrong = f"it falls everywhere: the core and the axes of {listed([*axes])} are below {other.name}'s"
@@ -314,7 +314,7 @@ def findings_of(contents: Contents) -> list[Finding]:
     for name, each in compare_groups(contents.agent.results, other.results, groups).items():
         rest = compare_groups(contents.agent.results, other.results, {"": sorted(core - {*groups[name]})})
         spared = rest[""].interval.value if rest else 0.0
-        if name in SIGNS and each.verdict == WORSE and spared > each.interval.value / 2:
+        if name in LOSS_SIGNS and each.verdict == WORSE and spared > each.interval.value / 2:
             where = f"core tasks with {name}" if name in by_property else f"core tasks seen as {name}"
             findings += _loss(name, each.interval.value, f"{where}, beside {spared:+.2f} on the others", other.name)
     for axis, own in axes.items():
@@ -326,7 +326,7 @@ def findings_of(contents: Contents) -> list[Finding]:
 def _loss(name: str, difference: float, where: str, other: str) -> list[Finding]:
     if difference > -LOSS:
         return []
-    advice, faults = SIGNS[name]
+    advice, faults = LOSS_SIGNS[name]
     wrong = f"it scores {-difference:.2f} less than {other} on {where}"
     return [Finding(name, difference, -LOSS, wrong, advice, -difference / LOSS, faults)]
 
@@ -345,5 +345,5 @@ def _own_findings(contents: Contents) -> list[Finding]:
     if noise and (loss := sum(noise) / len(facts)) > IN_PLAY:
         wrong = f"played greedily, the same policies score {loss:.2f} more on {listed([pluralize(len(facts), 'task')])}"
         advice = "judge the greedy policy of a learner of values; look at the temperature and the entropy bonus"
-        findings.append(Finding("noise", loss, IN_PLAY, wrong, advice, loss / LEAST, ("plays_at_random",)))
+        findings.append(Finding("noise", loss, IN_PLAY, wrong, advice, loss / LEAST_DIFFERENCE, ("plays_at_random",)))
     return findings

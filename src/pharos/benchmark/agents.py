@@ -44,6 +44,7 @@ from pharos.system.sources import Source, find_source, is_reference, load_source
 from pharos.system.wording import capped, in_one_line, line_in
 from pharos.system.workers import Terminated, Workers
 from pharos.training import (
+    MOST_ERROR_LETTERS,
     Curve,
     Execution,
     FailedRun,
@@ -74,7 +75,6 @@ EXACT = ("oracle", "random")
 WARM = ("torch", "stable_baselines3")
 """Libraries that take long to load: the process that runs are forked from has them if the agent has."""
 LINGER_SECONDS = 10.0  # that a process may take to end when its run has
-LONGEST = 500  # letters of an agent's error
 
 OnProgress = Callable[[float, str], None]
 """on_progress(share of the steps that are done, text)."""
@@ -499,9 +499,11 @@ def record_run(
 
 def failure(label: str, job: Job, end: BaseException | str, file: str | None = None) -> str:
     """The message of a run that has failed: its agent, task and seed, the error, and the line of the agent's file."""
-    text, place = (end, "") if isinstance(end, str) else (in_one_line(end), line_in(end, file))
-    printable = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in capped(text, LONGEST))
-    return f"{label} on {job.id}: {printable.rstrip(': ')}{place}"
+    text, line = (end, "") if isinstance(end, str) else (in_one_line(end), line_in(end, file))
+    printable = "".join(
+        letter if letter.isprintable() else ascii(letter)[1:-1] for letter in capped(text, MOST_ERROR_LETTERS)
+    )
+    return f"{label} on {job.id}: {printable.rstrip(': ')}{line}"
 
 
 # Processes ------------------------------------------------------------------------------------------------------------

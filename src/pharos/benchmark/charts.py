@@ -11,7 +11,7 @@ import numpy as np
 
 from pharos.benchmark.scores import ConfidenceInterval
 
-POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+CONTENT_SECURITY_POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 WIDTH = 340
 MARKERS = ("M-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0z", "M-4 -4h8v8h-8z", "M0 -5l5 9h-10z", "M0 -5.5l5 5.5l-5 5.5l-5 -5.5z")
 CIVIDIS = ((0, 34, 78), (60, 78, 109), (124, 123, 120), (187, 174, 107), (254, 232, 56))  # Nunez et al. (2018)
@@ -89,7 +89,7 @@ def document(title: str, lead: Sequence[Element], sections: Sequence[Element]) -
     meta = (
         {"charset": "utf-8"},
         {"name": "viewport", "content": "width=device-width, initial-scale=1"},
-        {"http_equiv": "Content-Security-Policy", "content": POLICY},
+        {"http_equiv": "Content-Security-Policy", "content": CONTENT_SECURITY_POLICY},
     )
     head = element(
         "head", *(element("meta", **each) for each in meta), element("title", title), element("style", STYLE)
@@ -155,8 +155,8 @@ def path(points: Sequence[tuple[float, float]]) -> str:
 def marker(x: float, y: float, agent: int, title: str = "") -> Element:
     """The marker of an agent, with a tooltip."""
     tip = [element("title", title)] if title else []
-    shape, place = MARKERS[agent % len(MARKERS)], f"translate({x:.1f} {y:.1f})"
-    return element("path", *tip, d=shape, class_=f"f{agent % 6}", transform=place)
+    shape, transform = MARKERS[agent % len(MARKERS)], f"translate({x:.1f} {y:.1f})"
+    return element("path", *tip, d=shape, class_=f"f{agent % 6}", transform=transform)
 
 
 def label(x: float, y: float, text: str, anchor: str = "start", class_: str = "") -> Element:
@@ -231,8 +231,8 @@ def ladder_panel(
     height = (bottom - top) / 1.05
 
     def across(level: float) -> float:
-        place = np.interp(level, levels, np.arange(len(levels))) / max(1, len(levels) - 1)
-        return float(left + 10 + (right - left - 20) * place)
+        share = np.interp(level, levels, np.arange(len(levels))) / max(1, len(levels) - 1)
+        return float(left + 10 + (right - left - 20) * share)
 
     def down(regret: float) -> float:
         return bottom - height * min(max(regret, 0.0), 1.05)
@@ -289,7 +289,7 @@ def learning_panel(steps: int, lines: Sequence[Sequence[ConfidenceInterval]], ti
         shapes.append(label(at(k / 3, 0)[0], bottom + 15, f"{steps * k / 3:,.0f}", "middle", "faint"))
     shapes.append(label((left + right) / 2, bottom + 32, "steps", "middle"))
     for k, own in reversed([(k, own) for k, own in enumerate(lines) if own]):
-        shares = [place / len(own) for place in range(1, len(own) + 1)]
+        shares = [rank / len(own) for rank in range(1, len(own) + 1)]
         if not k:
             low, high = ([at(x, ends(each)[end]) for x, each in zip(shares, own, strict=True)] for end in (0, 1))
             shapes.append(element("path", d=path([*low, *reversed(high)]) + "Z", class_="f0", opacity="0.16"))
@@ -348,8 +348,8 @@ def scatter(
 
 def shade(share: float) -> str:
     """Colour of a number in [0, 1] in the scale cividis, readable with colour vision deficiencies."""
-    place = np.linspace(0, 1, len(CIVIDIS))
-    red, green, blue = (round(float(np.interp(share, place, [color[k] for color in CIVIDIS]))) for k in range(3))
+    shares = np.linspace(0, 1, len(CIVIDIS))
+    red, green, blue = (round(float(np.interp(share, shares, [color[k] for color in CIVIDIS]))) for k in range(3))
     return f"#{red:02x}{green:02x}{blue:02x}"
 
 

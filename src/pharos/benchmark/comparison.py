@@ -43,9 +43,9 @@ SIGNIFICANCE = 1.0 - CONFIDENCE
 POWER = 0.8
 SEEDS = (3, 5, 10, 20)
 MOST_SEEDS = 100_000
-LEAST = 0.02  # a difference of scores that matters
-BETTER, WORSE, UNDECIDED, UNKNOWN = "better", "worse", "not shown to differ", "one seed"
-NEGLIGIBLE = f"less than {LEAST:g} apart"
+LEAST_DIFFERENCE = 0.02  # a difference of scores that matters
+BETTER, WORSE, NOT_SHOWN_TO_DIFFER, ONE_SEED = "better", "worse", "not shown to differ", "one seed"
+NEGLIGIBLE = f"less than {LEAST_DIFFERENCE:g} apart"
 EQUAL_SEEDS = "equal seeds"
 
 
@@ -139,7 +139,7 @@ def compare(
     for each in (ours, theirs):
         check_suite(each, suite)
     # Scores of the tasks that both have run
-    unknown = EQUAL_SEEDS if has_equal_seeds(ours) or has_equal_seeds(theirs) else UNKNOWN
+    unknown = EQUAL_SEEDS if has_equal_seeds(ours) or has_equal_seeds(theirs) else ONE_SEED
     x, y = run_scores(as_one_run(ours)), run_scores(as_one_run(theirs))
     common = [task.name for task in suite.tasks if task.name in x and task.name in y]
     if not common:
@@ -180,7 +180,7 @@ def compare_groups(
         ours, theirs: results on one suite.
         groups: name -> names of tasks; tasks that one of them lacks are left out, and so are groups without a task.
     """
-    unknown = EQUAL_SEEDS if has_equal_seeds(ours) or has_equal_seeds(theirs) else UNKNOWN
+    unknown = EQUAL_SEEDS if has_equal_seeds(ours) or has_equal_seeds(theirs) else ONE_SEED
     x, y = run_scores(as_one_run(ours)), run_scores(as_one_run(theirs))
     common = {group: [name for name in names if name in x and name in y] for group, names in groups.items()}
     return _judged({group: _difference(x, y, names) for group, names in common.items() if names}, unknown)
@@ -292,11 +292,11 @@ def _difference(
         ),
         p_value=p_value,
         adjusted=p_value,
-        verdict=UNDECIDED,
+        verdict=NOT_SHOWN_TO_DIFFER,
     )
 
 
-def _judged(differences: Mapping[str, Difference], unknown: str = UNKNOWN) -> dict[str, Difference]:
+def _judged(differences: Mapping[str, Difference], unknown: str = ONE_SEED) -> dict[str, Difference]:
     """The differences of one family, with Holm's correction and verdicts; `unknown` is that without a p-value."""
     adjusted = holm([each.p_value for each in differences.values()]).tolist()
     return {
@@ -307,8 +307,8 @@ def _judged(differences: Mapping[str, Difference], unknown: str = UNKNOWN) -> di
 
 def _verdict(difference: float, p_value: float, unknown: str) -> str:
     if not p_value < SIGNIFICANCE:
-        return unknown if math.isnan(p_value) else UNDECIDED
-    return NEGLIGIBLE if abs(difference) < LEAST else BETTER if difference > 0 else WORSE
+        return unknown if math.isnan(p_value) else NOT_SHOWN_TO_DIFFER
+    return NEGLIGIBLE if abs(difference) < LEAST_DIFFERENCE else BETTER if difference > 0 else WORSE
 
 
 def _seeds_for(variances: np.ndarray, difference: float) -> int | None:

@@ -11,16 +11,16 @@ from dataclasses import replace
 from pharos.benchmark.charts import frontier_text
 from pharos.benchmark.comparison import (
     BETTER,
-    LEAST,
+    LEAST_DIFFERENCE,
     NEGLIGIBLE,
-    UNDECIDED,
+    NOT_SHOWN_TO_DIFFER,
     WORSE,
     AxisComparison,
     Comparison,
     Difference,
 )
 from pharos.benchmark.contents import (
-    PREDICTORS,
+    PREDICTOR_PHRASES,
     Contents,
     ScoredAgent,
     learner_kind,
@@ -37,10 +37,10 @@ from pharos.benchmark.suite import BenchmarkTask
 from pharos.system.wording import pluralize
 
 SHIPPED = {"dqn": ("dqn",), "ppo": ("ppo",), "table": ("q_learning",), "both": ("dqn", "ppo")}
-OWN = 0.1  # by which the regret of a residual is above the regret of the shipped agent of the kind
+OWN_RESIDUAL = 0.1  # by which the regret of a residual is above the regret of the shipped agent of the kind
 ONE_ACTION = 0.9  # share of states in which a policy prefers the same action, to be told so
-SHOWN = 5  # names of tasks in a sentence
-VERDICTS = (WORSE, BETTER, NEGLIGIBLE, UNDECIDED)
+SHOWN_TASKS = 5  # names of tasks in a sentence
+VERDICTS = (WORSE, BETTER, NEGLIGIBLE, NOT_SHOWN_TO_DIFFER)
 
 
 def nearest(contents: Contents) -> tuple[int, float, bool] | None:
@@ -59,8 +59,8 @@ def nearest(contents: Contents) -> tuple[int, float, bool] | None:
         return None
     kind = learner_kind(contents.agent.results)
     same = [k for k in distances if kind == learner_kind(contents.beside[k].results) and kind not in ("both", "none")]
-    place = min(same or distances, key=distances.__getitem__)
-    return place, distances[place], bool(same)
+    nearest = min(same or distances, key=distances.__getitem__)
+    return nearest, distances[nearest], bool(same)
 
 
 def strengths(contents: Contents) -> dict[str, list[str]]:
@@ -153,7 +153,7 @@ def falls(contents: Contents) -> list[list[str]]:
     return rows
 
 
-def gaps(contents: Contents) -> list[list[str]]:
+def level_gaps(contents: Contents) -> list[list[str]]:
     """Rows on each pair of levels seen and held out that was run: both scores of the agent, and the gap of all agents.
 
     The gap is regret on held-out levels less that on training levels, by seed.
@@ -185,9 +185,9 @@ def groups_of(contents: Contents) -> tuple[dict[str, list[str]], dict[str, list[
             continue
         by_observation.setdefault(task.observation, []).append(task.name)
         if (own := known_properties().get(task.digest)) is not None:
-            for place, group in enumerate(own.groups):
-                kinds += [{}] * (place == len(kinds))
-                kinds[place] = {**kinds[place], group: [*kinds[place].get(group, []), task.name]}
+            for index, group in enumerate(own.groups):
+                kinds += [{}] * (index == len(kinds))
+                kinds[index] = {**kinds[index], group: [*kinds[index].get(group, []), task.name]}
     return by_observation, {group: names for kind in kinds if len(kind) > 1 for group, names in sorted(kind.items())}
 
 
@@ -218,17 +218,17 @@ def shipped_regret(contents: Contents, task: BenchmarkTask) -> float | None:
 def is_own(contents: Contents, task: BenchmarkTask, regret: float) -> bool:
     """Whether a residual is the agent's own: it is more than 0.1 worse than the shipped agent, or there is none."""
     shipped = shipped_regret(contents, task)
-    return shipped is None or regret - shipped > OWN
+    return shipped is None or regret - shipped > OWN_RESIDUAL
 
 
 def predictor_sentence(contents: Contents) -> str:
     """Sentence on which idealised learner was taken, and the number of tasks that the others would list."""
     counts = {
         name: len(residual_tasks(replace(contents, predictor=name)))
-        for name in PREDICTORS
+        for name in PREDICTOR_PHRASES
         if name != contents.predictor
     }
-    others = listed([f"{count} beside {PREDICTORS[name]}" for name, count in counts.items()])
+    others = listed([f"{count} beside {PREDICTOR_PHRASES[name]}" for name, count in counts.items()])
     request = (
         "The agent's name does not say its kind, so the worse of two was taken, which lists the fewest; say it: "
         "--predictor dqn, ppo, table or none. "
@@ -280,7 +280,8 @@ def policy_sentences(contents: Contents) -> list[str]:
     count, sentences = pluralize(len(facts), "core task"), []
     fixed = [name for name, each in facts.items() if each["one_action"] >= ONE_ACTION]
     if fixed:
-        shown = f"{', '.join(fixed[:SHOWN])}{f' and {len(fixed) - SHOWN} more' if len(fixed) > SHOWN else ''}"
+        more = f" and {len(fixed) - SHOWN_TASKS} more" if len(fixed) > SHOWN_TASKS else ""
+        shown = f"{', '.join(fixed[:SHOWN_TASKS])}{more}"
         sentences.append(
             f"One action in {100 * ONE_ACTION:.0f} % of states and more: on {len(fixed)} of {count} the final policy "
             f"prefers the same action nearly everywhere ({shown}). If the observation does not reach the policy, or "
@@ -296,9 +297,9 @@ def policy_sentences(contents: Contents) -> list[str]:
         best = sum(facts[name].get("greedy_score", float(runs[name].mean())) for name in facts) / len(facts)
         noise = (
             f"of {1 - own:.2f} below optimal, {best - own:.2f} is noise in play"
-            if best - own >= LEAST
+            if best - own >= LEAST_DIFFERENCE
             else "noise in play costs nothing"
-            if best - own > -LEAST
+            if best - own > -LEAST_DIFFERENCE
             else f"it plays {own - best:.2f} better with its chance"
         )
         sentences.append(

@@ -23,7 +23,7 @@ from pharos.benchmark.faults import HEALTHY
 from pharos.benchmark.profiles import Profile, deviations
 from pharos.benchmark.scores import ConfidenceInterval
 
-ROWS = 12  # readings in the plot
+MOST_READINGS = 12  # readings in the plot
 WIDEST = 8.0  # deviations
 
 
@@ -76,7 +76,7 @@ def profile_rows(
     away = deviations(numbers, library)
     own = away.rows[away.faults.index(HEALTHY)]
     columns = np.array([own, *(own - away.rows[away.faults.index(fault)] for fault in faults)])
-    order = np.argsort(-np.abs(np.clip(columns, -WIDEST, WIDEST)).sum(axis=0), kind="stable")[:ROWS]
+    order = np.argsort(-np.abs(np.clip(columns, -WIDEST, WIDEST)).sum(axis=0), kind="stable")[:MOST_READINGS]
     return [away.names[k] for k in order], [tuple(map(float, columns[:, k])) for k in order]
 
 

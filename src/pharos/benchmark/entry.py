@@ -19,9 +19,9 @@ from pharos.system import records, storage
 from pharos.system.sealed import check_values, write_sealed
 from pharos.training import RunConfig, check_agent_files, read_record, read_rows, run_id
 
-POLICY = "policy"
+POLICY_ARRAY = "policy"
 """The array of a tabular agent; a network has arrays by the names of its parameters."""
-_ARRAYS = "arrays"
+_ARRAYS_KEY = "arrays"
 TRAINING = (
     "episodes",
     "cumulative_regret",
@@ -31,7 +31,7 @@ TRAINING = (
     "mean_return",
 )
 """Of the result of a run, what only training again could verify."""
-WHAT = "submission to a benchmark"
+ENTRY_KIND = "submission to a benchmark"
 
 
 @dataclass(frozen=True)
@@ -88,16 +88,16 @@ class Entry:
 
     def write(self, file: str | os.PathLike) -> None:
         """Write the entry to a file, replacing it atomically; the same entry gives the same bytes."""
-        body = {name: value for name, value in vars(self).items() if name != _ARRAYS}
+        body = {name: value for name, value in vars(self).items() if name != _ARRAYS_KEY}
         record = {**body, "id": self.id, "config": self.config.to_dict(), "claim": asdict(self.claim)}
-        write_sealed(file, record, self.arrays, WHAT, follow=True)
+        write_sealed(file, record, self.arrays, ENTRY_KIND, follow=True)
 
     @staticmethod
     def of_record(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Entry":
         """Entry of the record and the arrays of a file; FileFormatError or ValueError if they are damaged."""
         check_values(record)
         fields = {name: value for name, value in record.items() if name not in ("format", "id", storage.DIGEST)}
-        entry = records.parse_record(Entry, {**fields, _ARRAYS: arrays}, "its record")
+        entry = records.parse_record(Entry, {**fields, _ARRAYS_KEY: arrays}, "its record")
         if record["id"] != run_id(record["config"]):
             raise ValueError("its configuration is not that of its run")
         if entry.claim.error_bound < 0:
@@ -144,7 +144,7 @@ class Entry:
             rules_version=_rules_version(run, record, config),
             claim=claim,
             training={key: result.get(key) for key in TRAINING} | {"seconds": record.get("seconds")},
-            arrays={POLICY: stored_table(run)} if agent_called(config.agent).has_table else _network(run),
+            arrays={POLICY_ARRAY: stored_table(run)} if agent_called(config.agent).has_table else _network(run),
         )
 
 

@@ -33,7 +33,7 @@ from pharos.training import (
     regret,
 )
 
-PROTOCOL = Protocol(steps=4000, evaluations=10, seeds=2)
+EXAMINATION_PROTOCOL = Protocol(steps=4000, evaluations=10, seeds=2)
 LATE, LAST = 0.2, 0.025  # parts of a run
 
 
@@ -120,7 +120,7 @@ def solved(name: str) -> tuple[Task, WorldArrays, np.ndarray]:
     """Task, arrays and observations of all states of one of WORLDS. UnknownName: there is none of this name."""
     if name not in NAMES:
         raise UnknownName("world", name, NAMES)
-    task = WORLDS[NAMES.index(name)].training_task(PROTOCOL)
+    task = WORLDS[NAMES.index(name)].training_task(EXAMINATION_PROTOCOL)
     mdp, size = task.mdp, task.mdp.num_states
     states = np.arange(size)
     observations: Any = task.observer.observe(task.space.states(states), np.full(size, -1), np.zeros(size, np.int64))
@@ -184,7 +184,7 @@ class Witness(PolicyRecorder):
     def __init__(self, name: str, seed: int, steps: int):
         self.name, self.seed, self.log = name, seed, Log()
         task, self.world, self.observations = solved(name)
-        super().__init__(task, steps=steps, interval=max(1, steps // PROTOCOL.evaluations), seed=seed)
+        super().__init__(task, steps=steps, interval=max(1, steps // EXAMINATION_PROTOCOL.evaluations), seed=seed)
         self.env = WatchedEnv(task, self.budget, seed, self.log)
         self.answers: tuple[np.ndarray | None, np.ndarray | None, np.ndarray, float] | None = None
 
@@ -364,7 +364,7 @@ def examine(
     hyperparameters: Mapping[str, Any] | None = None,
     worlds: Sequence[str] = NAMES,
     seeds: Sequence[int] = (0, 1),
-    steps: int = PROTOCOL.steps,
+    steps: int = EXAMINATION_PROTOCOL.steps,
     timeout: float | None = None,
     progress: Callable[[float, str], object] = lambda share, text: None,
 ) -> list[Examination]:

@@ -20,7 +20,7 @@ import numpy as np
 
 from pharos.agents import COMPILED
 from pharos.benchmark.agents import Form, Job, OnProgress, RunSettings, agent_form
-from pharos.benchmark.results import FILE, AgentResults
+from pharos.benchmark.results import RESULTS_FILE, AgentResults
 from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, equal_seeds, score
 from pharos.benchmark.suite import CORE, EARLIER, BenchmarkTask, Suite, load_suite
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError, PharosError, UnknownName
@@ -30,7 +30,7 @@ from pharos.system.workers import usable_workers
 from pharos.training import versions
 
 SUITE, AGENT, SCORE = "suite.json", "agent.json", "score.json"
-SHOWN = 200  # characters of what differs
+SHOWN_CHARACTERS = 200  # characters of what differs
 
 
 @dataclass(frozen=True)
@@ -198,8 +198,9 @@ def claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str, 
         different = [name for name in entry if before.get(name) != entry[name]]
         if different:
             raise ParameterError(
-                f"{folder}: holds runs with another {different[0]}: {str(before.get(different[0]))[:SHOWN]}, now "
-                f"{str(entry[different[0]])[:SHOWN]}; choose another folder, or delete it"
+                f"{folder}: holds runs with another {different[0]}: "
+                f"{str(before.get(different[0]))[:SHOWN_CHARACTERS]}, now "
+                f"{str(entry[different[0]])[:SHOWN_CHARACTERS]}; choose another folder, or delete it"
             )
     return contents[AGENT]
 
@@ -240,7 +241,7 @@ def collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any],
     if not whole:
         reason, _ = Counter(missing.values()).most_common(1)[0]
         raise AllRunsFailed(folder, {reason: reason}, outcome)
-    results.write(folder / FILE)
+    results.write(folder / RESULTS_FILE)
     if outcome.scores.has_core:
         storage.replace_json(folder / SCORE, {"agent": results.agent, "suite": suite.name, **asdict(outcome.scores)})
     return outcome

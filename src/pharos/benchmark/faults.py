@@ -1,4 +1,4 @@
-"""Faults that people make in agents, each a switch of a small DQN or PPO: what `pharos diagnose` knows.
+"""Faults that people faulty_agent in agents, each a switch of a small DQN or PPO: what `pharos diagnose` knows.
 
     pharos diagnose pharos.benchmark.faults:dqn --set fault=target_never_copied
     pharos benchmark run --agent pharos.benchmark.faults:ppo --set fault=gamma_half --out results/fault
@@ -74,7 +74,7 @@ FAMILIES = {
 """Families of faults: name -> what they are about, and which."""
 
 
-def make(agent: str, fault: str = HEALTHY, **hyperparameters: Any) -> partial[Iterator["Greedy | Stochastic"]]:
+def faulty_agent(agent: str, fault: str = HEALTHY, **hyperparameters: Any) -> partial[Iterator["Greedy | Stochastic"]]:
     """The agent "dqn" or "ppo" with a fault, as learn(env, steps, seed), which `benchmark.run` and `diagnose` take.
 
     Args:

@@ -42,7 +42,7 @@ from pharos.training import (
     write_record,
 )
 
-OWN = "own loop"
+OWN_LOOP = "own loop"
 """Name of an agent that has none."""
 
 
@@ -144,7 +144,7 @@ def task(
     suite: str | Path | Suite = "v1",
     seed: int = 0,
     out: str | os.PathLike | None = None,
-    agent: str = OWN,
+    agent: str = OWN_LOOP,
     hyperparameters: Mapping[str, Any] | None = None,
 ) -> TaskEnv:
     """The environment of a task of a suite, which counts its steps and takes the policies of a loop of your own.
@@ -209,7 +209,7 @@ class LoopRun:
         *,
         steps: int = 50_000,
         seed: int = 0,
-        agent: str = OWN,
+        agent: str = OWN_LOOP,
         out: str | os.PathLike | None = None,
         **options: Any,
     ):

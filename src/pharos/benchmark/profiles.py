@@ -20,10 +20,10 @@ import numpy as np
 from pharos.benchmark.doctor import EQUATIONS
 from pharos.benchmark.faults import FAMILIES, HEALTHY
 
-FILE = Path(__file__).parent / "data" / "fault_profiles.csv"
+PROFILES_FILE = Path(__file__).parent / "data" / "fault_profiles.csv"
 DECIMALS = 3
 LARGEST = 4.0  # deviations within a fault that a reading counts as being away
-OWN = 0.5  # weight of the deviations alone in the covariance within a fault
+DIAGONAL_WEIGHT = 0.5  # weight of the deviations alone in the covariance within a fault
 INDEPENDENT = 8  # readings that count as independent evidence
 LEAST_MARGIN = 0.3  # of a symptom's margin, that is added to the deviation of healthy agents
 CREDIBLE = 0.6  # likeness from which a fault is said
@@ -342,7 +342,7 @@ class Profile:
 @cache
 def shipped() -> tuple[Profile, ...]:
     """Profiles of the library."""
-    with open(FILE, encoding="utf-8", newline="") as lines:
+    with open(PROFILES_FILE, encoding="utf-8", newline="") as lines:
         return tuple(
             Profile(row.pop("agent"), row.pop("fault"), {name: float(text) for name, text in row.items() if text})
             for row in csv.DictReader(lines)
@@ -396,7 +396,7 @@ def deviations(numbers: Mapping[str, float], library: Sequence[Profile]) -> Devi
     freedom = max(len(rows) - len(faults), 1)
     units = np.sqrt((within**2).sum(axis=0) / freedom) + 0.05 * rows.std(axis=0) + 1e-3
     standard = within / units
-    covariance = (1 - OWN) * standard.T @ standard / freedom + OWN * np.eye(len(names))
+    covariance = (1 - DIAGONAL_WEIGHT) * standard.T @ standard / freedom + DIAGONAL_WEIGHT * np.eye(len(names))
     x = np.array([numbers[name] for name in names])
     return Deviations(names, faults, members.sum(axis=1), (x - means) / units, covariance)
 
@@ -458,8 +458,8 @@ def accuracy(kind: str) -> Accuracy:
     """Accuracy of a shipped library for a kind of agent: each of its agents is left out in turn, then its fault."""
     library = [each for each in shipped() if each.kind == kind]
     ranks, healthy, unknown = [], [], []
-    for place, each in enumerate(library):
-        rest = library[:place] + library[place + 1 :]
+    for index, each in enumerate(library):
+        rest = library[:index] + library[index + 1 :]
         if each.fault not in {other.fault for other in rest}:
             continue
         answer = judged(each.readings, rest)
@@ -470,10 +470,10 @@ def accuracy(kind: str) -> Accuracy:
         answer = judged(each.readings, [other for other in rest if other.fault != each.fault])
         own = {fault for _, faults in FAMILIES.values() if each.fault in faults for fault in faults}
         unknown.append(answer.fault in own if answer.fault else bool(answer.findings) or answer.is_strange)
-    places = np.array(ranks)
+    rank = np.array(ranks)
     if not ranks or not healthy:
         return Accuracy(0, *[float("nan")] * 4)
-    shares = (places == 0).mean(), (places < 3).mean(), np.mean(healthy), np.mean(unknown)
+    shares = (rank == 0).mean(), (rank < 3).mean(), np.mean(healthy), np.mean(unknown)
     return Accuracy(len(ranks) + len(healthy), *map(float, shares))
 
 

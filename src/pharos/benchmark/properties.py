@@ -17,8 +17,8 @@ from pharos.benchmark.suite import BenchmarkTask, Protocol
 from pharos.mdp import rewards_of_outcomes
 from pharos.policies import evaluate_policy
 
-FILE = Path(__file__).parent / "data" / "task_properties.csv"
-PURPOSES = FILE.with_name("task_purposes.csv")
+PROPERTIES_FILE = Path(__file__).parent / "data" / "task_properties.csv"
+PURPOSES = PROPERTIES_FILE.with_name("task_purposes.csv")
 SHORT, LONG = 32, 400  # steps
 
 
@@ -86,7 +86,7 @@ def known_properties() -> dict[str, TaskProperties]:
         "time_limit": int,
         "constant": float,
     }
-    with open(FILE, encoding="utf-8", newline="") as lines:
+    with open(PROPERTIES_FILE, encoding="utf-8", newline="") as lines:
         rows = [
             TaskProperties(
                 **{each.name: read.get(each.name, "True".__eq__)(row[each.name]) for each in fields(TaskProperties)}

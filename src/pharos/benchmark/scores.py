@@ -82,7 +82,7 @@ class ConfidenceInterval:
     __str__ = text
 
 
-UNKNOWN = ConfidenceInterval(math.nan)
+UNKNOWN_INTERVAL = ConfidenceInterval(math.nan)
 
 
 def _digits(number: float) -> str:
@@ -105,8 +105,8 @@ class AxisScore:
     unit: str
     score: ConfidenceInterval
     frontier: ConfidenceInterval
-    lowest: ConfidenceInterval = field(default=UNKNOWN)
-    fall: ConfidenceInterval = field(default=UNKNOWN)
+    lowest: ConfidenceInterval = field(default=UNKNOWN_INTERVAL)
+    fall: ConfidenceInterval = field(default=UNKNOWN_INTERVAL)
 
     def to_dict(self) -> Mapping[str, Mapping[str, object]]:
         """Score and frontier, for JSON."""
@@ -189,14 +189,14 @@ def axis_score(ladder: "Ladder", runs: Mapping[str, np.ndarray]) -> AxisScore | 
     rungs = [task for task in ladder.tasks if task.name in weights]
     own = [runs[task.name] for task in rungs]
     if ladder.pairs:
-        return AxisScore(ladder.axis, ladder.unit, _contrast(own, list(weights.values()), 1.0), UNKNOWN)
+        return AxisScore(ladder.axis, ladder.unit, _contrast(own, list(weights.values()), 1.0), UNKNOWN_INTERVAL)
     levels = np.array([task.level for task in rungs], np.float64)
     several = len(rungs) > 1
     return AxisScore(
         ladder.axis,
         ladder.unit,
         ConfidenceInterval.of_mean(own, (0.0, 1.0)),
-        frontier(levels, [1.0 - x for x in own]) if several else UNKNOWN,
+        frontier(levels, [1.0 - x for x in own]) if several else UNKNOWN_INTERVAL,
         *((ConfidenceInterval.of_mean(own[:1], (0.0, 1.0)), _fall(own)) if rungs[0] is ladder.tasks[0] else ()),
     )
 
@@ -204,7 +204,7 @@ def axis_score(ladder: "Ladder", runs: Mapping[str, np.ndarray]) -> AxisScore | 
 def _fall(rungs: Sequence[np.ndarray]) -> ConfidenceInterval:
     """Mean on the first rung less the mean over the others, with Student's interval; NaN with one rung."""
     if len(rungs) < 2:
-        return UNKNOWN
+        return UNKNOWN_INTERVAL
     return _contrast(rungs, [1.0, *[-1.0 / (len(rungs) - 1)] * (len(rungs) - 1)])
 
 
@@ -214,23 +214,23 @@ def _contrast(strata: Sequence[np.ndarray], weights: Sequence[float], constant: 
     return ConfidenceInterval(*statistics.student_interval(value, *statistics.standard_error(strata, weights)))
 
 
-def check_suite(results: "AgentResults", suite: "Suite", whose: str = "") -> None:
+def check_suite(results: "AgentResults", suite: "Suite", source: str = "") -> None:
     """Refuse results of another suite, by name.
 
     Args:
-        whose: the file that they are of, for messages.
+        source: the file that they come from, for messages.
     Raises:
         ParameterError: the digest is another one, or there are curves of tasks that are not in the suite.
     """
     if results.digest != suite.digest:
         raise ParameterError(
-            f"{f'{whose}: ' * bool(whose)}results of {results.agent} are of suite {results.suite} with digest "
+            f"{f'{source}: ' * bool(source)}results of {results.agent} are of suite {results.suite} with digest "
             f"{results.digest[:12]}; expected {suite.name} with {suite.digest[:12]}: run the agent on that suite, or "
             f"name its suite (--suite)"
         )
     if unknown := sorted({*results.curves} - {task.name for task in suite.tasks}):
         raise ParameterError(
-            f"{whose or f'results of {results.agent}'}: curves of {unknown[0]!r}, which is no task of suite "
+            f"{source or f'results of {results.agent}'}: curves of {unknown[0]!r}, which is no task of suite "
             f"{suite.name}"
         )
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.benchmark.entry import WHAT, Entry, stored_table
+from pharos.benchmark.entry import ENTRY_KIND, Entry, stored_table
 from pharos.benchmark.results import AgentResults, entries_of
 from pharos.benchmark.scores import check_suite
 from pharos.benchmark.suite import Suite, load_suite
@@ -59,18 +59,18 @@ class Submission:
         }
         arrays = {f"curve/{task}": curve for task, curve in results.curves.items()}
         arrays |= {f"policy/{task}/{seed}": policy for (task, seed), policy in self.policies.items()}
-        write_sealed(file, record, arrays, WHAT, follow=True)
+        write_sealed(file, record, arrays, ENTRY_KIND, follow=True)
 
     @staticmethod
     def read(file: str | os.PathLike) -> "Submission":
         """Read runs of a suite; raises as `pharos.benchmark.read`, also for the run of one task."""
-        return read_sealed(file, WHAT, Submission.of_record)
+        return read_sealed(file, ENTRY_KIND, Submission.of_record)
 
     @staticmethod
     def of_record(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Submission":
         """Submission of the record and the arrays of a file; FileFormatError or ValueError if they are damaged."""
         kinds = {"name": str, "author": str, "note": str, "suite": str, "suite_digest": str, "seeds": list}
-        values = entries_of(record, {**kinds, "record": dict}, WHAT)
+        values = entries_of(record, {**kinds, "record": dict}, ENTRY_KIND)
         name, author, note, suite, digest, seeds, provenance = values
         curves, policies = {}, {}
         for key, array in arrays.items():
@@ -123,7 +123,7 @@ def read(file: str | os.PathLike) -> Entry | Submission:
     def content(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Entry | Submission:
         return (Submission if "suite" in record else Entry).of_record(record, arrays)
 
-    return read_sealed(file, WHAT, content)
+    return read_sealed(file, ENTRY_KIND, content)
 
 
 def submit(
@@ -201,7 +201,7 @@ def final_policy(run: Path, task: Task, *, trust: bool = False) -> np.ndarray | 
     if (run / "policy.npy").exists():
         table = stored_table(run)
     elif (run / "agent").is_dir():
-        table = Snapshots(task).taken(load_agent(run, trust=trust)[1])
+        table = Snapshots(task).evaluate(load_agent(run, trust=trust)[1])
     else:
         return None
     if not isinstance(table, np.ndarray) or table.ndim > 2:

@@ -39,7 +39,7 @@ EARLIER = {"3a1d2bb3986015bb807c596528212e8ea9f8c6579252bc3f53c70a8e596665fe": V
 CORE = "core"
 PAIRS = "pairs"
 """Measure of an axis of pairs: one world in two ways, and how much worse an agent is at the second."""
-BITS = 40
+MANTISSA_BITS = 40
 """Of a mantissa that enter a digest, 12 digits: what compilers and processors may round differently is beyond."""
 SAMPLED = 4096
 """States of a large task whose rewards and observations enter its digest."""
@@ -132,7 +132,7 @@ class BenchmarkTask:
                 f"task {self.name}: gamma is 1 without a horizon, so regret may be infinite, and no score a mean of "
                 f"it; give a horizon, or gamma < 1"
             )
-        if self.environment == levels.LEVELS:
+        if self.environment == levels.ENVIRONMENT_NAME:
             world: tuple[Any, ...] = (levels.levels_of(**self.parameters),)
         else:
             world = self.environment, self.parameters
@@ -281,72 +281,74 @@ def load_suite(name_or_file: str | Path = "v1", *, trust: bool = False) -> Suite
     return suite
 
 
-def suite_of(entry: object, whose: str) -> Suite:
+def suite_of(entry: object, source: str) -> Suite:
     """A suite from the entries of its file; checked to be complete and to have the digest that it names.
 
     Raises:
-        FileFormatError: an entry is missing, unknown, of another type or damaged; `whose` says of which file.
+        FileFormatError: an entry is missing, unknown, of another type or damaged; `source` says of which file.
     """
     keys = [each.name for each in fields(Suite)]
     if not isinstance(entry, dict) or {*entry, "quick"} != {*keys}:
-        raise FileFormatError(f"{whose}: is no suite; expected the entries {', '.join(keys)}")
+        raise FileFormatError(f"{source}: is no suite; expected the entries {', '.join(keys)}")
     ladders: list[Ladder] = []
-    for each in _list(entry["ladders"], f"{whose}: ladders"):
-        of = f"{whose}: ladder {each.get('axis')}"
+    for each in _list(entry["ladders"], f"{source}: ladders"):
+        of = f"{source}: ladder {each.get('axis')}"
         tasks = _tasks(each.get("tasks"), str(each.get("axis")), of)
         ladders.append(replace(parse_record(Ladder, {**each, "tasks": ()}, of, ("measure",)), tasks=tasks))
         if ladders[-1].measure == PAIRS and len(tasks) % 2:
             raise FileFormatError(f"{of}: has {len(tasks)} tasks; expected pairs")
     settings = entry["hyperparameters"]
     if not isinstance(settings, dict) or not all(isinstance(each, dict) for each in settings.values()):
-        raise FileFormatError(f"{whose}: hyperparameters are {str(settings)[:60]}; expected some of each baseline")
+        raise FileFormatError(f"{source}: hyperparameters are {str(settings)[:60]}; expected some of each baseline")
     quick = entry.get("quick", {})
     if not isinstance(quick, dict) or not {*quick} <= {"tasks", "seeds"}:
-        raise FileFormatError(f"{whose}: quick is {str(quick)[:60]}; expected tasks and seeds")
+        raise FileFormatError(f"{source}: quick is {str(quick)[:60]}; expected tasks and seeds")
     suite = Suite(
         str(entry["name"]),
-        parse_record(Protocol, entry["protocol"], f"{whose}: protocol"),
-        _tasks(entry["core"], CORE, f"{whose}: core"),
+        parse_record(Protocol, entry["protocol"], f"{source}: protocol"),
+        _tasks(entry["core"], CORE, f"{source}: core"),
         tuple(ladders),
         str(entry["digest"]),
         settings,
         quick,
     )
     if len(suite._by_name) < len(suite.tasks):
-        raise FileFormatError(f"{whose}: two tasks have the same name; expected a name of its own for each")
+        raise FileFormatError(f"{source}: two tasks have the same name; expected a name of its own for each")
     names = {CORE, *suite._by_name, *(ladder.axis for ladder in ladders)}
     tasks, seeds = quick.get("tasks", [CORE]), quick.get("seeds", QUICK)
     if not isinstance(tasks, list) or not tasks or not all(isinstance(each, str) and each in names for each in tasks):
-        raise FileFormatError(f"{whose}: quick has the tasks {str(tasks)[:60]}; expected names of its tasks and axes")
+        raise FileFormatError(f"{source}: quick has the tasks {str(tasks)[:60]}; expected names of its tasks and axes")
     if type(seeds) is not int or not 1 <= seeds <= MOST_QUICK:
-        raise FileFormatError(f"{whose}: quick has {str(seeds)[:20]} seeds; expected 1 to {MOST_QUICK:,}")
+        raise FileFormatError(f"{source}: quick has {str(seeds)[:20]} seeds; expected 1 to {MOST_QUICK:,}")
     try:
         digest = digest_of_suite(suite)
     except (TypeError, ValueError, RecursionError):
-        raise FileFormatError(f"{whose}: is no suite; expected entries that JSON has: text, numbers, lists") from None
+        raise FileFormatError(f"{source}: is no suite; expected entries that JSON has: text, numbers, lists") from None
     if digest != suite.digest:
         raise FileFormatError(
-            f"{whose}: what it says has the digest {digest[:16]}...; it names {suite.digest[:16]}...: it was changed; "
+            f"{source}: what it says has the digest {digest[:16]}...; it names {suite.digest[:16]}...: it was changed; "
             f"take the file as it was published"
         )
     return suite
 
 
-def _list(value: object, whose: str) -> list[dict[str, Any]]:
+def _list(value: object, source: str) -> list[dict[str, Any]]:
     if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
-        raise FileFormatError(f"{whose}: expected a list of objects")
+        raise FileFormatError(f"{source}: expected a list of objects")
     return value
 
 
-def _tasks(entries: object, axis: str, whose: str) -> tuple[BenchmarkTask, ...]:
+def _tasks(entries: object, axis: str, source: str) -> tuple[BenchmarkTask, ...]:
     optional = [each.name for each in fields(BenchmarkTask) if each.name not in ("name", "environment", "digest")]
     try:
         return tuple(
-            parse_record(BenchmarkTask, {**each, "axis": axis}, f"{whose}: task {str(each.get('name'))[:60]}", optional)
-            for each in _list(entries, whose)
+            parse_record(
+                BenchmarkTask, {**each, "axis": axis}, f"{source}: task {str(each.get('name'))[:60]}", optional
+            )
+            for each in _list(entries, source)
         )
     except ParameterError as error:  # of a name
-        raise FileFormatError(f"{whose}: {error}") from None
+        raise FileFormatError(f"{source}: {error}") from None
 
 
 def digest_of_suite(suite: Suite) -> str:
@@ -463,9 +465,9 @@ def _arrays(mdp: TabularMDP) -> Iterable[np.ndarray]:
 
 
 def rounded(values: np.ndarray) -> np.ndarray:
-    """Numbers with mantissas of BITS bits; zero has no sign."""
+    """Numbers with mantissas of MANTISSA_BITS bits; zero has no sign."""
     mantissa, exponent = np.frexp(np.asarray(values, np.float64))
-    return np.ldexp(np.round(np.ldexp(mantissa, BITS)), exponent - BITS) + 0.0
+    return np.ldexp(np.round(np.ldexp(mantissa, MANTISSA_BITS)), exponent - MANTISSA_BITS) + 0.0
 
 
 def _canonical(value: object) -> bytes:

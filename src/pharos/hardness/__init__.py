@@ -19,7 +19,7 @@ from pharos.hardness.effective_horizon import (
     effective_horizon,
     stationary_effective_horizon,
 )
-from pharos.hardness.gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
+from pharos.hardness.gaps import ERRORS_PER_TIE, Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
 from pharos.hardness.gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
 from pharos.hardness.interval import Budget, Certificate, Certified, Interval, MeasureProgress
 from pharos.hardness.registry import Measure, Problem, measures, register, selected_measures

@@ -36,6 +36,7 @@ from pharos.mdp import (
     require_mdp,
 )
 from pharos.solvers import Solution, value_iteration
+from pharos.system.arrays import UNIT_ROUNDOFF
 from pharos.system.memory import large_zeros
 
 # States at once; fixed, so that sums do not depend on the machine, and so few that a block stays in the cache.
@@ -163,7 +164,7 @@ def _with_end(values: np.ndarray) -> np.ndarray:
 
 
 # Different values up to which the map is kept; beyond, it would take more than 200 MB, and nothing is proven.
-MOST = 1 << 21
+MOST_MAP_VALUES = 1 << 21
 # Places of the map in the beginning.
 _FIRST = 1 << 12
 
@@ -199,7 +200,7 @@ class TieProof:
         begin = 0
         while self.holds and begin < len(gap):
             begin, self._filled = kernels.extend(*bits, gap, counted, begin, self._map, self._filled)
-            if begin < 0 or self._filled > MOST:
+            if begin < 0 or self._filled > MOST_MAP_VALUES:
                 self.holds = False
             elif begin < len(gap):
                 larger = _empty_map(4 * len(self._map), own.shape[1])
@@ -298,7 +299,6 @@ VALUE_WIDTH = 1e-6
 ERRORS_PER_TIE = 2.5
 # Relative rounding of a gap, its reciprocal and sums of these: a few units each, and one for each action.
 _ROUNDING = 1e-12
-_UNIT = 2.0**-53
 # Sweeps at most, after the solution, until values settle; and sweeps that change values by no more than rounding.
 _SWEEPS = 200
 _AT_REST = 40
@@ -450,7 +450,7 @@ def _settled(mdp: TabularMDP, solution: Solution, in_place: bool, go_on: Callabl
     """
     equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, BEST)
     operations = 2 * mdp.num_actions + mdp.dynamics.operations + 16
-    rho = mdp.gamma * max(1.0, mdp.dynamics.mass) * (1 + 16 * _UNIT)
+    rho = mdp.gamma * max(1.0, mdp.dynamics.mass) * (1 + 16 * UNIT_ROUNDOFF)
     if rho >= 1:
         return solution
     largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
@@ -464,7 +464,7 @@ def _settled(mdp: TabularMDP, solution: Solution, in_place: bool, go_on: Callabl
         sweeps += 1
         change = mdp.dynamics.sweep(equation, x)
         largest += change
-        rounding = operations * _UNIT * (largest_reward + largest + change) + mdp.reward_table.rounding
+        rounding = operations * UNIT_ROUNDOFF * (largest_reward + largest + change) + mdp.reward_table.rounding
         bound = min(bound, (rho * change + rounding) / (1 - rho) * (1 + _ROUNDING))
         at_rest += change <= rounding
         if change == 0.0 or at_rest == _AT_REST:

@@ -280,7 +280,7 @@ class TargetBounds:
         farther: the words for a target that may exceed it.
         upper: (targets,) of the time to each; -inf if it is settled.
         lower: the largest time that is proven. settled_upper: the largest upper bound of settled targets.
-        limited: targets whose bounds are as close as floats allow, and no closer than the tolerance.
+        limited: number of targets whose bounds cannot reach the tolerance in float64.
     """
 
     farther: str
@@ -513,7 +513,7 @@ class _TargetResult:
     """Result for a target: bounds of its largest hitting time, and how many states do not surely reach it.
 
     Attributes:
-        limited: whether floats allow no closer bounds.
+        limited: whether the bounds cannot reach the tolerance in float64.
         scale: 99th percentile of hitting time divided by distance.
         times: (nodes,) upper bounds of the hitting times, if other targets are to be bounded.
     """

@@ -21,10 +21,10 @@ from pharos.mdp import (
     require_mdp,
 )
 from pharos.solvers import Solution
+from pharos.system.arrays import UNIT_ROUNDOFF
 
 # States at once: values of all their outcomes are in memory.
 _VARIANCE_BLOCK = 1 << 16
-_UNIT = 2.0**-53
 # Relative width up to which an interval counts as the value.
 _NARROW = 1e-6
 
@@ -80,7 +80,7 @@ def certified_value_norm(
             here = mdp.chance.at(block[is_node]), means[is_node], within[is_node]
             largest = max(largest, _largest_variance(*here, previous))
     value = math.sqrt(largest) * scale
-    error = solution.error_bound + (3 * mdp.num_actions + mdp.dynamics.operations + 16) * _UNIT * size
+    error = solution.error_bound + (3 * mdp.num_actions + mdp.dynamics.operations + 16) * UNIT_ROUNDOFF * size
     lower, upper = max(0.0, value - error), value + error
     return Certified(value, lower, upper, upper - lower <= _NARROW * upper or upper == 0.0)
 

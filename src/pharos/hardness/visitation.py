@@ -159,7 +159,7 @@ def occupancy(
 def discounted_visits(
     mdp: TabularMDP, policy: TablePolicy | None = None, *, tolerance: float = 1e-9
 ) -> tuple[np.ndarray, float]:
-    """Return the visits of states without a horizon, from below, and what they may lack together.
+    """Return discounted state visits without a horizon, from below, and a bound on the mass that was cut off.
 
         d(s) = sum over t of gamma^t P(s_t = s),   t = 0, 1, ...
 
@@ -188,8 +188,7 @@ def discounted_arrivals(
     tolerance: float = 1e-9,
     report: Callable[[str], object] = str,
 ) -> tuple[np.ndarray, float]:
-    """Return the visits of states without a horizon, in terminal states and the end by arrival; and what they may lack
-    together.
+    """Return discounted state visits and a bound on the mass that was cut off. Terminal states count on arrival.
 
         d(s) = sum over t of gamma^t P(s_t = s), times 1 - gamma if s is terminal or the end, which is never left
 

@@ -15,7 +15,7 @@ from pharos.errors import ParameterError
 from pharos.statistics import bootstrap_interval, interquartile_mean, mean_of_means
 from pharos.study.blocks import Run
 from pharos.study.regression import (
-    MEASURES,
+    MODEL_MEASURES,
     Fit,
     aggregate_r_squared,
     fit,
@@ -68,7 +68,11 @@ class Models:
 
 
 def models(
-    cells: "pd.DataFrame", *, agent: str = "dqn", regret: str = "cumulative_regret", measures: Sequence[str] = MEASURES
+    cells: "pd.DataFrame",
+    *,
+    agent: str = "dqn",
+    regret: str = "cumulative_regret",
+    measures: Sequence[str] = MODEL_MEASURES,
 ) -> Models:
     """Fit the models to the cells of one agent: the single one, one a representation, one a class; as far as there are
     rows.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 ARCHIVE_FORMAT = 1
-CURVE_COLUMNS = ("step",)
+STEP_COLUMNS = ("step",)
 _STUDY, _FORMAT_KEYS, _DIGESTS = b"pharos.study", b"pharos.format", b"pharos.digests"
 _FETCH_AGAIN = "fetch or pack it again"
 EARLIER_HYPERPARAMETERS = {
@@ -68,7 +68,7 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
         if record is not None and record["status"] == _worker.FINISHED:
             ids.append(run.id)
             records.append(json.dumps(_placeless(record, study.folder)))
-            curves.append(training.read_curve_table(directory / "runs" / run.id, CURVE_COLUMNS))
+            curves.append(training.read_curve_table(directory / "runs" / run.id, STEP_COLUMNS))
     if not ids:
         raise ParameterError(f"{directory}: no run of {study.name!r} is finished; execute `pharos study run` first")
     columns: dict[str, Any] = {"id": pa.array(ids), "record": pa.array(records)}
@@ -212,7 +212,7 @@ def _curve(file: Path, id: str, row: dict[str, list | None], schema: "pa.Schema"
 
     columns = {name: values for name, values in row.items() if values is not None}
     try:
-        if not set(CURVE_COLUMNS) <= set(columns) or len({len(values) for values in columns.values()}) != 1:
+        if not set(STEP_COLUMNS) <= set(columns) or len({len(values) for values in columns.values()}) != 1:
             raise ValueError("its columns differ in length, or have no steps")
         return pa.table(
             {name: pa.array(values, schema.field(name).type.value_type) for name, values in columns.items()}

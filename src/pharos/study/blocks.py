@@ -12,7 +12,7 @@ from pharos.agents import agent_called, agent_source, hyperparameters
 from pharos.environments import Environment, as_tuples, class_source, import_class, make
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.observations import OwnObservation, names, own_observation, title
-from pharos.study.regression import MEASURES
+from pharos.study.regression import MODEL_MEASURES
 from pharos.system.sources import is_reference
 from pharos.system.storage import check_name
 from pharos.training import ENGINES, ChanceSetting, Horizon, RunConfig
@@ -206,7 +206,7 @@ class Hardness(_Part):
     """Measures of hardness that are computed, their discount, and the seconds that each may take for one instance."""
 
     gamma: Gamma = 0.99
-    measures: list[str] = Field(default_factory=lambda: [name for name in MEASURES if name in registered_names()])
+    measures: list[str] = Field(default_factory=lambda: [name for name in MODEL_MEASURES if name in registered_names()])
     budget: Annotated[float, BeforeValidator(_number)] = Field(default=60.0, gt=0)
 
     @field_validator("measures")
@@ -224,7 +224,7 @@ class Hardness(_Part):
         The stationary effective horizon stands for the effective horizon if that is not taken.
         """
         stand_in = {"effective_horizon": "stationary_effective_horizon"}
-        names = [name if name in self.measures else stand_in.get(name) for name in MEASURES]
+        names = [name if name in self.measures else stand_in.get(name) for name in MODEL_MEASURES]
         return [name for name in names if name in self.measures] or list(self.measures)
 
 

@@ -64,7 +64,7 @@ def run(
     runner: _worker.Runner = train_run,
     prepare: Callable[[Mapping[str, Any]], Any] | None = None,
     batch_runner: _worker.BatchRunner | None = None,
-    foretold: Callable[[Forecast], None] | None = None,
+    on_forecast: Callable[[Forecast], None] | None = None,
     **options: Any,
 ) -> Status:
     """Execute the runs of a study that are not over, on this machine.
@@ -78,7 +78,7 @@ def run(
             spaces for the usual runner, and does nothing for another.
         batch_runner: `runner(configs, folders, folder for checkpoints)` of runs that the study says are batched; None:
             the usual one for the usual runner, else each of them alone.
-        foretold: called before the first run with how many are to come, and how long they will take.
+        on_forecast: called before the first run with how many are to come, and how long they will take.
         options: of `pharos.training.ExecutionOptions`: shard, retry_failed, resume, timeout, workers, device, block,
             agent, observation.
     Returns:
@@ -88,15 +88,16 @@ def run(
             device here.
         AllRunsFailed: every run has failed; its `outcome` is the Status.
     """
+    on_forecast = options.pop("foretold", on_forecast)  # its name before
     execution = StudyExecution(*opened(source, folder), ExecutionOptions(**options), runner, batch_runner, progress)
     missing = execution.missing
     if missing and runner is train_run:
-        refuse_missing(execution.options.device)
-    if foretold is not None and missing:
-        foretold(execution.forecast())
+        check_device_in_process(execution.options.device)
+    if on_forecast is not None and missing:
+        on_forecast(execution.forecast())
     if prepare is None and runner is train_run:
         prepare = prepare_instance
-    if prepare is not None:  # a failure there is left to the runs to tell
+    if prepare is not None:  # the runs report a failure there
         prepare_instances(prepare, missing, execution.report)
     end = execution.run()
     if end.failed and end.failed == end.total:
@@ -320,7 +321,7 @@ def prepare_instances(
                     todo.popleft()
 
 
-def refuse_missing(device: str) -> None:
+def check_device_in_process(device: str) -> None:
     """Raise ParameterError for a device that torch does not have here, before each run fails for it.
 
     A process of its own asks torch: it would keep some of a GPU's memory.

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from statsmodels.regression.linear_model import RegressionResultsWrapper
 
-MEASURES = ("effective_horizon", "sum_of_reciprocal_gaps", "diameter")
+MODEL_MEASURES = ("effective_horizon", "sum_of_reciprocal_gaps", "diameter")
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Fit:
     design: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
 
 
-def fit_models(rows: "pd.DataFrame", measures: Sequence[str] = MEASURES) -> tuple[list[Fit], list[str]]:
+def fit_models(rows: "pd.DataFrame", measures: Sequence[str] = MODEL_MEASURES) -> tuple[list[Fit], list[str]]:
     """The single model (equation 7), one model a representation (8), one model a class (9).
 
     Returns:
@@ -178,7 +178,7 @@ def aggregate_r_squared(fits: Sequence[Fit]) -> float:
     return r_squared(actual, actual - np.concatenate([fit.fitted for fit in fits]))
 
 
-def leave_one_class_out_r_squared(rows: "pd.DataFrame", measures: Sequence[str] = MEASURES) -> float:
+def leave_one_class_out_r_squared(rows: "pd.DataFrame", measures: Sequence[str] = MODEL_MEASURES) -> float:
     """R2 of predictions for each class by a model fitted on the others (representation and measures only).
 
     Returns:

@@ -44,7 +44,7 @@ from pharos.training.task import Task
 
 RECORDER_BLOCK = 4096  # observations that a policy is asked about at once
 MOST_STATES_ASKED = 100_000  # states that it is asked about in advance
-MOST_LETTERS = 500  # letters of an agent's error
+MOST_ERROR_LETTERS = 500  # letters of an agent's error
 KEPT = 1 << 28  # bytes of observations that are kept between snapshots
 UNIFORM_TOLERANCE = 1e-9  # of normalised regret: as far from uniform play a policy without a step may be, by rounding
 IGNORED = 1000
@@ -235,7 +235,7 @@ class Snapshots:
         self._kept: list[tuple[int, Any]] | None = None
         self._num_checked = 0
 
-    def taken(self, policy: PolicyLike) -> PolicyLike | Evaluation:
+    def evaluate(self, policy: PolicyLike) -> PolicyLike | Evaluation:
         """The current policy as (S, A) probabilities; or its value if it sees more than the state, or there are too
         many states.
 
@@ -346,7 +346,7 @@ class PolicyRecorder:
         if self.count and not self.budget.steps:
             raise not_stepped(self.budget.limit)
         self.pass_points(self.budget.steps)
-        self.in_force = self._snapshots.taken(policy)
+        self.in_force = self._snapshots.evaluate(policy)
         if not self.count:
             self._first_step = self.budget.steps
         self.count += 1
@@ -473,7 +473,7 @@ def errors_in_one_line(agent: str, file: str | None) -> Iterator[None]:
     except BaseException as error:
         if not (line := line_in(error, file)):
             raise
-        text = capped(in_one_line(error).rstrip(": "), MOST_LETTERS)
+        text = capped(in_one_line(error).rstrip(": "), MOST_ERROR_LETTERS)
         raise PharosError(f"agent {agent} raised {text}{line}") from error
 
 

@@ -155,7 +155,7 @@ def _values_of_tables(batch: Learner, task: Task, indices: Sequence[int]) -> dic
         for i in list(tables):
             try:
                 tables[i].append(answers[i].answer(observations, len(states)))
-            except PharosError:  # which it will be told when it is evaluated alone
+            except PharosError:  # the error is reported when the run is evaluated alone
                 del tables[i]
     if not tables:
         return {}

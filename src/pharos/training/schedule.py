@@ -17,7 +17,7 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.observations import observe
 from pharos.training.task import RunConfig
 
-SEEN = ("environment", "parameters", "observation", "observation_options", "sources")
+OBSERVED_FIELDS = ("environment", "parameters", "observation", "observation_options", "sources")
 
 
 def plan(
@@ -96,7 +96,7 @@ class Shapes:
     def shape(self, config: RunConfig) -> RunShape:
         """The sizes of a run; the sizes of an observation that needs states, or cannot be made, are not known."""
         entry = config.to_dict()
-        key = json.dumps([entry.get(name) for name in SEEN], sort_keys=True)
+        key = json.dumps([entry.get(name) for name in OBSERVED_FIELDS], sort_keys=True)
         if key not in self._shapes:
             self._shapes[key] = _run_shape(config, key)
         return self._shapes[key]

@@ -20,7 +20,7 @@ from pharos.mdp import TabularMDP, mdp_within, states_within, uniform_choice, wh
 from pharos.regret import regret_scale
 from pharos.solvers import Solution, chain, evaluate_policy, uniform_value, value_iteration
 
-MOST_EXACT = 4096
+MOST_WITHOUT_LANDMARKS = 4096
 """Different observations up to which a kernel is used as it is; beyond, by landmarks."""
 DEFAULT_LANDMARKS = 600
 
@@ -34,8 +34,8 @@ class Representation:
             semidefinite, and symmetric if rows are columns.
         classes: (S,) the number of each state's observation, from 0: states of one number look alike.
         time_limit: steps of an episode that the agent sees, if the MDP has no horizon; or None.
-        landmarks: of the approximation beyond MOST_EXACT different observations; 0: none, whatever it takes; 2 or more:
-            for all sizes.
+        landmarks: of the approximation beyond MOST_WITHOUT_LANDMARKS different observations. 0 means none, whatever it
+            takes; 2 or more are used for all sizes.
         conventions: what it is, JSON-able.
     """
 
@@ -519,7 +519,7 @@ class IdealisedLearner:
         of them; the number of landmarks), drawn by `weights`."""
         kernel, observed = self.representation.kernel, self.observations.representatives
         landmarks = self.representation.landmarks
-        if landmarks is None and len(observed) > MOST_EXACT:
+        if landmarks is None and len(observed) > MOST_WITHOUT_LANDMARKS:
             landmarks = DEFAULT_LANDMARKS
         if not landmarks or landmarks >= len(observed):
             return [Exact(kernel, observed)], None

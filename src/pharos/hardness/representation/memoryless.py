@@ -23,7 +23,7 @@ LOSS_WIDTH = 1e-7
 # Improvements of one policy, and steps of its occupancy
 MOST_MEMORYLESS_IMPROVEMENTS, MOST_STEPS = 20, 400
 # States times actions of relaxed problems: larger ones get one bound from above, the optimum
-MOST_ENTRIES = 2_000_000
+MOST_PAIRS = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class _PolicySearch:
         self.classes = classes
         self.count = int(classes.max()) + 1
         self.is_shared = np.bincount(classes[self.live], minlength=self.count) > 1
-        self.is_small = mdp.num_states * mdp.num_actions <= MOST_ENTRIES
+        self.is_small = mdp.num_states * mdp.num_actions <= MOST_PAIRS
         self.sets = np.ones((self.count, mdp.num_actions), np.bool_)
         if mdp.available is not None:
             np.logical_and.at(self.sets, classes, mdp.available)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from pharos.plots import save_for_page
 from pharos.study.figures import all_curves, all_figures, tables_of
 from pharos.study.prediction_figures import unseen_figures
-from pharos.study.report.model_sections import doubts, judged, unseen_section
+from pharos.study.report.model_sections import doubts, judged_cells, unseen_section
 from pharos.study.report.page import render_page
 from pharos.study.report.results import Results, coefficients, study_results
 from pharos.study.report.sections import sections_of
@@ -86,7 +86,7 @@ def report(
             images["curves"] = curves[name].to_json().encode()
     # Predictors on classes left out, with their figures and tables
     report_progress("leaving out classes")
-    judgement, outcomes = judged(results, predicted)
+    judgement, outcomes = judged_cells(results, predicted)
     more = {"outcomes": outcomes}
     if predicted is not None:
         more["predicted"] = predicted.cells

@@ -128,7 +128,7 @@ def agreement_section(results: Results, figures: Figures, left_out: list[str]) -
 FEW_PERMUTATIONS = 499
 
 
-def judged(results: Results, predictions: "PredictedCells | None") -> "tuple[pd.DataFrame | None, pd.DataFrame]":
+def judged_cells(results: Results, predictions: "PredictedCells | None") -> "tuple[pd.DataFrame | None, pd.DataFrame]":
     """(statistics of predictors, or None if there are fewer than two classes; cells with outcomes).
 
     Raises:
