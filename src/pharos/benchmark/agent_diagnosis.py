@@ -74,13 +74,13 @@ class Diagnosis:
         agent: its label. kind: "dqn", "ppo", or empty if it offers no values.
         verdict: one sentence.
         findings: symptoms that are there, signs of the likeliest fault first, then the strongest.
-        likeness: probability of each known fault, "none" among them, the largest first; empty for a finished run.
-        fault: the known fault that is said; None: none of the known ones.
+        likeness: probability of each known fault, "none" among them, the largest first. Empty for a finished run.
+        fault: the known fault that is said, or None for none of the known ones.
         strange: whether it is farther from all known faults, and from health, than known ones are.
         accuracy: how often the likeness was right for agents that the library did not have.
         scores: by world, or by task of a finished run: 1 optimal and 0 as uniform play, mean of the seeds.
-        readings: all numbers, see `doctor.readings`; empty for a finished run.
-        on_policy: whether its values are those of the policy that explores, as of SARSA; then `readings` are by what
+        readings: all numbers, see `doctor.readings`. Empty for a finished run.
+        on_policy: whether its values are those of the policy that explores, as of SARSA. If so, `readings` are by what
             was played, not by the largest next value. It is no fault of a learner on-policy.
     """
 
@@ -125,7 +125,7 @@ class Diagnosis:
         return library_of(self.kind)
 
     def nearest(self) -> list[tuple[str, float, str]]:
-        """The three likeliest faults: name, "healthy" for none; likeness; in words."""
+        """The three likeliest faults: (name, or "healthy" for none, likeness, in words)."""
         words = meanings(self.kind)
         three = list(self.likeness.items())[:3]
         return [("healthy" if name == HEALTHY else name, share, words.get(name, "")) for name, share in three]
@@ -141,7 +141,7 @@ class Diagnosis:
         }
 
     def to_html(self) -> str:
-        """The page as HTML, with a plot beside the nearest known agents; it loads and runs nothing."""
+        """The page as HTML, with a plot beside the nearest known agents. It loads and runs nothing."""
         from pharos.benchmark.diagnosis_page import diagnosis_page
 
         return diagnosis_page(self)
@@ -163,7 +163,7 @@ class Diagnosis:
 
 
 def meanings(kind: str) -> dict[str, str]:
-    """Faults in words; of all kinds if it is empty."""
+    """Faults in words, of all kinds if it is empty."""
     return {name: text for agent, table in FAULTS.items() if kind in ("", agent) for name, text in table.items()}
 
 
@@ -195,9 +195,9 @@ def diagnose(
         results: in place of an agent: the folder or file of a finished run of a benchmark, or results read.
         suite: the suite of `results`, if it is not shipped.
     Raises:
-        ParameterError: it is no agent, or it yields no policy; there are no such results; or both are given.
+        ParameterError: it is no agent, or it yields no policy, there are no such results, or both are given.
         PharosError: its code raises something, SystemExit included. TimeLimit: a run took longer than was allowed.
-    Cost: 24 runs of 4,000 steps, in this process; of results, less than a second.
+    Cost: 24 runs of 4,000 steps, in this process. Of results: less than a second.
     """
     if (agent is None) == (results is None):
         raise ParameterError(f"agent {agent!r}, results {results!r}; expected one of both")
@@ -287,7 +287,8 @@ def diagnosis_of_results(contents: Contents) -> Diagnosis:
 
 
 def findings_of(contents: Contents) -> list[Finding]:
-    """Symptoms that a finished run shows beside the baseline that it is nearest to; without one, those of its own."""
+    """Symptoms that a finished run shows beside the baseline that it is nearest to. Without one, symptoms of its
+    own."""
     findings = _own_findings(contents)
     if (near := nearest(contents)) is None:
         return findings

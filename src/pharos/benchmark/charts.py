@@ -1,4 +1,4 @@
-"""Charts of the report as SVG inside its page: a few shapes, no library; texts are escaped by the tree that holds them.
+"""Charts of the report as SVG inside its page: a few shapes, no library. Texts are escaped by the tree that holds them.
 
 Colours and text are classes of the page's style (`STYLE`), so that charts follow light and dark pages. Agent k has the
 colour, the dash and the marker of its place, so that no line is told by its colour alone.
@@ -117,7 +117,7 @@ def bullets(texts: Sequence[str]) -> Element:
 
 
 def html_table(heads: Sequence[str], rows: Sequence[Sequence[Child]], numeric: Sequence[int] = ()) -> Element:
-    """A table that scrolls if it is wide; numbers to the right in the columns `numeric`."""
+    """A table that scrolls if it is wide. Numbers of the columns `numeric` stand at the right."""
 
     def kind(k: int, cell: Child) -> str:
         return "n" if k in numeric else "bar" if not isinstance(cell, str) and cell.tag == "svg" else ""
@@ -132,7 +132,7 @@ def _text(value: object) -> str:
 
 
 def drawing(width: int, height: int, title: str, *shapes: Element) -> Element:
-    """An SVG with a title for screen readers; without a title it is hidden from them, as nearby text says the same."""
+    """An SVG with a title for screen readers. Without a title it is hidden from them, as nearby text says the same."""
     name = {"role": "img", "aria_label": title} if title else {"aria_hidden": "true"}
     return element("svg", *shapes, viewBox=f"0 0 {width} {height}", **name)
 
@@ -165,7 +165,7 @@ def label(x: float, y: float, text: str, anchor: str = "start", class_: str = ""
 
 
 def legend(names: Sequence[str], theory: str | None = None) -> Element:
-    """A list of agents with the marks of each; `theory` names the dashed line."""
+    """A list of agents with the marks of each. `theory` names the dashed line."""
     marks = [
         (name, drawing(34, 12, "", line(1, 6, 33, 6, f"l{k % 6}"), marker(17, 6, k))) for k, name in enumerate(names)
     ]
@@ -193,7 +193,7 @@ def bars(rows: Mapping[int, tuple[str, ConfidenceInterval]], title: str) -> Elem
 
 
 def radar(axes: Sequence[str], scores: Sequence[Mapping[str, float]], title: str) -> Element:
-    """Scores in [0, 1] along rays, one for each axis; an outline for each agent."""
+    """Scores in [0, 1] along rays, one for each axis, with an outline for each agent."""
     size, middle, radius = 360, 180, 120
     angles = 2 * np.pi * np.arange(len(axes)) / len(axes) - np.pi / 2
     rays = np.column_stack([np.cos(angles), np.sin(angles)])
@@ -221,7 +221,7 @@ def ladder_panel(
     """Normalised regret along the rungs of a ladder: the first line with whiskers and its frontier.
 
     Args:
-        levels: of the rungs, which stand equally far apart; between them the frontier is interpolated.
+        levels: of the rungs, which stand equally far apart. Between them the frontier is interpolated.
         lines: for each agent its normalised regret on each rung, None if it did not run.
         theory: of the idealised learner, None if it was not predicted.
         frontier: of the first agent, in units of `levels`.
@@ -277,7 +277,8 @@ def learning_panel(steps: int, lines: Sequence[Sequence[ConfidenceInterval]], ti
     """Normalised regret at evaluations, equally far apart up to `steps`: a line for each agent, the first with a band.
 
     Args:
-        lines: for each agent its regret at each evaluation; empty: it has none, and keeps its colour.
+        lines: for each agent its regret at each evaluation. An agent without any has an empty one, and keeps its
+            colour.
     """
     left, right, top, bottom = 54, 540, 12, 220
     shapes = regret_axis(left, right, top, bottom)

@@ -62,7 +62,7 @@ def check_agent(
         agent, hyperparameters, workers: as `benchmark.run` takes them.
         timeout: seconds after which a run is ended.
     Returns:
-        An AgentCheck, which is true if there was no error; print it.
+        An AgentCheck, which is true if there was no error. Print it.
     """
     label = agent if isinstance(agent, str) else getattr(agent, "__qualname__", repr(agent))
     suite = Suite("check", CHECK_PROTOCOL, tuple(frozen(task, CHECK_PROTOCOL) for task in TASKS), ())

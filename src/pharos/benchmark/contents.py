@@ -76,7 +76,7 @@ class Contents:
     Attributes:
         suite: of the results. agent: the one that it is about. beside: baselines.
         comparisons: of the agent with each of `beside`.
-        predictor: "dqn", "ppo", "table" or "both" (the larger of dqn and ppo), by which residuals are taken; "none".
+        predictor: "dqn", "ppo", "table" or "both" (the larger of dqn and ppo), by which residuals are taken, or "none".
     """
 
     suite: Suite
@@ -91,7 +91,7 @@ class Contents:
         return [self.agent, *self.beside]
 
     def predicted(self, task: BenchmarkTask) -> float | None:
-        """Normalised regret of the idealised learner on a task; None without a prediction."""
+        """Normalised regret of the idealised learner on a task, or None without a prediction."""
         if self.predictor == "both":
             pair = [task.predicted[name] for name in LEARNERS if name in task.predicted]
             return max(pair) if len(pair) == 2 else None
@@ -109,7 +109,7 @@ def contents_of(
     predictor: str | None = None,
     suite: Suite | str | None = None,
 ) -> Contents:
-    """Contents of a report; arguments and errors as for `report`."""
+    """Contents of a report. Arguments and errors are the same as for `report`."""
     own = results_of(results)
     suite = suite_of_results(own, suite)
     if beside is None:
@@ -129,7 +129,7 @@ def contents_of(
 
 
 def learner_kind(results: AgentResults) -> str:
-    """The idealised learner that an agent is a kind of, by its name and source; "both" if these do not tell."""
+    """The idealised learner that an agent is a kind of, by its name and source, or "both" if these do not decide it."""
     names = f"{results.agent} {results.record.get('source')}".lower()
     if "recurrent" in names:  # no idealised learner has a memory
         return "none"
@@ -151,7 +151,7 @@ def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:
 
 
 def regret_of(agent: ScoredAgent, task: BenchmarkTask) -> ConfidenceInterval | None:
-    """Normalised regret of an agent on a task, clipped to [0, 1]; None if it did not run."""
+    """Normalised regret of an agent on a task, clipped to [0, 1], or None if it did not run."""
     own = agent.score.tasks.get(task.name)
     return None if own is None else ConfidenceInterval(1 - own.value, 1 - own.high, 1 - own.low)
 
@@ -229,7 +229,7 @@ def final_regret(agent: ScoredAgent, task: BenchmarkTask) -> float:
 
 
 def learning_curve(agent: ScoredAgent, names: Sequence[str]) -> list[ConfidenceInterval]:
-    """Mean over tasks of normalised regret at each evaluation, each run's clipped to [0, 1]; empty if one was not run.
+    """Mean over tasks of normalised regret at each evaluation, each run's clipped to [0, 1]. Empty if one was not run.
 
     Args:
         names: of the tasks.

@@ -46,7 +46,7 @@ VERDICTS = (WORSE, BETTER, NEGLIGIBLE, NOT_SHOWN_TO_DIFFER)
 def nearest(contents: Contents) -> tuple[int, float, bool] | None:
     """Index of the baseline to compare the agent with, mean distance of their scores, whether of the same kind.
 
-    Among baselines of the agent's kind, else among all, the one with the nearest scores on core tasks; None without
+    Among baselines of the agent's kind, else among all, the one with the nearest scores on core tasks, or None without
     any.
     """
     names = {task.name for task in contents.suite.core}
@@ -64,7 +64,8 @@ def nearest(contents: Contents) -> tuple[int, float, bool] | None:
 
 
 def strengths(contents: Contents) -> dict[str, list[str]]:
-    """Lines on the axes for each verdict of `compare` that occurs, in the order of VERDICTS; without it, none.
+    """Lines on the axes for each verdict of `compare` that occurs, in the order of VERDICTS. Without a comparison,
+    none.
 
     A line: the axis with the agent's frontier, then each baseline's frontier and the difference of scores.
     """
@@ -91,18 +92,19 @@ def without_verdict(contents: Contents) -> dict[str, list[str]]:
 
 
 def is_worse_everywhere(comparison: Comparison) -> bool:
-    """Whether the core and all ladders, two or more, are worse; pairs hold an agent against itself."""
+    """Whether the core and all ladders, two or more, are worse. Pairs compare an agent with itself, so they do not
+    count."""
     verdicts = [each.score.verdict for each in ladders_of(comparison).values()]
     return comparison.core is not None and len(verdicts) > 1 and {comparison.core.verdict, *verdicts} == {WORSE}
 
 
 def ladders_of(comparison: Comparison) -> dict[str, AxisComparison]:
-    """The axes that are ladders, on which more than one rung was run; no pairs."""
+    """The axes that are ladders, on which more than one rung was run, without pairs."""
     return {axis: each for axis, each in comparison.axes.items() if not math.isnan(each.frontiers[0].value)}
 
 
 def fall_everywhere(contents: Contents) -> str:
-    """A sentence if the core and all axes are worse than the nearest baseline's; else empty."""
+    """A sentence if the core and all axes are worse than the nearest baseline's, else empty."""
     if (near := nearest(contents)) is None or not is_worse_everywhere(contents.comparisons[near[0]]):
         return ""
     return (
@@ -112,7 +114,7 @@ def fall_everywhere(contents: Contents) -> str:
 
 
 def fails_on_the_lowest_rung(own: AxisScore) -> bool:
-    """Whether regret on the first rung is above 0.5 by its whole interval; not of memory, which that rung asks for."""
+    """Whether regret on the first rung is above 0.5 by its whole interval. Not for memory, which that rung asks for."""
     return own.axis != "memory" and not math.isnan(own.lowest.low) and own.lowest.high < CROSSING
 
 
@@ -176,7 +178,7 @@ def level_gaps(contents: Contents) -> list[list[str]]:
 def groups_of(contents: Contents) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
     """Names of core tasks by what is seen, and by property: reward sizes, length, ends, chance, number of actions.
 
-    Properties with one group say nothing, and are left out; so are tasks that `known_properties` lacks.
+    Properties with one group say nothing, and are left out. So are tasks that `known_properties` lacks.
     """
     by_observation: dict[str, list[str]] = {}
     kinds: list[dict[str, list[str]]] = []
@@ -204,7 +206,8 @@ def worst_groups(groups: Mapping[str, Difference]) -> str:
 
 
 def shipped_regret(contents: Contents, task: BenchmarkTask) -> float | None:
-    """Normalised regret on a task of the shipped agent of the predictor's kind, the larger of two; None without one."""
+    """Normalised regret on a task of the shipped agent of the predictor's kind, the larger of two, or None without
+    one."""
     regrets = []
     for name in SHIPPED.get(contents.predictor, ()):
         beside = [each.results for each in contents.beside if each.results.agent == name]

@@ -28,7 +28,7 @@ WIDEST = 8.0  # deviations
 
 
 def diagnosis_page(diagnosis: Diagnosis) -> str:
-    """The HTML page of a diagnosis; every text passes through the tree, which escapes it."""
+    """The HTML page of a diagnosis. Every text passes through the tree, which escapes it."""
     lead = [element("p", diagnosis.verdict, class_="lead")]
     parts = [_findings(diagnosis), _likeness(diagnosis), _profile(diagnosis), _scores(diagnosis)]
     return document(f"Diagnosis of {diagnosis.agent}", lead, [part for part in parts if part is not None])
@@ -69,7 +69,7 @@ def _profile(diagnosis: Diagnosis) -> Element | None:
 def profile_rows(
     numbers: Mapping[str, float], library: list[Profile], faults: list[str]
 ) -> tuple[list[str], list[tuple[float, ...]]]:
-    """Names of the readings in which an agent, or one of some faults, differs most from healthy ones; and how much.
+    """Names of the readings in which an agent, or one of some faults, differs most from healthy ones, and how much.
 
     Each row: the agent, then the faults, in deviations from the mean of healthy ones.
     """

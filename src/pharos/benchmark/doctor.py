@@ -9,7 +9,7 @@ arrays.
 A learner of the values of the policy that explores, such as SARSA, obeys Q(s, a) = r(s, a) + gamma E sum mu(a'|s')
 Q(s', a') in place of it, with mu as it was played. `on_policy` has the same readings for it.
 
-Source: Sutton and Barto (2018), sections 3.6, 6.4 (SARSA) and 11.4 (Bellman residuals); the equations of faults are
+Source: Sutton and Barto (2018), sections 3.6, 6.4 (SARSA) and 11.4 (Bellman residuals). The equations of faults are
 ours.
 """
 
@@ -46,7 +46,7 @@ def targets(examination: Examination, gamma: float) -> dict[str, np.ndarray]:
     Args:
         examination: with `q`, (S, A), or `v`, (S,).
     Returns:
-        Arrays of the shape of `q`, or of `v`; those equations alone that the world tells from the right one.
+        Arrays of the shape of `q`, or of `v`, for the equations that the world can distinguish from the right one.
     """
     world, values, v = examination.world, answers_of(examination), state_values(examination)
     q = values if values.ndim == 2 else None
@@ -108,7 +108,7 @@ def deviation(values: np.ndarray, weights: np.ndarray) -> float:
 
 
 def distance(values: np.ndarray, target: np.ndarray, weights: np.ndarray, least: float) -> float:
-    """Root mean square of `values - target` in units of the deviation of the target, or of `least` if that is larger;
+    """Root mean square of `values - target` in units of the deviation of the target, or of `least` if that is larger:
     at most 100.
     """
     error = float(np.sqrt((weights * (values - target) ** 2).sum()))
@@ -226,7 +226,7 @@ def exact_values(examination: Examination, gamma: float) -> np.ndarray:
 
 
 def optimal(world: WorldArrays, gamma: float, policy: np.ndarray | None = None, sweeps: int = 2000) -> np.ndarray:
-    """(S, A) values of actions of the optimal policy, or of a policy (S, A); by iteration until nothing changes."""
+    """(S, A) values of actions of the optimal policy, or of a policy (S, A), by iteration until nothing changes."""
     q = np.zeros_like(world.rewards)
     for _ in range(sweeps):
         v = q.max(axis=1) if policy is None else (policy * q).sum(axis=1)
@@ -241,7 +241,7 @@ def optimal(world: WorldArrays, gamma: float, policy: np.ndarray | None = None, 
 
 
 def readings(examinations: Sequence[Examination]) -> dict[str, float]:
-    """Numbers that describe an agent, by name; those that do not apply to it are left out.
+    """Numbers that describe an agent, by name. Numbers that do not apply to it are left out.
 
     Of an agent with values: `gamma`, the discount that fits them best, as log10 of 1 / (1 - gamma); `consistency`,
     log10 of the residual; of each other equation the residual less the right one's, negative if it fits better;
@@ -302,7 +302,7 @@ def _of_values(examinations: Sequence[Examination]) -> dict[str, float]:
 
 
 def _mean_contrast(contrasts: Iterable[float]) -> float:
-    """Mean of those that are numbers; NaN if none is."""
+    """Mean of those that are numbers, or NaN if none is."""
     rows = [each for each in contrasts if np.isfinite(each)]
     return float(np.mean(rows)) if rows else np.nan
 
@@ -368,7 +368,7 @@ def _size(examination: Examination, gamma: float) -> float:
 
 
 def correlation(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> float:
-    """Correlation under weights; 0 if one of them is constant."""
+    """Correlation under weights, or 0 if one of them is constant."""
     x, y = x - (weights * x).sum(), y - (weights * y).sum()
     both = float(np.sqrt((weights * x * x).sum() * (weights * y * y).sum()))
     return float((weights * x * y).sum() / both) if both > 1e-12 else 0.0
@@ -384,7 +384,7 @@ def greedy_share(q: np.ndarray, exact: np.ndarray, weights: np.ndarray) -> float
 def reward_slope(examination: Examination, gamma: float) -> float:
     """log10 of the factor with which rewards enter values: the slope of values less discounted next values on rewards.
 
-    NaN if rewards do not differ in states that it visited; -3 if the slope is not positive.
+    NaN if rewards do not differ in states that it visited. -3 if the slope is not positive.
     """
     values, world = answers_of(examination), examination.world
     live = np.where(world.terminal, 0.0, state_values(examination))

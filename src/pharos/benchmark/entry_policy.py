@@ -119,7 +119,7 @@ def _known_agent(name: str) -> str:
 
 
 def _network_options(entry: Entry) -> dict[str, Any]:
-    """Hyperparameters that shape the network; FileFormatError if some are not plain numbers and truths."""
+    """Hyperparameters that shape the network. FileFormatError if some are not plain numbers and truths."""
     hyperparameters = entry.hyperparameters
     options = {name: hyperparameters[name] for name in ("net_arch", "policy_kwargs") if name in hyperparameters}
     kwargs = options.get("policy_kwargs", {})
@@ -220,7 +220,7 @@ def task_of(entry: Entry, trust: bool, max_states: int, values: MutableMapping[s
 
 
 def task_key(config: RunConfig) -> str:
-    """Digest of the task by which entries are compared: environment, chance, setting of values; 1 and 1.0 are equal."""
+    """Digest of the task by which entries are compared: environment, chance, setting of values. 1 and 1.0 are equal."""
     chance = {name: value for name, value in config.chance.to_dict().items() if value}
     task = [config.environment, config.parameters, chance, config.gamma, config.horizon]
     return storage.digest_of_json(_as_floats(storage.plain(task)))
@@ -235,7 +235,8 @@ def _as_floats(value: object) -> object:
 
 
 def _check_code(config: RunConfig, trust: bool) -> None:
-    """Refuse code, environments and observations that are not part of pharos, unless trusted; not agents."""
+    """Refuse code, environments and observations that are not part of pharos, unless trusted. Agents are not checked
+    here."""
     if trust:
         return
     if config.sources:

@@ -57,7 +57,7 @@ def levels_of(world: str, options: Mapping[str, Any], *, train: int, held_out: i
 
 
 def _is_whole(folder: Path) -> bool:
-    """Whether a folder has the levels, undamaged; else they are written anew."""
+    """Whether a folder has the levels, undamaged. If not, they are written anew."""
     try:
         return mdp_files.is_folder(folder) and bool(mdp_files.read_arrays(folder, mdp_files.read_mdp_manifest(folder)))
     except (FileFormatError, ValueError):
@@ -124,7 +124,7 @@ def twins(suite: "Suite") -> list[tuple["BenchmarkTask", "BenchmarkTask"]]:
 
 
 def overlap(env: Environment) -> float:
-    """Share of the distinct observations of held-out levels that training levels show as well; terminal states apart.
+    """Share of the distinct observations of held-out levels that training levels show as well, without terminal states.
 
     Args:
         env: of `levels_of`, with held-out levels.

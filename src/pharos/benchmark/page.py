@@ -1,6 +1,6 @@
 """The report of an agent's results: one HTML file that loads and runs nothing, and LaTeX for a paper.
 
-Frontiers and scores stand beside the baselines'; a difference is said in words only if an interval shows it. Of
+Frontiers and scores stand beside the baselines'. A difference is said in words only if an interval shows it. Of
 theory the page has two things: the dashed line on each ladder, and residuals, tasks that an idealised learner solves
 and the agent does not. The page is a tree of elements, so that every text in it is escaped.
 """
@@ -93,10 +93,10 @@ def report(
     Args:
         results: folder of a run, file, shipped baseline by name, or results read.
         out: the page, one self-contained file of HTML.
-        beside: agents to stand beside it, as `results`; None: dqn, ppo and q_learning, if shipped.
+        beside: agents to stand beside it, as `results`. Default: dqn, ppo and q_learning, if shipped.
         latex: whether to write a table and a paragraph on methods beside the page, with the ending .tex.
         predictor: idealised learner that the agent is compared with: "dqn", "ppo", "table", "both" (the larger regret
-            of dqn and ppo) or "none"; None: by the agent's name, and "both" if that says nothing.
+            of dqn and ppo) or "none". Default: by the agent's name, and "both" if that says nothing.
         suite: the one that `results` are of, if that is not shipped.
     Raises:
         ParameterError: there are no such results, they are of another suite, or the predictor is none of these.
@@ -111,7 +111,7 @@ def report(
 
 
 def page(contents: Contents) -> str:
-    """The HTML page; every text passes through the tree, which escapes it."""
+    """The HTML page. Every text passes through the tree, which escapes it."""
     title = f"{contents.agent.name} on the Pharos Benchmark {contents.suite.name}"
     sections = [part for make in SECTIONS if (part := make(contents)) is not None]
     return document(title, _lead(contents), sections)

@@ -1,8 +1,8 @@
 """Diagnosis of an agent: symptoms in its values and behaviour, and the nearest of known faults.
 
 `data/fault_profiles.csv` has the readings of small DQNs and PPOs, healthy ones and ones with a fault of `faults.py`,
-each with hyperparameters and seeds of its own; `benchmarks/fault_profiles.py` makes it. Limits of symptoms are the most
-extreme healthy agents in it, with a margin, so that no healthy agent of the table is told that something is wrong.
+each with hyperparameters and seeds of its own. `benchmarks/fault_profiles.py` makes it. Limits of symptoms are the most
+extreme healthy agents in it, with a margin, so that no healthy agent of the table gets a finding.
 The likeness of a fault is its probability by linear discriminant analysis among all faults of the agent's kind. An
 agent that is far from all of them is like none of the known ones.
 
@@ -42,9 +42,9 @@ class Symptom:
         margin: beyond the most extreme healthy agent. beyond: what it is beyond besides, whatever healthy agents have.
         wrong: sentence, with {value} for `show(reading)`. advice: what to look at.
         faults: of the library that it is a sign of, the most likely first.
-        kind: of agents that it is a symptom of; empty: of all.
+        kind: of agents that it is a symptom of, or empty for all.
         also: another reading that has to be beyond its limit as well, with the same margin and `beyond`: of lately
-            visited states, as values that lag behind elsewhere look like it; empty: none.
+            visited states, as values that lag behind elsewhere look like it. Empty for none.
     """
 
     reading: str
@@ -59,7 +59,7 @@ class Symptom:
     also: str = ""
 
     def limit(self, healthy: Sequence[Mapping[str, float]], reading: str = "") -> float:
-        """The limit by the readings of healthy agents, of its own reading or another one; no limit if they lack it."""
+        """The limit by the readings of healthy agents, of its own reading or another one. No limit if they lack it."""
         sign, name = 1 if self.is_high else -1, reading or self.reading
         values = [sign * each[name] for each in healthy if name in each]
         return sign * (max(max(values) + self.margin, sign * self.beyond) if values else np.inf)
@@ -373,7 +373,7 @@ class Deviations:
     """Distances of an agent from each fault of a library, F, in each of n readings.
 
     Attributes:
-        names: of readings that all have; a reading that is missing on one side says nothing.
+        names: of readings that all have. A reading that is missing on one side says nothing.
         faults: F names, "none" among them. counts: (F,) agents with each.
         rows: (F, n) from the mean of each fault, in deviations within faults. covariance: (n, n) within faults.
     """
@@ -402,7 +402,7 @@ def deviations(numbers: Mapping[str, float], library: Sequence[Profile]) -> Devi
 
 
 def likeness(numbers: Mapping[str, float], library: Sequence[Profile]) -> dict[str, float]:
-    """Probability of each fault of a library, "none" among them, the largest first; they sum to 1.
+    """Probability of each fault of a library, "none" among them, the largest first. They sum to 1.
 
     Differences of more than LARGEST deviations count as so many.
     """
@@ -484,7 +484,7 @@ def accuracy(kind: str) -> Accuracy:
 class Finding:
     """A symptom that is there: the reading and the limit that no healthy agent passes, in words, and what to try.
 
-    `strength` is how far beyond the limit it is, in deviations of healthy agents; `faults` are what it is a sign of.
+    `strength` is how far beyond the limit it is, in deviations of healthy agents. `faults` are what it is a sign of.
     """
 
     reading: str
@@ -497,7 +497,7 @@ class Finding:
 
 
 def failed(numbers: Mapping[str, float], library: Sequence[Profile]) -> list[Finding]:
-    """Findings of symptoms that are there, the strongest first; of equations the one that fits best.
+    """Findings of symptoms that are there, the strongest first. Of equations only the one that fits best.
 
     Args:
         numbers: readings of an agent. library: profiles, of which the healthy ones set limits.
@@ -532,8 +532,8 @@ class Judgement:
 def judged(numbers: Mapping[str, float], library: Sequence[Profile]) -> Judgement:
     """The answer that a library gives. Signs of the fault that is said come first among the findings.
 
-    The likeliest fault is said if a sign of it is there; without one if it has none, or nothing else is wrong either,
-    and the agent is as near to it as known ones are.
+    The likeliest fault is said if a sign of it is there. Without a sign it is said if it has none, or nothing else is
+    wrong either, and the agent is as near to it as known ones are.
     """
     shares, findings = likeness(numbers, library), failed(numbers, library)
     is_strange = strangeness(numbers, library) > FARTHEST

@@ -1,6 +1,6 @@
 """Properties of the tasks of v1 that are known before any run, by which the report groups them.
 
-`data/task_properties.csv` holds them, by `benchmarks/benchmark_properties.py`; a test computes them again. The digest
+`data/task_properties.csv` holds them, by `benchmarks/benchmark_properties.py`. A test computes them again. The digest
 of a task is its key, so tasks of v1 in a suite of somebody's own have them as well.
 """
 
@@ -111,7 +111,7 @@ def _purposes() -> dict[str, Purpose]:
 
 
 def purpose_of(task: BenchmarkTask) -> Purpose | None:
-    """Purpose of a task by its class of environments, and kind of MiniGrid; None for other classes."""
+    """Purpose of a task by its class of environments, and kind of MiniGrid, or None for other classes."""
     name, _, instance = task.environment.partition("/")
     kind = str(task.parameters.get("kind", instance))
     keys = [key for key in _purposes() if key.split()[0] == name and kind.startswith(key.partition(" ")[2])]

@@ -27,7 +27,7 @@ class AgentResults:
 
     Attributes:
         agent: label of the agent.
-        suite, digest: name and digest of the suite; an earlier digest of the same tasks becomes today's.
+        suite, digest: name and digest of the suite. An earlier digest of the same tasks becomes today's.
         seeds: of the runs, in the order of the rows.
         curves: name of a task -> (seeds, evaluations) normalised regret (V* - V) / (V* - U) of the policy after each
             equal part of the steps: 0 is optimal, 1 is uniform play, not clipped. Tasks that were not run, or of which
@@ -67,7 +67,7 @@ class AgentResults:
 
     @staticmethod
     def read(source: str | os.PathLike) -> "AgentResults":
-        """Results of the folder of a run, of a file, or of a shipped baseline, by name (`dqn`, of v1; or `v1/dqn`).
+        """Results of the folder of a run, of a file, or of a shipped baseline, by name (`dqn`, of v1, or `v1/dqn`).
 
         Nothing is executed, and nothing is allocated before sizes in the file were held against the size of the file.
 
@@ -95,13 +95,13 @@ class AgentResults:
         return read_sealed(path, RESULTS_KIND, _results)
 
     def write(self, file: str | os.PathLike) -> None:
-        """Replace a file by these results, in one step; the same results give the same bytes."""
+        """Replace a file by these results, in one step. The same results give the same bytes."""
         own = {"agent": self.agent, "suite": self.suite, "suite_digest": self.digest, "seeds": list(self.seeds)}
         write_sealed(file, {**own, "record": dict(self.record)}, self.curves, RESULTS_KIND)
 
 
 def baselines(suite: str = "v1") -> tuple[str, ...]:
-    """Names of the results that are shipped for a suite; each is the results file of a run, and says its seeds."""
+    """Names of the results that are shipped for a suite. Each is the results file of a run, and says its seeds."""
     return tuple(sorted(file.stem for file in (BASELINES / suite).glob("*.safetensors")))
 
 
@@ -112,7 +112,8 @@ def _results(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Age
 
 
 def entries_of(record: Mapping[str, Any], kinds: Mapping[str, type], what: str) -> tuple[Any, ...]:
-    """Entries of the record of a file, in the order of `kinds`; FileFormatError: one is missing or of another type."""
+    """Entries of the record of a file, in the order of `kinds`. FileFormatError if one is missing or of another
+    type."""
     check_values(record)
     wrong = [name for name, kind in kinds.items() if not isinstance(record.get(name), kind)]
     if wrong or not all(type(seed) is int for seed in record["seeds"]):
