@@ -2,7 +2,7 @@
 
 Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation complexity: `gaps`,
 `sum_of_reciprocal_gaps`, `minimal_gap`, `environmental_value_norm`. Planning: `effective_horizon`. All of them:
-`report`; `register` adds your own.
+`report`. `register` adds your own.
 """
 
 from typing import TYPE_CHECKING
