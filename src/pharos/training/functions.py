@@ -1,4 +1,4 @@
-"""Learners of agents that are functions: a generator of policies, and a function of JAX; see `pharos.agents.own`.
+"""Learners of agents that are functions: a generator of policies, and a function of JAX, see `pharos.agents.own`.
 
 Neither is resumed: a run that was killed begins anew, and ends with the same bytes if its function has chance by its
 seed alone.
@@ -45,8 +45,8 @@ class GeneratorLearner(PolicyRecorder):
         """Train until the generator ends or its budget is spent, and call `at_point` at each point.
 
         Raises:
-            ParameterError: it is no generator; or it has a second policy, or ends with another one than uniform play,
-                when no step was counted; or yields very many policies without a step while it has some.
+            ParameterError: it is no generator, or it has a second policy, or ends with another one than uniform play,
+                when no step was counted. Or it yields very many policies without a step while it has some.
             PharosError: its code raises something, SystemExit included.
         """
         self.at_point = at_point
@@ -72,7 +72,7 @@ class GeneratorLearner(PolicyRecorder):
 
 
 class CompiledLearner:
-    """Learner of runs of one task: a function of JAX, one program for all seeds; neither steps nor episodes count."""
+    """Learner of runs of one task: a function of JAX, one program for all seeds. Neither steps nor episodes count."""
 
     def __init__(self, runs: Sequence[Any], learn: Callable[..., Any]):
         self.runs, self.function = runs, learn

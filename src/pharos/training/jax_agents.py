@@ -9,8 +9,8 @@ is compiled. `snapshots` are parameters: a tree of arrays whose first axis has K
 ..., `steps` steps. `apply(parameters, observations)` gives (N, A) probabilities or (N,) actions. Observations of all
 states are one batch, so that a policy is one forward pass.
 
-At an evaluation point the snapshot counts that was taken last, at that step or before; none yet: uniform play. Steps
-are not counted here, nor are episodes: that a function takes `steps` steps can be read in its code alone.
+At an evaluation point the snapshot counts that was taken last, at that step or before. Before the first, uniform play
+counts. Steps are not counted here, nor are episodes: that a function takes `steps` steps can be read in its code alone.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,7 +41,7 @@ def compiled_curves(
         episodes in it.
     Raises:
         MissingExtra: JAX or gymnax is not installed.
-        ParameterError: the task is none of tables alone; or the function returns something else.
+        ParameterError: the task is none of tables alone, or the function returns something else.
     """
     context = task.observer.observe
     lacking = [

@@ -40,7 +40,7 @@ class FailedRun:
 
 
 class TaskCache:
-    """Tasks of runs by configuration; they share spaces, rewards, solved values and observations.
+    """Tasks of runs by configuration. They share spaces, rewards, solved values and observations.
 
     Args:
         values: config -> values at the start of its task, if they are known.
@@ -60,7 +60,7 @@ class TaskCache:
         self._shared: dict[str, Any] = {}
 
     def task(self, config: RunConfig) -> Task:
-        """The task of a run, the same object for all runs on it; tasks share spaces and rewards."""
+        """The task of a run, the same object for all runs on it. Tasks share spaces and rewards."""
         return self.shared("task", config, TASK_ENTRIES, lambda: self._task(config))
 
     def adopt(self, config: RunConfig, task: Task) -> None:
@@ -75,7 +75,7 @@ class TaskCache:
         return task
 
     def world(self, config: RunConfig, task: Task) -> tuple[StateSpace, TabularMDP]:
-        """The states of a task, and their MDP without chance and horizon; the same for all tasks of a world."""
+        """The states of a task, and their MDP without chance and horizon, the same for all tasks of a world."""
         return self.shared("world", config, WORLD, lambda: (task.space, task.space.mdp(gamma=task.gamma)))
 
     def shared(self, what: str, config: RunConfig, names: Sequence[str], make: Callable[[], T]) -> T:
@@ -92,9 +92,9 @@ class PreparedRun:
     """A run before and while it is trained: a `pharos.agents.LearningRun`, with its curve and its record.
 
     Attributes:
-        index: among the configurations; None for a run of a checkpoint that nobody asks for.
+        index: among the configurations. None for a run of a checkpoint that nobody asks for.
         tasks: that it shares with other runs.
-        key: runs with equal keys train together, see `pharos.agents.Agent.prepare`; None: it is alone, has checkpoints
+        key: runs with equal keys train together, see `pharos.agents.Agent.prepare`. None: it is alone, has checkpoints
             in its own folder, and holds that.
         error: why it has failed.
     """
@@ -164,6 +164,6 @@ class PreparedRun:
         write_record(self.folder, record)
 
     def fail(self, error: Exception) -> None:
-        """Mark the run as failed; the reason is kept in run.json."""
+        """Mark the run as failed. The reason is kept in run.json."""
         self.error = error
         self.write("failed", error=in_one_line(error))

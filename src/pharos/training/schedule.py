@@ -28,7 +28,7 @@ def plan(
     Args:
         workers: most processes.
         device: on which networks are trained.
-        seconds: that each run takes, in any unit; None: all take as long.
+        seconds: that each run takes, in any unit. Default: all take as long.
     """
     if workers < 2 or len(configs) < 2:
         return [list(range(len(configs)))]
@@ -42,7 +42,7 @@ def lanes(keys: Sequence[Hashable | None], widths: Sequence[int]) -> list[list[i
     """Return the lanes of runs, in the order of their first run.
 
     Args:
-        keys: runs with equal keys fit together; None: a run is alone.
+        keys: runs with equal keys fit together. None: a run is alone.
         widths: most runs of the lane that a run begins.
     """
     groups: list[list[int]] = []
@@ -83,7 +83,7 @@ class Shapes:
         self._shapes: dict[str, RunShape] = {}
 
     def key(self, config: RunConfig) -> Hashable | None:
-        """Key of a run; runs with equal keys fit together. None: it is alone, or something is wrong with it."""
+        """Key of a run. Runs with equal keys fit together. None: it is alone, or something is wrong with it."""
         try:
             return agent_called(config.agent).group_key(_Sizes(config, self), self.device)
         except Exception:  # the error is reported when the run begins
@@ -94,7 +94,7 @@ class Shapes:
         return agent_called(config.agent).width(_Sizes(config, self), self.device)
 
     def shape(self, config: RunConfig) -> RunShape:
-        """The sizes of a run; the sizes of an observation that needs states, or cannot be made, are not known."""
+        """The sizes of a run. The sizes of an observation that needs states, or cannot be made, are not known."""
         entry = config.to_dict()
         key = json.dumps([entry.get(name) for name in OBSERVED_FIELDS], sort_keys=True)
         if key not in self._shapes:

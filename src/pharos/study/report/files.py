@@ -55,16 +55,16 @@ def report(
 
     Args:
         source: YAML file, preset, mapping, Specification, the folder of a study, or the name of one in `studies`.
-        folder: of the results; None for that folder, or studies/NAME.
-        out: folder to write to; None for `report` in the folder of the study.
+        folder: of the results. Default: that folder, or studies/NAME.
+        out: folder to write to. Default: `report` in the folder of the study.
         progress: called with what is being done.
-        trust: whether code that the study names may be imported; as for `specification`.
-        predictions: of `read_predictions`, or several of them, of different cells; figures, a section and a table say
+        trust: whether code that the study names may be imported, as for `specification`.
+        predictions: of `read_predictions`, or several of them, of different cells. Figures, a section and a table say
             what came true of them, and how many runs had begun before they were written.
     Raises:
-        ParameterError: no run is finished; or none of those that were predicted, or of fewer than three classes; or a
-            cell was predicted twice.
-    Cost: the measures of hardness of what has finished runs, once, each at most its budget; then seconds.
+        ParameterError: no run is finished. Or none of the predicted runs is, or these have fewer than three classes, or
+            a cell was predicted twice.
+    Cost: the measures of hardness of what has finished runs, once, each at most its budget, then seconds.
     """
     from pharos.study.predictions import PredictedCells
 
@@ -132,7 +132,7 @@ def _write_tables(folder: Path, results: Results, more: "Mapping[str, pd.DataFra
 
 
 def spreadsheet_safe(data: "pd.DataFrame") -> "pd.DataFrame":
-    """The same table, in which no text begins as a formula of a spreadsheet does; numbers stay numbers."""
+    """The same table, in which no text begins as a formula of a spreadsheet does. Numbers stay numbers."""
     safe = data.rename(columns=_no_formula)
     for name in safe.columns:
         if safe[name].dtype.kind not in "fiub":
