@@ -35,10 +35,10 @@ import pandas as pd
 from pharos import study
 from pharos.agents import primary_predictors
 from pharos.prediction import Published
-from pharos.prediction.calibration import BINS, FILE, NUMBERS
+from pharos.prediction.calibration import BINS, CELLS_FILE, NUMBER_COLUMNS
 from pharos.prediction.learners import primary_regret
-from pharos.prediction.pilot import FILE as PILOT_FILE
-from pharos.prediction.pilot import SHARES as PILOTS
+from pharos.prediction.pilot import CELLS_FILE as PILOT_FILE
+from pharos.prediction.pilot import PILOT_SHARES as PILOTS
 from pharos.statistics import spearman
 from pharos.study.cross_validation import held_out
 from pharos.study.tables import CELL
@@ -190,7 +190,7 @@ def said_of(cells, resamples):
     return f"{r_squared} | {rho} | {pairs} of {len(known.pairs.first)} | {unfitted} | {width}"
 
 
-SHARES = (0.05, 0.1, 0.25, 0.5, 1.0)
+PILOT_SHARES = (0.05, 0.1, 0.25, 0.5, 1.0)
 
 
 def pilot_cells(file):
@@ -200,18 +200,18 @@ def pilot_cells(file):
     spread = curves["value_optimal"] - curves["value_uniform"]
     regret = (curves["value_optimal"].to_numpy()[:, None] - np.stack(curves["value"])) / spread.to_numpy()[:, None]
     share = np.linspace(0, 1, regret.shape[1])
-    so_far = {f"{part:.0%}": regret[:, share <= part + 1e-9].mean(axis=1) for part in SHARES}
+    so_far = {f"{part:.0%}": regret[:, share <= part + 1e-9].mean(axis=1) for part in PILOT_SHARES}
     cells = curves[[*CELL, "seed"]].assign(**so_far)
     others = cells[cells["seed"] > 0].groupby(CELL)["100%"].mean().rename("others").reset_index()
     return cells[cells["seed"] == 0].merge(others, on=CELL).merge(frame[frame["study"] == "sealed-2"], on=CELL)
 
 
 def r_squared_of_pilots(file):
-    """Yield (agent, words, R2 of classes left out by SHARES): pilots, pilots with the measure, and the measure alone.
+    """Yield (agent, words, R2 of classes left out): pilots, pilots with the measure, and the measure alone.
 
     After a line or a plane through the cells of the other classes, of the mean regret of three other seeds.
     """
-    cells, names = pilot_cells(file), [f"{share:.0%}" for share in SHARES]
+    cells, names = pilot_cells(file), [f"{share:.0%}" for share in PILOT_SHARES]
     for agent in primary_predictors():
         of_agent = cells[cells["agent"] == agent]
         y, classes = of_agent["others"].to_numpy(), np.unique(of_agent["environment"], return_inverse=True)[1]
@@ -231,7 +231,7 @@ def pilots(file, write=False):
         kept = cells[[*CELL, "predicted", "others"]].assign(**{str(share): cells[f"{share:.0%}"] for share in PILOTS})
         kept.round(6).to_csv(PILOT_FILE, index=False, lineterminator="\n")
     for agent, words, values in r_squared_of_pilots(file):
-        texts = [f"{value:.2f}" for value in values] + [""] * (len(SHARES) - len(values))
+        texts = [f"{value:.2f}" for value in values] + [""] * (len(PILOT_SHARES) - len(values))
         print(f"| {agent.upper()} | {words} | {' | '.join(texts)} |")
 
 
@@ -296,7 +296,7 @@ def cost():
 
 def of(cells):
     mdps = cells["study"] + " " + cells["instance"] + " " + cells["chance"]
-    numbers = (cells[name].to_numpy(float) for name in NUMBERS)
+    numbers = (cells[name].to_numpy(float) for name in NUMBER_COLUMNS)
     return Published(cells["environment"].to_numpy(str), mdps.to_numpy(str), *numbers)
 
 
@@ -324,8 +324,8 @@ def statistics(known, counts):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", choices=("compute", "judge", "orders", "sealed", "pilots", "draw", "cost"))
-    parser.add_argument("--out", type=Path, default=FILE)
-    parser.add_argument("--cells", type=Path, default=FILE)
+    parser.add_argument("--out", type=Path, default=CELLS_FILE)
+    parser.add_argument("--cells", type=Path, default=CELLS_FILE)
     parser.add_argument("--block", action="append", choices=[*BLOCKS])
     parser.add_argument("--write", action="store_true", help="write what `pharos predict --pilot` rests on")
     parser.add_argument("--resamples", type=int, default=1000)

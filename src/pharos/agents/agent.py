@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 POLICY, NETWORK = "policy.npy", "agent"
 """What was learnt, in the folder of a run: a table, or a folder with a network."""
-LIBRARIES = ("stable_baselines3", "sb3_contrib")
+AGENT_LIBRARIES = ("stable_baselines3", "sb3_contrib")
 """Their algorithms are known by name: they need no trust, and no source in the configuration of a run."""
 TABULAR_OBSERVATION = "index"
 """What tabular agents see."""
@@ -287,8 +287,8 @@ def register(agent: Agent) -> None:
 
 
 def is_known(name: str) -> bool:
-    """Whether an agent comes with pharos or with one of LIBRARIES, so that it is not code of the user's own."""
-    return not is_reference(name) or name.partition(":")[0].split(".")[0] in LIBRARIES
+    """Whether an agent comes with pharos or with one of AGENT_LIBRARIES, so that it is not code of the user's own."""
+    return not is_reference(name) or name.partition(":")[0].split(".")[0] in AGENT_LIBRARIES
 
 
 # Tables ---------------------------------------------------------------------------------------------------------------

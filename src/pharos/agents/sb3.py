@@ -48,11 +48,14 @@ if TYPE_CHECKING:
 
 EXTRACTED_FEATURES = 128
 LEAST_ONE = ("n_envs", "n_steps", "n_epochs", "batch_size", "buffer_size", "train_freq", "target_update_interval")
-SHARES = ("gamma", "gae_lambda", "tau", "exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
+SHARE_OPTIONS = (
+    *("gamma", "gae_lambda", "tau"),
+    *("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"),
+)
 POSITIVE = ("learning_rate", "clip_range", "max_grad_norm")
 NOT_NEGATIVE = ("learning_starts", "ent_coef", "vf_coef")
 # What `make_model` gives itself.
-OURS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}
+RESERVED_ARGUMENTS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}
 NO_NORMALIZER = (
     "leave it out, as `vector` is in [0, 1] and rewards are small; or train behind VecNormalize yourself, and evaluate "
     "with pharos.evaluate_policy, which applies it"
@@ -129,7 +132,7 @@ def check_hyperparameters(
         if hyperparameter in hyperparameters and hyperparameter not in parameters:
             raise ParameterError(f"agent {name!r}: {hyperparameter} is RL Zoo's, for wrappers; {remedy}")
     if all(each.kind is not inspect.Parameter.VAR_KEYWORD for each in parameters.values()):
-        names = sorted({*parameters, "n_envs", "n_timesteps", "net_arch", *also} - OURS)
+        names = sorted({*parameters, "n_envs", "n_timesteps", "net_arch", *also} - RESERVED_ARGUMENTS)
         for hyperparameter in hyperparameters:
             if hyperparameter not in names:
                 raise UnknownName(f"hyperparameter of {name}", hyperparameter, names)
@@ -171,7 +174,7 @@ def _expected(name: str, value: object) -> str | None:
     number = value if not isinstance(value, bool | str) else math.nan
     if name in LEAST_ONE and not (number >= 1 and float(number).is_integer()):
         return "an integer of at least 1"
-    if name in SHARES and not 0 <= number <= 1:
+    if name in SHARE_OPTIONS and not 0 <= number <= 1:
         return "a number from 0 to 1"
     if name in POSITIVE and not 0 < number < math.inf:
         return "a number above 0"
@@ -301,12 +304,12 @@ class BatchedAgent(DeepAgent):
     engines: tuple[str, ...] = ("sb3", "batched")
 
     def check(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
-        from pharos.agents.batched import OURS, supports
+        from pharos.agents.batched import OWN_OPTIONS, supports
 
         if engine == "sb3":
             super().check(hyperparameters, engine)
             return
-        check_hyperparameters(self.name, hyperparameters, OURS)
+        check_hyperparameters(self.name, hyperparameters, OWN_OPTIONS)
         lacking = supports(self.name, hyperparameters)
         if lacking is not None:
             raise ParameterError(f"the batched engine: {lacking}; the engine sb3 has it")

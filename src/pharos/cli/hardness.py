@@ -273,12 +273,12 @@ def predict(
         plot: Draw the bars into a PNG, PDF or SVG file.
     """
     env = target.found_environment()
-    from pharos.prediction import predict as foretell
+    from pharos.prediction import predict as predict_regret
 
     if preset not in (None, "common"):
         raise UnknownName("set of hyperparameters", str(preset), ("common",))
     with progress_line("predicting") as report:
-        prediction = foretell(
+        prediction = predict_regret(
             env,
             [_observation(text) for text in observation or ["vector"]],
             networks=network or None,

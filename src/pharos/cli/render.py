@@ -161,7 +161,7 @@ def _optimal(target: Target, gamma: float, max_states: int | None) -> Callable[[
 
 
 ESCAPES = {"[A": "up", "[B": "down", "[C": "right", "[D": "left", "OA": "up", "OB": "down", "OC": "right", "OD": "left"}
-SIGNS = {"up": "↑", "left": "←", "down": "↓", "right": "→", "space": "space"}
+KEY_SIGNS = {"up": "↑", "left": "←", "down": "↓", "right": "→", "space": "space"}
 QUIT, NEW_GAME, UNDO = "q", "r", "u"
 
 
@@ -245,7 +245,7 @@ def _picture(game: Game) -> "RenderableType":
         line.append("   the episode has ended", style="bold yellow")
     names: dict[int, list[str]] = {}
     for key, action in game.keys.items():
-        names.setdefault(action, []).append(SIGNS.get(key, key))
+        names.setdefault(action, []).append(KEY_SIGNS.get(key, key))
     does = [f"{'/'.join(sorted(shown, key=len))} {game.env.actions[action]}" for action, shown in names.items()]
     help_line = Text("   ".join([*does, f"{UNDO} undo", f"{NEW_GAME} restart", f"{QUIT} quit"]), style="dim")
     return Group(line, Text(), colored_text(game.env, game.state), Text(), help_line)

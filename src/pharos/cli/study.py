@@ -137,7 +137,7 @@ def run(
             end = study.run_on_ray(opened, directory, address=address, progress=report, **options)
         else:
             try:
-                end = study.run(opened, directory, foretold=_say, progress=report, **options)
+                end = study.run(opened, directory, on_forecast=_print_forecast, progress=report, **options)
             except AllRunsFailed as error:  # the answer says of each why
                 end = error.outcome
     if logs is not None:
@@ -145,7 +145,7 @@ def run(
     return _answer(end, failed=bool(end.failed))
 
 
-def _say(forecast: object) -> None:
+def _print_forecast(forecast: object) -> None:
     """Print the forecast of the duration on standard error."""
     console(stderr=True).print(str(forecast), soft_wrap=True)
 

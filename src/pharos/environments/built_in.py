@@ -90,7 +90,7 @@ _CALLBACKS: list[Callable[[type["Environment"]], None]] = []
 
 
 def on_registration(callback: Callable[[type["Environment"]], None]) -> None:
-    """Call `hear` with every user class that is registered from now on."""
+    """Call `callback` with every user class that is registered from now on."""
     _CALLBACKS.append(callback)
 
 

@@ -34,7 +34,7 @@ from pharos.explorer.states import (
     States,
     probabilities,
 )
-from pharos.hardness import discounted_visits, occupancy
+from pharos.hardness import ERRORS_PER_TIE, discounted_visits, occupancy
 from pharos.mdp import TabularMDP, names_of, uniform_choice
 from pharos.observations import num_values
 from pharos.policies import state_losses
@@ -87,7 +87,6 @@ LONGEST_PATH = 2_000  # steps that are shown
 MOST_LISTED_STARTS = 100  # start states that are listed
 LISTED = 48  # states of a layer that are listed at a time
 MOST_WORST_STATES = 24  # states that are listed where a policy goes wrong
-ERRORS_PER_TIE = 2.5  # the gap of a tie is at most this times the bound on errors of values, see hardness.gaps
 
 
 class Exploration:

@@ -47,7 +47,7 @@ class Explorer:
         exploration: what it shows.
         port: 0 for any that is free.
     Attributes:
-        url: its address, with its token, on this machine alone; whoever knows it may look.
+        url: of the page, with an access token. It can be reached from this machine only.
     Raises:
         ParameterError: the port is taken, or may not be used.
     """

@@ -14,13 +14,13 @@ sign.
 
 The slow mode. If an attempt mostly fails and begins again, sweeps bring J nearer by one failure each. What is
 missing then has one shape: W(n), how likely the target is missed for long from n. It is swept along,
-W(n) = sum_m p(m | n, a) W(m) under the best actions, beginning with 1. A sweep adds f to J and takes g from W; if f
-is nearly c g, J + c W is the solution, but for what sweeps mend. If J is so low that the best actions never arrive,
-as each failure costs less than is missing, J is raised by itself along W first: from above, attempts are worth their
+W(n) = sum_m p(m | n, a) W(m) under the best actions, beginning with 1. A sweep adds f to J and takes g from W. If f is
+nearly c g, J + c W is the solution, but for what sweeps mend. If J is so low that the best actions never arrive, as
+each failure costs less than is missing, J is raised by itself along W first: from above, attempts are worth their
 while.
 
 Rounding. Rows sum to 1, so T J(n) - J(n) = 1 + min_a sum_m p(m | n, a) (J(m) - J(n)), and its rounding error is a few
-units in the last place of sum_m p(m | n, a) |J(m) - J(n)|; the kernels add it to `above` and `below`. What is left is
+units in the last place of sum_m p(m | n, a) |J(m) - J(n)|. The kernels add it to `above` and `below`. What is left is
 that J itself is rounded: a float of 1e10 is known to 1e-6 steps, and each of the 1e10 visits on the way to the target
 may lose as much. So beyond 1e9 or so J is kept as the sum of two floats, improved by Newton's method (`_refined`), and
 moved up and down by W with
@@ -184,7 +184,7 @@ class HittingTimes:
         return float(np.quantile(j[there] / self.distance[there], 0.99)) if there.any() else 1.0
 
     def distances(self, target: int) -> int:
-        """Put the nodes that lead to the target into `order` by their `distance`; returns how many they are."""
+        """Put the nodes that lead to the target into `order` by their `distance`. Returns how many they are."""
         self.goal[:] = False
         self.goal[self.nodes_of(target)] = True
         return int(hitting.backward_order(*self.back, self.goal, self.order, self.distance))
@@ -235,7 +235,7 @@ class HittingTimes:
         return self.bounds(j, count)
 
     def _sweep_with_mode(self, j: np.ndarray, count: int) -> float:
-        """Sweep J and the slow mode, along which J is moved now and then; return the largest change by the sweep."""
+        """Sweep J and the slow mode, along which J is moved now and then. Return the largest change by the sweep."""
         if self.mode is None:
             self.mode = np.zeros(len(j))
             self.mode[self.order[:count]] = ~self.goal[self.order[:count]]
@@ -323,7 +323,7 @@ class HittingTimes:
         return np.bincount(self.distance[self.order[:count]])
 
     def _factored(self, count: int) -> "tuple[np.ndarray, Factors] | None":
-        """(inner nodes, factors of 1 - P of the greedy policy); None if no policy is proper. Rows are made to sum to
+        """(inner nodes, factors of 1 - P of the greedy policy), or None if no policy is proper. Rows are made to sum to
         1."""
         nodes = self.order[:count]
         inner = nodes[~self.goal[nodes]]
@@ -331,7 +331,7 @@ class HittingTimes:
         return None if factors is None else (inner, factors)
 
     def _evaluate(self, count: int) -> np.ndarray | None:
-        """The hitting times of the greedy policy; None if it is not proper."""
+        """The hitting times of the greedy policy, or None if it is not proper."""
         factored = self._factored(count)
         if factored is None:
             return None
@@ -348,7 +348,7 @@ class HittingTimes:
     def _refined(
         self, j: np.ndarray, count: int, tolerance: float, plain: HittingBounds, spending: BudgetClock
     ) -> HittingBounds:
-        """Bounds of a J that is the sum of two floats; `plain`, the bounds of one, if these are no better. j
+        """Bounds of a J that is the sum of two floats, or `plain`, the bounds of one, if these are no better. j
         becomes J + W."""
         high, low = j.copy(), np.zeros_like(j)
         best, policy = plain.but_limited(), None
@@ -383,8 +383,8 @@ class HittingTimes:
         factored: tuple[np.ndarray, "Factors"],
         spending: BudgetClock,
     ) -> tuple[HittingBounds, np.ndarray]:
-        """(bounds of J* relative to J + W, J + W rounded up); a policy that is greedy in J - W in place of one in J
-        if ties need it."""
+        """(bounds of J* relative to J + W, J + W rounded up), by a policy that is greedy in J - W in place of J if ties
+        need it."""
         inner, factors = factored
         residual, error, _ = self._residuals(high, low, count)
         cost = 2 * (np.abs(residual[inner]) + error[inner])
@@ -413,7 +413,7 @@ class HittingTimes:
     def _residuals(
         self, high: np.ndarray, low: np.ndarray, count: int
     ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-        """(residuals of J = high + low, their errors, (bound of T J - J, bound of J - T J)); the greedy policy stands
+        """(residuals of J = high + low, their errors, (bound of T J - J, bound of J - T J)). The greedy policy stands
         in `policy`."""
         residual, error = np.zeros_like(high), np.zeros_like(high)
         arrays = (high, low, self.policy, residual, error)
@@ -450,7 +450,7 @@ def multiplications(layers: np.ndarray) -> float:
 
 
 def factors_of(choices: ExpandedMDP, policy: np.ndarray, inner: np.ndarray) -> Factors | None:
-    """The factors of 1 - P of a policy on the `inner` nodes; None if it is not proper. Rows are made to sum to 1."""
+    """The factors of 1 - P of a policy on the `inner` nodes, or None if it is not proper. Rows are made to sum to 1."""
     first, unknown = _numbered_once(choices.is_restart[inner])
     index = np.full(len(policy), first.size)  # what leads elsewhere is left out of the equations
     index[inner] = unknown
@@ -496,7 +496,7 @@ def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[tuple[np.nda
     Under random and sticky actions most of a row is shared.
 
     Returns:
-        ((first, node, weight) of the rest, one row for each action; (first, node, weight) of the shared part, one row
+        ((first, node, weight) of the rest, one row for each action, (first, node, weight) of the shared part, one row
         for each node).
     """
     nodes = matrix.shape[0] // num_actions

@@ -1,15 +1,15 @@
 """Diameter under chance: for every target a stochastic shortest path problem, most of them only as far as bounds need.
 
-`hitting_times` bounds the hitting times of one target; here the targets are chosen. A target whose upper bound falls
+`hitting_times` bounds the hitting times of one target. Here the targets are chosen. A target whose upper bound falls
 below the largest hitting time proven so far is dropped at once. Solved targets bound the others (`HubBounds`), so that
 there is an interval whenever the budget ends. If a look at each target would take longer than that, the target with
 the largest upper bound is always the next. So it is for the start eccentricity, whose first bounds are those from the
-start; solved targets are hubs for others as long as they rule some out.
+start. Solved targets are hubs for others as long as they rule some out.
 
 Upper bounds for all targets at once, from the solution of one of them (`HubBounds`). Let E(s, y) be the least expected
 number of steps from s to y, and h a hub with E(s, h) <= U(s) for all s. To go from x to y, choose an action a that may
 lead there. With probability P(s') it leads to s' != y instead. From there take a short way back to y if there is
-one, each of its steps in the same manner; else give up, and go to the hub. This attempt takes at most c(x, a, y)
+one, each of its steps in the same manner. Otherwise give up, and go to the hub. This attempt takes at most c(x, a, y)
 expected steps and is given up with probability at most l(x, a, y), where
 
     c(x, a, y) = 1 + sum over near s' of P(s') (sum of c along the way back) + sum over other s' of P(s') U(s')
@@ -75,9 +75,9 @@ SUM_SLACK = 1 + 1e-9
 
 
 class HubBounds:
-    """The bounds of an MDP; nodes are its states, and the implicit end if there is one.
+    """The bounds of an MDP. Nodes are its states, and the implicit end if there is one.
 
-    Cost: two searches of 64 nodes around each state, once; for a hub some passes over the ways back and one run of
+    Cost: two searches of 64 nodes around each state, once. For a hub some passes over the ways back and one run of
         Dijkstra's algorithm. Memory: some 30 bytes for each outcome of each action and a byte for each pair of outcomes
         of a state.
     """
@@ -134,7 +134,7 @@ class HubBounds:
         self._ways = (square, steps, start, way)
 
     def _solve(self, own: float, times: np.ndarray) -> np.ndarray:
-        """(outcomes,) c for own = 1 and times = U; l for own = 0 and times = 1."""
+        """(outcomes,) c for own = 1 and times = U, and l for own = 0 and times = 1."""
         value = np.full(len(self._fixed[1]), own)
         new = value.copy()
         edges = np.linspace(0, len(value), self._threads + 1).astype(np.int64)
@@ -166,7 +166,7 @@ class HubBounds:
             times, bound: (N,) upper bounds of the expected steps to the hub, and from it.
             targets: those whose bounds are to be shortened.
             size: nodes around each of them.
-            is_over: whether to leave the rest as it is; asked between parts.
+            is_over: whether to leave the rest as it is, asked between parts.
         Cost: for each of the targets some passes over `size` nodes.
         """
         outcomes, owner, weights, num_previous = self._fixed
@@ -202,12 +202,12 @@ class HubBounds:
 
     @cached_property
     def _into(self) -> tuple[np.ndarray, np.ndarray]:
-        """Outcomes that lead to each node, a large table; computed on demand, as only shortening needs it."""
+        """Outcomes that lead to each node, a large table. It is computed on demand, as only shortening needs it."""
         first, _, node, _ = self._outcomes
         return hitting.outcomes_into(node, len(first) - 1)
 
     def _steps_from(self, hub: int) -> np.ndarray:
-        """(N,) int32, see `vicinity.steps_from`; the last ones are kept, as rounds of shortening have one hub."""
+        """(N,) int32, see `vicinity.steps_from`. The last ones are kept, as rounds of shortening have one hub."""
         if hub != self._steps[0]:
             first, _, node, _ = self._outcomes
             self._steps = hub, hitting.steps_from(hub, first, node)
@@ -215,7 +215,7 @@ class HubBounds:
 
 
 def _outcome_lists(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(first, action, node, probability) of the outcomes of executing each action in each state; action -1: any."""
+    """(first, action, node, probability) of the outcomes of executing each action in each state. Action -1 is any."""
     terminal = np.asarray(mdp.terminal)
     executed, ends = outcome_matrix(mdp, terminal)
     num_states, num_actions = mdp.num_states, mdp.num_actions
@@ -278,9 +278,9 @@ class TargetBounds:
 
     Attributes:
         farther: the words for a target that may exceed it.
-        upper: (targets,) of the time to each; -inf if it is settled.
+        upper: (targets,) of the time to each, -inf if it is settled.
         lower: the largest time that is proven. settled_upper: the largest upper bound of settled targets.
-        limited: targets whose bounds are as close as floats allow, and no closer than the tolerance.
+        limited: number of targets whose bounds cannot reach the tolerance in float64.
     """
 
     farther: str
@@ -470,7 +470,7 @@ class _Diameter(TargetBounds):
     def _solved(
         self, targets: HittingTimes, some: Sequence[int], enough: float, scaling: bool, bounding: bool
     ) -> "list[_TargetResult]":
-        """Solve each of `some`; one with an upper bound of at most `enough` no further than that."""
+        """Solve each of `some`. A target with an upper bound of at most `enough` is solved no further."""
         looks = []
         for target in some:
             j, count, lost = targets.open(target)
@@ -513,7 +513,7 @@ class _TargetResult:
     """Result for a target: bounds of its largest hitting time, and how many states do not surely reach it.
 
     Attributes:
-        limited: whether floats allow no closer bounds.
+        limited: whether the bounds cannot reach the tolerance in float64.
         scale: 99th percentile of hitting time divided by distance.
         times: (nodes,) upper bounds of the hitting times, if other targets are to be bounded.
     """
@@ -582,7 +582,7 @@ class _Eccentricity(TargetBounds):
         self.spending.report(self.lower, max(self.settled_upper, float(self.upper.max())), self.num_open)
 
     def _settle(self, target: int) -> np.ndarray | None:
-        """Settle a target; returns upper bounds (nodes,) of its hitting times, if all are known."""
+        """Settle a target. Returns upper bounds (nodes,) of its hitting times, if all are known."""
         targets, rounding = self.targets, 1 + (len(self.nodes) + 8) * UNIT
         self.spending.searches += 1
         before, self.upper[target] = float(self.upper[target]), -math.inf

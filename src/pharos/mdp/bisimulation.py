@@ -142,6 +142,6 @@ def _quotient(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray)
 
 def _lost() -> Rewards:
     raise ParameterError(
-        "lazy_actions: the states of this MDP stand for several, which staying may pay differently; "
-        "add lazy actions before you minimize, or say what staying= pays"
+        "cannot add lazy actions to a minimised MDP: merged states may pay differently for staying; "
+        "add lazy actions before you minimize, or pass staying="
     )

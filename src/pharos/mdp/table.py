@@ -21,6 +21,7 @@ from pharos.mdp.actions import States
 from pharos.mdp.arguments import ROUNDED, array_argument, normalized_rows, rounding_hint
 from pharos.mdp.dynamics import Dynamics, Outcomes, TopologicalOrder, as_indices, part_with_halo
 from pharos.system.arrays import (
+    UNIT_ROUNDOFF,
     Indices,
     OutcomeCheck,
     OutcomeRows,
@@ -113,9 +114,6 @@ class Table(Dynamics):
 # Lazy -----------------------------------------------------------------------------------------------------------------
 
 
-_UNIT = 2.0**-53
-
-
 class Lazy(Dynamics):
     """Tables of next states or of outcomes, and a probability that a state stays what it is.
 
@@ -143,7 +141,7 @@ class Lazy(Dynamics):
         self.num_states, self.num_actions = tables.num_states, tables.num_actions
         self.operations = tables.operations + roundings
         # of the products with 1 - p, and of 1 - p
-        self.mass = max(1.0, tables.mass) * (1 + (self.operations + 2) * _UNIT)
+        self.mass = max(1.0, tables.mass) * (1 + (self.operations + 2) * UNIT_ROUNDOFF)
 
     @property
     def for_kernels(self) -> object:
@@ -215,7 +213,7 @@ class Lazy(Dynamics):
 # The share of a dense table that may be padding before successors are kept one row after another.
 MOST_PADDING = 0.3
 # Vectors of probabilities that codes of one and of two bytes tell apart.
-ONE_BYTE_CODES, MOST_CODES = 1 << 8, 1 << 16
+ONE_BYTE_CODES, TWO_BYTE_CODES = 1 << 8, 1 << 16
 
 
 def checked_outcomes(
@@ -269,7 +267,7 @@ def compact_outcomes(
     probabilities: np.ndarray,
     *,
     most_padding: float = MOST_PADDING,
-    most_vectors: int = MOST_CODES,
+    most_vectors: int = TWO_BYTE_CODES,
 ) -> dict[str, Any]:
     """Arguments of an `OutcomeTable`, from (S, A, K) arrays: the possible outcomes alone, in their order."""
     num_states, num_actions, _ = successors.shape
@@ -409,7 +407,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
             beyond = max(math.fsum([*vector, -1.0]) for vector in np.asarray(self.palette).tolist())
             return 1.0 if beyond <= 0 else math.nextafter(1.0 + beyond, 2.0)
         sums = self.expected(np.ones(self.num_states + 1))
-        return max(1.0, float(sums.max()) * (1 + self.num_outcomes * _UNIT))
+        return max(1.0, float(sums.max()) * (1 + self.num_outcomes * UNIT_ROUNDOFF))
 
     @cached_property
     def has_ends(self) -> bool:  # type: ignore[override]

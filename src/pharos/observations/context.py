@@ -5,9 +5,9 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.observations.observation import Observation
 from pharos.observations.vector import Vector
+from pharos.rules import NO_ACTION
 
 Seen = np.ndarray | dict[str, np.ndarray]  # one observation or a batch of them; a dict if there are several parts
-NO_ACTION = -1  # the previous action on the first step of an episode
 
 
 class ObservationInContext:

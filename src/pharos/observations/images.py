@@ -110,7 +110,7 @@ class Drawing:
 # Frames ---------------------------------------------------------------------------------------------------------------
 
 
-MOST = 16
+MOST_FRAMES = 16
 
 
 class Frames(Observation):
@@ -128,11 +128,11 @@ class Frames(Observation):
         """Set `space` to k stacked frames, if it was the space of one; `channels` is the axis of its channels.
 
         Raises:
-            ParameterError: k is no integer from 1 to MOST.
+            ParameterError: k is no integer from 1 to MOST_FRAMES.
         """
         from gymnasium.spaces import Box
 
-        k = whole_number(frames, f"{self.name} of {self.env}: frames", f"1 to {MOST}", most=MOST)
+        k = whole_number(frames, f"{self.name} of {self.env}: frames", f"1 to {MOST_FRAMES}", most=MOST_FRAMES)
         self.frames, self.channel_axis = k, channels
         if k > 1:
             shape = list(self.space.shape or ())

@@ -16,7 +16,7 @@ from pharos.observations.observation import Observation, hidden_names
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
-MOST_EXACT = 1 << 24  # integers up to here are told apart in float32
+LARGEST_EXACT_INTEGER = 1 << 24  # integers up to here are told apart in float32
 MOST_ONE_HOT = 1 << 20
 MOST_IRRELEVANT = 10
 MOST_STARTS = 4096
@@ -44,11 +44,11 @@ class Vector(Observation):
         from gymnasium.spaces import Box
 
         components = env.components
-        if (components.size > MOST_EXACT).any():
+        if (components.size > LARGEST_EXACT_INTEGER).any():
             i = int(np.argmax(components.size))
             raise ParameterError(
                 f"{env}: {components.names[i]} has {components.size[i]} values; the vector observation tells at most "
-                f"{MOST_EXACT} apart: pass an observation of your own"
+                f"{LARGEST_EXACT_INTEGER} apart: pass an observation of your own"
             )
         self.name = "vector"
         self.env = env

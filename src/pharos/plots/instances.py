@@ -40,7 +40,7 @@ ARROW_VECTORS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)
 
 
 ROW_AND_COLUMN = ("row", "column")
-MOST_LETTERS = 40  # a side: beyond it, letters in cells are too small to read
+LONGEST_LETTERED_SIDE = 40  # a side: beyond it, letters in cells are too small to read
 
 
 @styled
@@ -93,7 +93,7 @@ def value_map(
     drawn.colorbar(image, ax=axis, shrink=0.8, label="value").outline.set_visible(False)
     # The actions of the policy in each cell
     lengths, letters = _lengths(solution), _letters(space.environment.actions)
-    draws_actions = over == ROW_AND_COLUMN or max(size) <= MOST_LETTERS
+    draws_actions = over == ROW_AND_COLUMN or max(size) <= LONGEST_LETTERED_SIDE
     low, high = _range_of(values)
     for s, (row, column) in zip(shown, cells, strict=True):
         value = values[row, column]

@@ -40,7 +40,7 @@ from pharos.policies.policy import (
     masks_for,
 )
 from pharos.solvers import Solution
-from pharos.system.arrays import as_index_array
+from pharos.system.arrays import UNIT_ROUNDOFF, as_index_array
 
 # Histories whose frames are drawn at once
 HISTORY_BATCH = 512
@@ -272,7 +272,6 @@ def policy_answers(
 TAIL = 1e-9
 MOST_ROWS = 1 << 16  # pairs of a state and what came before, so that all of them may be reached by many policies
 MOST_TOGETHER = 1 << 18  # such pairs of the policies that are evaluated at once
-_UNIT = 2.0**-53
 
 
 @dataclass(frozen=True)
@@ -748,7 +747,7 @@ def walk_values(
             state[i] = np.where(next_states < 0, s, next_states)
         history = np.concatenate([history[:, 1:], state[:, None]], axis=1)
         discount *= gammas
-    bounds = [tail for _, tail in ahead] + 2 * _UNIT * (len(path) + 1) * size + of_rewards
+    bounds = [tail for _, tail in ahead] + 2 * UNIT_ROUNDOFF * (len(path) + 1) * size + of_rewards
     visited = [
         len(np.unique(column[column[:, 0] >= 0], axis=None if frames == 1 else 0))
         for column in np.array(path, np.int64).reshape(-1, len(mdps), frames).swapaxes(0, 1)

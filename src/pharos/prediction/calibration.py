@@ -15,7 +15,7 @@ from pharos.agents import primary_predictors
 from pharos.errors import ParameterError
 from pharos.prediction.pairs import CLEAR, Pairs
 
-FILE = Path(__file__).parent / "data" / "cells.csv"
+CELLS_FILE = Path(__file__).parent / "data" / "cells.csv"
 BINS = (0.0, 0.05, 0.1, 0.2, 0.4)
 """Lower ends of the predicted differences that are counted together."""
 LEVEL = 0.8
@@ -32,7 +32,7 @@ COMMON: dict[str, dict[str, object]] = {
     },
 }
 """Hyperparameters of the published cells: those of the presets hardness-dev and hardness-sealed."""
-NUMBERS = ("predicted", "observed", "states", "steps", "spread")
+NUMBER_COLUMNS = ("predicted", "observed", "states", "steps", "spread")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,8 +129,8 @@ def published(agent: str) -> Published:
         raise ParameterError(
             f"agent {agent!r}: no published runs to calibrate on; expected one of {', '.join(primary_predictors())}"
         )
-    with FILE.open(newline="", encoding="utf-8") as file:
+    with CELLS_FILE.open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["agent"] == agent]
     mdps = [" ".join((row["study"], row["instance"], row["chance"])) for row in rows]
-    numbers = (np.array([float(row[name]) for row in rows]) for name in NUMBERS)
+    numbers = (np.array([float(row[name]) for row in rows]) for name in NUMBER_COLUMNS)
     return Published(np.array([row["environment"] for row in rows]), np.array(mdps), *numbers)

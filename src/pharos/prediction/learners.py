@@ -16,7 +16,13 @@ if TYPE_CHECKING:
 
 Network = str | Callable[[tuple[int, ...]], Any]
 """A name, or a function of the shape of an input: `pharos.observations.representation`."""
-MEASURES = ("kernel_regret", "kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time")
+LEARNER_MEASURES = (
+    "kernel_regret",
+    "kernel_learning_time",
+    "kernel_sample_complexity",
+    "aliasing_floor",
+    "exploration_time",
+)
 PREDICTORS = (
     *("kernel_regret", "kernel_regret_played", "adam_regret", "adam_regret_played"),
     *("tabular_regret", "tabular_regret_played"),
@@ -50,7 +56,7 @@ def predicted(config: Mapping[str, Any], *, primary: bool = False) -> dict[str, 
         idealised = agent_called(config["agent"]).idealised
         schedule = idealised.schedule(config)
         user_measures = own_measures()
-        measures = report(task.mdp, (*MEASURES, *user_measures), schedule=schedule, **options)
+        measures = report(task.mdp, (*LEARNER_MEASURES, *user_measures), schedule=schedule, **options)
         rescaled = report(task.mdp, ["kernel_regret"], schedule=replace(schedule, optimizer="adam"), **options)
         row |= idealised.columns(config, task.mdp, options)
     except PharosError as error:
@@ -68,7 +74,7 @@ def predicted(config: Mapping[str, Any], *, primary: bool = False) -> dict[str, 
             "adam_regret_played": regret["played"],
             "adam_curve": curve_points(regret),
         }
-    for measure in (*MEASURES[1:], *user_measures):
+    for measure in (*LEARNER_MEASURES[1:], *user_measures):
         value = measures[measure].value
         if value is not None:
             row[measure] = float(value["value"] if isinstance(value, Mapping) else value)

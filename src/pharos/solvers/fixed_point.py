@@ -49,9 +49,9 @@ from pharos.solvers.convergence import (
     sweeps_left,
 )
 from pharos.solvers.policy_iteration import PolicyIteration
+from pharos.system.arrays import UNIT_ROUNDOFF
 from pharos.system.memory import SHARE_OF_VALUES, available_memory, large_zeros
 
-_UNIT = 2.0**-53
 M = TypeVar("M", bound="TabularMDP | Part")
 Numbers = TypeVar("Numbers", float, np.ndarray)
 # Half a unit in the last place of 32 bits, for numbers from 1 to 2, and for the smallest ones.
@@ -108,7 +108,7 @@ class Backup(Generic[M]):
         chance, dynamics = self.mdp.chance, self.mdp.dynamics
         executed = chance.chosen * mass + chance.previous + chance.uniform
         is_exact = mass == 1.0 and dynamics.mass == 1.0 and chance.is_none
-        return self.mdp.gamma * (1.0 if is_exact else max(1.0, executed * dynamics.mass) * (1 + 8 * _UNIT))
+        return self.mdp.gamma * (1.0 if is_exact else max(1.0, executed * dynamics.mass) * (1 + 8 * UNIT_ROUNDOFF))
 
     @property
     def patience(self) -> float:
@@ -146,7 +146,7 @@ class Backup(Generic[M]):
         Rewards that are means have errors of their own, which any choice between them passes on once. 0 if whole
         numbers are added up, and 53 bits hold them.
         """
-        bound = self.operations * (_UNIT * (rewards + largest) + 2.0**-1074) + self.rounding_of_rewards
+        bound = self.operations * (UNIT_ROUNDOFF * (rewards + largest) + 2.0**-1074) + self.rounding_of_rewards
         return bound * np.logical_not(rewards + largest <= self._exact_to)
 
     def stored(self, largest: float) -> float:
@@ -343,7 +343,7 @@ WORTH = 5e8
 # States under sticky actions that are swept in one call, at least.
 LEAST_PART = 512
 # Sweeps over all states that an attempt may cost, at most: near gamma = 1 the number of sweeps left has no limit.
-MOST = 4096
+MOST_ATTEMPT_SWEEPS = 4096
 # Bytes of a state that an attempt takes, at most.
 STATE_BYTES = 48
 # The share of the change that the tolerance allows which a component may have left.
@@ -373,8 +373,8 @@ class ComponentSolver:
     def improve(self, x: np.ndarray, tolerance: float) -> bool:
         """Settle the components of x (S + 1, W) one after another; return whether that was tried.
 
-        An attempt may cost half of the sweeps that seem to be left, and at most `MOST`; after that every remaining
-        component is swept once.
+        An attempt may cost half of the sweeps that seem to be left, and at most `MOST_ATTEMPT_SWEEPS`. After that every
+        remaining component is swept once.
         """
         mdp, self._is_tried = self.mdp, True
         components = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST_PART if mdp.is_sticky else 1)
@@ -382,7 +382,7 @@ class ComponentSolver:
             return False
         target = COMPONENT_SHARE * tolerance * (1 - mdp.gamma)
         with np.errstate(over="ignore", invalid="ignore"):
-            most = min(0.5 * self._left, MOST) * mdp.num_states
+            most = min(0.5 * self._left, MOST_ATTEMPT_SWEEPS) * mdp.num_states
             mdp.dynamics.settle_components(self.equation, x, components, target, SETTLED, most)
         return True
 

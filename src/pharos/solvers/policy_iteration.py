@@ -165,7 +165,7 @@ def fills_little(matrix: "csr_matrix") -> bool:
 FIRST_ATTEMPT, FIRST_INEXACT = 64, 256
 # Nodes times actions of the largest linear system that is solved directly, and nodes of the largest that is tried so
 # at once. (Nodes are states, or pairs with a previous action.)
-MOST_ENTRIES, DIRECTLY = 2_000_000, 3000
+MOST_CHOICES, DIRECTLY = 2_000_000, 3000
 # States whose greedy actions are worked out in one go.
 GREEDY_BLOCK = 1 << 16
 # Improvements of one attempt.
@@ -222,8 +222,8 @@ class PolicyIteration:
     @property
     def is_direct(self) -> bool:
         """Whether linear systems are solved directly: if they are small, or the inexact way has failed twice."""
-        most = MOST_ENTRIES if self._failures > 1 else DIRECTLY
-        return self.nodes <= most and self.nodes * self.mdp.num_actions <= MOST_ENTRIES
+        most = MOST_CHOICES if self._failures > 1 else DIRECTLY
+        return self.nodes <= most and self.nodes * self.mdp.num_actions <= MOST_CHOICES
 
     @property
     def is_chain(self) -> bool:

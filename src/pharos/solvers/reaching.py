@@ -32,7 +32,7 @@ from pharos.solvers.goals import GoalProblem, table_of_choices, total_reward
 if TYPE_CHECKING:
     from pharos.solvers.goals import Choices
 
-TERMINAL = "terminal"
+TERMINAL_TARGET = "terminal"
 """Name of the target that all terminal states, and the end of an episode without a next state, are."""
 
 
@@ -234,7 +234,7 @@ def reach(
     Cost: as of total rewards, see `value_iteration`.
     Source: Baier and Katoen (2008), chapter 10; Haddad and Monmege (2018).
     """
-    with_end = isinstance(target, str) and target == TERMINAL
+    with_end = isinstance(target, str) and target == TERMINAL_TARGET
     mask = _target_mask(mdp, target)
     if costs is not None:
         costs = np.asarray(costs, np.float64)
@@ -246,7 +246,7 @@ def reach(
 
 def _target_mask(mdp: TabularMDP, target: ArrayLike | str) -> np.ndarray:
     if isinstance(target, str):
-        if target == TERMINAL:
+        if target == TERMINAL_TARGET:
             return np.array(mdp.terminal)
         return names_of(mdp).states_where(target, mdp.num_states)
     array = np.asarray(target)
@@ -255,7 +255,7 @@ def _target_mask(mdp: TabularMDP, target: ArrayLike | str) -> np.ndarray:
     if array.dtype.kind not in "iu" or array.ndim > 1 or ((array < 0) | (array >= mdp.num_states)).any():
         raise ParameterError(
             f"target is {array.dtype} of shape {array.shape}; expected ({mdp.num_states},) bool, indices of states "
-            f"from 0 to {mdp.num_states - 1}, {TERMINAL!r}, a label or an expression"
+            f"from 0 to {mdp.num_states - 1}, {TERMINAL_TARGET!r}, a label or an expression"
         )
     mask = np.zeros(mdp.num_states, np.bool_)
     mask[array] = True

@@ -25,12 +25,13 @@ from pharos.drawing import ground_of, shape_of
 from pharos.environments import Environment, Layer, State, classes, start_distribution
 from pharos.errors import ParameterError, RuleError, UnknownName
 from pharos.rules import mentioned_names, mutable_attributes, pack_states, unpack_states
-from pharos.state_space.guarded_rules import SUM_TOLERANCE, InterpretedCheck
+from pharos.state_space.guarded_rules import InterpretedCheck
+from pharos.system.arrays import SUM_TOLERANCE
 
 if TYPE_CHECKING:
     from pharos.rules import Rules
 
-RULES = ("transition", "is_terminal", "reward", "draw", "probability", "age", "is_available", "draw_motion")
+CHECKED_RULES = ("transition", "is_terminal", "reward", "draw", "probability", "age", "is_available", "draw_motion")
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
         _check_built(env, check, states)
         if check.transitions and not _has_choice(check, states):
             notes.append("no policy beats another: at discount 0.99, V* is the value of uniform play")
-    for name in mutable_attributes(env, RULES):
+    for name in mutable_attributes(env, CHECKED_RULES):
         kind = type(getattr(env, name)).__name__
         notes.append(f"rules read {name}, a {kind}, which can change after states were enumerated; expected a tuple")
     _note_unseen_values(env, states, complete, notes)
@@ -420,7 +421,7 @@ def check_declarations(env: Environment) -> None:
         if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
             raise RuleError(f"{env}: {attribute} is {value!r}; expected an integer of at least 1")
     _ = env.has_chance  # which looks at `outcomes`
-    for rule in RULES:
+    for rule in CHECKED_RULES:
         if "print" in mentioned_names([getattr(cls, rule)], cls):
             raise RuleError(
                 f"{env}: {rule} prints: remove it; rules compute a state, and a compiled one prints no array"

@@ -10,9 +10,7 @@ import numpy as np
 
 from pharos.environments import Environment, Layer, State
 from pharos.errors import RuleError
-
-SUM_TOLERANCE = 1e-9
-"""Largest difference from 1 of the sum of the probabilities of an action's outcomes."""
+from pharos.system.arrays import SUM_TOLERANCE
 
 SAME_ANSWER = "expected the same answer to the same question"
 

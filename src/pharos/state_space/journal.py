@@ -283,7 +283,7 @@ def number_blocks(file: GrowingFile, dtype: np.dtype, entries: int | None = None
 # Outcomes of a build with chance --------------------------------------------------------------------------------------
 
 
-MOST_PADDING = (3, 10)
+MOST_PADDING_RATIO = (3, 10)
 """The share of (S, A, K) that may be padding, as a fraction."""
 
 ENTRIES = 1 << 18  # of rows of K, as many as are copied at a time
@@ -372,7 +372,7 @@ class OutcomeParts:
         successors, index_type = self.indices, INDEX_TYPES[self.indices]
         num_entries = written[PART_NAMES[successors]]["bytes"] // dtype_of(index_type).itemsize
         # form of the rows: padded to K, or with offsets; palette and codes, or probabilities
-        is_dense = MOST_PADDING[1] * (self.rows * most - num_entries) <= MOST_PADDING[0] * self.rows * most
+        is_dense = MOST_PADDING_RATIO[1] * (self.rows * most - num_entries) <= MOST_PADDING_RATIO[0] * self.rows * most
         dtypes = {successors: index_type}
         if not is_dense:
             dtypes[OFFSETS] = "<i8"

@@ -33,7 +33,7 @@ from pharos.rules import rules_of
 from pharos.state_space.journal import Journal, Position
 from pharos.state_space.manifest import Plan
 from pharos.state_space.progress import BuildCallback
-from pharos.state_space.search import Options, Search
+from pharos.state_space.search import EMPTY_TABLE, Options, Search
 from pharos.state_space.table import BranchBlock, MemoryTable
 from pharos.system.memory import huge_pages
 
@@ -42,7 +42,6 @@ SUPERSTEP_SUCCESSORS = 1 << 20  # of a rank's rows, at most
 _END, _TAKE, _EXPAND = range(3)
 _COUNTS_HEADER = np.zeros(4, np.int64)
 _INT32 = np.dtype(np.int32)
-_NOTHING = np.full(1 << 16, -1, np.int32)  # a table that holds nothing, in which the slot of a state is its bucket
 
 
 def rows_of_rank(plan: Plan) -> int:
@@ -191,7 +190,7 @@ class RankedTable:
         keys, indices = self._keys[:size], self._indices[:size]
         terminal, probabilities = self._terminal[: len(states)], self._probabilities[: len(states)]
         # 1. expand the rows, and send the successors to their owners
-        self.rules.expand_and_find(states, 0, len(states), 0, keys, indices, terminal, probabilities, _NOTHING)
+        self.rules.expand_and_find(states, 0, len(states), 0, keys, indices, terminal, probabilities, EMPTY_TABLE)
         order, counts = self._routed(keys)
         candidates = rank.exchange(self._parts(keys[order], counts))
         block_indices = rank.exchange(self._parts(order + row * branches, counts))

@@ -41,7 +41,7 @@ NARROW_LEVEL_STATES = 2048
 WORTH_FORGETTING = 1 << 16
 FORGETTING_BLOCK = 1 << 18
 # A table that holds nothing, in which the slot of a state is its bucket.
-_NOTHING = np.full(1 << 16, -1, np.int32)
+EMPTY_TABLE = np.full(1 << 16, -1, np.int32)
 
 
 @dataclass(frozen=True)
@@ -353,7 +353,7 @@ class Search:
         """Write the successors of states to keys; to indices -1 - bucket, or in terminal states their own row."""
         threads = self.threads if len(states) >= WIDE_FOR_THREADS else 1
         cuts = [len(states) * i // threads for i in range(threads + 1)]
-        arrays = (0, keys, indices, block.terminal, block.probabilities, _NOTHING)
+        arrays = (0, keys, indices, block.terminal, block.probabilities, EMPTY_TABLE)
         if threads == 1:
             self.rules.expand_and_find(states, 0, len(states), *arrays)
             return

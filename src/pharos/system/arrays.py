@@ -20,6 +20,9 @@ from numpy.typing import DTypeLike
 
 from pharos.errors import ParameterError
 
+UNIT_ROUNDOFF = 2.0**-53
+"""Largest relative error of one rounding to 64-bit floats."""
+
 INT40 = "<i5"
 """What manifests call the type, after the names that NumPy gives to others."""
 

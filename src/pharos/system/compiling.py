@@ -23,7 +23,7 @@ from pharos.system.storage import compiled_folders
 SMALL_STATES = 1 << 16
 """Entries below which rules and kernels are interpreted, as compiling takes longer (benchmarks/startup.py); 0: none."""
 
-TOLD_AFTER, TOLD_EVERY = 2.0, 10.0
+NOTICE_AFTER, NOTICE_EVERY = 2.0, 10.0
 """Seconds of compiling after which a line on standard error says so, and says so again."""
 
 announces = True
@@ -31,7 +31,7 @@ announces = True
 
 _lock = threading.Lock()
 _total, _running, _began = 0.0, 0, 0.0
-_next, _kernels = TOLD_AFTER, 0
+_next, _kernels = NOTICE_AFTER, 0
 _timer: threading.Timer | None = None
 
 
@@ -126,8 +126,8 @@ def _announce(name: str) -> None:
         if not _running:
             return
         now = _total + time.perf_counter() - _began
-        _next = now + TOLD_EVERY
-        _start_timer(TOLD_EVERY, name)
+        _next = now + NOTICE_EVERY
+        _start_timer(NOTICE_EVERY, name)
     outcome = "" if storage.is_cache_temporary() else "; kept for the next time"
     with contextlib.suppress(OSError, ValueError, AttributeError):  # of a stream that is closed, or None
         sys.stderr.write(f"pharos: compiling {name}, kernel {_kernels}, {now:.0f} s so far{outcome}\n")

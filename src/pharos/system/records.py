@@ -128,7 +128,7 @@ def parse_record(cls: type[T], entry: object, source: str, optional: Collection[
     A whole number is a number; no value is converted, so that digests of the entries stay what they are.
 
     Args:
-        whose: the entries are, for errors.
+        source: what the entries belong to, for errors.
         optional: fields that may be left out.
     Raises:
         FileFormatError: an entry is missing, unknown or of another type.

@@ -139,7 +139,7 @@ def own_file(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
-def check_name(name: str, whose: str = "name") -> str:
+def check_name(name: str, context: str = "name") -> str:
     """Return a name that is fit for a file: at most 128 letters, digits and `._-`, and a letter or digit first.
 
     Raises:
@@ -147,7 +147,7 @@ def check_name(name: str, whose: str = "name") -> str:
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{,127}", name):
         raise ParameterError(
-            f"{whose} is {name[:60]!r}; expected at most 128 letters, digits and ._-, and a letter or a digit first"
+            f"{context} is {name[:60]!r}; expected at most 128 letters, digits and ._-, and a letter or a digit first"
         )
     return name
 
@@ -314,7 +314,7 @@ def _is_at(path: Path, file: TextIO) -> bool:
 def waiting_lock(
     folder: Path, error: type[PharosError], activity: str, on_wait: Callable[[str], Any]
 ) -> contextlib.ExitStack:
-    """Hold a folder as `lock` does, waiting while another process holds it; `tell` is called once, with a line.
+    """Hold a folder as `lock` does, waiting while another process holds it; `on_wait` is called once, with a line.
 
     Returns:
         A context in which the folder is held, already entered: `with waiting_lock(...):`.

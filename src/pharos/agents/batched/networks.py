@@ -20,10 +20,10 @@ from pharos.kernels import patches
 from pharos.kernels.batched import linear_row
 
 ALIGNED_FLOATS = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
-RELU, TANH, NONE = "relu", "tanh", "none"
+RELU_ACTIVATION, TANH_ACTIVATION, NO_ACTIVATION = "relu", "tanh", "none"
 ALL_PARAMETERS = "all parameters"
 PIXEL_MASK = "which pixels there are"
-KERNEL, FILTERS = 3, patches.FILTERS  # of the small convolution
+KERNEL = 3  # of the small convolution
 FEATURES = 128
 
 Values = dict[str, Tensor]
@@ -129,16 +129,16 @@ class NetworkLayer:
         return y, dx
 
     def _activate(self, y: Tensor) -> None:
-        if self.activation == RELU:
+        if self.activation == RELU_ACTIVATION:
             y.clamp_(min=0.0)
-        elif self.activation == TANH:
+        elif self.activation == TANH_ACTIVATION:
             flat_view(y).tanh_()
 
     def _before_activation(self, dy: Tensor, y: Tensor) -> Tensor:
         """Gradient before the activation, written over dy."""
-        if self.activation == RELU:
+        if self.activation == RELU_ACTIVATION:
             return torch.ops.aten.threshold_backward.grad_input(dy, y, 0, grad_input=dy)
-        if self.activation == TANH:
+        if self.activation == TANH_ACTIVATION:
             return torch.ops.aten.tanh_backward.grad_input(dy, y, grad_input=dy)
         return dy
 
@@ -170,11 +170,11 @@ class LinearLayer(NetworkLayer):
     def forward(self, values: Values, x: Tensor) -> Tensor:
         """The outputs."""
         y, _ = self._buffers(x)
-        if x.shape[1] == 1 and x.device.type == "cpu" and self.activation != TANH:
+        if x.shape[1] == 1 and x.device.type == "cpu" and self.activation != TANH_ACTIVATION:
             # to act once is to read all weights; weights of inputs that a ReLU made 0 need not be
             rows = values[ALL_PARAMETERS].numpy()
             weight, bias = self._offsets
-            linear_row(rows, weight, bias, x[:, 0].numpy(), self.activation == RELU, y[:, 0].numpy())
+            linear_row(rows, weight, bias, x[:, 0].numpy(), self.activation == RELU_ACTIVATION, y[:, 0].numpy())
             return y
         torch.baddbmm(values[f"{self.name}.bias"], x, values[f"{self.name}.weight"], out=y)
         self._activate(y)
@@ -200,7 +200,7 @@ class PatchConvolutionLayer(NetworkLayer):
     def __init__(self, parameters: Parameters, name: str, shape: tuple[int, ...], filters: int):
         channels, height, width = shape
         self.pixels, self.neighbours, self.filters = height * width, channels * KERNEL**2, filters
-        super().__init__(name, self.pixels * self.neighbours, self.pixels * filters, RELU)
+        super().__init__(name, self.pixels * self.neighbours, self.pixels * filters, RELU_ACTIVATION)
         outside = (filters, channels, KERNEL, KERNEL)
         parameters.add(
             f"{name}.weight",
@@ -249,7 +249,7 @@ class ConvolutionLayer(NetworkLayer):
         channels, height, width = shape
         self.shape_in, self.stride, self.scale = shape, stride, scale
         self.shape_out = (filters, (height - kernel) // stride + 1, (width - kernel) // stride + 1)
-        super().__init__(name, math.prod(shape), math.prod(self.shape_out), RELU)
+        super().__init__(name, math.prod(shape), math.prod(self.shape_out), RELU_ACTIVATION)
         fan_in = channels * kernel**2
 
         def same(w: np.ndarray) -> np.ndarray:
@@ -320,7 +320,7 @@ class PictureLayers(NetworkLayer):
 
     def __init__(self, parameters: Parameters, name: str, shape: tuple[int, ...]):
         self.shape, self.indices = shape, input_indices(shape, True).reshape(math.prod(shape[1:]), -1)
-        super().__init__(name, math.prod(shape), FEATURES, RELU)
+        super().__init__(name, math.prod(shape), FEATURES, RELU_ACTIVATION)
         picture_layers(parameters, name, shape)
         self._offsets = tuple(each.offset for each in parameters.shapes[-4:])
         self._memories: dict[tuple[int, int], tuple[np.ndarray, ...]] = {}
@@ -334,7 +334,7 @@ class PictureLayers(NetworkLayer):
             self._memories[width, number] = (
                 np.zeros((width, pixels + 1), np.int64),
                 *(np.empty(groups, np.int32) for _ in range(2)),
-                np.empty((*groups, FILTERS), np.float32),
+                np.empty((*groups, patches.FILTERS), np.float32),
                 np.empty((width, pixels, number), np.int32),
             )
         memory, pictures = self._memories[width, number], flat_view(x).numpy()
@@ -395,8 +395,11 @@ class Stack:
 
 def picture_layers(parameters: Parameters, name: str, shape: tuple[int, ...]) -> list[NetworkLayer]:
     """The small convolution and the linear layer after it, for observations with the neighbours of each pixel."""
-    small = PatchConvolutionLayer(parameters, f"{name}.layers.0.0", shape, FILTERS)
-    return [small, LinearLayer(parameters, f"{name}.layers.1", small.outputs, FEATURES, RELU, pixels=small.pixels)]
+    small = PatchConvolutionLayer(parameters, f"{name}.layers.0.0", shape, patches.FILTERS)
+    return [
+        small,
+        LinearLayer(parameters, f"{name}.layers.1", small.outputs, FEATURES, RELU_ACTIVATION, pixels=small.pixels),
+    ]
 
 
 def extractor_layers(
@@ -404,7 +407,7 @@ def extractor_layers(
 ) -> list[NetworkLayer]:
     """The layers from an observation to 128 features: SmallMLP, or SmallCNN with one or three convolutions."""
     if not is_image:
-        return [LinearLayer(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
+        return [LinearLayer(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU_ACTIVATION)]
     if is_small(shape, is_image):
         return [PictureLayers(parameters, name, shape)] if device == "cpu" else picture_layers(parameters, name, shape)
     convolutions: list[NetworkLayer] = []
@@ -413,7 +416,7 @@ def extractor_layers(
         layer = ConvolutionLayer(parameters, f"{name}.layers.0.{2 * i}", shape, filters, kernel, stride, scale)
         convolutions.append(layer)
         shape = layer.shape_out
-    return [*convolutions, LinearLayer(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
+    return [*convolutions, LinearLayer(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU_ACTIVATION)]
 
 
 def pad(own: Parameters, rows: np.ndarray, common: Parameters) -> np.ndarray:
@@ -481,8 +484,10 @@ class QNetworks:
         self.parameters = parameters = Parameters()
         sizes = sizes_of(net_arch)
         layers = extractor_layers(parameters, "q_net.features_extractor", shape, is_image, device)
-        layers += hidden(parameters, "q_net.q_net", sizes, RELU)
-        last = LinearLayer(parameters, f"q_net.q_net.{2 * len(sizes)}", [FEATURES, *sizes][-1], num_actions, NONE)
+        layers += hidden(parameters, "q_net.q_net", sizes, RELU_ACTIVATION)
+        last = LinearLayer(
+            parameters, f"q_net.q_net.{2 * len(sizes)}", [FEATURES, *sizes][-1], num_actions, NO_ACTIVATION
+        )
         self.stack = Stack([*layers, last])
 
     def scores(self, values: Values, x: Tensor) -> Tensor:
@@ -513,10 +518,10 @@ class ActorCritics:
         self.parameters = parameters = Parameters()
         self.trunk = Stack(extractor_layers(parameters, "features_extractor", shape, is_image, device))
         actor, critic = sizes_of(net_arch, "pi"), sizes_of(net_arch, "vf")
-        actor_layers = hidden(parameters, "mlp_extractor.policy_net", actor, TANH)
-        critic_layers = hidden(parameters, "mlp_extractor.value_net", critic, TANH)
-        actor_layers.append(LinearLayer(parameters, "action_net", [FEATURES, *actor][-1], num_actions, NONE))
-        critic_layers.append(LinearLayer(parameters, "value_net", [FEATURES, *critic][-1], 1, NONE))
+        actor_layers = hidden(parameters, "mlp_extractor.policy_net", actor, TANH_ACTIVATION)
+        critic_layers = hidden(parameters, "mlp_extractor.value_net", critic, TANH_ACTIVATION)
+        actor_layers.append(LinearLayer(parameters, "action_net", [FEATURES, *actor][-1], num_actions, NO_ACTIVATION))
+        critic_layers.append(LinearLayer(parameters, "value_net", [FEATURES, *critic][-1], 1, NO_ACTIVATION))
         self.actor, self.critic = Stack(actor_layers), Stack(critic_layers)
 
     def both(self, values: Values, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -63,7 +63,7 @@ OF_A_BATCH: dict[str, dict[str, Any]] = {
         "net_arch": [128],
     },
 }
-OURS = ("double",)
+OWN_OPTIONS = ("double",)
 """Hyperparameters that Stable-Baselines3 does not have."""
 # Names that change nothing here, or that may have this one value only.
 WITHOUT_EFFECT = ("n_timesteps", "verbose", "stats_window_size")
@@ -78,7 +78,7 @@ ONLY: dict[str, Any] = {
     "sde_sample_freq": -1,
     "clip_range_vf": None,
 }
-NATURE = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in sb3.py
+NATURE_PIXELS = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in sb3.py
 MOST_REMEMBERED = 1 << 14  # states whose target values are kept
 OBSERVED_AT_ONCE = 4096  # states that are observed at once
 
@@ -240,7 +240,7 @@ def _scale(number: int) -> int:
 
 def is_small(shape: tuple[int, ...], is_image: bool) -> bool:
     """Whether an observation is an image of the small convolution, which sees the neighbours of each pixel."""
-    return is_image and min(shape[1:]) < NATURE
+    return is_image and min(shape[1:]) < NATURE_PIXELS
 
 
 def as_networks_see(shape: tuple[int, ...], is_image: bool) -> tuple[tuple[int, ...], bool]:

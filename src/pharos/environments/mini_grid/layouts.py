@@ -20,10 +20,10 @@ from pharos.errors import ParameterError
 
 FLOOR, WALL, GOAL, LAVA = "..", "##", "GG", "~~"
 PLAYER = (">>", "vv", "<<", "^^")
-COLORS = "BGEPRY"  # blue, green, grey, purple, red, yellow: the order in which minigrid draws them
+COLOR_LETTERS = "BGEPRY"  # blue, green, grey, purple, red, yellow: the order in which minigrid draws them
 RIGHT, DOWN, LEFT, UP = range(4)
 AHEAD = ((1, 0), (0, 1), (-1, 0), (0, -1))
-ATTEMPTS = 1000  # at a free cell of a room; minigrid gives up after as many
+FREE_CELL_ATTEMPTS = 1000  # at a free cell of a room; minigrid gives up after as many
 CONNECTIONS = 5000  # likewise, at doors that connect all rooms
 
 Place = tuple[int, int]
@@ -52,7 +52,7 @@ class Canvas:
 
     def color(self) -> str:
         """Random one of the six colours."""
-        return COLORS[self.integer(0, len(COLORS))]
+        return COLOR_LETTERS[self.integer(0, len(COLOR_LETTERS))]
 
     def walls_around(self, left: int, top: int, width: int, height: int) -> None:
         """Draw walls along the outline of a rectangle."""
@@ -71,7 +71,9 @@ class Canvas:
             distance = abs(column - self.player[0]) + abs(row - self.player[1])
             if self.cells[column, row] == FLOOR and distance >= (2 if away else 1):
                 return column, row
-        raise ParameterError(f"MiniGrid: this seed finds no free cell in {ATTEMPTS} attempts; choose another seed")
+        raise ParameterError(
+            f"MiniGrid: this seed finds no free cell in {FREE_CELL_ATTEMPTS} attempts; choose another seed"
+        )
 
     def put_player(self, corner: Place = (0, 0), size: Place | None = None, attempts: float = math.inf) -> None:
         """Put the player onto a random free cell, with a random direction."""
@@ -131,7 +133,7 @@ class Rooms(Canvas):
         """Put a key K, ball A or box B on a random cell of a room; return it with its colour, drawn unless given."""
         thing = letter + (color or self.color())
         size = (self.size, self.size)
-        self.cells[self.free_cell(self.corner(column, row), size, away=True, attempts=ATTEMPTS)] = thing
+        self.cells[self.free_cell(self.corner(column, row), size, away=True, attempts=FREE_CELL_ATTEMPTS)] = thing
         return thing
 
     def remove_wall(self, column: int, row: int, side: int) -> None:
@@ -143,7 +145,7 @@ class Rooms(Canvas):
     def put_player_into(self, column: int, row: int) -> None:
         """Put the player into a room, with floor or a wall in front."""
         while True:
-            self.put_player(self.corner(column, row), (self.size, self.size), attempts=ATTEMPTS)
+            self.put_player(self.corner(column, row), (self.size, self.size), attempts=FREE_CELL_ATTEMPTS)
             ahead = AHEAD[self.direction]
             if self.cells[self.player[0] + ahead[0], self.player[1] + ahead[1]] in (FLOOR, WALL):
                 return
@@ -336,7 +338,7 @@ def multi_room(size: int, rooms: int, seed: int) -> GridLayout:
     for number, room in enumerate(chain):
         canvas.walls_around(*room[:4])
         if number > 0:
-            colors = COLORS.replace(before, "") if before else COLORS
+            colors = COLOR_LETTERS.replace(before, "") if before else COLOR_LETTERS
             before = colors[canvas.integer(0, len(colors))]
             canvas.cells[room.entry] = "D" + before
     canvas.put_player(chain[0][:2], chain[0][2:4])

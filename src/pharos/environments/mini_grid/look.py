@@ -13,7 +13,7 @@ from pharos.environments.base import Layer, Look
 Mask = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 # In the order of `mini_grid_layouts.COLORS`: blue, green, grey, purple, red, yellow
-PALETTE = ((72, 104, 240), (64, 190, 84), (150, 152, 160), (164, 92, 224), (228, 70, 66), (240, 208, 62))
+GRID_COLORS = ((72, 104, 240), (64, 190, 84), (150, 152, 160), (164, 92, 224), (228, 70, 66), (240, 208, 62))
 SAMPLES = 4  # on each side of a pixel
 DARK = (24, 26, 33)
 
@@ -103,8 +103,8 @@ LAYERS = {
     "goal": Layer("G", (74, 200, 96), shape=goal),
     "lava": Layer("~", (240, 122, 36), shape=lava),
     "walls": Layer("#", (112, 116, 126), shape=wall),
-    "doors": Layer(tuple("_DL" * len(PALETTE)), tuple(c for c in PALETTE for _ in range(3)), shape=door),
-    "things": Layer(tuple("KAB" * len(PALETTE)), tuple(c for c in PALETTE for _ in range(3)), shape=thing),
+    "doors": Layer(tuple("_DL" * len(GRID_COLORS)), tuple(c for c in GRID_COLORS for _ in range(3)), shape=door),
+    "things": Layer(tuple("KAB" * len(GRID_COLORS)), tuple(c for c in GRID_COLORS for _ in range(3)), shape=thing),
     "player": Layer(tuple(">v<^"), (236, 64, 60), shape=player),
 }
 LOOK = Look(ground="plain", color="#882255")

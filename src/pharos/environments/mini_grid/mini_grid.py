@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pharos.environments.base import Environment, one_of, parameter, store
-from pharos.environments.mini_grid.layouts import COLORS, FLOOR, GOAL, KINDS, LAVA, PLAYER, WALL, GridLayout
+from pharos.environments.mini_grid.layouts import COLOR_LETTERS, FLOOR, GOAL, KINDS, LAVA, PLAYER, WALL, GridLayout
 from pharos.environments.mini_grid.look import LAYERS, LOOK
 from pharos.errors import ParameterError
 
@@ -20,7 +20,7 @@ OPEN, CLOSED, LOCKED = range(3)  # doors
 KEY, BALL, BOX = range(3)  # things
 FREE, WON, LOST, BLOCKED, DOOR = range(5)  # cells; DOOR + i has door number i
 DOOR_LETTERS, THING_LETTERS = "ODL", "KAB"
-CELLS = {FLOOR: FREE, WALL: BLOCKED, GOAL: WON, LAVA: LOST}
+CELL_KINDS = {FLOOR: FREE, WALL: BLOCKED, GOAL: WON, LAVA: LOST}
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Level:
     Attributes:
         start: (row, column, direction) of the player.
         cells: (rows, columns) int64: FREE, WON, LOST, BLOCKED, or DOOR + the number of a door.
-        door_conditions, door_colors: of each door at the start; numbers of `COLORS`.
+        door_conditions, door_colors: of each door at the start; numbers of `COLOR_LETTERS`.
         things: (n, 4) int64: row, column, KEY, BALL or BOX, and colour of each.
         target_door, target_thing: what pays; -1: none.
     """
@@ -54,19 +54,19 @@ def level_of(layout: GridLayout) -> Level:
     # Cells, player, doors and things, by their two letters
     for row, texts in enumerate(rows):
         for column, text in enumerate(texts):
-            if text in CELLS:
-                cells[row, column] = CELLS[text]
+            if text in CELL_KINDS:
+                cells[row, column] = CELL_KINDS[text]
             elif text in PLAYER:
                 starts.append((row, column, PLAYER.index(text)))
-            elif text[0] in DOOR_LETTERS and text[1] in COLORS:
+            elif text[0] in DOOR_LETTERS and text[1] in COLOR_LETTERS:
                 cells[row, column] = DOOR + len(doors)
                 doors.append(text)
-            elif text[0] in THING_LETTERS and text[1] in COLORS:
-                things.append((row, column, THING_LETTERS.index(text[0]), COLORS.index(text[1]), text))
+            elif text[0] in THING_LETTERS and text[1] in COLOR_LETTERS:
+                things.append((row, column, THING_LETTERS.index(text[0]), COLOR_LETTERS.index(text[1]), text))
             else:
                 raise ParameterError(
                     f"MiniGrid: level has {text!r} at row {row}, column {column}; expected .. ## GG ~~ >> vv << ^^, or "
-                    f"one of {' '.join(DOOR_LETTERS + THING_LETTERS)} and one of {' '.join(COLORS)}"
+                    f"one of {' '.join(DOOR_LETTERS + THING_LETTERS)} and one of {' '.join(COLOR_LETTERS)}"
                 )
     # One player, a goal or target, and no way out of the grid
     if len(starts) != 1:
@@ -79,7 +79,7 @@ def level_of(layout: GridLayout) -> Level:
         start=starts[0],
         cells=cells,
         door_conditions=np.array([DOOR_LETTERS.index(text[0]) for text in doors], np.int64),
-        door_colors=np.array([COLORS.index(text[1]) for text in doors], np.int64),
+        door_colors=np.array([COLOR_LETTERS.index(text[1]) for text in doors], np.int64),
         things=np.array([numbers[:4] for numbers in things], np.int64).reshape(-1, 4),
         target_door=door,
         target_thing=thing,

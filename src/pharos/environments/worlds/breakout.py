@@ -16,13 +16,13 @@ WIDE_TRAIL = ("." * 16,) * 4 + ("." * 6 + "#" * 4 + "." * 6,) * 4 + ("." * 16,) 
 WIDE_BALL = ("." * 16,) * 3 + ("." * 6 + "#" * 4 + "." * 6,) * 6 + ("." * 16,) * 3
 
 # (height, columns, paddle width): first the paper's table, then the drawings of its appendix B
-PAPER = tuple(
+PAPER_SIZES = tuple(
     (height, columns, width) for width in (1, 3) for height, columns in ((12, 10), (12, 8), (16, 8), (20, 8), (24, 8))
 )
-DRAWN = ((14, 8, 1), (14, 10, 3), (20, 10, 1), (20, 10, 3), (24, 10, 3))
+DRAWN_SIZES = ((14, 8, 1), (14, 10, 3), (20, 10, 1), (20, 10, 3), (24, 10, 3))
 INSTANCES = {
     f"{height}x{columns}x{width}": {"height": height, "columns": columns, "extra_paddle_width": (width - 1) // 2}
-    for height, columns, width in (*PAPER, *DRAWN)
+    for height, columns, width in (*PAPER_SIZES, *DRAWN_SIZES)
 }
 INSTANCES |= {  # 923,305,259 and 1,083,934,871 states
     f"{height}x10x1-3rows": {"height": height, "columns": 10, "brick_rows": 3} for height in (20, 30)
@@ -30,7 +30,7 @@ INSTANCES |= {  # 923,305,259 and 1,083,934,871 states
 INSTANCES["6x4x1"] = {"height": 6, "columns": 4}  # 4,620 states, for examples and pages
 
 # found by searches on courts of 11 x 7 and 10 x 8 under three kinds of chance, docs/agents.md
-VECTOR = {
+VECTOR_SETTINGS = {
     "learning_rate": 0.00036,
     "gamma": 0.99,
     "n_steps": 5,
@@ -99,9 +99,9 @@ class Breakout(Environment):
         ),
     )
     instances = INSTANCES
-    paper_instances = tuple(INSTANCES)[: len(PAPER)]
+    paper_instances = tuple(INSTANCES)[: len(PAPER_SIZES)]
     first_version = 2
-    hyperparameters = {**ARCADE, "dqn": {**ARCADE["dqn"], "vector": VECTOR}}
+    hyperparameters = {**ARCADE, "dqn": {**ARCADE["dqn"], "vector": VECTOR_SETTINGS}}
 
     @property
     def paddle_width(self) -> int:

@@ -12,8 +12,8 @@ PLAYER_ROW, PLAYER_TIMER, CARS = range(3)  # positions of the cars follow, then 
 STAY, UP, DOWN = range(3)
 
 SPEEDS = (1, 2, 3, 4, 5, 6, 7, 8, 11)  # least common multiple 9240
-COLORS = ((200, 72, 72), (214, 186, 92), (66, 158, 130), (110, 140, 220), (186, 110, 190))
-NUM_COLORS = len(COLORS)
+CAR_COLORS = ((200, 72, 72), (214, 186, 92), (66, 158, 130), (110, 140, 220), (186, 110, 190))
+NUM_COLORS = len(CAR_COLORS)
 CHICKEN = (  # in pictures for people
     "...##...",
     "...###..",
@@ -118,7 +118,7 @@ class Freeway(Environment):
     max_episode_steps = 1000
     layers = {
         "kerb": Layer("=", (142, 142, 142)),
-        "cars": Layer((*">" * NUM_COLORS, *"<" * NUM_COLORS), COLORS * 2, shape="car"),
+        "cars": Layer((*">" * NUM_COLORS, *"<" * NUM_COLORS), CAR_COLORS * 2, shape="car"),
         "player": Layer("@", (252, 252, 84), CHICKEN),
     }
 

@@ -14,7 +14,7 @@ TWO, FOUR = range(1, 3)
 FOURS = 0.1  # of the tiles that appear
 
 GLYPHS = "123456789ABCDEFGH"  # the exponents of tiles
-COLORS = (
+TILE_COLORS = (
     *((238, 228, 218), (237, 224, 200), (242, 177, 121), (245, 149, 99), (246, 124, 95), (246, 94, 59)),
     *((237, 207, 114), (237, 204, 97), (237, 200, 80), (237, 197, 63), (237, 194, 46), (120, 180, 120)),
     *((90, 160, 140), (70, 140, 160), (60, 110, 170), (70, 80, 160), (60, 58, 50)),
@@ -58,7 +58,7 @@ class Game2048(Environment):
     name = "game_2048"
     actions = ("up", "right", "down", "left")
     version = 1
-    layers = {"tiles": Layer(tuple(GLYPHS), COLORS, shape="power")}
+    layers = {"tiles": Layer(tuple(GLYPHS), TILE_COLORS, shape="power")}
 
     look = Look(color="#E8A33D")
     instances = {

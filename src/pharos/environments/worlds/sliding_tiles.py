@@ -19,7 +19,7 @@ def _color(i: int) -> Color:
     return red, green, blue
 
 
-COLORS = tuple(map(_color, range(len(NUMBERS))))  # neighbours in the solved order differ in hue
+NUMBER_COLORS = tuple(map(_color, range(len(NUMBERS))))  # neighbours in the solved order differ in hue
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class SlidingTiles(Environment):
     name = "sliding_tiles"
     actions = ("up", "right", "down", "left")
     version = 1
-    layers = {"tiles": Layer(tuple(NUMBERS), COLORS, shape="lettered")}
+    layers = {"tiles": Layer(tuple(NUMBERS), NUMBER_COLORS, shape="lettered")}
 
     look = Look(color="#8C564B")
     instances = {

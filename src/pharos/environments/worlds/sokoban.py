@@ -202,14 +202,14 @@ def boxes_on(targets, state):
 # A level is rows of letters: # wall, @ player, $ box, . target, + player on a target, * box on a target, and - or a
 # space for the floor. In one line rows are separated by "/".
 
-WALL, FLOOR, PLAYER, BOX, TARGET = "#-@$."
-LETTERS = "#-@$.+*"
-ROWS = LETTERS + " _"
+WALL_LETTER, FLOOR_LETTER, PLAYER_LETTER, BOX_LETTER, TARGET_LETTER = "#-@$."
+LEVEL_LETTERS = "#-@$.+*"
+ROW_LETTERS = LEVEL_LETTERS + " _"
 HEADING = r"\W*(?:level|maze|puzzle|title)?\W*(\d+)\W*"
 """A line of a file that numbers a level."""
 WAYS = ((-1, 0), (0, 1), (1, 0), (0, -1))  # up, right, down, left
-OPEN, PULL = 0.75, 0.5  # chance of a cell to be floor, and of a step to pull a box along
-STEPS, ATTEMPTS = 400, 1000
+OPEN_CHANCE, PULL_CHANCE = 0.75, 0.5  # chance of a cell to be floor, and of a step to pull a box along
+STEPS, ROOM_ATTEMPTS = 400, 1000
 LARGEST_FILE = 2**26
 
 Cell = tuple[int, int]
@@ -221,7 +221,7 @@ def level_text(source: str) -> str:
     In a file any line that is no row ends a level. A line with a number, "; 3" or "Level 3", numbers the level after
     it, as in Boxoban's files: then each level needs one. Without such lines levels count from 0.
     """
-    if set(source) <= set(ROWS + "/\n"):
+    if set(source) <= set(ROW_LETTERS + "/\n"):
         rows = re.split(r"[/\n]", source.strip("\n"))
     else:
         file, _, number = source.rpartition(":") if re.search(r":\d+$", source) else (source, "", "0")
@@ -231,9 +231,9 @@ def level_text(source: str) -> str:
             raise ValueError(f"the file has no level {number}; {levels_there}")
         rows = levels[int(number)]
     width = max(map(len, rows))
-    rows = [re.sub("[ _]", FLOOR, row).ljust(width, FLOOR) for row in rows]
-    if not width or set("".join(rows)) - set(LETTERS):
-        raise ValueError(f"expected rows of the letters {LETTERS}")
+    rows = [re.sub("[ _]", FLOOR_LETTER, row).ljust(width, FLOOR_LETTER) for row in rows]
+    if not width or set("".join(rows)) - set(LEVEL_LETTERS):
+        raise ValueError(f"expected rows of the letters {LEVEL_LETTERS}")
     return "/".join(rows)
 
 
@@ -252,17 +252,19 @@ def _levels_of(file: Path) -> dict[int, list[str]]:
     boards: dict[int, list[str]] = {}  # first line -> rows
     first = None
     for at, line in enumerate(lines, 1):
-        if set(line) & set("#@$.+*") and set(line) <= set(ROWS):
+        if set(line) & set("#@$.+*") and set(line) <= set(ROW_LETTERS):
             first = first or at
             boards.setdefault(first, []).append(line.rstrip())
             continue
         first = None
-        if WALL in line and set(line) <= set(ROWS + "|()pPbB0123456789"):
-            raise ValueError(f"line {at} has run lengths or other letters, {line[:40]!r}; expected rows of {LETTERS}")
+        if WALL_LETTER in line and set(line) <= set(ROW_LETTERS + "|()pPbB0123456789"):
+            raise ValueError(
+                f"line {at} has run lengths or other letters, {line[:40]!r}; expected rows of {LEVEL_LETTERS}"
+            )
         heading = re.fullmatch(HEADING, line, re.IGNORECASE)
         if heading:
             numbers[at] = int(heading[1])
-    boards = {at: rows for at, rows in boards.items() if any(WALL in row for row in rows)}
+    boards = {at: rows for at, rows in boards.items() if any(WALL_LETTER in row for row in rows)}
     if not numbers:
         return dict(enumerate(boards.values()))
     order, levels = sorted([*numbers, *boards]), {}
@@ -286,7 +288,7 @@ def within_reach(text: str) -> tuple[list[Cell], dict[Cell, str]]:
         row, column = frontier.pop()
         for down, right in WAYS:
             cell = row + down, column + right
-            if letters.get(cell, WALL) != WALL and cell not in reachable:
+            if letters.get(cell, WALL_LETTER) != WALL_LETTER and cell not in reachable:
                 reachable.add(cell)
                 frontier.append(cell)
     return sorted(reachable), letters
@@ -298,15 +300,15 @@ def random_level(height: int, width: int, boxes: int, seed: int) -> str:
     Source: ours, after the reverse play of Racaniere et al. (2017), appendix.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
-    for _ in range(ATTEMPTS):
+    for _ in range(ROOM_ATTEMPTS):
         is_floor = np.zeros((height, width), np.bool_)
-        is_floor[1:-1, 1:-1] = rng.random((height - 2, width - 2)) < OPEN
+        is_floor[1:-1, 1:-1] = rng.random((height - 2, width - 2)) < OPEN_CHANCE
         cells = [(int(y), int(x)) for y, x in np.argwhere(is_floor)]
         if len(cells) <= boxes + 1:
             continue
         player, *targets = (cells[i] for i in np.argsort(rng.random(len(cells)))[: boxes + 1])
         free, placed = set(cells), set(targets)
-        for step, pulls in zip(rng.integers(0, 4, STEPS), rng.random(STEPS) < PULL, strict=True):
+        for step, pulls in zip(rng.integers(0, 4, STEPS), rng.random(STEPS) < PULL_CHANCE, strict=True):
             down, right = WAYS[step]
             ahead, behind = ((player[0] + sign * down, player[1] + sign * right) for sign in (1, -1))
             if ahead not in free or ahead in placed:
@@ -319,10 +321,14 @@ def random_level(height: int, width: int, boxes: int, seed: int) -> str:
         text = _text(height, width, free, player, placed, set(targets))
         if {*placed, *targets} <= set(within_reach(text)[0]):
             return text
-    raise ValueError(f"none of {ATTEMPTS} random levels has its {boxes} boxes off their targets")
+    raise ValueError(f"none of {ROOM_ATTEMPTS} random levels has its {boxes} boxes off their targets")
 
 
 def _text(height: int, width: int, free: set[Cell], player: Cell, boxes: set[Cell], targets: set[Cell]) -> str:
-    letters = {**dict.fromkeys(free, FLOOR), **dict.fromkeys(targets, TARGET), **dict.fromkeys(boxes, BOX)}
-    letters[player] = "+" if player in targets else PLAYER
-    return "/".join("".join(letters.get((y, x), WALL) for x in range(width)) for y in range(height))
+    letters = {
+        **dict.fromkeys(free, FLOOR_LETTER),
+        **dict.fromkeys(targets, TARGET_LETTER),
+        **dict.fromkeys(boxes, BOX_LETTER),
+    }
+    letters[player] = "+" if player in targets else PLAYER_LETTER
+    return "/".join("".join(letters.get((y, x), WALL_LETTER) for x in range(width)) for y in range(height))
