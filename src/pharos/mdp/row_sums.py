@@ -2,8 +2,8 @@
 
 | sum of a row | what happens |
 |---|---|
-| within 1e-6 of 1 | the row is divided by its sum; what that may change is counted in the error bounds of values |
-| lower | the rest ends the episode if the caller has said that rows may end; else an error |
+| within 1e-6 of 1 | the row is divided by its sum. What that may change is counted in the error bounds of values |
+| lower | the rest ends the episode if the caller has said that rows may end, else an error |
 | higher | an error |
 
 The MDP is the one with the divided rows P. Its values also hold, within their bounds, for every MDP with other rows P'
@@ -71,7 +71,7 @@ def normalized_rows(
     Args:
         probabilities: (N,) finite numbers >= 0. rows: (N,) the row of each.
         refuse: (row, sum) -> the error to raise.
-        ends: True: what lacks by more than 1e-6 ends the episode; or (count,) the probability that each row ends, a
+        ends: True if what lacks by more than 1e-6 ends the episode. Or (count,) the probability that each row ends, a
             part of its sum.
     """
     most = int(np.bincount(rows, minlength=1).max())
@@ -91,6 +91,6 @@ def normalized_rows(
 
 
 def rounding_hint(total: float) -> str:
-    """The likely reason if a sum is nearly 1, for the end of a message; else empty."""
+    """The likely reason if a sum is nearly 1, for the end of a message, else empty."""
     is_near = abs(total - 1) <= 1e-2
     return ": were they rounded, or computed in float32? divide each row by its sum" if is_near else ""
