@@ -44,7 +44,7 @@ TESTED_BY = {  # path in src/pharos: weight of its faults (kernels compile again
     "mdp/tabular.py": (1.0, "test_mdp test_natural_arguments test_dynamics"),
     "mdp/construction.py": (1.0, "test_mdp test_natural_arguments"),
     "mdp/reachability.py": (1.0, "test_mdp test_dynamics"),
-    "mdp/arguments.py": (1.0, "test_mdp test_natural_arguments test_dynamics"),
+    "mdp/arguments.py": (1.0, "test_mdp test_natural_arguments test_dynamics test_row_sums"),
     "solvers/fixed_point.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/policy_iteration.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/values.py": (1.0, "test_solvers test_error_bounds"),

@@ -27,6 +27,7 @@ import numpy as np
 from pharos import errors
 from pharos.errors import MissingExtra, ParameterError, PharosError
 from pharos.system import compiling
+from pharos.system.workers import check_processes
 
 MOST_NUMBERS = 3  # most numbers that a rank sends to all others with the header of an exchange
 _ROWS_AT_ONCE = 1 << 20  # most rows that rank 0 sends to each rank in one exchange
@@ -257,15 +258,6 @@ _BANNER = "=   BAD TERMINATION OF ONE OF YOUR APPLICATION PROCESSES"  # of MPICH
 _STARTED = "PHAROS_STARTED"  # variable of processes that pharos itself has started under mpiexec
 
 T = TypeVar("T")
-
-
-def check_processes(processes: int | str) -> None:
-    """Raise a ParameterError unless `processes` is 1 or "mpi"."""
-    if processes != "mpi" and (processes != 1 or isinstance(processes, bool)):
-        raise ParameterError(
-            f"processes is {processes!r}; expected 1, or 'mpi' in a program that `mpiexec -n 8 python PROGRAM` starts; "
-            "`pharos build` and `pharos solve` take --processes 8"
-        )
 
 
 def check_ranks(num_states: int, ranks: int) -> None:

@@ -12,7 +12,7 @@ from pharos.benchmark import BenchmarkTask, Protocol, Suite
 from pharos.benchmark.suite import digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.training import Task, evaluate_agent
-from pharos.training.jax_agents import compiled_curves
+from pharos.training.functions import compiled_curves
 
 GRID = "simple_grid/4x4-plain"
 

@@ -12,7 +12,7 @@ from pharos.mdp import TabularMDP, lazy_actions, sticky_actions
 from pharos.policies import Evaluation, TableAnswers, is_small_table, table_values
 from pharos.training import ChanceSetting, RunConfig, TaskCache, evaluate_agent
 from pharos.training.curve import joint_values
-from pharos.training.prepared import PreparedRun
+from pharos.training.schedule import PreparedRun
 
 SETTING = {"steps": 300, "horizon": 16, "evaluation_interval": 100, "engine": "batched"}
 

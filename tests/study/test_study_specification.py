@@ -52,7 +52,7 @@ def test_hyperparameters_come_by_reference_or_in_place_and_scientific_notation_i
 
 
 def test_a_config_holds_every_hyperparameter_so_that_other_defaults_are_other_runs():
-    from pharos.agents.hyperparameters import hyperparameters
+    from pharos.agents.registry import hyperparameters
 
     for run in parse(LAKES).runs:
         usual = hyperparameters(run.config["agent"], run.config["environment"], run.config["observation"])

@@ -4,6 +4,7 @@ trains them on a task.
 
 from pharos.agents import batched
 from pharos.agents.agent import (
+    AGENT_LIBRARIES,
     NETWORK,
     POLICY,
     TABULAR_OBSERVATION,
@@ -11,10 +12,10 @@ from pharos.agents.agent import (
     Learner,
     RunShape,
     agents,
+    is_known,
     joined_states,
     learner_state,
 )
-from pharos.agents.hyperparameters import hyperparameters
 from pharos.agents.idealised import (
     POLICY_CURVES,
     POLICY_PREDICTORS,
@@ -22,25 +23,25 @@ from pharos.agents.idealised import (
     Idealised,
     curve_points,
 )
-from pharos.agents.own import (
+from pharos.agents.q_learning import QLearning
+from pharos.agents.registry import (
     CLASS,
     COMPILED,
     GENERATOR,
+    agent_called,
     agent_name,
     agent_source,
     check_keywords,
     form_of,
     generator_of,
+    hyperparameters,
+    primary_predictors,
     register_form,
 )
-from pharos.agents.q_learning import QLearning
-from pharos.agents.registry import agent_called, primary_predictors
 from pharos.agents.sb3 import (
-    AGENT_LIBRARIES,
     algorithm,
     check_hyperparameters,
     extractor_class,
-    is_known,
     make_model,
 )
 

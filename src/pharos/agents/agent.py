@@ -18,6 +18,7 @@ from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import ChanceSetting, TabularMDP
 from pharos.policies import Observer, PolicyLike, is_small_table
 from pharos.system import storage
+from pharos.system.sources import is_reference
 
 if TYPE_CHECKING:
     from pharos.environments import Environment
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 POLICY, NETWORK = "policy.npy", "agent"
 """What was learnt, in the folder of a run: a table, or a folder with a network."""
+AGENT_LIBRARIES = ("stable_baselines3", "sb3_contrib")
+"""Their algorithms are known by name: they need no trust, and no source in the configuration of a run."""
 TABULAR_OBSERVATION = "index"
 """What tabular agents see."""
 TABLES_AT_ONCE = 16  # runs of one program that learn tables
@@ -281,6 +284,11 @@ def agents() -> Mapping[str, Agent]:
 def register(agent: Agent) -> None:
     """Add an agent to those that have a name."""
     _AGENTS[agent.name] = agent
+
+
+def is_known(name: str) -> bool:
+    """Whether an agent comes with pharos or with one of AGENT_LIBRARIES, so that it is not code of the user's own."""
+    return not is_reference(name) or name.partition(":")[0].split(".")[0] in AGENT_LIBRARIES
 
 
 # Tables ---------------------------------------------------------------------------------------------------------------

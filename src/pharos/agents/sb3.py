@@ -31,13 +31,14 @@ from pharos.agents.agent import (
     LearningTask,
     PlannedRun,
     agents,
+    is_known,
     new_agent,
     reading_checkpoint,
 )
 from pharos.environments import Environment
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.policies import PolicyLike, deep_policy
-from pharos.system.sources import find_source, is_reference, load_source
+from pharos.system.sources import find_source, load_source
 
 if TYPE_CHECKING:
     from stable_baselines3.common.buffers import ReplayBuffer
@@ -68,8 +69,6 @@ ZOO = {
     "vec_env_wrapper": "choose an observation, chance or a class of your own",
     "env_kwargs": "give parameters to the environment",
 }
-AGENT_LIBRARIES = ("stable_baselines3", "sb3_contrib")
-"""Their algorithms are known by name: they need no trust, and no source in the configuration of a run."""
 
 
 def algorithm(agent: str | Callable[..., Any]) -> type:
@@ -255,14 +254,6 @@ def make_model(
         formats: list[KVWriter] = [HumanOutputFormat(sys.stdout)] if options.get("verbose") else []
         model.set_logger(Logger(folder=None, output_formats=formats))
     return model
-
-
-# Code of the user's own ----------------------------------------------------------------------------------------------
-
-
-def is_known(name: str) -> bool:
-    """Whether an agent comes with pharos or with one of AGENT_LIBRARIES, so that it is not code of the user's own."""
-    return not is_reference(name) or name.partition(":")[0].split(".")[0] in AGENT_LIBRARIES
 
 
 # Agents ---------------------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
     engine       q_learning, dqn, ppo (the batched engine), a2c: pharos trains them, with one setting for all tasks
     class        module:Class or file.py:Class, with Stable-Baselines3's interface
     generator    file.py:learn or a function: learn(env, steps, seed), see budget.py. Its policies may have a memory
-    jax          the same with learn(env, params, steps, key) -> (apply, snapshots), see jax_agents.py
+    jax          the same with learn(env, params, steps, key) -> (apply, snapshots), see training/functions.py
     exact        oracle and random: the optimal policy and uniform play, solved and not run
 
 `agent_form` chooses. A further form is a subclass of `Form`, and a line there.

@@ -405,7 +405,7 @@ class Environment:
         instances: dict             name -> parameters: `make("breakout/12x8x1")` and "pharos/Breakout-12x8x1-v0"
         paper_instances: tuple      names of instances in the tables of the pharos paper, in their order
         hyperparameters: dict       agent -> observation, or "default" for all -> values that suit the class; they
-                                    override agents/hyperparameters.py
+                                    override `Agent.defaults`
         foreign_parameters: dict    name that other libraries have -> what to do here instead; for the error message
         numbered_by: tuple          variables by which the source numbers its states, the last one fastest, as Gymnasium
                                     does; for the observation `number`
@@ -413,7 +413,7 @@ class Environment:
         first_version: int          the `version` that the Gymnasium id pharos/ClassName-v0 stands for
         outcomes: int               K, how many outcomes an action has at most: of classes with chance; an attribute or
                                     a property. 1 in the base class
-        residual: tuple             of an imported MDP: what its source leaves open, see mdp/row_sums.py
+        residual: tuple             of an imported MDP: what its source leaves open, see `mdp.Residual`
 
     Parameters are the fields of the dataclass. `parameter(12, low=4)` as a default declares what they may be.
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
         random_actions,
         sticky_actions,
     )
-    from pharos.mdp.arguments import STEPS_EXPECTED, check_horizon, require_mdp, whole_number
+    from pharos.mdp.arguments import STEPS_EXPECTED, Residual, check_horizon, normalized_rows, require_mdp, whole_number
     from pharos.mdp.bisimulation import Minimization, minimize
     from pharos.mdp.dynamics import (
         BellmanEquation,
@@ -68,7 +68,6 @@ if TYPE_CHECKING:
         rewards_of_staying,
         rounding_of_mean,
     )
-    from pharos.mdp.row_sums import Residual, normalized_rows
     from pharos.mdp.table import Lazy, Matrices, OutcomeTable, Table
     from pharos.mdp.tabular import TabularMDP
 

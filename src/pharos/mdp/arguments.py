@@ -1,22 +1,35 @@
-"""Checks of arguments: each error names the argument, the value found, and the first entry that is wrong.
+"""Checks of arguments, and the one rule for the sums of rows, in whatever form they were given.
 
-`require_mdp` suggests what to write if a function gets something that an MDP can be made of. The others check the parts
-of a TabularMDP.
+Each error names the argument, the value found, and the first entry that is wrong. `require_mdp` suggests what to write
+if a function gets something that an MDP can be made of. The others check the parts of a TabularMDP.
+
+Sums of rows:
+
+| sum of a row | what happens |
+|---|---|
+| within 1e-6 of 1 | the row is divided by its sum. What that may change is counted in the error bounds of values |
+| lower | the rest ends the episode if the caller has said that rows may end, else an error |
+| higher | an error |
 """
 
 import functools
 import math
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from pharos.errors import ParameterError
+from pharos.system.arrays import rounding_of_sums
 from pharos.system.wording import capped
 
 P = ParamSpec("P")
 R = TypeVar("R")
+NumberOrArray = TypeVar("NumberOrArray", float, np.ndarray)
+STEPS_EXPECTED = "a whole number of steps, at least 1"
+ROUNDED = 1e-6
+"""The sum of a row that was rounded differs from 1 by at most this."""
 
 
 def require_mdp(function: Callable[P, R]) -> Callable[P, R]:
@@ -77,9 +90,6 @@ def checked_next_states(next_states: object) -> np.ndarray:
     return np.ascontiguousarray(table, np.int32 if len(table) < 2**31 else np.int64)
 
 
-STEPS_EXPECTED = "a whole number of steps, at least 1"
-
-
 def whole_number(
     value: object, name: str, expected: str = "a whole number, at least 1", least: int = 1, most: float = math.inf
 ) -> int:
@@ -137,3 +147,82 @@ def start_of(initial: npt.ArrayLike, num_states: int) -> tuple[np.ndarray, np.nd
             f"initial names state {states[(states < 0) | (states >= num_states)][0]}; expected 0 to {num_states - 1}"
         )
     return states.astype(np.int64), np.asarray(probabilities, np.float64)
+
+
+# Sums of rows ---------------------------------------------------------------------------------------------------------
+
+
+class Residual(NamedTuple):
+    """Distance to which the bounds of values cover other MDPs: what the sums of rows leave open.
+
+    The MDP is the one with the divided rows P. Its values also hold, within their bounds, for every MDP with other rows
+    P' and rewards r' that is as near as the sums say:
+
+        sum over t of |P'(t | s, a) - P(t | s, a)| <= d      the end counts as an outcome; no other outcome is new
+        |r'(s, a) - r(s, a)| <= e
+
+    where d is the largest |sum - 1| of a row and e the same times the largest reward of an outcome of that row (0 if
+    rewards were given for states and actions). The rows as they were given are such P', if what they lack ends the
+    episode. With V' = T' V', |V' - V| <= |T' V' - T' V| + |T' V - T V| <= gamma |V' - V| + gamma d |V| + e in the
+    maximum norm, hence |V' - V| <= (gamma d |V| + e) / (1 - gamma). With a horizon, or if no state is visited twice,
+    the step from one backup to the next is the same, and the sum has as many terms as there are steps.
+
+    Attributes:
+        probabilities: d, the largest |sum - 1| of a row. rewards: e, in reward.
+    """
+
+    probabilities: float = 0.0
+    rewards: float = 0.0
+
+    def deviation(self, gamma: float, largest: NumberOrArray) -> NumberOrArray:
+        """gamma d |V| + e: how far a backup of values up to `largest` may be from the backup of such an MDP."""
+        return gamma * self.probabilities * largest + self.rewards
+
+    def plus(self, other: "Residual") -> "Residual":
+        """The distance to MDPs within one residual of an MDP that is within the other one."""
+        return Residual(self.probabilities + other.probabilities, self.rewards + other.rewards)
+
+    @staticmethod
+    def of(residuals: np.ndarray, largest: np.ndarray | float = 0.0) -> "Residual":
+        """The largest of |sum - 1| (N,) of all rows, and of its products with the largest reward of each row (N,)."""
+        return Residual(float(residuals.max(initial=0.0)), float((residuals * largest).max(initial=0.0)))
+
+
+def normalized_rows(
+    probabilities: np.ndarray,
+    rows: np.ndarray,
+    count: int,
+    refuse: Callable[[int, float], Exception],
+    *,
+    ends: bool | np.ndarray = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (probabilities (N,), |sum - 1| (count,) of the rows that were divided by their sums, else 0).
+
+    Rows that sum to 1 up to the rounding of their entries keep every bit.
+
+    Args:
+        probabilities: (N,) finite numbers >= 0. rows: (N,) the row of each.
+        refuse: (row, sum) -> the error to raise.
+        ends: True: what lacks by more than 1e-6 ends the episode; or (count,) the probability that each row ends, a
+            part of its sum.
+    """
+    most = int(np.bincount(rows, minlength=1).max())
+    sums = np.bincount(rows, probabilities, minlength=count)
+    if not isinstance(ends, bool):
+        sums = sums + ends
+    away, rounding = np.abs(sums - 1), rounding_of_sums(most)
+    is_near = away <= ROUNDED + rounding
+    wrong = ~is_near & ~((sums < 1) & (ends is True))
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise refuse(row, float(sums[row]))
+    is_divided = is_near & (away > rounding)
+    if not is_divided.any():
+        return probabilities, np.zeros(count)
+    return probabilities / np.where(is_divided, sums, 1.0)[rows], np.where(is_divided, away + rounding, 0.0)
+
+
+def rounding_hint(total: float) -> str:
+    """The likely reason if a sum is nearly 1, for the end of a message; else empty."""
+    is_near = abs(total - 1) <= 1e-2
+    return ": were they rounded, or computed in float32? divide each row by its sum" if is_near else ""

@@ -7,10 +7,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pharos.mdp.action_sets import filled, sets_of, with_sets
-from pharos.mdp.arguments import array_argument, checked_next_states, start_of, terminal_states
+from pharos.mdp.arguments import Residual, array_argument, checked_next_states, start_of, terminal_states
 from pharos.mdp.matrices import expected_rewards, transitions_of
 from pharos.mdp.rewards import Rewards, expected_over_outcomes, rewards_of_shape
-from pharos.mdp.row_sums import Residual
 from pharos.mdp.table import Matrices, OutcomeTable, Table, checked_outcomes, compact_outcomes
 
 if TYPE_CHECKING:

@@ -7,9 +7,8 @@ import numpy.typing as npt
 
 from pharos.errors import ParameterError
 from pharos.mdp.action_sets import filled, sets_of, stand_ins
-from pharos.mdp.arguments import array_argument
+from pharos.mdp.arguments import ROUNDED, Residual, array_argument, normalized_rows, rounding_hint
 from pharos.mdp.rewards import Rewards, rounding_of_mean
-from pharos.mdp.row_sums import ROUNDED, Residual, normalized_rows, rounding_hint
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

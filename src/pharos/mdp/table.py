@@ -18,9 +18,8 @@ import numpy.typing as npt
 from pharos.errors import ParameterError
 from pharos.kernels import outcomes as kernels
 from pharos.mdp.actions import States
-from pharos.mdp.arguments import array_argument
+from pharos.mdp.arguments import ROUNDED, array_argument, normalized_rows, rounding_hint
 from pharos.mdp.dynamics import Dynamics, Outcomes, TopologicalOrder, as_indices, part_with_halo
-from pharos.mdp.row_sums import ROUNDED, normalized_rows, rounding_hint
 from pharos.system.arrays import (
     UNIT_ROUNDOFF,
     Indices,

@@ -16,6 +16,7 @@ from pharos.mdp import construction
 from pharos.mdp.action_sets import filled, stand_ins
 from pharos.mdp.actions import Chance, States
 from pharos.mdp.arguments import (
+    Residual,
     check_gamma,
     check_horizon,
     start_of,
@@ -23,7 +24,6 @@ from pharos.mdp.arguments import (
 from pharos.mdp.dynamics import Dynamics, TopologicalOrder
 from pharos.mdp.names import Names, names_from
 from pharos.mdp.rewards import Rewards, rewards_of_shape
-from pharos.mdp.row_sums import Residual
 from pharos.mdp.table import (
     Lazy,
 )
@@ -60,8 +60,8 @@ class TabularMDP:
             everywhere. Transitions and rewards of the others are the same as for the first available action.
         names: of states and actions: labels, variables, names of actions. None: the names of the space, if there is
             one.
-        residual: what the sums of rows that were given leave open, see mdp/row_sums.py. Error bounds of values count
-            it.
+        residual: what the sums of rows that were given leave open, see `Residual`. Error bounds of values
+            count it.
     """
 
     dynamics: Dynamics

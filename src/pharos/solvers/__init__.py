@@ -6,10 +6,9 @@ from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.solvers.average import AverageReward, GainInterval, average_reward
-    from pharos.solvers.options import Solving, SolvingOptions
     from pharos.solvers.policy_iteration import chain
     from pharos.solvers.reaching import Bounds, Reachability, StateBounds, reach
-    from pharos.solvers.solution import Solution
+    from pharos.solvers.solution import Solution, Solving, SolvingOptions
     from pharos.solvers.values import (
         TablePolicy,
         evaluate_parts,

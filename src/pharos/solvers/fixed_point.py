@@ -276,7 +276,7 @@ def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np
 def within_residual(mdp: TabularMDP, bound: float, x: np.ndarray) -> float:
     """The error bound of a fixed point x, enlarged so that it holds for every MDP within the residual of this one.
 
-    (gamma d |V| + e) / (1 - gamma), see mdp/row_sums.py; at gamma = 1 the sum over the steps of the longest path.
+    (gamma d |V| + e) / (1 - gamma), see `Residual`; at gamma = 1 the sum over the steps of the longest path.
     """
     if not any(mdp.residual):
         return bound

@@ -35,14 +35,13 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp import Part, Selection, TabularMDP, runs_between, runs_of, shares_of
-from pharos.ranks import Halo, Rank, check_processes, check_ranks, cuts_of, run_spmd
+from pharos.ranks import Halo, Rank, check_ranks, cuts_of, run_spmd
 from pharos.solvers.convergence import Convergence
 from pharos.solvers.fixed_point import Backup, bound_of_steps, largest_of, within_residual
-from pharos.solvers.options import Solving
-from pharos.solvers.solution import Solution
+from pharos.solvers.solution import Solution, Solving
 from pharos.system import storage
 from pharos.system.compiling import Stopwatch
-from pharos.system.workers import usable_workers
+from pharos.system.workers import check_processes, usable_workers
 
 # Values so far --------------------------------------------------------------------------------------------------------
 

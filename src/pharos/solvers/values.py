@@ -33,9 +33,8 @@ from pharos.solvers.fixed_point import (
     fixed_point,
     within_residual,
 )
-from pharos.solvers.options import Solving, SolvingOptions
 from pharos.solvers.policy_iteration import chain, chain_values
-from pharos.solvers.solution import Solution
+from pharos.solvers.solution import Solution, Solving, SolvingOptions
 from pharos.system import memory
 from pharos.system.compiling import Stopwatch
 from pharos.system.memory import kept_array

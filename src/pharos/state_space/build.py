@@ -22,6 +22,7 @@ from pharos.state_space.store import StateSpace, load
 from pharos.state_space.stored import SHARDS, check_files
 from pharos.system import memory as machine
 from pharos.system import storage
+from pharos.system.workers import check_processes
 
 if TYPE_CHECKING:
     from pharos.ranks import Rank
@@ -75,7 +76,6 @@ def build(
         docs/evidence/performance.md.
     Source: the pharos paper, appendix A, Algorithm 1 (whose successors are stored under the wrong index there).
     """
-    from pharos.ranks import check_processes
     from pharos.state_space.ranked_table import rank_of_build  # loads Numba
     from pharos.state_space.search import Options
 

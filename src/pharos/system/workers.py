@@ -32,6 +32,15 @@ def usable_workers(workers: int | None) -> int:
     return int(workers)
 
 
+def check_processes(processes: int | str) -> None:
+    """Raise a ParameterError unless `processes` is 1 or "mpi"."""
+    if processes != "mpi" and (processes != 1 or isinstance(processes, bool)):
+        raise ParameterError(
+            f"processes is {processes!r}; expected 1, or 'mpi' in a program that `mpiexec -n 8 python PROGRAM` starts; "
+            "`pharos build` and `pharos solve` take --processes 8"
+        )
+
+
 class Terminated(SystemExit):
     """SIGTERM in a worker: its `finally` blocks run, and it ends."""
 

@@ -34,9 +34,8 @@ if TYPE_CHECKING:
         stored_batches,
         train_configs,
     )
-    from pharos.training.jax_agents import LearnCompiled, compiled_curves
-    from pharos.training.options import ENGINES, ExecutionOptions, Horizon, TrainingOptions
-    from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
+    from pharos.training.functions import LearnCompiled, compiled_curves
+    from pharos.training.options import ENGINES, ExecutionOptions, TrainingOptions
     from pharos.training.results import (
         TrainingResult,
         check_agent_files,
@@ -55,8 +54,8 @@ if TYPE_CHECKING:
         write_table,
     )
     from pharos.training.runs import train, train_config, train_many
-    from pharos.training.schedule import Shapes, dealt, halves, lanes, plan
-    from pharos.training.task import CELL, HELD_OUT, RunConfig, Task, TaskValues, run_id
+    from pharos.training.schedule import FailedRun, PreparedRun, Shapes, TaskCache, dealt, halves, lanes, plan
+    from pharos.training.task import CELL, HELD_OUT, Horizon, RunConfig, Task, TaskValues, run_id
     from pharos.training.tuning import TuningResult, tune
 
 __all__ = [

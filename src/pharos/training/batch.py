@@ -30,9 +30,8 @@ from pharos.training import functions  # noqa: F401  (who trains functions)
 from pharos.training import results as _results
 from pharos.training.curve import Evaluation, joint_values
 from pharos.training.evaluators import Evaluators, NetworkLearner, evaluates_apart
-from pharos.training.prepared import FailedRun, PreparedRun
 from pharos.training.results import Checkpoint, TrainingResult, clear_run, finished_result
-from pharos.training.schedule import lanes
+from pharos.training.schedule import FailedRun, PreparedRun, lanes
 from pharos.training.task import RunConfig
 
 Values = dict[int, Evaluation | PharosError]

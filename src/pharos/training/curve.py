@@ -33,7 +33,7 @@ from pharos.training import results as _results
 from pharos.training.task import Task
 
 if TYPE_CHECKING:
-    from pharos.training.prepared import PreparedRun
+    from pharos.training.schedule import PreparedRun
 
 
 CURVE_BLOCK = 4096  # observations that policies are asked about at once

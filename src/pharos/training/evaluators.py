@@ -20,8 +20,7 @@ from pharos.policies import Evaluation
 from pharos.system.wording import in_one_line
 from pharos.system.workers import Workers, is_in_main, one_thread, usable_workers
 from pharos.training.curve import evaluate_agent, joint_values
-from pharos.training.prepared import PreparedRun, TaskCache
-from pharos.training.schedule import lanes
+from pharos.training.schedule import PreparedRun, TaskCache, lanes
 from pharos.training.task import RunConfig
 
 FEWEST = 8

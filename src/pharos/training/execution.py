@@ -22,9 +22,8 @@ from pharos.system.storage import read_json
 from pharos.system.wording import in_one_line, pluralize
 from pharos.system.workers import SERVER_LOST, Workers, one_thread
 from pharos.training.batch import CallbackError, remove_batch, train_group
-from pharos.training.prepared import FailedRun, PreparedRun, TaskCache
 from pharos.training.results import TrainingResult
-from pharos.training.schedule import halves, plan
+from pharos.training.schedule import FailedRun, PreparedRun, TaskCache, halves, plan
 from pharos.training.task import RunConfig, TaskValues
 
 GROUP_ATTEMPTS = 3

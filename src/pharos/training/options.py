@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-from pharos.environments import Environment, parameter
-from pharos.errors import ParameterError
+from pharos.environments import parameter
 from pharos.mdp import ChanceSetting
 from pharos.system.records import flat
 
@@ -15,44 +14,6 @@ ENGINES = ("sb3", "batched")
 
 OBJECTIVES = ("total", "average")
 """Objectives beside values with a discount or a horizon: total reward, and the average reward of a step."""
-
-
-@dataclass(frozen=True)
-class Horizon:
-    """The number of steps of an episode in values and returns: a number, the environment's time limit, or none.
-
-    Attributes:
-        value: a number of steps, "limit" for the time limit of the environment, or "none" for discounted values without
-            a horizon, or total rewards with gamma 1.
-    """
-
-    value: int | str = "limit"
-
-    @staticmethod
-    def of(setting: "Horizon | int | str | None") -> "Horizon":
-        """Read a setting: a number of steps, "limit" (also "default"), or "none" (also None).
-
-        Raises:
-            ParameterError: none of these.
-        """
-        if isinstance(setting, Horizon):
-            return setting
-        if setting in ("limit", "default"):
-            return Horizon("limit")
-        if setting is None or setting == "none":
-            return Horizon("none")
-        if isinstance(setting, int) and not isinstance(setting, bool) and 1 <= setting < 2**31:
-            return Horizon(setting)
-        raise ParameterError(
-            f"horizon: found {setting!r}; expected a number of steps, limit (the environment's), or none"
-            + (" (a number below 2^31)" if isinstance(setting, int) and setting >= 2**31 else "")
-        )
-
-    def steps(self, env: Environment) -> int | None:
-        """The number of steps in an environment, or None for discounted values without a horizon."""
-        if self.value == "none":
-            return None
-        return int(env.max_episode_steps if self.value == "limit" else self.value)
 
 
 @flat
@@ -67,8 +28,9 @@ class TrainingOptions:
             `module:name` or `file.py:name`. Tables see the index of the state.
         observation_options: option of the observation, such as size=natural.
         chance: of acting, and in how rewards are paid. Values, returns and regret are of what is earned.
-        hyperparameters: hyperparameter of the agent, such as learning_rate=0.001. These go before the entries of
-            agents/hyperparameters.py. `train` also takes a YAML file of the same form, such as one that `tune` wrote.
+        hyperparameters: hyperparameter of the agent, such as learning_rate=0.001. These go before what
+            the agent and the class of environments declare. `train` also takes a YAML file of the same form, such as
+            one that `tune` wrote.
         steps: steps to learn from.
         gamma: discount of values and returns. The agent's own discount is a hyperparameter.
         horizon: steps of an episode in values and returns, as `Horizon.of` reads it.

@@ -489,7 +489,7 @@ def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task,
         UntrustedCode: the run names code, and is not trusted.
         MissingExtra: Stable-Baselines3 is not installed.
     """
-    from pharos.training.prepared import PreparedRun, TaskCache
+    from pharos.training.schedule import PreparedRun, TaskCache
 
     folder = Path(folder)
     record = read_record(folder)

@@ -22,9 +22,8 @@ from pharos.observations import own_observation
 from pharos.system.records import split_options, takes
 from pharos.training.execution import ProgressCallback, Training, TrainingProgress, train_configs
 from pharos.training.options import TrainingOptions
-from pharos.training.prepared import FailedRun, TaskCache
 from pharos.training.results import TrainingResult
-from pharos.training.schedule import Shapes
+from pharos.training.schedule import FailedRun, Shapes, TaskCache
 from pharos.training.task import RunConfig, Task, TaskValues
 
 RunProgress = Callable[[int, int, Mapping[str, Any]], None]

@@ -31,12 +31,50 @@ from pharos.solvers import GainInterval, Solution, average_reward, uniform_value
 from pharos.state_space import StateSpace, build
 from pharos.system.records import flat, parse_record
 from pharos.system.sources import Source, is_reference, resolve, untrusted_code
-from pharos.training.options import ENGINES, OBJECTIVES, Horizon, TrainingOptions
+from pharos.training.options import ENGINES, OBJECTIVES, TrainingOptions
 
 RETURN_TAIL = 1e-9  # part of a discounted return that is not looked at
 HELD_OUT = 2.0**-1000
 """Probability of start states in which no episode begins, as no random number is so small: they are held out. If a task
 has some, values and regret are those of episodes that begin there, each state as likely."""
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """The number of steps of an episode in values and returns: a number, the environment's time limit, or none.
+
+    Attributes:
+        value: a number of steps, "limit" for the time limit of the environment, or "none" for discounted values without
+            a horizon, or total rewards with gamma 1.
+    """
+
+    value: int | str = "limit"
+
+    @staticmethod
+    def of(setting: "Horizon | int | str | None") -> "Horizon":
+        """Read a setting: a number of steps, "limit" (also "default"), or "none" (also None).
+
+        Raises:
+            ParameterError: none of these.
+        """
+        if isinstance(setting, Horizon):
+            return setting
+        if setting in ("limit", "default"):
+            return Horizon("limit")
+        if setting is None or setting == "none":
+            return Horizon("none")
+        if isinstance(setting, int) and not isinstance(setting, bool) and 1 <= setting < 2**31:
+            return Horizon(setting)
+        raise ParameterError(
+            f"horizon: found {setting!r}; expected a number of steps, limit (the environment's), or none"
+            + (" (a number below 2^31)" if isinstance(setting, int) and setting >= 2**31 else "")
+        )
+
+    def steps(self, env: Environment) -> int | None:
+        """The number of steps in an environment, or None for discounted values without a horizon."""
+        if self.value == "none":
+            return None
+        return int(env.max_episode_steps if self.value == "limit" else self.value)
 
 
 @dataclass(frozen=True)

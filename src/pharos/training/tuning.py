@@ -37,7 +37,7 @@ from pharos.system import storage
 from pharos.system.wording import pluralize
 from pharos.training import results as _results
 from pharos.training.execution import TrainingProgress, train_configs
-from pharos.training.prepared import FailedRun, TaskCache
+from pharos.training.schedule import FailedRun, TaskCache
 from pharos.training.task import RunConfig, Task, run_id
 
 if TYPE_CHECKING:
