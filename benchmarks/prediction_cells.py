@@ -37,8 +37,8 @@ from pharos.agents import primary_predictors
 from pharos.prediction import Published
 from pharos.prediction.calibration import BINS, CELLS_FILE, NUMBER_COLUMNS
 from pharos.prediction.learners import primary_regret
-from pharos.prediction.pilot import CELLS_FILE as PILOT_FILE
 from pharos.prediction.pilot import PILOT_SHARES as PILOTS
+from pharos.prediction.pilot import PILOTS_FILE
 from pharos.statistics import spearman
 from pharos.study.cross_validation import held_out
 from pharos.study.tables import CELL
@@ -190,7 +190,7 @@ def said_of(cells, resamples):
     return f"{r_squared} | {rho} | {pairs} of {len(known.pairs.first)} | {unfitted} | {width}"
 
 
-PILOT_SHARES = (0.05, 0.1, 0.25, 0.5, 1.0)
+SHARES = (0.05, 0.1, 0.25, 0.5, 1.0)
 
 
 def pilot_cells(file):
@@ -200,7 +200,7 @@ def pilot_cells(file):
     spread = curves["value_optimal"] - curves["value_uniform"]
     regret = (curves["value_optimal"].to_numpy()[:, None] - np.stack(curves["value"])) / spread.to_numpy()[:, None]
     share = np.linspace(0, 1, regret.shape[1])
-    so_far = {f"{part:.0%}": regret[:, share <= part + 1e-9].mean(axis=1) for part in PILOT_SHARES}
+    so_far = {f"{part:.0%}": regret[:, share <= part + 1e-9].mean(axis=1) for part in SHARES}
     cells = curves[[*CELL, "seed"]].assign(**so_far)
     others = cells[cells["seed"] > 0].groupby(CELL)["100%"].mean().rename("others").reset_index()
     return cells[cells["seed"] == 0].merge(others, on=CELL).merge(frame[frame["study"] == "sealed-2"], on=CELL)
@@ -211,7 +211,7 @@ def r_squared_of_pilots(file):
 
     After a line or a plane through the cells of the other classes, of the mean regret of three other seeds.
     """
-    cells, names = pilot_cells(file), [f"{share:.0%}" for share in PILOT_SHARES]
+    cells, names = pilot_cells(file), [f"{share:.0%}" for share in SHARES]
     for agent in primary_predictors():
         of_agent = cells[cells["agent"] == agent]
         y, classes = of_agent["others"].to_numpy(), np.unique(of_agent["environment"], return_inverse=True)[1]
@@ -229,9 +229,9 @@ def pilots(file, write=False):
     if write:
         cells = pilot_cells(file)
         kept = cells[[*CELL, "predicted", "others"]].assign(**{str(share): cells[f"{share:.0%}"] for share in PILOTS})
-        kept.round(6).to_csv(PILOT_FILE, index=False, lineterminator="\n")
+        kept.round(6).to_csv(PILOTS_FILE, index=False, lineterminator="\n")
     for agent, words, values in r_squared_of_pilots(file):
-        texts = [f"{value:.2f}" for value in values] + [""] * (len(PILOT_SHARES) - len(values))
+        texts = [f"{value:.2f}" for value in values] + [""] * (len(SHARES) - len(values))
         print(f"| {agent.upper()} | {words} | {' | '.join(texts)} |")
 
 

@@ -96,6 +96,6 @@ def test_the_score_of_a_pilot_lies_between_those_of_its_neighbours():
 
 def test_scores_of_pilots_are_those_of_the_page():
     cells = benchmark("prediction_cells")
-    for agent, words, values in cells.r_squared_of_pilots(cells.FILE):
+    for agent, words, values in cells.r_squared_of_pilots(cells.CELLS_FILE):
         texts = [f"{value:.2f}" for value in values] + [""] * (len(cells.SHARES) - len(values))
         assert f"| {agent.upper()} | {words} | {' | '.join(texts)} |" in PAGE

@@ -22,7 +22,7 @@ class SmallMLP(BaseFeaturesExtractor):
 
 
 class SmallCNN(BaseFeaturesExtractor):
-    """16 filters of 3 x 3, stride 1 (MinAtar); from 36 pixels on, the three convolutions of Mnih et al. (2015)."""
+    """16 filters of 3 x 3, stride 1 (MinAtar). From 36 pixels on, the three convolutions of Mnih et al. (2015)."""
 
     def __init__(self, observation_space: spaces.Box, features_dim: int = 128):
         super().__init__(observation_space, features_dim)

@@ -1,7 +1,7 @@
 """Data of a page about an MDP: states with their values, gaps and successors, paths, layers, maps.
 
-Answers are plain dictionaries, ready for JSON; numbers that JSON cannot say are None. A position is a state and, under
-sticky actions, the action executed before; there is none before the first step.
+Answers are plain dictionaries, ready for JSON. Numbers that JSON cannot say are None. A position is a state and, under
+sticky actions, the action executed before. There is none before the first step.
 
 How often policies are in states, and what they lose there.
 
@@ -60,7 +60,7 @@ class DiscountedVisits:
         return visits[:, None] * (np.eye(mdp.num_actions)[table] if table.ndim == 1 else table)
 
     def of(self, policy: str) -> np.ndarray:
-        """(S,) visits of states; kept for the next time."""
+        """(S,) visits of states, kept for the next time."""
         if policy not in self._known:
             self._known[policy] = discounted_visits(self.exploration.mdp, self._table(policy))[0]
         return self._known[policy]
@@ -74,7 +74,7 @@ class DiscountedVisits:
         return state_losses(world.solutions[OPTIMAL], pairs, first), pairs.sum(axis=1), pairs.argmax(axis=1)
 
     def _table(self, policy: str) -> np.ndarray | None:
-        """The policy as solvers take it; None for the uniform one. Uniform in states in which it was not asked."""
+        """The policy as solvers take it, or None for the uniform one. Uniform in states in which it was not asked."""
         if policy == UNIFORM:
             return None
         table = np.asarray(self.exploration.solutions[policy].policy)
@@ -157,7 +157,7 @@ class Exploration:
         return self.mdp.chance.at(states).chosen_values(executed, self._before(states, previous))
 
     def chances(self, name: str, states: np.ndarray, q: np.ndarray, previous: int | None = None) -> np.ndarray:
-        """(N, A) how often a policy chooses each action; `q`: optimal values of choosing, for the optimal one."""
+        """(N, A) how often a policy chooses each action. `q`: optimal values of choosing, for the optimal one."""
         if name == UNIFORM:
             return uniform_choice(self.mdp)[states]
         if name == LEARNT:
@@ -189,7 +189,7 @@ class Exploration:
 
         Args:
             state: its number.
-            previous: the action executed before, under sticky actions; None: there was none.
+            previous: the action executed before, under sticky actions. None: there was none.
         Returns:
             state, previous, values (of its variables), labels, terminal, layer, start (probability that an episode
             starts there), v (policy -> value), the drawing as `Pictures.of` has it, and for each action: `name`, if
@@ -249,7 +249,7 @@ class Exploration:
         return self.mdp.chance.at(here).weights(choices, self._before(choices, previous))
 
     def _outcomes(self, state: int, executed: np.ndarray) -> list[list[Any]]:
-        """(state, previous, probability, reward) of possible outcomes, likeliest first; executed: (A,) chances."""
+        """(state, previous, probability, reward) of possible outcomes, likeliest first. executed: (A,) chances."""
         merged: dict[tuple[int | None, int | None, float], float] = {}
         for action in np.flatnonzero(executed).tolist():
             for after, probability, reward in self._of_executing(state, action):
@@ -289,7 +289,7 @@ class Exploration:
         return self._variables_of(state) if self.space is not None else (state,)
 
     def _number_of(self, state: State) -> int | None:
-        """The number of a state of the environment; None: the end."""
+        """The number of a state of the environment. None: the end."""
         if self.space is not None:
             return self.states.number(state)
         return int(state[0]) if state[0] < self.mdp.num_states else None
@@ -441,7 +441,7 @@ class Exploration:
 
 
 def float_or_none(value: float | np.floating) -> float | None:
-    """A float; None if it is not a number."""
+    """A float, or None if it is not a number."""
     return float(value) if np.isfinite(value) else None
 
 
@@ -463,8 +463,8 @@ class Pictures:
     """Draws the states of an environment. If that is not possible, `fault` is the reason, in one line.
 
     Attributes:
-        kit: what all drawings are composed of, for the page; None if the states cannot be drawn.
-        fault: why they cannot; "" if they can.
+        kit: what all drawings are composed of, for the page. None if the states cannot be drawn.
+        fault: why they cannot, or "" if they can.
     """
 
     def __init__(self, env: Environment | None, start: State | None):

@@ -1,7 +1,7 @@
 """Tables of transitions.
 
 `Table`: one next state for each state and action, of deterministic games. `Lazy`: another table in which actions have
-no effect with some probability; neither successors nor probabilities are copied. `OutcomeTable`: several outcomes for
+no effect with some probability. Neither successors nor probabilities are copied. `OutcomeTable`: several outcomes for
 each state and action, of games whose rules have chance.
 
 Arrays of outcomes as users write them are checked, and held compactly. A sparse matrix of transitions becomes such a
@@ -42,7 +42,7 @@ class Table(Dynamics):
     """One next state for each state and action, as a table.
 
     Attributes:
-        next_states: (S, A) int32, int64 or `PackedIndices`; -1: the episode ends there.
+        next_states: (S, A) int32, int64 or `PackedIndices`. -1: the episode ends there.
     """
 
     operations, mass, is_deterministic = 0, 1.0, True
@@ -122,7 +122,7 @@ class Lazy(Dynamics):
     Under sticky actions the action that had no effect counts as executed.
 
     Attributes:
-        tables: the dynamics without laziness; if they are lazy already, their own tables, and p is the probability of
+        tables: the dynamics without laziness. If they are lazy already, their own tables, and p is the probability of
             both.
         laziness: p, in (0, 1).
         roundings: of p and of the mean. Joining two p is off by at most 4 units, which move as much weight from one
@@ -222,7 +222,7 @@ def checked_outcomes(
     """(successors, probabilities as float64, |sum - 1| (S, A) of the rows divided by it), the first two (S, A, K).
 
     Raises:
-        ParameterError: a shape or type is wrong, an index is outside, or a row holds no probabilities; the first such
+        ParameterError: a shape or type is wrong, an index is outside, or a row holds no probabilities. The first such
             entry is named.
     """
     table, chances = array_argument(successors, "successors"), array_argument(probabilities, "probabilities")
@@ -321,7 +321,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
     """Several next states for each state and action, and their probabilities, as the tables of `OutcomeRows`."""
 
     def __init__(self, successors: Indices, num_actions: int, **others: Indices | None):
-        """others: offsets, codes, palette, probabilities; see `OutcomeRows`, which also raises."""
+        """others: offsets, codes, palette, probabilities, see `OutcomeRows`, which also raises."""
         super().__init__(successors, **others)
         self.num_actions = num_actions
         rows = len(successors) * num_actions if self.offsets is None else len(self.offsets) - 1
@@ -335,7 +335,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
         30 % of (S, A, K) would be padding.
 
         Raises:
-            ParameterError: a shape, an index or a probability is wrong, or a row does not sum to 1 within 1e-6; the
+            ParameterError: a shape, an index or a probability is wrong, or a row does not sum to 1 within 1e-6. The
                 first such entry is named. Rows within that are divided by their sums.
         """
         return OutcomeTable(**compact_outcomes(*checked_outcomes(successors, probabilities)[:2]))
@@ -473,7 +473,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
         return self._renumbered(representatives, np.append(classes, -1))
 
     def ends_and_stays(self) -> tuple[np.ndarray, np.ndarray]:
-        """(S,) bool each: whether a state leads to nothing but the end; and to nothing but the end or itself."""
+        """(S,) bool each: whether a state leads to nothing but the end, and to nothing but the end or itself."""
         successors, states = np.asarray(self.flat), np.arange(self.num_states + 1)
         first = self.begins(states * self.num_actions)
         ends = successors == -1
@@ -483,14 +483,14 @@ class OutcomeTable(OutcomeRows, Dynamics):
     # Parts of it ------------------------------------------------------------------------------------------------------
 
     def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
-        """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for the state of the row."""
+        """The rows of some states. number: (S + 1,) of each next state, -1 for the end, -2 for the state of the row."""
         which, entries = self.entry_indices(self._rows(np.asarray(states)))
         next_states = number[self.flat[entries]]
         next_states = np.where(next_states == -2, which // self.num_actions, next_states)
         return self._of_states(states, entries, as_indices(next_states, len(states)))
 
     def _of_states(self, states: States, entries: States, successors: Indices) -> "OutcomeTable":
-        """Rows of some states, with other successors (N,); entries (N,): indices of all their outcomes, in order."""
+        """Rows of some states, with other successors (N,). entries: (N,) indices of all their outcomes, in order."""
         arrays: dict[str, Any] = {"successors": successors.reshape(-1, *self.successors.shape[1:])}
         if self.offsets is not None:
             rows = self._rows(np.arange(self.num_states)[states])
@@ -511,7 +511,7 @@ class Matrices(OutcomeTable):
     """A table of outcomes, row after row, that was given as a sparse matrix, and is stored in files as one.
 
     Attributes:
-        transitions: (S A, S) CSR float64, row s A + a; 1 minus the sum of a row is the probability that the episode
+        transitions: (S A, S) CSR float64, row s A + a. 1 minus the sum of a row is the probability that the episode
             ends, if it exceeds 4 (n + 2) units of 2^-53 for rows of n entries: less may be rounding.
     """
 

@@ -41,7 +41,7 @@ class OrderCounts:
 
     Attributes:
         pairs: all of them. right: those in which the one that was predicted to have less regret had less, however
-            little; a tie is not right.
+            little. A tie is not right.
         clear_pairs, clear_right: the same of the pairs whose regrets differ by more than `CLEAR`.
     """
 
@@ -58,7 +58,7 @@ class Published:
     Attributes:
         classes: (N,) names of the classes of environments, which weigh alike.
         mdps: (N,) study, instance and chance of each.
-        predicted, observed: (N,) normalised regret of the learnt policies, 0 optimal and 1 uniform play; observed is
+        predicted, observed: (N,) normalised regret of the learnt policies, 0 optimal and 1 uniform play. observed is
             the mean over evaluations and seeds.
         states: (N,) numbers of states. steps: (N,) of training. spreads: (N,) V* - U, in return.
     """
@@ -79,7 +79,7 @@ class Published:
 
         Args:
             but: a class that is left out.
-        Source: Lei et al. (2018), split conformal prediction; Dunn, Wasserman and Ramdas (2023) for groups.
+        Source: Lei et al. (2018), split conformal prediction, and Dunn, Wasserman and Ramdas (2023) for groups.
         """
         use = self.classes != but
         errors, classes = np.abs(self.observed - self.predicted)[use], self.classes[use]

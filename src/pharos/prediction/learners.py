@@ -33,13 +33,13 @@ PREDICTORS = (
 
 def predicted(config: Mapping[str, Any], *, primary: bool = False) -> dict[str, Any]:
     """Return PREDICTORS of a run, the columns of its agent's idealised learner (`pharos.agents.Idealised`), and their
-    curves; and the measures that a user has registered, under their names.
+    curves, and the measures that a user has registered, under their names.
 
     Args:
         config: of a run of a study that was read already, so that code which it names is trusted.
-        primary: the idealised learner alone, with its table; `estimated_error` is then its own.
+        primary: the idealised learner alone, with its table. `estimated_error` is then its own.
     Returns:
-        Numbers, NaN if there is none and `notes` says why; `network`, `estimated_error`, `curve`, `adam_curve`.
+        Numbers, NaN if there is none and `notes` says why, `network`, `estimated_error`, `curve`, `adam_curve`.
     """
     from pharos.hardness import report
 
@@ -129,7 +129,7 @@ class PrimaryRegret:
     Attributes:
         network: its name.
         value: normalised regret of the learnt policies, a mean over training: 0 optimal, 1 uniform play.
-        deviation: standard deviation of one walk of the idealised learner; NaN if nothing is drawn.
+        deviation: standard deviation of one walk of the idealised learner, NaN if nothing is drawn.
         tabular: of the same learner with a table of the states in the place of the network.
         note: what is random in it, and what half of the landmarks change if they stand for the kernel.
     """
@@ -151,7 +151,7 @@ def primary_regret(
 
     Args:
         config: of the run. task: its task.
-        network: as `pharos.observations.representation` takes it; None: the agent's own, with its `net_arch`.
+        network: as `pharos.observations.representation` takes it. Default: the agent's own, with its `net_arch`.
     Raises:
         ParameterError: the agent has no such learner, the network does not fit, or the kernel is too large.
         UndefinedMeasure: no policy beats uniform play.

@@ -79,7 +79,7 @@ def cut(hyperparameters: Mapping[str, Any], share: float) -> dict[str, Any]:
 
 
 def pilot_regret(agent: str, task: "Task", steps: int, hyperparameters: Mapping[str, Any], share: float) -> float:
-    """Train one seed for a share of the steps; return its mean regret so far.
+    """Train one seed for a share of the steps, and return its mean regret so far.
 
     Raises:
         MissingExtra: torch is not installed.

@@ -1,6 +1,6 @@
 """The rules of an environment at two speeds: compiled and interpreted. `rules_of(env)` gives the faster one that can.
 
-Only names that load no Numba are imported at once; the others when they are asked for.
+Only names that load no Numba are imported at once, the others when they are asked for.
 """
 
 from typing import TYPE_CHECKING

@@ -1,9 +1,8 @@
-"""Layout of states in 64-bit words: the position of each component; integer vectors <-> packed states.
+"""Layout of states in 64-bit words: the position of each component, and integer vectors <-> packed states.
 
 Component i with `size[i]` values takes ceil(log2(size[i])) bits and holds value - low[i]. Components follow one another
-in the order of declaration; one that would straddle two words starts the next word. The rule is part of the file
-format. `kernels.hash_table` has compiled twins of both functions for a few states at a time; this file loads no
-Numba.
+in the order of declaration. One that would straddle two words starts the next word. The rule is part of the file
+format. `kernels.hash_table` has compiled twins of both functions for a few states at a time. This file loads no Numba.
 """
 
 from dataclasses import dataclass

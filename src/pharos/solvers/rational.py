@@ -59,7 +59,7 @@ def rational_values(
 
 
 def fractions_of(choices: "Choices") -> list[Row] | None:
-    """The rows as rational numbers, equal to the floats; None if they are too many."""
+    """The rows as rational numbers, equal to the floats. None if they are too many."""
     matrix = choices.matrix
     if matrix.nnz > MOST_RATIONAL_ENTRIES:
         return None
@@ -78,7 +78,7 @@ def _divided(reward: Fraction, after: dict[int, Fraction]) -> Row:
 
 
 def exact_sums(after: list[dict[int, Fraction]], b: list[Fraction]) -> list[Fraction] | None:
-    """x = b + P x of n nodes, of rows without what stays, each left almost surely; None if it fills in too much."""
+    """x = b + P x of n nodes, of rows without what stays, each left almost surely. None if it fills in too much."""
     rows = [_divided(*each) for each in zip(b, after, strict=True)]
     return eliminated(rows, len(b), MOST_RATIONAL_ENTRIES)[0]
 
@@ -86,7 +86,7 @@ def exact_sums(after: list[dict[int, Fraction]], b: list[Fraction]) -> list[Frac
 def best_mean(
     choices: "Choices", rows: list[Row], policy: np.ndarray, class_of: np.ndarray
 ) -> tuple[Fraction, np.ndarray] | None:
-    """(The mean reward of a policy (M,), a better policy or the same one); None if it fills in too much.
+    """(The mean reward of a policy (M,), a better policy or the same one). None if it fills in too much.
 
     Args:
         class_of: (M,) 0 in the only recurrent class of the policy, else -1.
@@ -121,7 +121,7 @@ def _too_many_nodes(count: int) -> PrecisionError:
 
 
 def eliminated(rows: list[Row], count: int, most: int) -> tuple[list[Fraction] | None, int]:
-    """(x = r + P x by elimination without subtraction of probabilities; entries that it filled in).
+    """(x = r + P x by elimination without subtraction of probabilities, entries that it filled in).
 
     x is None if some nodes never end, or if it would fill in more entries than `most`.
     Source: Grassmann, Taksar and Heyman (1985).

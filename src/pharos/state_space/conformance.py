@@ -70,10 +70,10 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
     same states in the same order, terminal states absorbing.
 
     Args:
-        max_states: how many states are looked at; half of them nearest to the start, half by depth-first search.
+        max_states: how many states are looked at: half of them nearest to the start, half by depth-first search.
         seed: of the order of the depth-first search.
     Returns:
-        a Conformance; print it.
+        a Conformance. Print it.
     Raises:
         RuleError: the first breach found: the rule, the state and the action, what was found and what is expected.
     Cost: about 0.1 ms for each state and action, and a few seconds to compile the rules of a class for the first time.
@@ -223,7 +223,7 @@ def _names_in(value: object) -> tuple[str, ...]:
 
 
 def _check_compiled(env: Environment, check: InterpretedCheck, states: list[State], notes: list[str]) -> bool:
-    """Compare compiled rules with interpreted ones on `states`; False, and a note, if Numba cannot compile them."""
+    """Compare compiled rules with interpreted ones on `states`. False, and a note, if Numba cannot compile them."""
     from pharos.rules import CompiledExpansion, not_compiled, rules_of
 
     rules = rules_of(env)
@@ -454,7 +454,7 @@ def check_declarations(env: Environment) -> None:
 
 
 def check_layers(env: Environment, notes: list[str]) -> None:
-    """Raise a RuleError if a layer or the grid breaks the contract; a note if there are no layers."""
+    """Raise a RuleError if a layer or the grid breaks the contract. A note if there are no layers."""
     source = type(env).__name__
     if not isinstance(env.layers, dict) or not all(isinstance(name, str) for name in env.layers):
         raise RuleError(f"{source}.layers is {env.layers!r}; expected a dict of name -> Layer")

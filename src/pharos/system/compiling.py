@@ -1,6 +1,6 @@
-"""The folder that keeps compiled code, so that it is compiled once; and the seconds of compiling, apart from work.
+"""The folder that keeps compiled code, so that it is compiled once, and the seconds of compiling, apart from work.
 
-`pharos.kernels` calls `prepare` as it is loaded; before that nothing can have been compiled.
+`pharos.kernels` calls `prepare` as it is loaded. Before that nothing can have been compiled.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ _timer: threading.Timer | None = None
 
 
 def seconds() -> float:
-    """Seconds of wall-clock time in which this process has compiled so far; threads that compile at once count once."""
+    """Seconds of wall-clock time in which this process has compiled so far. Threads that compile at once count once."""
     with _lock:
         return _total + (time.perf_counter() - _began if _running else 0.0)
 
@@ -59,7 +59,7 @@ class Stopwatch:
 
 
 def prepare() -> None:
-    """Start the timing of what Numba compiles; loads Numba.
+    """Start the timing of what Numba compiles. Loads Numba.
 
     Raises:
         ParameterError: variables of the environment keep Numba from compiling.
@@ -72,7 +72,7 @@ def prepare() -> None:
         raise ParameterError(f"Numba cannot be loaded: {error}; look at its variables, NUMBA_...") from error
 
     class Compiling(event.Listener):
-        """Adds up the seconds of compiling; kernels that others call are compiled within them.
+        """Adds up the seconds of compiling. Kernels that others call are compiled within them.
 
         Meanwhile no garbage is sought, which was a tenth of compiling: it makes many objects, and all live until its
         end.
@@ -142,7 +142,7 @@ def _name_of(function: Callable) -> str:
 
 @cache
 def private_folder(cache_directory: Path) -> Path | None:
-    """The folder of compiled code, which is this user's and which nobody else can write to; None if there is none.
+    """The folder of compiled code, which is this user's and which nobody else can write to. None if there is none.
 
     It is `compiled`, or, if several users share the cache, `compiled-` and the user's number. A warning says what is
     wrong with a folder that is refused.

@@ -82,7 +82,7 @@ class Parameters:
         self.length += -(-self.shapes[-1].size // ALIGNED_FLOATS) * ALIGNED_FLOATS
 
     def views(self, rows: Tensor) -> Values:
-        """name -> (W, ...) view of (W, P); all of it under the name ALL_PARAMETERS."""
+        """name -> (W, ...) view of (W, P), all of it under the name ALL_PARAMETERS."""
         views = {
             each.name: rows[:, each.offset : each.offset + each.size].view(len(rows), *each.shape)
             for each in self.shapes
@@ -91,7 +91,7 @@ class Parameters:
 
 
 def aligned_zeros(width: int, *shape: int, device: str | torch.device | None = None) -> Tensor:
-    """(W, ...) float32 zeros; each run begins at a multiple of 64 bytes, so that its position changes no result."""
+    """(W, ...) float32 zeros. Each run begins at a multiple of 64 bytes, so that its position changes no result."""
     size = math.prod(shape)
     rows = torch.zeros((width, -(-size // ALIGNED_FLOATS) * ALIGNED_FLOATS), device=device)
     return rows[:, :size].view(width, *shape)
@@ -103,7 +103,7 @@ def flat_view(y: Tensor) -> Tensor:
 
 
 class NetworkLayer:
-    """x (W, B, in) -> (W, B, out); keeps its buffers for each number of rows, overwritten by the next call."""
+    """x (W, B, in) -> (W, B, out). Keeps its buffers for each number of rows, overwritten by the next call."""
 
     def __init__(self, name: str, inputs: int, outputs: int, activation: str):
         self.name, self.inputs, self.outputs, self.activation = name, inputs, outputs, activation
@@ -114,7 +114,7 @@ class NetworkLayer:
         raise NotImplementedError
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> Tensor | None:
-        """Write the gradients of the parameters, after `forward` of x; return the gradient of x if `onward`."""
+        """Write the gradients of the parameters, after `forward` of x. Return the gradient of x if `onward`."""
         raise NotImplementedError
 
     def _buffers(self, x: Tensor, *, onward: bool = False) -> tuple[Tensor, Tensor]:
@@ -147,8 +147,8 @@ class LinearLayer(NetworkLayer):
     """y = activation(x w + b).
 
     Args:
-        pixels: if the inputs are `pixels` cells of a picture with all channels each; Stable-Baselines3 has the
-            channels outside.
+        pixels: if the inputs are `pixels` cells of a picture with all channels each. Stable-Baselines3 has the channels
+            outside.
     """
 
     def __init__(
@@ -192,7 +192,7 @@ class LinearLayer(NetworkLayer):
 class PatchConvolutionLayer(NetworkLayer):
     """A convolution of 3 x 3 with padding as one product: x holds the 9 C neighbours of each pixel, from 0 to 255.
 
-    They come out of a table, so that nothing is unfolded here; 1 / 255 is a factor of the weights. y is (W, B, pixels
+    They come out of a table, so that nothing is unfolded here. 1 / 255 is a factor of the weights. y is (W, B, pixels
     x filters). Runs whose pictures are smaller than the pictures of others in their lane have a mask (W, pixels) among
     the values, which keeps what is no pixel of theirs at 0.
     """
@@ -222,7 +222,7 @@ class PatchConvolutionLayer(NetworkLayer):
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
-        """See `NetworkLayer`; there is no gradient of the input."""
+        """See `NetworkLayer`. There is no gradient of the input."""
         y, _ = self._buffers(x)
         rows = self._rows(self._before_activation(dy, y))
         torch.sum(rows, 1, keepdim=True, out=gradients[f"{self.name}.bias"])
@@ -234,10 +234,10 @@ class PatchConvolutionLayer(NetworkLayer):
 
 
 class ConvolutionLayer(NetworkLayer):
-    """A strided convolution without padding; on the processor run by run, else as one grouped one.
+    """A strided convolution without padding, on the processor run by run, else as one grouped one.
 
     Args:
-        shape: (C, H, W) of its inputs; scale: a factor of them.
+        shape: (C, H, W) of its inputs. scale: a factor of them.
     Attributes:
         shape_out: (filters, H, W).
     """
@@ -315,7 +315,7 @@ class ConvolutionLayer(NetworkLayer):
 class PictureLayers(NetworkLayer):
     """The small convolution and the linear layer after it, on the processor: each different patch once.
 
-    x (W, B, C pixels), from 0 to 255. The parameters belong to the two layers; see kernels/patches.py.
+    x (W, B, C pixels), from 0 to 255. The parameters belong to the two layers, see kernels/patches.py.
     """
 
     def __init__(self, parameters: Parameters, name: str, shape: tuple[int, ...]):
@@ -344,7 +344,7 @@ class PictureLayers(NetworkLayer):
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
-        """See `NetworkLayer`; there is no gradient of the input."""
+        """See `NetworkLayer`. There is no gradient of the input."""
         dy = self._before_activation(dy, self._buffers(x)[0])
         rows, written = values[ALL_PARAMETERS].numpy(), gradients[ALL_PARAMETERS].numpy()
         memory, pictures = self._memories[x.shape[0], x.shape[1]], flat_view(x).numpy()
@@ -383,7 +383,7 @@ class Stack:
         return x
 
     def backward(self, values: Values, gradients: Values, dy: Tensor, *, onward: bool = False) -> Tensor:
-        """Write the gradients of all parameters, after `forward`; return the gradient of the input if `onward`."""
+        """Write the gradients of all parameters, after `forward`. Return the gradient of the input if `onward`."""
         for i in range(len(self.layers) - 1, -1, -1):
             dx = self.layers[i].backward(values, gradients, self._inputs[i], dy, onward=onward or i > 0)
             dy = dy if dx is None else dx
@@ -447,7 +447,7 @@ def sizes_of(net_arch: NetArch, head: str = "pi") -> list[int]:
 
 
 def parameter_names(name: str) -> list[str]:
-    """All names of a parameter in Stable-Baselines3; parameters of shared parts have several."""
+    """All names of a parameter in Stable-Baselines3. Parameters of shared parts have several."""
     extractors = [name]
     if name.startswith("features_extractor."):
         extractors += [f"{part}_{name}" for part in ("pi", "vf")]
@@ -455,7 +455,7 @@ def parameter_names(name: str) -> list[str]:
 
 
 class BatchedNetwork(Protocol):
-    """W networks of one shape; interface to a lane.
+    """W networks of one shape, the interface to a lane.
 
     Attributes:
         parameters: their positions. eps: of Adam.
@@ -495,7 +495,7 @@ class QNetworks:
         return self.stack.forward(values, x)
 
     def backward(self, values: Values, gradients: Values, dq: Tensor) -> None:
-        """Write the gradients; called after `scores`."""
+        """Write the gradients. Called after `scores`."""
         self.stack.backward(values, gradients, dq)
 
     def initial(self, draws: Draws) -> np.ndarray:
@@ -538,13 +538,13 @@ class ActorCritics:
         return self.critic.forward(values, self.trunk.forward(values, x))
 
     def backward(self, values: Values, gradients: Values, dscores: Tensor, dvalues: Tensor) -> None:
-        """Write the gradients; called after `both`."""
+        """Write the gradients. Called after `both`."""
         features = self.actor.backward(values, gradients, dscores, onward=True)
         features.add_(self.critic.backward(values, gradients, dvalues, onward=True))
         self.trunk.backward(values, gradients, features)
 
     def initial(self, draws: Draws) -> np.ndarray:
-        """(W, P): orthogonal weights times sqrt(2), 0.01 for the actions and 1 for the value; biases 0.
+        """(W, P): orthogonal weights times sqrt(2), 0.01 for the actions and 1 for the value. Biases are 0.
 
         Source: Saxe et al. (2014), as torch draws it: the Q of a normal matrix, its columns signed by R's diagonal.
         """

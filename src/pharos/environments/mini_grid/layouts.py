@@ -30,7 +30,8 @@ Place = tuple[int, int]
 
 
 class GridLayout(NamedTuple):
-    """A grid, row by row, and the target: a thing to pick up or a door to open, such as "BR"; None: only goals."""
+    """A grid, row by row, and the target: a thing to pick up or a door to open, such as "BR", or None for goals
+    only."""
 
     rows: tuple[str, ...]
     target: str | None = None
@@ -61,7 +62,7 @@ class Canvas:
         self.cells[[left, right], top : bottom + 1] = WALL
 
     def free_cell(self, corner: Place, size: Place, *, away: bool = False, attempts: float = math.inf) -> Place:
-        """Random cell of floor in a rectangle without the player; with `away`, not beside the player either."""
+        """Random cell of floor in a rectangle without the player. With `away`, not beside the player either."""
         left, top = corner
         right, bottom = min(left + size[0], self.width), min(top + size[1], self.height)
         tried = 0
@@ -88,7 +89,7 @@ class Canvas:
 
 
 class Rooms(Canvas):
-    """Rooms of `size` x `size` cells, walls included and shared; places for doors are drawn, but no doors yet."""
+    """Rooms of `size` x `size` cells, walls included and shared. Places for doors are drawn, but no doors yet."""
 
     def __init__(self, columns: int, rows: int, size: int, seed: int | None):
         pitch = size - 1
@@ -121,7 +122,7 @@ class Rooms(Canvas):
         return column + AHEAD[side][0], row + AHEAD[side][1], (side + 2) % 4
 
     def add_door(self, column: int, row: int, side: int, *, locked: bool = False) -> str:
-        """Add a door of a random colour; return the colour."""
+        """Add a door of a random colour, and return the colour."""
         color = self.color()
         self.cells[self.doorways[column, row, side]] = ("L" if locked else "D") + color
         self.doors |= {(column, row, side), self.across(column, row, side)}
@@ -130,7 +131,8 @@ class Rooms(Canvas):
         return color
 
     def add_thing(self, column: int, row: int, letter: str, color: str | None = None) -> str:
-        """Put a key K, ball A or box B on a random cell of a room; return it with its colour, drawn unless given."""
+        """Put a key K, ball A or box B on a random cell of a room. Return it with its colour, drawn if none is
+        passed."""
         thing = letter + (color or self.color())
         size = (self.size, self.size)
         self.cells[self.free_cell(self.corner(column, row), size, away=True, attempts=FREE_CELL_ATTEMPTS)] = thing
@@ -151,7 +153,7 @@ class Rooms(Canvas):
                 return
 
     def connect(self) -> None:
-        """Add doors between rooms until every room is reachable; locked rooms get no further doors."""
+        """Add doors between rooms until every room is reachable. Locked rooms get no further doors."""
         start = (self.player[0] // (self.size - 1), self.player[1] // (self.size - 1))
         for _ in range(CONNECTIONS + 1):
             if len(self._reachable(start)) == self.rows * self.columns:
@@ -374,7 +376,7 @@ def _exit(canvas: Canvas, room: Room) -> tuple[int, Place]:
 
 
 def _room(canvas: Canvas, size: int, side: int, entry: Place, *, is_first: bool = False) -> Room:
-    """A room of random size with its entry on a side; the first has it in its corner."""
+    """A room of random size with its entry on a side. The first has it in its corner."""
     width, height = canvas.integer(SMALLEST_ROOM, size + 1), canvas.integer(SMALLEST_ROOM, size + 1)
     left, top = entry
     if not is_first:
@@ -413,7 +415,7 @@ class Recipe(NamedTuple):
 
     Attributes:
         draw: function of the parameters below, by name, that returns the layout.
-        parameters: name -> what it may be; "seed" if something is drawn.
+        parameters: name -> what it may be, with "seed" if something is drawn.
         max_steps: the time limit of minigrid, by size and number of rooms.
     """
 

@@ -1,6 +1,6 @@
 """Appearance of MiniGrid: colours, shapes of walls, lava, doors, things and the player, in the spirit of the package.
 
-Shapes are functions of (colour, pixels of a cell, glyph), see `look.Shape`; x goes right and y down, from 0 to 1.
+Shapes are functions of (colour, pixels of a cell, glyph), see `look.Shape`. x goes right and y down, from 0 to 1.
 """
 
 from collections.abc import Callable
@@ -64,7 +64,7 @@ def goal(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
 
 
 def door(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
-    """A door: open, at the side of the cell; closed, with a handle; locked, with a keyhole in a darker leaf."""
+    """A door: open at the side of the cell, closed with a handle, or locked with a keyhole in a darker leaf."""
     if glyph == "_":
         return painted(cell, (box(0.84, 1, 0, 1), color), (box(0.9, 0.94, 0.06, 0.94), DARK))
     leaf = (box(0, 1, 0, 1), color), (box(0.08, 0.92, 0.08, 0.92), DARK), (box(0.13, 0.87, 0.13, 0.87), color * 0.8)
@@ -89,7 +89,7 @@ KEY_SHAFT = box(0.45, 0.56, 0.44, 0.9)
 
 
 def player(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
-    """An arrowhead with a pale rim that points where the player looks; what is carried shows behind it."""
+    """An arrowhead with a pale rim that points where the player looks. What is carried shows behind it."""
 
     def arrow(rim: float) -> Mask:
         return lambda x, y: (

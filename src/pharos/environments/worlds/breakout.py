@@ -45,28 +45,28 @@ VECTOR_SETTINGS = {
 class Breakout(Environment):
     """A ball, a paddle and `brick_rows` rows of bricks on a court of `height` x `columns` cells.
 
-    Rules    The ball moves one cell diagonally at each step; side walls and the ceiling turn it within the step. Row 0
+    Rules    The ball moves one cell diagonally at each step. Side walls and the ceiling turn it within the step. Row 0
              is free, so the ball can run above the bricks, which fill rows 1 to `brick_rows`. A ball that meets a
              brick breaks it, stays in its cell for that step and turns back vertically. The paddle lies in the bottom
              row and moves first, by at most one cell. A ball is hit by the paddle in the row above it: when the paddle
-             lies ahead of the ball, the ball bounces, one column on in its row, and goes up onwards; when the paddle
+             lies ahead of the ball, the ball bounces, one column on in its row, and goes up onwards. When the paddle
              lies straight below the ball but not ahead, its edge turns the ball back, one column towards where it
              came from. So the player steers by where the paddle is hit, whatever its width, and can reach every brick.
     State    (ball row, ball column, ball goes right, ball goes down, leftmost cell of the paddle, bricks row by row).
-    Start    ball below the middle of the bricks, going down to the right; paddle in the middle; all bricks there.
+    Start    ball below the middle of the bricks, going down to the right, paddle in the middle, all bricks there.
     Actions  left, stay, right.
     Reward   1 a brick, otherwise 0.
-    Ends     when the ball reaches the bottom row; without `respawn` also when no brick is left.
+    Ends     when the ball reaches the bottom row, without `respawn` also when no brick is left.
     Respawn  when no brick is left, all come back as the paddle next hits the ball.
     Limit    1000 steps.
-    Ours     the paper prints height, columns and extra paddle width; brick rows, respawn, angles and limit are ours.
+    Ours     the paper prints height, columns and extra paddle width. Brick rows, respawn, angles and limit are ours.
     Source   the pharos paper, section 3.3 and appendix B.
 
     Attributes:
-        height: rows of the court; at least brick_rows + 4.
+        height: rows of the court, at least brick_rows + 4.
         columns: at least 2 and at least as wide as the paddle.
         brick_rows: at least 1.
-        extra_paddle_width: cells on each side of the paddle's middle; the paddle is 1 + 2 * extra_paddle_width wide.
+        extra_paddle_width: cells on each side of the paddle's middle. The paddle is 1 + 2 * extra_paddle_width wide.
         respawn: whether cleared bricks come back.
     """
 

@@ -29,13 +29,13 @@ MARK = ("........", "........", "..#..#..", "...##...", "...##...", "..#..#..", 
 class Sokoban(Environment):
     """Push every box onto a target. Boxes cannot be pulled, so some pushes can never be made good.
 
-    Rules    A step onto a box pushes it on by one cell, if no wall and no other box lies behind it; else nothing
+    Rules    A step onto a box pushes it on by one cell, if no wall and no other box lies behind it. Otherwise nothing
              happens.
     State    (row, column) of the player, and for each cell of the floor whether a box is there: boxes are all alike, so
              their permutations are one state. The floor are the cells within reach of a player without boxes, row by
              row.
     Actions  up, right, down, left.
-    Reward   -0.1 a step; 1 for each box pushed onto a target, -1 for each pushed off; 10 when all are on targets. So
+    Reward   -0.1 a step, 1 for each box pushed onto a target, -1 for each pushed off, 10 when all are on targets. So
              the undiscounted optimal return is 10 and the boxes not on targets at the start, less 0.1 for each step of
              a shortest solution.
     Ends     when a box is on every target.
@@ -46,11 +46,11 @@ class Sokoban(Environment):
 
     Attributes:
         level: rows of # (wall), - or a space (floor), @ (player), $ (box), . (target), + (player on a target) and *
-            (box on a target), separated by "/" or line ends; or a file of levels, such as Boxoban's, and the number of
+            (box on a target), separated by "/" or line ends. Or a file of levels, such as Boxoban's, and the number of
             one: "000.txt:17". None stands for the level "corner", or for the level of `seed`.
         seed: draws a level of `height` x `width` cells, walls around it included, that can be solved.
-        height, width: of a random level; at least 4.
-        boxes: of a random level; at least 1.
+        height, width: of a random level, at least 4.
+        boxes: of a random level, at least 1.
     """
 
     level: str | None = None
@@ -216,7 +216,7 @@ Cell = tuple[int, int]
 
 
 def level_text(source: str) -> str:
-    """The level in one line: of a text, or of a file, `levels.txt` or `levels.txt:3`; ValueError says what is wrong.
+    """The level in one line: of a text, or of a file, `levels.txt` or `levels.txt:3`. ValueError says what is wrong.
 
     In a file any line that is no row ends a level. A line with a number, "; 3" or "Level 3", numbers the level after
     it, as in Boxoban's files: then each level needs one. Without such lines levels count from 0.
@@ -238,7 +238,7 @@ def level_text(source: str) -> str:
 
 
 def _levels_of(file: Path) -> dict[int, list[str]]:
-    """The rows of each level of a file by its number; ValueError if it is not clear which is which."""
+    """The rows of each level of a file by its number. ValueError if it is not clear which is which."""
     from pharos.system.storage import check_regular  # which levels in text do without
 
     try:
