@@ -9,7 +9,7 @@
     ladders: [{axis, unit, quantity, measure, tasks: [tasks, the easiest first]}]
 
 A task is an entry with the fields of `BenchmarkTask`, but its axis. Empty ones are left out. Names say little about a
-world: two libraries had a deep_sea source actions meant other things. So a task is known by its arrays.
+world: two libraries had a deep_sea whose actions meant other things. So a task is known by its arrays.
 """
 
 import hashlib
@@ -43,7 +43,7 @@ PAIRS = "pairs"
 MANTISSA_BITS = 40
 """Of a mantissa that enter a digest, 12 digits: what compilers and processors may round differently is beyond."""
 SAMPLED = 4096
-"""States of a large task source rewards and observations enter its digest."""
+"""States of a large task whose rewards and observations enter its digest."""
 STORED = ("states", "worst", "lowest", "highest", "error_bound")
 HUGE = 1e300  # stored values are less
 QUICK, MOST_QUICK = 3, 1000  # seeds
