@@ -269,9 +269,13 @@ def policies_of(results: AgentResults) -> dict[str, Mapping[str, float]]:
         for name, facts in entries
         if name in results.curves
         and isinstance(facts, Mapping)
-        and all(isinstance(facts.get(each), int | float) for each in ("one_action", "deterministic"))
-        and isinstance(facts.get("greedy_score", 0.0), int | float)
+        and all(_is_share(facts.get(each)) for each in ("one_action", "deterministic"))
+        and _is_share(facts.get("greedy_score", 0.0))
     }
+
+
+def _is_share(value: object) -> bool:
+    return isinstance(value, int | float) and 0 <= value <= 1
 
 
 def policy_sentences(contents: Contents) -> list[str]:

@@ -18,6 +18,7 @@ import os
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -194,8 +195,8 @@ class Ladder:
     def weights(self, names: Container[str]) -> dict[str, float]:
         """Weight in the score of the axis of each task that is in `names`.
 
-        Of rungs equal ones, whose sum is 1. Of pairs 1 / n and -1 / n, of the second and the first task of each of n
-        whole pairs, whose sum is 0.
+        Of rungs equal ones, source sum is 1. Of pairs 1 / n and -1 / n, of the second and the first task of each of n
+        whole pairs, source sum is 0.
         """
         if self.measure != PAIRS:
             run = [task.name for task in self.tasks if task.name in names]
@@ -297,6 +298,7 @@ def suite_of(entry: object, source: str) -> Suite:
         ladders.append(replace(parse_record(Ladder, {**each, "tasks": ()}, of, ("measure",)), tasks=tasks))
         if ladders[-1].measure == PAIRS and len(tasks) % 2:
             raise FileFormatError(f"{of}: has {len(tasks)} tasks; expected pairs")
+        _check_levels(ladders[-1], of)
     settings = entry["hyperparameters"]
     if not isinstance(settings, dict) or not all(isinstance(each, dict) for each in settings.values()):
         raise FileFormatError(f"{source}: hyperparameters are {str(settings)[:60]}; expected some of each baseline")
@@ -332,6 +334,17 @@ def suite_of(entry: object, source: str) -> Suite:
     return suite
 
 
+def _check_levels(ladder: Ladder, source: str) -> None:
+    """Raise FileFormatError if levels are not finite and increasing, or, of pairs, 0 and 1 in turn."""
+    levels = [task.level for task in ladder.tasks]
+    numbers = [level for level in levels if level is not None and abs(level) < HUGE]
+    is_pairs = ladder.measure == PAIRS
+    is_right = levels == [0, 1] * (len(levels) // 2) if is_pairs else all(x < y for x, y in pairwise(numbers))
+    if not levels or len(numbers) < len(levels) or not is_right:
+        expected = "0 and 1 in turn" if is_pairs else "increasing numbers"
+        raise FileFormatError(f"{source}: has the levels {str(levels)[:60]}; expected {expected}")
+
+
 def _list(value: object, source: str) -> list[dict[str, Any]]:
     if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
         raise FileFormatError(f"{source}: expected a list of objects")
@@ -341,7 +354,7 @@ def _list(value: object, source: str) -> list[dict[str, Any]]:
 def _tasks(entries: object, axis: str, source: str) -> tuple[BenchmarkTask, ...]:
     optional = [each.name for each in fields(BenchmarkTask) if each.name not in ("name", "environment", "digest")]
     try:
-        return tuple(
+        tasks = tuple(
             parse_record(
                 BenchmarkTask, {**each, "axis": axis}, f"{source}: task {str(each.get('name'))[:60]}", optional
             )
@@ -349,6 +362,27 @@ def _tasks(entries: object, axis: str, source: str) -> tuple[BenchmarkTask, ...]
         )
     except ParameterError as error:  # of a name
         raise FileFormatError(f"{source}: {error}") from None
+    for task in tasks:
+        _check_values(task, source)
+    return tasks
+
+
+def _check_values(task: BenchmarkTask, source: str) -> None:
+    """Raise FileFormatError for values that are huge, or, of a large task, which nobody solves again, contradictory."""
+    own, uniform, optimal = task.stored, task.value_uniform, task.value_optimal
+    if abs(uniform) >= HUGE or abs(optimal) >= HUGE:
+        raise FileFormatError(
+            f"{source}: task {task.name}: values are {str(uniform)[:20]}, {str(optimal)[:20]}; expected finite numbers"
+        )
+    if not own:
+        return
+    bound, slack = own["error_bound"], own["error_bound"] + TOLERANCE * abs(own["worst"])
+    is_right = own["lowest"] <= own["highest"] and own["states"] >= 1 and own["states"] % 1 == 0
+    if not (is_right and own["worst"] <= uniform + slack and 0 <= bound < optimal - uniform):
+        raise FileFormatError(
+            f"{source}: task {task.name}: stored is {str(own)[:120]}, uniform play {uniform}, optimal play {optimal}; "
+            f"expected states, worst <= uniform < optimal, lowest <= highest, and 0 <= error_bound < optimal - uniform"
+        )
 
 
 def digest_of_suite(suite: Suite) -> str:
@@ -433,7 +467,7 @@ def _digest(task: Task, arrays: Iterable[np.ndarray], world: object = None) -> s
     env = task.env
     description = {
         "environment": env.name,
-        "parameters": {} if env.name == "imported" else env.parameters,  # whose folder may lie anywhere
+        "parameters": {} if env.name == "imported" else env.parameters,  # source folder may lie anywhere
         "rules_version": env.version,
         "observation": str(task.observation),
         "observation_options": dict(task.observation_options),

@@ -12,9 +12,7 @@ numbers, and returns the largest change of an entry.
 
 Topological orders, in which each state comes before those that it may lead to: (S,) states, or None for the order of
 their numbers. Source: Kahn (1962). live (S,) bool: states whose transitions count; what leads to -1 leads nowhere.
-Strongly connected components: sets of states each of which can come to each other, in topological order. Source: Tarjan
-(1972); with one number for each state: Pearce (2016), "A space-efficient algorithm for finding strongly connected
-components".
+Strongly connected components, in topological order, are numbered in end_components.py.
 """
 
 import numpy as np
@@ -492,70 +490,6 @@ def solve_chain(successor, reward, gamma, v, order):
 
 
 # Components -----------------------------------------------------------------------------------------------------------
-
-
-@kernel
-def number_components(transitions, live, component, path, waiting):
-    """component[s] = the number of the component of s, in topological order. Returns how many there are.
-
-    A component has a smaller number than those that it leads to. component, path, waiting (S,) integers. The last two
-    are scratch.
-    Cost: one look at each transition, in the order of a depth-first search, and 9 bytes a state on top.
-    """
-    num_states, num_actions = size_of(transitions)
-    action = np.empty(num_states, np.int32)  # of the states on the path: the action to go on with
-    branch = np.empty(num_states, np.int32)
-    is_root = np.empty(num_states, np.bool_)  # whether a state of the path is the first one seen of its component
-    component[:] = 0
-    number, last = 1, num_states  # numbers of states on the way go up from 1, of finished components down from S
-    tail = 0
-    for start in range(num_states):
-        depth = -1
-        next_state = start
-        while component[start] == 0 or depth >= 0:
-            # a new state: put it on the path, with the next number
-            if component[next_state] == 0:
-                depth += 1
-                path[depth], action[depth], branch[depth], is_root[depth] = next_state, 0, 0, True
-                component[next_state] = number
-                number += 1
-            s = np.int64(path[depth])
-            next_state = s
-            # look on at its transitions; a smaller number than its own shows a way back to an earlier state
-            if live[s]:
-                a, k = np.int64(action[depth]), np.int64(branch[depth])
-                while a < num_actions and next_state == s:
-                    while k < len(outcome_numbers(transitions, s, a)):
-                        t, _ = outcome(transitions, s, a, k)
-                        if t >= 0 and component[t] == 0:
-                            next_state = np.int64(t)  # and look at this transition again, when it is finished
-                            break
-                        if t >= 0 and component[t] < component[s]:
-                            component[s] = component[t]
-                            is_root[depth] = False
-                        k += 1
-                    else:
-                        a, k = a + 1, np.int64(0)
-                action[depth], branch[depth] = a, k
-            if next_state != s:
-                continue
-            # all transitions done: a root closes its component, other states wait for their root
-            if is_root[depth]:
-                number -= 1
-                while tail > 0 and component[waiting[tail - 1]] >= component[s]:
-                    tail -= 1
-                    component[waiting[tail]] = last
-                    number -= 1
-                component[s] = last
-                last -= 1
-            else:
-                waiting[tail] = s
-                tail += 1
-            depth -= 1
-    # numbers go down from S: shift them to begin at 0
-    for s in range(num_states):
-        component[s] -= last + 1
-    return num_states - last
 
 
 @kernel(makes_arrays=False)

@@ -346,11 +346,11 @@ class Dynamics(ABC):
             least: small components with cycles are put together until a group has as many states.
         Cost: one read of each transition, and 33 bytes a state.
         """
-        from pharos.kernels import bellman  # which few need
+        from pharos.kernels import bellman, end_components  # which few need
 
         dtype = np.int32 if self.num_states < 2**31 else np.int64
         number, path, waiting = (np.empty(self.num_states, dtype) for _ in range(3))
-        count = bellman.number_components(self.for_kernels, live, number, path, waiting)
+        count = end_components.number_components(self.for_kernels, None, live, None, number, path, waiting)
         first, is_cyclic = np.zeros(count + 1, np.int64), np.zeros(count, np.bool_)
         order = np.empty(self.num_states, np.int64)
         bellman.component_order(self.for_kernels, live, number, first, is_cyclic, order)

@@ -228,7 +228,7 @@ def end_components(mdp: TabularMDP, pairs: np.ndarray | None = None) -> EndCompo
     component, path, waiting = (np.empty(num_nodes, dtype) for _ in range(3))
     leaves, removed = np.empty(num_actions, np.bool_), 1
     while removed:
-        kernels.number_node_components(transitions, weights, allowed, count, component, path, waiting)
+        kernels.number_components(transitions, weights, allowed, count, component, path, waiting)
         removed, last = 0, 1
         while last:
             last = kernels.remove_leaving(transitions, weights, component, allowed, count, leaves)
