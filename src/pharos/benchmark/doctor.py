@@ -147,7 +147,7 @@ def residuals(examination: Examination, visits: np.ndarray | None = None) -> dic
     """Distances from each of the equations that the world tells apart, (len(GAMMAS),) by name.
 
     Args:
-        visits: (S, A), of the pairs that count; None: all of the run.
+        visits: (S, A), of the pairs that count. Default: all of the run.
     """
     weights = weights_of(examination, examination.visits if visits is None else visits)
     values, least = answers_of(examination), least_scale(examination.world)
@@ -170,7 +170,7 @@ def contrast(
     values obey this one. Each with its own discount. NaN: they differ nowhere where it was.
 
     Args:
-        visits: (S, A), of the pairs that count; None: all of the run.
+        visits: (S, A), of the pairs that count. Default: all of the run.
     """
     other, right = targets(examination, gamma), targets(examination, right_gamma)[RIGHT_EQUATION]
     if name not in other:
@@ -200,7 +200,7 @@ def cut_shares(examination: Examination, gamma: float, visits: np.ndarray | None
     NaN if the time limit ends less than one in CUTS steps.
 
     Args:
-        visits: (S, A), of the pairs that count; None: all of the run.
+        visits: (S, A), of the pairs that count. Default: all of the run.
     """
     if examination.cuts.sum() * CUTS < examination.visits.sum():
         return float("nan"), float("nan")
@@ -243,23 +243,36 @@ def optimal(world: WorldArrays, gamma: float, policy: np.ndarray | None = None, 
 def readings(examinations: Sequence[Examination]) -> dict[str, float]:
     """Numbers that describe an agent, by name. Numbers that do not apply to it are left out.
 
-    Of an agent with values: `gamma`, the discount that fits them best, as log10 of 1 / (1 - gamma); `consistency`,
-    log10 of the residual; of each other equation the residual less the right one's, negative if it fits better;
-    `cut_share` and `cut_partial`, see `cut_shares`; `image` and `image_size`, the residual and `size` if it sees
-    images less the same for others;
-    `cut_partial_late` and `itself_late`, the same in states that it visited in the last fifth alone: values elsewhere
-    lag behind, as if the time limit were an end, or what comes after the state itself;
-    `on_policy`, `consistency` if the next actions count as they were played, see `on_policy`;
-    `slope`, log10 of the factor with which rewards enter; `size`, log10 of the deviation of the values relative to
-    exact ones; `truth`, their correlation with exact ones, and `truth_unvisited` elsewhere; `bias`, their mean error in
-    deviations; `ends`, values of terminal states in deviations; `deaf`, the share of numbers of observations that
-    change nothing, `deaf_last` of last ones; `wavering`, log10 of the change if asked again; `forgets`, the residual
-    in lately visited states less the residual of all; `own`, whether they are nearer to values of its policy than to
-    optimal ones; `far`, the error far from the end less the error near it.
-    Of all: `overlap` of late behaviour with the policy, and `overlap_shifted` with its actions shifted, less that;
-    `random`, entropy of late behaviour, 1 as uniform; `certain`, probability of the likeliest action; `coverage` of
-    states; `behind`, late regret of behaviour less the policy's; `equal_seeds`, share of worlds in which two seeds
-    did the same; `regret` of each world.
+    Of an agent with values:
+
+    - `gamma`: the discount that fits them best, as log10 of 1 / (1 - gamma)
+    - `consistency`: log10 of the residual
+    - of each other equation the residual less the right one's, negative if it fits better
+    - `cut_share` and `cut_partial`: see `cut_shares`
+    - `image` and `image_size`: the residual and `size` if it sees images less the same for others
+    - `cut_partial_late` and `itself_late`: the same in states that it visited in the last fifth alone, as values
+      elsewhere lag behind, as if the time limit were an end, or what comes after the state itself
+    - `on_policy`: `consistency` if the next actions count as they were played, see `on_policy`
+    - `slope`: log10 of the factor with which rewards enter
+    - `size`: log10 of the deviation of the values relative to exact ones
+    - `truth`: their correlation with exact ones, and `truth_unvisited` elsewhere
+    - `bias`: their mean error in deviations
+    - `ends`: values of terminal states in deviations
+    - `deaf`: the share of numbers of observations that change nothing, and `deaf_last` of last ones
+    - `wavering`: log10 of the change if asked again
+    - `forgets`: the residual in lately visited states less the residual of all
+    - `own`: whether they are nearer to values of its policy than to optimal ones
+    - `far`: the error far from the end less the error near it
+
+    Of all:
+
+    - `overlap` of late behaviour with the policy, and `overlap_shifted` with its actions shifted, less that
+    - `random`: entropy of late behaviour, 1 as uniform
+    - `certain`: probability of the likeliest action
+    - `coverage` of states
+    - `behind`: late regret of behaviour less the policy's
+    - `equal_seeds`: share of worlds in which two seeds did the same
+    - `regret` of each world
     """
     numbers: dict[str, float] = {}
     with_values = [each for each in examinations if each.q is not None or each.v is not None]

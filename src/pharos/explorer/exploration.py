@@ -191,12 +191,22 @@ class Exploration:
             state: its number.
             previous: the action executed before, under sticky actions. None: there was none.
         Returns:
-            state, previous, values (of its variables), labels, terminal, layer, start (probability that an episode
-            starts there), v (policy -> value), the drawing as `Pictures.of` has it, and for each action: `name`, if
-            actions have other names in other states, else None; `q` and `gap`, of choosing it; `available`, whether it
-            is; `best`, whether the gap is a tie; of each policy, `policies` (how often it chooses it) and `q_of` (the
-            value of choosing it, and following the policy afterwards); `reward`, expected; `outcomes`: a list of state
-            (None for the end), previous action, probability, reward.
+            Entries of the position:
+
+            - state, previous, values (of its variables), labels, terminal, layer
+            - start: probability that an episode starts there
+            - v: policy -> value
+            - the drawing, as `Pictures.of` has it
+
+            Of each action:
+
+            - `name`: if actions have other names in other states, else None
+            - `q` and `gap`: of choosing it
+            - `available`: whether it is. `best`: whether the gap is a tie
+            - `policies`: how often each policy chooses it
+            - `q_of`: the value of choosing it, and following the policy afterwards, of each policy
+            - `reward`: expected
+            - `outcomes`: a list of state (None for the end), previous action, probability, reward
         Raises:
             ParameterError: there is no such state or action.
         """
@@ -320,9 +330,9 @@ class Exploration:
         the way, until the end, or until nothing new is left.
 
         Returns:
-            `steps`, a list of state, previous, action, probability (of the outcome), reward, gap (of the action);
-            `stops`: the last state and previous; `why`: "end", "circle", "limit", or "unknown" (the policy was not
-            asked there).
+            - `steps`: a list of state, previous, action, probability (of the outcome), reward, gap (of the action)
+            - `stops`: the last state and previous
+            - `why`: "end", "circle", "limit", or "unknown" (the policy was not asked there)
         Raises:
             ParameterError: there is no such policy or position.
         """
@@ -384,9 +394,11 @@ class Exploration:
         """Losses of a policy: along its most probable path, and in all states.
 
         Returns:
-            `regret`, V* minus its value at the start; `lost`, the sum of what it loses in all states; `first`, the
-            first step of its likeliest way whose gap is no tie, as `path` has it, with its `number`, or None; `worst`,
-            the states that lose most: state, loss, visits, action chosen most.
+            - `regret`: V* minus its value at the start
+            - `lost`: the sum of what it loses in all states
+            - `first`: the first step of its likeliest way whose gap is no tie, as `path` has it, with its `number`, or
+              None
+            - `worst`: the states that lose most: state, loss, visits, action chosen most
         Raises:
             ParameterError: there is no such policy.
         """
@@ -481,7 +493,7 @@ class Pictures:
             self.kit, self.fault = None, f"There is no drawing: {' '.join(str(error).split()) or type(error).__name__}"
 
     def of(self, state: State) -> dict[str, Any]:
-        """`cells`, a list of (layer, row, column, value); or `picture`, the URL of one that the class has of its own;
+        """`cells`, a list of (layer, row, column, value), or `picture`, the URL of one that the class has of its own,
         or `fault`."""
         if self.env is None or self.kit is None:
             return {"fault": self.fault}

@@ -85,9 +85,13 @@ def heat_map(
         how: what a cell of several states shows: "mean", "least", "most" or "sum". Of actions: the action if all
             states have the same, else -1.
     Returns:
-        `x`, `y`: the axes; `cells`: rows of values, None if there are none; `count`: rows of numbers of states;
-        `state`: rows of the first state of each cell, -1 if there is none; `terminal`: rows of how many are
-        terminal; `low`, `high`: of all cells; `states`: how many count.
+        - `x`, `y`: the axes
+        - `cells`: rows of values, None if there are none
+        - `count`: rows of numbers of states
+        - `state`: rows of the first state of each cell, -1 if there is none
+        - `terminal`: rows of how many are terminal
+        - `low`, `high`: of all cells
+        - `states`: how many count
     Raises:
         UnknownName: an axis, a variable or a quantity does not exist. ParameterError: `how` is none of these, or the
             axes are the same.

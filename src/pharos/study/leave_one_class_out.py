@@ -131,21 +131,33 @@ def unseen_classes(
         least_classes: with fewer there is an error.
         permutations: of classes, and of observations within them. 0: no floors and no p-values of these.
     Returns:
-        Columns `agent`, `outcome`, `predictor`, `baseline`, `cells`, `classes`, then
-        left out: `r_squared` and `rho` (Spearman's) of classes left out one by one, with the ends of their 95 %
-            intervals over classes drawn anew (NaN of fewer than four); `floor_r_squared` and `floor_rho`, what 95 % of
-            permutations of classes stay below; `p_rho`; `r_squared_mdp`, each instance left out with all its kinds of
-            chance; `calibration` and `calibration_offset`, slope and intercept of the outcome on what was predicted;
-            `ceiling`, the largest R2 that noise over seeds leaves;
-        within: `rho_within`, the mean over classes of the rank correlation within; `pairs`, of observations of one MDP
-            whose outcomes differ by more than 0.05; `agreement`, the share of them that is ordered rightly, with
-            interval, `p_agreement` and `agreement_ceiling`, what noise over seeds leaves; `image_pairs`,
-            `image_agreement`, of image against vector alone;
-        mixed: `slope` of the standardised predictor in a mixed model with random classes and MDPs, `slope_error`,
-            `p_slope`, and the shares of the variance that it leaves to `class_share`, `mdp_share`; `given_tabular`,
-            `given_tabular_regret`, partial rank correlations given the tabular measures, and given the regret of the
-            tabular learner, with intervals;
-        `tests`, how many p-values the table has, and each of them corrected for that number (Holm) as NAME_holm.
+        Columns `agent`, `outcome`, `predictor`, `baseline`, `cells`, `classes`, and these.
+
+        Of classes left out one by one:
+
+        - `r_squared` and `rho` (Spearman's), with the ends of their 95 % intervals over classes drawn anew (NaN for
+          fewer than four)
+        - `floor_r_squared` and `floor_rho`: what 95 % of permutations of classes stay below, and `p_rho`
+        - `r_squared_mdp`: each instance left out with all its kinds of chance
+        - `calibration` and `calibration_offset`: slope and intercept of the outcome on what was predicted
+        - `ceiling`: the largest R2 that noise over seeds leaves
+
+        Within classes:
+
+        - `rho_within`: the mean over classes of the rank correlation within
+        - `pairs`: of observations of one MDP whose outcomes differ by more than 0.05
+        - `agreement`: the share of pairs that is ordered rightly, with interval, `p_agreement` and
+          `agreement_ceiling`, what noise over seeds leaves
+        - `image_pairs`, `image_agreement`: of image against vector alone
+
+        By a mixed model and partial correlations:
+
+        - `slope` of the standardised predictor in a model with random classes and MDPs,        - `slope` of the standardised predictor in a mixed model with random classes and MDPs, `slope_error`,
+          `p_slope`, and the shares of the variance that it leaves to `class_share`, `mdp_share`
+        - `given_tabular`, `given_tabular_regret`: partial rank correlations given the tabular measures, and given the
+          regret of the tabular learner, with intervals
+
+        And `tests`, how many p-values the table has, and each of them corrected        `tests`, how many p-values the table has, and each of them corrected for that number (Holm) as NAME_holm.
     Raises:
         ParameterError: there are no cells that both have, or too few classes.
     """

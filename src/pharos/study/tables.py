@@ -96,12 +96,14 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
     """Table of the finished runs, a row each. Runs with damaged files are left out, with a warning that names them.
 
     Returns:
-        Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`,
-        `began` (date, or "" if the record does not say);
-        the result of the run (`cumulative_regret`, `normalized_regret`, `value_optimal`, ...); `return`, the mean
-        return of the training episodes in the last tenth of the run, undiscounted; `exact`, whether every value behind
-        the regret is computed; and `half_width`, by how much `normalized_regret` may at worst be wrong if some are
-        estimated, 0 if none is.
+        A row has the columns
+
+        - `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`
+        - `began`: date, or "" if the record does not say
+        - the result of the run: `cumulative_regret`, `normalized_regret`, `value_optimal`, ...
+        - `return`: mean undiscounted return of the training episodes in the last tenth of the run
+        - `exact`: whether every value behind the regret is computed
+        - `half_width`: by how much `normalized_regret` may at worst be wrong if some are estimated, 0 if none is
     Raises:
         ParameterError: no run is finished.
     """
@@ -167,10 +169,14 @@ def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.D
     """The means over seeds, a row for each cell, joined with hardness if `measures` (of `hardness_table`) is given.
 
     Returns:
-        Columns of the cell; `seeds`; `steps` (the most, if runs differ); means of `cumulative_regret`,
-        `normalized_regret`, `final_value`, `value_optimal`, `return`; `return_deviation` over seeds (population, as
-        0.00 is printed for equal runs, NaN for one seed); `exact`, whether all runs are; the mean of `half_width`; and
-        the measures.
+        A row has the columns
+
+        - of the cell
+        - `seeds`, and `steps` (the most, if runs differ)
+        - means of `cumulative_regret`, `normalized_regret`, `final_value`, `value_optimal`, `return`, `half_width`
+        - `return_deviation` over seeds: population, as 0.00 is printed for equal runs, NaN for one seed
+        - `exact`: whether all runs are
+        - the measures
     """
     values = ["cumulative_regret", "normalized_regret", "final_value", "value_optimal", "return"]
     groups = rows.groupby(CELL, sort=False)
@@ -420,12 +426,17 @@ def predict(
             are NaN, and `estimated_error` belongs to this predictor. A small part of the time.
         progress: called with what is being done.
     Returns:
-        Columns `environment`, `instance`, `chance`, `agent`, `observation`; PREDICTORS; `network`; `estimated_error`,
-        the error of `kernel_regret` if landmarks stand for the kernel; `curve` and `adam_curve`, the learner's steps
-        and greedy regrets as JSON; `notes`, why a number is missing. The idealised learner has the steps of the run,
-        and of a DQN its discount, exploration and target network. Of actor-critics, with the rollouts, steps and
-        discount of the agent, POLICY_PREDICTORS, `policy_curve` and `clipped_curve`, the curve of the distribution over
-        actions with PPO's clipping, NaN and "" in rows of others.
+        A row has the columns
+
+        - `environment`, `instance`, `chance`, `agent`, `observation`, PREDICTORS, `network`
+        - `estimated_error`: the error of `kernel_regret` if landmarks stand for the kernel
+        - `curve` and `adam_curve`: the learner's steps and greedy regrets as JSON
+        - of actor-critics POLICY_PREDICTORS, `policy_curve`, and `clipped_curve`, the curve of the distribution over
+          actions with PPO's clipping. NaN and "" in rows of others
+        - `notes`: why a number is missing
+
+        The idealised learner has the steps of the run, and of a DQN its discount, exploration and target network, of
+        an actor-critic its rollouts, steps and discount.
     Raises:
         ParameterError: the study has no such cell.
     Cost: measures of hardness are kept beside the state spaces, so that a second call is quick.
