@@ -69,7 +69,7 @@ def backward_order(first, previous, goal, order, distance):
 
 
 @interpreted_first()
-@kernel
+@kernel(makes_arrays=False)
 def sweep_in_place(rows, goal, order, j, mode):
     """One sweep of j(n) = 1 + min_a sum p j, in place over the nodes of `order`; j is 0 at the goal.
 
@@ -126,7 +126,7 @@ def sweep_in_place(rows, goal, order, j, mode):
 
 
 @interpreted_first()
-@kernel
+@kernel(makes_arrays=False)
 def residual_bounds(rows, goal, order, high, low, policy, residuals):
     """(bound of T j - j, bound of j - T j, largest j) over nodes of `order` but the goal; T is one Bellman step.
 
@@ -202,7 +202,7 @@ def rounding_units(num_actions, terms):
     return terms + num_actions + 24
 
 
-@kernel
+@kernel(makes_arrays=False)
 def _difference(high, low, m, value, correction):
     """(high[m] + low[m]) - (value + correction), to a unit of the difference; high[m] - value if low is None.
 
@@ -356,7 +356,7 @@ class Ways(NamedTuple):
     way: np.ndarray
 
 
-@kernel
+@kernel(makes_arrays=False)
 def _probability(executed, choice, previous, execution):
     """Probability that the action `executed` is executed if `choice` is chosen.
 
@@ -386,7 +386,7 @@ def outcomes_into(node, num_nodes):
     return first[:-1], outcome
 
 
-@kernel
+@kernel(makes_arrays=False)
 def _search_back(y, outcomes, into, room):
     """Search backward from y, along outcomes: the nodes by their distance to y are queue[:result].
 
@@ -415,7 +415,7 @@ def _search_back(y, outcomes, into, room):
 
 
 @interpreted_first()
-@kernel
+@kernel(makes_arrays=False)
 def ways_back(low, high, outcomes, into, ways, room):
     """Shortest ways back to node[i], for outcomes i into nodes low..high, from the other outcomes of its state.
 
@@ -450,7 +450,7 @@ def ways_back(low, high, outcomes, into, ways, room):
 
 
 @interpreted_first()
-@kernel
+@kernel(makes_arrays=False)
 def keep_near(outcomes, execution, ways, limit, length):
     """Drop the longest ways back until the expected steps on the way back are at most `limit`, for every outcome.
 
@@ -493,7 +493,7 @@ def keep_near(outcomes, execution, ways, limit, length):
 
 
 @interpreted_first()
-@kernel
+@kernel(makes_arrays=False)
 def attempt_costs(begin, end, outcomes, execution, ways, costs, once):
     """new[i] = constant + the expected cost of the outcomes that happen if outcome i is aimed at.
 
