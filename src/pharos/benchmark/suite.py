@@ -195,8 +195,8 @@ class Ladder:
     def weights(self, names: Container[str]) -> dict[str, float]:
         """Weight in the score of the axis of each task that is in `names`.
 
-        Of rungs equal ones, source sum is 1. Of pairs 1 / n and -1 / n, of the second and the first task of each of n
-        whole pairs, source sum is 0.
+        Of rungs equal ones, whose sum is 1. Of pairs 1 / n and -1 / n, of the second and the first task of each of n
+        whole pairs, whose sum is 0.
         """
         if self.measure != PAIRS:
             run = [task.name for task in self.tasks if task.name in names]
@@ -467,7 +467,7 @@ def _digest(task: Task, arrays: Iterable[np.ndarray], world: object = None) -> s
     env = task.env
     description = {
         "environment": env.name,
-        "parameters": {} if env.name == "imported" else env.parameters,  # source folder may lie anywhere
+        "parameters": {} if env.name == "imported" else env.parameters,  # whose folder may lie anywhere
         "rules_version": env.version,
         "observation": str(task.observation),
         "observation_options": dict(task.observation_options),
