@@ -152,12 +152,12 @@ def unseen_classes(
 
         By a mixed model and partial correlations:
 
-        - `slope` of the standardised predictor in a model with random classes and MDPs,        - `slope` of the standardised predictor in a mixed model with random classes and MDPs, `slope_error`,
+        - `slope` of the standardised predictor in a model with random classes and MDPs, `slope_error`,
           `p_slope`, and the shares of the variance that it leaves to `class_share`, `mdp_share`
         - `given_tabular`, `given_tabular_regret`: partial rank correlations given the tabular measures, and given the
           regret of the tabular learner, with intervals
 
-        And `tests`, how many p-values the table has, and each of them corrected        `tests`, how many p-values the table has, and each of them corrected for that number (Holm) as NAME_holm.
+        And `tests`, how many p-values the table has, and each of them corrected for that number (Holm) as NAME_holm.
     Raises:
         ParameterError: there are no cells that both have, or too few classes.
     """
