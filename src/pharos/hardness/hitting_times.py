@@ -152,7 +152,7 @@ class HittingTimes:
         matrix = choices.matrix
         self.choices = choices
         self.support = (matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), choices.num_actions)
-        self.rows = hitting.Rows(*without_common(matrix, choices.num_actions), choices.is_restart)
+        self.rows = hitting.Rows._make((*without_common(matrix, choices.num_actions), choices.is_restart))
         first, previous = choices.reversed
         self.back = (first.astype(np.int64), previous.astype(np.int64))
         self.node_order = np.argsort(choices.underlying, kind="stable")

@@ -136,13 +136,14 @@ class HubBounds:
         value = np.full(len(self._outcomes.node), own)
         new = value.copy()
         edges = np.linspace(0, len(value), self._threads + 1).astype(np.int64)
-        fixed = (self._outcomes, self._execution, self._ways)
+        outcomes, execution, ways = self._outcomes, self._execution, self._ways
         with ThreadPoolExecutor(self._threads) as pool:
             for passes in range(PASSES):
                 # twice with all arrays, as two take turns
-                arrays = (*fixed, (own, times, value, new), passes < 2)
+                values, is_first = (own, times, value, new), passes < 2
                 parts = [
-                    pool.submit(hitting.attempt_costs, low, high, *arrays) for low, high in itertools.pairwise(edges)
+                    pool.submit(hitting.attempt_costs, low, high, outcomes, execution, ways, values, is_first)
+                    for low, high in itertools.pairwise(edges)
                 ]
                 short = max(part.result() for part in parts)
                 if short <= ACCURACY * (1 - self._rho):
