@@ -152,7 +152,7 @@ class HittingTimes:
         matrix = choices.matrix
         self.choices = choices
         self.support = (matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), choices.num_actions)
-        self.arrays = (*without_common(matrix, choices.num_actions), choices.is_restart)
+        self.rows = hitting.Rows._make((*without_common(matrix, choices.num_actions), choices.is_restart))
         first, previous = choices.reversed
         self.back = (first.astype(np.int64), previous.astype(np.int64))
         self.node_order = np.argsort(choices.underlying, kind="stable")
@@ -211,7 +211,7 @@ class HittingTimes:
 
     def bounds(self, j: np.ndarray, count: int) -> HittingBounds:
         """Bounds by the residuals of J; the greedy policy stands in `policy` then. `least` is the best lower one."""
-        arrays = (*self.arrays, self.goal, self.order, count, j, None, self.policy, None, None)
+        arrays = (self.rows, self.goal, self.order[:count], j, None, self.policy, None)
         above, below, largest = hitting.residual_bounds(*arrays)
         bounds = certified(above, below, largest)
         self.least = max(self.least, bounds.lower)
@@ -222,7 +222,7 @@ class HittingTimes:
         move."""
         for number in range(sweeps):
             if self.swept < PLAIN_SWEEPS:
-                change = hitting.sweep_in_place(*self.arrays, self.goal, self.order, count, j, None)[0]
+                change = hitting.sweep_in_place(self.rows, self.goal, self.order[:count], j, None)[0]
             else:
                 change = self._sweep_with_mode(j, count)
             self.swept += 1
@@ -239,8 +239,7 @@ class HittingTimes:
         if self.mode is None:
             self.mode = np.zeros(len(j))
             self.mode[self.order[:count]] = ~self.goal[self.order[:count]]
-        arrays = (*self.arrays, self.goal, self.order, count, j, self.mode)
-        change, ff, fg, gg = hitting.sweep_in_place(*arrays)
+        change, ff, fg, gg = hitting.sweep_in_place(self.rows, self.goal, self.order[:count], j, self.mode)
         if self.swept % TIME_CHECKS != TIME_CHECKS - 1 or not (gg > 0 and math.isfinite(ff) and change > 0):
             return float(change)
         nodes = self.order[:count]
@@ -266,7 +265,7 @@ class HittingTimes:
             improved = self._evaluate(count)
             if improved is None:  # the greedy policy may stay away for ever: begin with one that does not
                 arrays = (*self.support[:2], self.choices.matrix.data, self.support[2])
-                hitting.proper_policy(*arrays, self.goal, self.order, count, np.empty_like(self.goal), self.policy)
+                hitting.proper_policy(*arrays, self.goal, self.order[:count], self.policy)
                 improved = self._evaluate(count)
             if improved is None:
                 failures += 1
@@ -415,9 +414,9 @@ class HittingTimes:
     ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
         """(residuals of J = high + low, their errors, (bound of T J - J, bound of J - T J)). The greedy policy stands
         in `policy`."""
-        residual, error = np.zeros_like(high), np.zeros_like(high)
-        arrays = (high, low, self.policy, residual, error)
-        return residual, error, hitting.residual_bounds(*self.arrays, self.goal, self.order, count, *arrays)[:2]
+        residuals = np.zeros_like(high), np.zeros_like(high)
+        arrays = (self.rows, self.goal, self.order[:count], high, low, self.policy, residuals)
+        return *residuals, hitting.residual_bounds(*arrays)[:2]
 
 
 # Hitting equations ----------------------------------------------------------------------------------------------------
@@ -490,7 +489,7 @@ def _numbered_once(is_restart: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(opens), group
 
 
-def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[np.ndarray, ...]:
     """Rows split into the part that all actions of a node share, to be added up once, and the rest of each action.
 
     Under random and sticky actions most of a row is shared.
@@ -515,7 +514,5 @@ def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[tuple[np.nda
     shared = least > 0
     first = np.concatenate([[0], np.cumsum(np.bincount(row[distinct], minlength=matrix.shape[0]))])
     always = np.concatenate([[0], np.cumsum(np.bincount(pairs[shared] // nodes, minlength=nodes))])
-    return (
-        (first.astype(np.int64), matrix.indices[distinct].astype(np.int64), rest[distinct]),
-        (always.astype(np.int64), (pairs[shared] % nodes).astype(np.int64), least[shared]),
-    )
+    rest_of_rows = first.astype(np.int64), matrix.indices[distinct].astype(np.int64), rest[distinct]
+    return *rest_of_rows, always.astype(np.int64), (pairs[shared] % nodes).astype(np.int64), least[shared]
