@@ -225,7 +225,7 @@ class SharedBuilding(Building):
     """Options of building by several processes, made before any output, as all but the first then fall silent.
 
     Attributes:
-        processes: processes that share the work and the memory, by MPI. Under mpiexec, the processes that it has
+        processes: processes that share the work and the memory, by MPI, or under mpiexec the processes that it has
             started.
     """
 

@@ -36,7 +36,7 @@ class TrainingOptions:
         horizon: steps of an episode in values and returns, as `Horizon.of` reads it.
         objective: total: values and regret of the total reward, gamma 1 without a horizon. average: the curve also has
             the average reward of a step in the long run, and its regret.
-        evaluation_interval: steps between evaluations. Default: a hundredth of the steps.
+        evaluation_interval: steps between evaluations, by default a hundredth of the steps.
         engine: sb3 (Stable-Baselines3), or batched: many seeds as one program. The latter is pharos' own DQN and PPO.
     """
 
@@ -60,11 +60,12 @@ class ExecutionOptions:
     Attributes:
         shard: only the I-th of N parts, such as 1/8. So N machines share a folder.
         retry_failed: execute failed runs again.
-        resume: killed runs go on from their last checkpoint. Their results may then differ. That is for long runs on
-            machines that come and go: a deep agent then ends elsewhere than without the interruption. Else killed runs
-            start anew, and results never depend on it.
+        resume: killed runs go on from their last checkpoint, and their results may then differ. That is for long runs
+            on machines that come and go: a deep agent then ends elsewhere than without the interruption. Else killed
+            runs start anew, and results never depend on it.
         timeout: seconds after which a run is ended, and failed. A batch gets as many for each of its runs.
-        workers: processes. Default: as many as processors, one on a GPU, whose memory they would share.
+        workers: processes that train runs, by default as many as processors, one on a GPU, whose memory they would
+            share.
         device: of batches: cpu or cuda. As torch names it.
         block: of this block alone, from 1. Again for another one.
         agent: of this agent alone. Again for another one.
