@@ -81,6 +81,83 @@ def test_python_is_refused_by_a_function_of_kernels_alone():
     assert twice.py_func(3) == 6
 
 
+def test_what_kernels_alone_call_becomes_machine_code_within_them_unless_python_calls_it():
+    @called_by_kernels
+    def twice(x):
+        return 2 * max(x, 1)
+
+    @numba.njit
+    def more(x):
+        return twice(x) + 1
+
+    @numba.njit
+    def most(x):
+        return more(x) * twice(x)
+
+    assert most(3) == 42 and more(3) == 7 and twice.nopython_signatures
+    (inner,), (outer,) = ([each.library for each in one.overloads.values()] for one in (twice, most))
+    assert outer._is_translated and not inner._is_translated
+    assert inner.get_pointer_to_function("nobody") == 0 and not inner._is_translated
+    name = next(each.name for each in inner.get_defined_functions() if "twice" in each.name)
+    assert inner.get_pointer_to_function(name) and inner._is_translated
+
+
+CODE_OF_A_USER = """
+import sys
+import numpy as np
+from numba import njit, objmode
+if "pharos" in sys.argv:
+    from pharos.kernels import graph
+
+@njit
+def is_even(n):
+    return n == 0 or is_odd(n - 1)
+
+@njit
+def is_odd(n):
+    return n != 0 and is_even(n - 1)
+
+@njit
+def refused(x):
+    if x < 0:
+        raise ValueError("less than nothing", x)
+    return x + 1
+
+@njit
+def median(x):
+    with objmode(y="float64"):
+        y = float(np.median([x, 2.0, 9.0]))
+    return y
+
+@njit
+def squares(n):
+    for i in range(n):
+        yield i * i
+
+@njit
+def everything(n):
+    total = 0
+    for each in squares(n):
+        total += each
+    return is_even(abs(n)), refused(n), median(n), total, sorted([3, 1, n]), str(n)
+
+print(everything(6), median(3.0), refused(3), is_odd(3))
+try:
+    everything(-1)
+except ValueError as error:
+    print(error.args)
+"""
+
+
+@pytest.mark.slow
+def test_what_users_compile_beside_pharos_does_the_same():
+    words = [sys.executable, "-W", "ignore", "-c", CODE_OF_A_USER]
+    there = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}
+    answers = [subprocess.check_output([*words, name], env=there, text=True) for name in ("pharos", "alone")]
+    assert answers[0] == answers[1]
+    assert answers[0].startswith("(True, 7, 6.0, 55, [1, 3, 6], '6') 3.0 4 True") and "less than" in answers[0]
+
+
 @pytest.mark.slow
 def test_a_folder_that_the_user_names_for_numba_has_the_kernels(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "environ", os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "named")})

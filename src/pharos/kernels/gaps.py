@@ -72,7 +72,7 @@ def add_up(gap, weight, counted, minimal, tolerance, error, regularizer, sums, c
         regularized = 0.0
         for a in range(gap.shape[1]):
             regularized += 1.0 / (gap[i, a] + regularizer)
-        _add_exactly(sums, 3, weight[i] * regularized)
+        _add_exactly(sums, np.int64(3), weight[i] * regularized)
         # sums and counts of one row, added as often as it counts
         times = counted[i]
         if times == 0:
@@ -94,15 +94,18 @@ def add_up(gap, weight, counted, minimal, tolerance, error, regularizer, sums, c
         counts[1] += times * (gap.shape[1] - num_large - num_zero)
         counts[2] += times * (num_zero - 1)
         if num_large:
-            _add_exactly(sums, 0, times * total)
-            _add_exactly(sums, 1, times * low)
-            _add_exactly(sums, 2, times * high)
+            _add_exactly(sums, np.int64(0), times * total)
+            _add_exactly(sums, np.int64(1), times * low)
+            _add_exactly(sums, np.int64(2), times * high)
     return minimal
 
 
 @kernel
 def _add_exactly(sums, k, value):
-    """Add a value to sum k (Kahan's algorithm): its error is two units, however many numbers there are."""
+    """Add a value to sum k (Kahan's algorithm): its error is two units, however many numbers there are.
+
+    k: no literal, each of which Numba compiles a form for.
+    """
     value -= sums[1, k]
     total = sums[0, k] + value
     sums[1, k] = (total - sums[0, k]) - value if math.isfinite(total) else 0.0

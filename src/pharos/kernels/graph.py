@@ -182,7 +182,7 @@ def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
     return num_out, num_in, far_out, far_in, middle
 
 
-@interpreted_first("n")
+@interpreted_first("n", each=8)
 @kernel
 def onwards(transitions, nodes, n, next_nodes, is_visited):
     """States that nodes[:n] lead to and that were not visited before. Returns how many.

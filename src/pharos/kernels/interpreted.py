@@ -48,7 +48,7 @@ def in_python(meaning: Callable) -> Callable:
     return decorate
 
 
-def interpreted_first(*counted: str) -> Callable:
+def interpreted_first(*counted: str, each: int = 1) -> Callable:
     """Decorator of a kernel: its calls are interpreted as long as they are small together, then compiled.
 
     They are small until they have counted COMPILING times `compiling.SMALL_STATES` entries, or 1 / LOADING of it if the
@@ -57,6 +57,7 @@ def interpreted_first(*counted: str) -> Callable:
     Args:
         counted: arguments whose entries count, a whole number as so many. None: all arrays. The work of a call must not
             grow faster.
+        each: entries that one of these stands for, as a state does for its actions.
     """
 
     def decorate(kernel: CPUDispatcher) -> CPUDispatcher:
@@ -67,8 +68,8 @@ def interpreted_first(*counted: str) -> Callable:
 
         def compiled_or_interpreted(*arguments: object) -> object:
             nonlocal count
-            read = [arguments[i] for i in indices] or [each for each in arguments if not isinstance(each, int)]
-            count += sum(map(_entries, read))
+            read = [arguments[i] for i in indices] or [one for one in arguments if not isinstance(one, int)]
+            count += each * sum(map(_entries, read))
             is_small = count < compiling.SMALL_STATES // LOADING or (
                 count < COMPILING * compiling.SMALL_STATES and not is_on_disk(kernel)
             )

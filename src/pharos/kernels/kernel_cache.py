@@ -29,6 +29,11 @@ from numba.core.serialize import dumps
 from pharos.system import storage
 from pharos.system.compiling import private_folder
 
+with contextlib.suppress(ImportError, AttributeError):  # of another Numba, which then compiles in its own way
+    from pharos.kernels import libraries
+
+    libraries.install()
+
 DIGEST_BYTES = 32
 UNUSED_DAYS = 30
 """Days after which the kernels of other texts, which no process has asked for since, are deleted."""

@@ -147,7 +147,7 @@ class Backup(Generic[M]):
         numbers are added up, and 53 bits hold them.
         """
         bound = self.operations * (UNIT_ROUNDOFF * (rewards + largest) + 2.0**-1074) + self.rounding_of_rewards
-        return bound * np.logical_not(rewards + largest <= self._exact_to)
+        return bound * (1 - (rewards + largest <= self._exact_to))
 
     def stored(self, largest: float) -> float:
         """A bound on the error of storing a backup, if the result is at most `largest`: 0 in 64 bits."""

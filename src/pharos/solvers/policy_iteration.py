@@ -216,7 +216,8 @@ class PolicyIteration:
     @property
     def _fits(self) -> bool:
         """Whether memory has room for what an attempt takes, some ten vectors of values."""
-        return NODE_BYTES * self.nodes <= max(LEAST_BYTES, available_memory())
+        needed = NODE_BYTES * self.nodes
+        return needed <= LEAST_BYTES or needed <= available_memory()
 
     @property
     def is_direct(self) -> bool:

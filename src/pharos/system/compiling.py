@@ -107,7 +107,7 @@ def prepare() -> None:
 def _announce_later(function: Callable) -> None:
     """Say on standard error that a function is being compiled, if that is not done when the time for a line comes."""
     global _kernels
-    if function.__module__.startswith("pharos."):
+    if (function.__module__ or "").startswith("pharos."):  # a class that Numba makes has none
         _kernels += 1
         if announces:
             _start_timer(max(0.0, _next - _total), _name_of(function))
