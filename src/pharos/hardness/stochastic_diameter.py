@@ -140,7 +140,7 @@ class HubBounds:
         with ThreadPoolExecutor(self._threads) as pool:
             for passes in range(PASSES):
                 # twice with all arrays, as two take turns
-                arrays = (*fixed, (own, times, value, new), passes < 2)
+                arrays: tuple[object, ...] = (*fixed, (own, times, value, new), passes < 2)
                 parts = [
                     pool.submit(hitting.attempt_costs, low, high, *arrays) for low, high in itertools.pairwise(edges)
                 ]
