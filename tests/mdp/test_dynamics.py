@@ -362,13 +362,13 @@ def test_weights_executed_choices_and_adjoints_of_chance_agree(sticky, random, s
         executed, returns, alive = np.full(6000, previous[b]), np.zeros(6000), np.arange(6000)
         numbers = rng.random(6000), rng.random(6000), rng.integers(num_actions, size=6000)
         rewards, setting = np.array([[1.0, 20.0, 300.0]]), (*chance.triple, float(chance.first_chosen))
-        where = np.full(6000, b), numbers, setting, rewards, np.empty(0), np.zeros(6000, np.int64)
-        execute_choices(chosen, *where, 0.5, alive[::2], executed, returns)
+        where, states = np.full(6000, b), np.zeros(6000, np.int64)
+        how = (rewards, np.empty(0)), 0.5
+        execute_choices(chosen, where, numbers, setting, *how, (alive[::2], states, executed, returns))
         np.testing.assert_allclose(np.bincount(executed[::2], minlength=3) / 3000, weights[b], atol=0.06)
         assert (returns[::2] == 0.5 * rewards[0, executed[::2]]).all()
         assert (executed[1::2] == previous[b]).all() and not returns[1::2].any()  # not among the episodes alive
-        always = where[0], numbers, (1.0, 0.0, 0.0, 1.0), *where[3:]
-        execute_choices(chosen, *always, 0.5, alive, executed, returns)
+        execute_choices(chosen, where, numbers, (1.0, 0.0, 0.0, 1.0), *how, (alive, states, executed, returns))
         choices = np.searchsorted(chosen[b].cumsum(), numbers[0])
         assert (executed == choices.clip(max=num_actions - 1)).all()
     if chance.is_sticky:

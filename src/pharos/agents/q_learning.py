@@ -94,7 +94,7 @@ class QLearning:
 
     def learn(self, steps: int) -> "QLearning":
         """Learn for so many more steps."""
-        from pharos.kernels.stepping import q_learning
+        from pharos.kernels.stepping import Episodes, q_learning
 
         mdp, options = self.mdp, self.options
         cumulative = np.cumsum(mdp.start_probabilities)
@@ -110,25 +110,16 @@ class QLearning:
             float(options["exploration_schedule"] == "exponential"),
             float(mdp.gamma),
         )
-        q_learning(
-            self._transitions,
-            *mdp.reward_table.for_kernels,
+        episodes = Episodes(
             np.asarray(mdp.terminal, np.bool_),
             mdp.start_states,
             cumulative,
             (*mdp.chance.triple, float(mdp.chance.first_chosen), *sets),
             int(self.limit),
-            schedule,
-            self.q,
-            self.visits,
-            self.cursor,
-            self.sums,
-            self.word,
-            self.reward_noise,
-            self.pending,
-            self.noise_word,
-            int(steps),
         )
+        learner = (self.q, self.visits, self.cursor, self.sums, self.word)
+        noise = (self.reward_noise, self.pending, self.noise_word)
+        q_learning(self._transitions, mdp.reward_table.for_kernels, episodes, schedule, learner, noise, int(steps))
         return self
 
     def policy_table(self) -> np.ndarray:

@@ -47,7 +47,6 @@ from pharos.kernels import hitting
 from pharos.mdp import ExpandedMDP
 
 if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
     from scipy.sparse.linalg import SuperLU
 
 # Relative rounding of a product of a bound and a factor.
@@ -152,7 +151,7 @@ class HittingTimes:
         matrix = choices.matrix
         self.choices = choices
         self.support = (matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), choices.num_actions)
-        self.rows = hitting.Rows._make((*without_common(matrix, choices.num_actions), choices.is_restart))
+        self.rows = without_common(choices)
         first, previous = choices.reversed
         self.back = (first.astype(np.int64), previous.astype(np.int64))
         self.node_order = np.argsort(choices.underlying, kind="stable")
@@ -489,15 +488,12 @@ def _numbered_once(is_restart: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(opens), group
 
 
-def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[np.ndarray, ...]:
+def without_common(choices: ExpandedMDP) -> hitting.Rows:
     """Rows split into the part that all actions of a node share, to be added up once, and the rest of each action.
 
     Under random and sticky actions most of a row is shared.
-
-    Returns:
-        ((first, node, weight) of the rest, one row for each action, (first, node, weight) of the shared part, one row
-        for each node).
     """
+    matrix, num_actions = choices.matrix, choices.num_actions
     nodes = matrix.shape[0] // num_actions
     row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
     pairs, index, times = np.unique(
@@ -515,4 +511,5 @@ def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[np.ndarray, 
     first = np.concatenate([[0], np.cumsum(np.bincount(row[distinct], minlength=matrix.shape[0]))])
     always = np.concatenate([[0], np.cumsum(np.bincount(pairs[shared] // nodes, minlength=nodes))])
     rest_of_rows = first.astype(np.int64), matrix.indices[distinct].astype(np.int64), rest[distinct]
-    return *rest_of_rows, always.astype(np.int64), (pairs[shared] % nodes).astype(np.int64), least[shared]
+    common = always.astype(np.int64), (pairs[shared] % nodes).astype(np.int64), least[shared]
+    return hitting.Rows(*rest_of_rows, *common, choices.is_restart)

@@ -9,7 +9,7 @@ Q-learning, compiled: in a table (agents/q_learning.py), and in a kernel from dr
 W[a] + q[a, c] for features F and a diagonal.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import float64, types, uint64
@@ -296,14 +296,16 @@ def first_outside(actions, num_actions):
 
 
 @kernel
-def execute_choices(policy, indices, numbers, chance, table, palette, states, discount, alive, previous, returns):
+def execute_choices(policy, indices, numbers, chance, rewards, discount, episodes):
     """One step of the episodes `alive` (N,): the executed actions become their `previous`, what these pay is added up.
 
     policy: (M, A), probabilities; indices: (N,), rows of the episodes there; numbers: (u, v, w), (N,) each: u chooses,
     v decides between the choice, the previous action and w, a uniform one; chance: (chosen, previous, uniform,
-    first_chosen); table, palette: of rewards; states, previous (A if there is none), returns: of all episodes.
+    first_chosen); rewards: (table, palette); episodes: (alive; states, previous (A if there is none), returns: of all).
     """
     u, v, w = numbers
+    table, palette = rewards
+    alive, states, previous, returns = episodes
     num_actions = policy.shape[1]
     for k in range(len(alive)):
         i, choice, sum_of = alive[k], 0, policy[indices[k], 0]
@@ -394,41 +396,41 @@ def _next_state_of(transitions, s, a, word):
     return lambda transitions, s, a, word: drawn(transitions, s, a, uniform_number(word, 0))
 
 
-@kernel
-def q_learning(
-    transitions,
-    table,
-    palette,
-    terminal,
-    starts,
-    cumulative,
-    chance,
-    limit,
-    schedule,
-    q,
-    visits,
-    cursor,
-    sums,
-    word,
-    noise,
-    pending,
-    noise_word,
-    steps,
-):
+class Episodes(NamedTuple):
+    """Start, course and end of the episodes of an MDP.
+
+    Attributes:
+        terminal: (S,) bool.
+        starts, cumulative: (K,), start states and their cumulated probabilities.
+        chance: (chosen, previous, uniform, first_chosen), with sets behind if some actions are not available.
+        limit: steps of an episode.
+    """
+
+    terminal: np.ndarray
+    starts: np.ndarray
+    cumulative: np.ndarray
+    chance: tuple[Any, ...]
+    limit: int
+
+
+@kernel(makes_arrays=False)
+def q_learning(transitions, rewards, episodes, schedule, learner, noise, steps):
     """`steps` steps of Watkins' Q-learning; everything that changes is in the arrays, so that it goes on from them.
 
-    transitions: see kernels/outcomes.py; table, palette: rewards; starts (K,), cumulative (K,): start states and their
-    cumulated probabilities;
-    chance: (chosen, previous, uniform, first_chosen), with sets behind if some actions are not available; limit:
-    steps of an episode; q, visits (R, A): values and number
-    of updates, R = S, or S (A + 1) with rows s (A + 1) + b if the agent observes the previous action b (A: none).
+    transitions: see kernels/outcomes.py; rewards: (table, palette); episodes: see `Episodes`, with sets of states.
     schedule: (learning rate, exponent of visits or 0, gamma, first epsilon, last epsilon, steps of exploration,
         exponential?, gamma of returns).
-    cursor: int64 (state or -1, previous action, steps in the episode, steps in all, episodes); sums: float64 (return of
-    this episode, its discount, sum of finished returns); word: uint64 (1,).
-    noise: standard deviation of the noise of paid rewards; pending: float64 (steps by which they are late,), what
-    is due; noise_word: uint64 (1,). Returns are of earned rewards.
+    learner: (q, visits (R, A): values and number of updates, R = S, or S (A + 1) with rows s (A + 1) + b if the agent
+    observes the previous action b (A: none); cursor: int64 (state or -1, previous action, steps in the episode, steps
+    in all, episodes); sums: float64 (return of this episode, its discount, sum of finished returns); word: uint64
+    (1,)).
+    noise: (standard deviation of the noise of paid rewards; pending: float64 (steps by which they are late,), what
+    is due; word of the noise: uint64 (1,)). Returns are of earned rewards.
     """
+    table, palette = rewards
+    terminal, starts, cumulative, chance, limit = episodes
+    q, visits, cursor, sums, word = learner
+    deviation, pending, noise_word = noise
     num_states, num_actions = size_of(transitions)
     rate, exponent, gamma, first_epsilon, last_epsilon, exploration, exponential, measure_gamma = schedule
     observes_previous = len(q) > num_states
@@ -452,13 +454,11 @@ def q_learning(
         if uniform_number(word, 0) < epsilon:
             action = action_of_set(chance, num_actions, word, s)
         else:  # greedy, ties at random
-            best, ties, action = q[row, 0], 1, 0
-            if not set_has(chance, s, 0):
-                best = -np.inf
-            for a in range(1, num_actions):
+            best, ties, action = -np.inf, 1, 0
+            for a in range(num_actions):
                 if not set_has(chance, s, a):
                     continue
-                if q[row, a] > best:
+                if a == 0 or q[row, a] > best:
                     best, ties, action = q[row, a], 1, a
                 elif q[row, a] == best:
                     ties += 1
@@ -473,16 +473,16 @@ def q_learning(
         value = 0.0
         if not ended:
             next_row = t * (num_actions + 1) + executed if observes_previous else t
-            value = q[next_row, 0] if set_has(chance, t, 0) else -np.inf
-            for a in range(1, num_actions):
+            value = -np.inf
+            for a in range(num_actions):
                 if set_has(chance, t, a):
-                    value = max(value, q[next_row, a])
+                    value = max(value, q[next_row, a]) if a else q[next_row, a]
         # the reward that the agent gets, late and noisy
         paid_reward = reward
         if len(pending) > 0:
             paid_reward = delayed_reward(pending, cursor[2], reward, ended or cursor[2] + 1 >= limit)
-        if noise > 0.0:
-            paid_reward += noise * normal_number(noise_word, 0)
+        if deviation > 0.0:
+            paid_reward += deviation * normal_number(noise_word, 0)
         # update Q of the chosen action, which may not be the executed one
         visits[row, action] += 1
         alpha = rate if exponent == 0.0 else max(rate, visits[row, action] ** -exponent)
@@ -549,32 +549,44 @@ def kernel_values(kernel, learned, out):
             out[c, a] = _q_value(kernel, learned, c, a)
 
 
-@kernel
-def learn(
-    outcomes, terminal, group, starts, cumulative, chance, limit, kernel, learned, target, memory, visits, cursor, word,
-    noise, schedule, largest_step, steps,
-):  # fmt: skip
+class Walk(NamedTuple):
+    """The walk of a learner, which goes on from these arrays.
+
+    Attributes:
+        memory: (observations (M,), actions (M,), next observations (M,), -1 for an end, rewards (M,)), a ring.
+        visits: (C, A) numbers of choices.
+        cursor: int64 (state or -1, previous action or -1, steps in the episode, steps in all).
+        word: uint64 (1,).
+        noise: (standard deviation of the noise of rewards, its random word uint64 (1,)).
+        minibatch: (int64 (B,), float64 (B,)), room for the places in the ring of a minibatch and its errors.
+    """
+
+    memory: tuple[np.ndarray, ...]
+    visits: np.ndarray
+    cursor: np.ndarray
+    word: np.ndarray
+    noise: tuple[Any, ...]
+    minibatch: tuple[np.ndarray, ...]
+
+
+@kernel(makes_arrays=False)
+def learn(outcomes, group, episodes, values, walk, schedule, steps):
     """`steps` steps of an epsilon-greedy walk, with gradient steps on minibatches of its transitions.
 
     outcomes: (offsets (S A + 1,), states (N,), -1 for the end; rewards (N,); cumulative probabilities of a row (N,)).
-    terminal: (S,); group: (S,) the observation of each state; starts, cumulative (K,): of episodes; chance: (chosen,
-    previous, uniform, first_chosen), with the sets of observations (C, A) behind if some actions are not available;
-    limit: steps of an episode.
-    kernel: (K (C, C) or (0, 0), F (C, m), diagonal (C,)); learnt, target: each (q (A, C), weights (A, m)), of which
-    target stays as it is. memory: (observations (M,), actions (M,), next observations (M,), -1 for an end, rewards
-    (M,)), a ring; visits: (C, A) numbers of choices.
-    cursor: int64 (state or -1, previous action or -1, steps in the episode, steps in all); word, noise_word: uint64
-        (1,)
-    noise: (standard deviation of the noise of rewards, its random word); schedule: (gamma, first epsilon, last epsilon,
-    steps of exploration, first step of learning, gradient steps in so many steps: two numbers, size of a minibatch).
-    largest_step: the largest that does not overshoot; a minibatch takes that, or the largest that it bears itself.
+    group: (S,) the observation of each state; episodes: see `Episodes`, with sets of observations (C, A).
+    values: (kernel, learnt, target). kernel: (K (C, C) or (0, 0), F (C, m), diagonal (C,)); learnt, target: each
+    (q (A, C), weights (A, m)), of which target stays as it is. walk: see `Walk`.
+    schedule: (gamma, first epsilon, last epsilon, steps of exploration, first step of learning, gradient steps in so
+    many steps: two numbers, largest step that does not overshoot; a minibatch takes that, or the largest that it bears
+    itself).
     """
     offsets, next_states, outcome_rewards, cumulative_probabilities = outcomes
-    observations, actions, next_observations, rewards = memory
-    deviation, noise_word = noise
-    gamma, first_epsilon, last_epsilon, exploration, begin, gradient_steps, period, size = schedule
-    num_actions, capacity = visits.shape[1], len(observations)
-    batch, errors = np.zeros(size, np.int64), np.zeros(size)
+    terminal, starts, cumulative, chance, limit = episodes
+    kernel, learned, _ = values
+    memory, visits, cursor, word, noise, _ = walk
+    num_actions = visits.shape[1]
+    gamma, first_epsilon, last_epsilon, exploration, begin, gradient_steps, period, largest_step = schedule
     for _ in range(steps):
         # start an episode
         if cursor[0] < 0:
@@ -583,27 +595,11 @@ def learn(
             cursor[2] = 0
         s, t = cursor[0], cursor[3]
         c = group[s]
-        # epsilon-greedy action; before learning begins, a uniform one
+        # act, epsilon-greedy; before learning begins, at random
         share = min(1.0, t / exploration) if exploration > 0 else 1.0
         epsilon = first_epsilon + share * (last_epsilon - first_epsilon) if t >= begin else 1.0
-        action = 0
-        if uniform_number(word, 0) < epsilon:
-            action = action_of_set(chance, num_actions, word, c)
-        else:  # greedy, ties at random
-            best, ties = _q_value(kernel, learned, c, 0), 1
-            if not set_has(chance, c, 0):
-                best = -np.inf
-            for a in range(1, num_actions):
-                if not set_has(chance, c, a):
-                    continue
-                q = _q_value(kernel, learned, c, a)
-                if q > best:
-                    best, ties, action = q, 1, a
-                elif q == best:
-                    ties += 1
-                    if uniform_number(word, 0) * ties < 1.0:
-                        action = a
-        # one step of the MDP: the outcome by its cumulated probability
+        action = _act(kernel, learned, chance, c, epsilon, word)
+        visits[c, action] += 1
         executed = redrawn_action(action, cursor[1], chance, num_actions, word, c)
         row = s * num_actions + executed
         k, last = offsets[row], offsets[row + 1] - 1
@@ -613,13 +609,8 @@ def learn(
                 k += 1
         next_state = next_states[k]
         ended = next_state < 0 or terminal[next_state]
-        # store the transition in the ring, with a noisy reward
-        slot = t % capacity
-        observations[slot], actions[slot], next_observations[slot] = c, action, -1 if ended else group[next_state]
-        rewards[slot] = outcome_rewards[k]
-        if deviation > 0.0:
-            rewards[slot] += deviation * normal_number(noise_word, 0)
-        visits[c, action] += 1
+        # remember the transition, and go on
+        _remember(memory, noise, t, (c, action, -1 if ended else group[next_state], outcome_rewards[k]))
         cursor[0], cursor[1] = next_state, executed
         cursor[2] += 1
         cursor[3] += 1
@@ -627,34 +618,74 @@ def learn(
             cursor[0] = -1
         if t < begin:
             continue
-        # gradient steps that fall due between this step and the next
-        num_stored = min(t + 1, capacity)
+        # learn: the gradient steps that fall due between this step and the next
         num_gradient_steps = (t + 1 - begin) * gradient_steps // period - (t - begin) * gradient_steps // period
         for _ in range(num_gradient_steps):
-            # draw a minibatch; its temporal differences by the target
-            for i in range(size):
-                j = integer_below(word, 0, num_stored)
-                batch[i] = j
-                y = rewards[j]
-                if next_observations[j] >= 0:
-                    d = next_observations[j]
-                    best = _q_value(kernel, target, d, 0) if set_has(chance, d, 0) else -np.inf
-                    for a in range(1, num_actions):
-                        if set_has(chance, d, a):
-                            best = max(best, _q_value(kernel, target, d, a))
-                    y += gamma * best
-                errors[i] = y - _q_value(kernel, learned, observations[j], actions[j])
-            # largest step of this minibatch that does not overshoot, by the row sums of its kernel (Gershgorin)
-            bound = 0.0
-            for i in range(size):
-                total = 0.0
-                for j in range(size):
-                    if actions[batch[i]] == actions[batch[j]]:
-                        total += abs(_likeness(kernel, observations[batch[i]], observations[batch[j]]))
-                bound = max(bound, total / size)
-            if bound <= 0.0:
-                continue
-            # move Q along the kernel of each transition
-            step = min(largest_step, 1.0 / bound) / size
-            for i in range(size):
-                _gradient_step(kernel, learned, observations[batch[i]], actions[batch[i]], step * errors[i])
+            _learn_minibatch(values, walk, chance, gamma, largest_step, min(t + 1, len(memory[0])))
+
+
+@kernel(makes_arrays=False, forceinline=True)
+def _act(kernel, learned, chance, c, epsilon, word):
+    """An epsilon-greedy action for observation c, ties at random."""
+    num_actions = len(learned[0])
+    if uniform_number(word, 0) < epsilon:
+        return action_of_set(chance, num_actions, word, c)
+    best, ties, action = -np.inf, 1, 0
+    for a in range(num_actions):
+        if not set_has(chance, c, a):
+            continue
+        q = _q_value(kernel, learned, c, a)
+        if a == 0 or q > best:
+            best, ties, action = q, 1, a
+        elif q == best:
+            ties += 1
+            if uniform_number(word, 0) * ties < 1.0:
+                action = a
+    return action
+
+
+@kernel(makes_arrays=False, forceinline=True)
+def _remember(memory, noise, t, transition):
+    """Store the transition of step t in the ring, with a noisy reward."""
+    observations, actions, next_observations, rewards = memory
+    deviation, noise_word = noise
+    slot = t % len(observations)
+    observations[slot], actions[slot], next_observations[slot], rewards[slot] = transition
+    if deviation > 0.0:
+        rewards[slot] += deviation * normal_number(noise_word, 0)
+
+
+@kernel(makes_arrays=False, forceinline=True)
+def _learn_minibatch(values, walk, chance, gamma, largest_step, num_stored):
+    """A gradient step on drawn transitions of the ring, the largest that they bear, at most `largest_step`."""
+    kernel, learned, target = values
+    memory, visits, _, word, _, (batch, errors) = walk
+    observations, actions, next_observations, rewards = memory
+    num_actions, size = visits.shape[1], len(batch)
+    # draw a minibatch; its temporal differences by the target
+    for i in range(size):
+        j = integer_below(word, 0, num_stored)
+        batch[i] = j
+        y = rewards[j]
+        if next_observations[j] >= 0:
+            d, best = next_observations[j], -np.inf
+            for a in range(num_actions):
+                if set_has(chance, d, a):
+                    q = _q_value(kernel, target, d, a)
+                    best = max(best, q) if a else q
+            y += gamma * best
+        errors[i] = y - _q_value(kernel, learned, observations[j], actions[j])
+    # largest step of this minibatch that does not overshoot, by the row sums of its kernel (Gershgorin)
+    bound = 0.0
+    for i in range(size):
+        total = 0.0
+        for j in range(size):
+            if actions[batch[i]] == actions[batch[j]]:
+                total += abs(_likeness(kernel, observations[batch[i]], observations[batch[j]]))
+        bound = max(bound, total / size)
+    if bound <= 0.0:
+        return
+    # move Q along the kernel of each transition
+    step = min(largest_step, 1.0 / bound) / size
+    for i in range(size):
+        _gradient_step(kernel, learned, observations[batch[i]], actions[batch[i]], step * errors[i])

@@ -787,9 +787,8 @@ def estimate(
             before = previous[alive]
             can_be = sets[np.arange(alive.size), np.minimum(before, mdp.num_actions - 1)]
             previous[alive] = np.where(can_be, before, mdp.num_actions)
-        execute_choices(
-            answers.probabilities, indices, numbers, chance, *rewards, states, mdp.gamma**step, alive, previous, returns
-        )
+        running = (alive, states, previous, returns)
+        execute_choices(answers.probabilities, indices, numbers, chance, rewards, mdp.gamma**step, running)
         executed = previous[alive]
         next_states = mdp.dynamics.sample(states[alive], executed, rng)
         goes_on = (next_states >= 0) & ~terminal[next_states]

@@ -277,17 +277,21 @@ class SampledLearner(IdealisedLearner):
         target = tuple(each.copy() for each in learnt)
         size = min(sampling.buffer_size, schedule.steps)
         memory = *(np.zeros(size, np.int64) for _ in range(3)), np.zeros(size)
+        minibatch = np.zeros(sampling.batch_size, np.int64), np.zeros(sampling.batch_size)
         visits, cursor = np.zeros((count, num_actions)), np.array([-1, -1, 0, 0], np.int64)
         words = np.random.SeedSequence(seed, spawn_key=(2,)).generate_state(2, np.uint64)
         word, noise = words[:1].copy(), (float(sampling.reward_noise), words[1:].copy())
         numbers = (
             *(schedule.gamma, schedule.exploration_initial_eps, schedule.exploration_final_eps),
             schedule.exploration_fraction * schedule.steps,
-            *(int(schedule.learning_starts), int(schedule.gradient_steps), int(schedule.period), sampling.batch_size),
+            *(int(schedule.learning_starts), int(schedule.gradient_steps), int(schedule.period)),
         )
         chance = (*mdp.chance.triple[:2], 0.0, float(mdp.chance.first_chosen))
         sets = () if observations.sets is None else (np.ascontiguousarray(observations.sets),)
         cumulative = np.append(np.cumsum(mdp.start_probabilities[:-1]), 1.0)
+        starts, terminal = np.asarray(mdp.start_states, np.int64), np.asarray(mdp.terminal, np.bool_)
+        episodes = kernels.Episodes(terminal, starts, cumulative, (*chance, *sets), self.episode)
+        state = kernels.Walk(memory, visits, cursor, word, noise, minibatch)
         vector, largest_step = np.full((count, 1), count**-0.5), 0.0
         stops = np.unique([*looks, *range(0, schedule.steps, schedule.period)])
         for step, next_stop in zip(stops, [*stops[1:], schedule.steps], strict=True):
@@ -302,9 +306,5 @@ class SampledLearner(IdealisedLearner):
                 weights = visits.max(axis=1, keepdims=True) / max(step, 1)
                 largest = operator.largest_eigenvalue(weights, vector) if step else 0.0
                 largest_step = 1 / (STEP_MARGIN * largest) if largest > 0 else math.inf
-            kernels.learn(
-                *(self.outcomes, np.asarray(mdp.terminal, np.bool_), group),
-                *(np.asarray(mdp.start_states, np.int64), cumulative, (*chance, *sets)),
-                *(self.episode, kernel, learnt, target, memory, visits, cursor, word, noise, numbers),
-                *(largest_step, int(next_stop - step)),
-            )
+            learning = (kernel, learnt, target), state, (*numbers, largest_step)
+            kernels.learn(self.outcomes, group, episodes, *learning, int(next_stop - step))
