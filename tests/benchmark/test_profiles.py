@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -292,6 +293,9 @@ def test_a_run_of_a_shipped_agent_shows_no_symptom():
         assert said.is_healthy and said.verdict == "Nothing is wrong that these results and checks can see."
 
 
+PAGE = (Path(__file__).parents[2] / "docs" / "diagnose.md").read_text(encoding="utf-8")
+
+
 def as_known(profile, agent):
     """A run of the shipped DQN with the scores of a known agent on the tasks of the table."""
     whole = AgentResults.read("dqn")
@@ -312,7 +316,11 @@ def test_a_finished_run_is_like_the_known_agents_with_its_scores():
         assert [*said.likeness].index(each.fault) < 3
     for kind, words in FAULTS.items():
         assert {each.fault for each in table if each.kind == kind} == {HEALTHY, *words} - {"seeds_ignored"}
-        assert accuracy(kind, SCORES).three > 3 / len(words)  # better than a guess
+        right = accuracy(kind, SCORES)
+        assert right.three > 3 / len(words)  # better than a guess
+        shares = right.first, right.three, right.healthy, right.unknown
+        row = f"| {kind.upper()}, {len(words) - (kind == 'dqn')} faults | {right.agents} | "
+        assert row + " | ".join(f"{100 * share:.0f} %" for share in shares) + " |" in PAGE
 
 
 def test_a_likeness_of_scores_says_a_fault_only_beside_a_sign_of_it():

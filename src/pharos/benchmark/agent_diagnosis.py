@@ -126,10 +126,10 @@ class Diagnosis:
         right = self.accuracy
         if right.agents and self.from_results:
             return (
-                f"By scores on {pluralize(len(SCORED_TASKS), 'task')} alone. Of {right.agents} agents, each left out of "
-                f"the table in turn, the fault was the likeliest for {right.first:.0%}, among three for {right.three:.0%}; "
-                f"health was the likeliest for {right.healthy:.0%} of the healthy ones. Values say more: `pharos "
-                f"diagnose AGENT`."
+                f"By scores on {pluralize(len(SCORED_TASKS), 'task')} alone. Of {right.agents} agents of one author, "
+                f"each left out of the table in turn, the fault was the likeliest for {right.first:.0%}, among three "
+                f"for {right.three:.0%}; health was the likeliest for {right.healthy:.0%} of the healthy ones. "
+                "It is right less often for other code. Values say more: `pharos diagnose AGENT`."
             )
         if not right.agents:
             return "The table has one agent with each fault, so nothing is known of how often the likeness is right."

@@ -291,11 +291,11 @@ def _of_values(examinations: Sequence[Examination]) -> dict[str, float]:
     if all(each.q is not None for each in examinations):
         played = [np.log10(residuals(on_policy(each))[RIGHT] + FLOOR) for each in examinations]
         numbers["on_policy"] = float(np.mean(played, axis=0).min())
-        late = [
+        both = [
             [np.log10(residuals(own, each.late)[RIGHT] + FLOOR) for own in (lately(each), each)]
             for each in examinations
         ]
-        lowest = np.mean(late, axis=0).min(axis=1)
+        lowest = np.mean(both, axis=0).min(axis=1)
         numbers["on_policy_gap"] = float(lowest[0] - lowest[1])
     for name in EQUATIONS:
         applicable = [table for table in logs if name in table]
