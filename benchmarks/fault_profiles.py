@@ -1,9 +1,13 @@
 """Profiles of known faults for `pharos diagnose`: readings of small agents, healthy ones and ones with a fault.
 
     python benchmarks/fault_profiles.py --rounds 3
+    python benchmarks/fault_profiles.py --rounds 2 --scores
 
 Each round has all faults once, each with hyperparameters and seeds of its own, and three healthy agents of each kind.
 An agent takes about 6 s of a processor. Writes src/pharos/benchmark/data/fault_profiles.csv.
+
+With `--scores` it writes fault_scores.csv beside it: scores on some tasks of v1, for finished runs, of all but agents
+whose seeds are ignored, and of two healthy ones a round. An agent takes about 3 s a task.
 """
 
 import argparse
@@ -12,10 +16,11 @@ import zlib
 
 import numpy as np
 
-from pharos.benchmark import faults
+from pharos.benchmark import faults, load_suite
 from pharos.benchmark.doctor import readings
 from pharos.benchmark.examination import NAMES, examine
-from pharos.benchmark.profiles import DECIMALS, PROFILES_FILE
+from pharos.benchmark.profiles import DECIMALS, PROFILES_FILE, SCORED_TASKS, SCORES
+from pharos.training.budget import generated_curve
 
 FURTHER = 100  # between numbers of the healthy agents of a round
 
@@ -53,10 +58,23 @@ def examinations(agent, fault, number):
     return examine(learn, seeds=[10 * number]) + again
 
 
+def scores(agent, fault, number):
+    """Scores of one agent on SCORED_TASKS, with one seed."""
+    suite, numbers = load_suite("v1"), {}
+    protocol = suite.protocol
+    for name in SCORED_TASKS:
+        learn, task = faults.make(agent, fault, **setting(agent, fault, number)), suite.task(name).check(protocol)
+        options = {"steps": protocol.steps, "evaluations": protocol.evaluations, "seed": 10 * number}
+        with np.errstate(all="ignore"):
+            rows = generated_curve(learn, task, **options).rows[1:]
+        numbers[f"score_{name}"] = 1 - float(np.clip(np.mean([row["normalized_regret"] for row in rows]), 0, 1))
+    return numbers
+
+
 def write(rows, file=PROFILES_FILE):
     """Write (agent, fault, readings) as a table."""
     names = list(dict.fromkeys(name for *_, numbers in rows for name in numbers if not name.startswith("regret_")))
-    names += [f"regret_{name}" for name in NAMES]
+    names += [f"regret_{name}" for name in NAMES] if file == PROFILES_FILE else []
     with open(file, "w", encoding="utf-8", newline="") as lines:
         table = csv.writer(lines, lineterminator="\n")
         table.writerow(["agent", "fault", *names])
@@ -68,11 +86,15 @@ def write(rows, file=PROFILES_FILE):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=3)
-    rows = []
-    for agent, fault, number in agents(range(parser.parse_args().rounds)):
-        rows.append((agent, fault, readings(examinations(agent, fault, number))))
+    parser.add_argument("--scores", action="store_true")
+    options, rows = parser.parse_args(), []
+    for agent, fault, number in agents(range(options.rounds)):
+        if options.scores and (fault == "seeds_ignored" or number >= 2 * FURTHER):
+            continue
+        numbers = scores(agent, fault, number) if options.scores else readings(examinations(agent, fault, number))
+        rows.append((agent, fault, numbers))
         print(agent, fault, number, flush=True)
-    write(rows)
+    write(rows, SCORES if options.scores else PROFILES_FILE)
 
 
 if __name__ == "__main__":

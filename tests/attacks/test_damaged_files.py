@@ -1,19 +1,26 @@
 """Every kind of file that pharos reads, damaged in every way: refused in one line, or read right."""
 
 import hashlib
+import itertools
 import json
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy
 import xxhash
 import yaml
 
 import pharos
-from attacks.damage import Attack, Tally, command, entry_changed, flipped, outcome
+from attacks.damage import NUMBERS, OTHERS, Attack, Tally, command, entry_changed, flipped, outcome
 from pharos import benchmark, exporters, hardness, importers, study
+from pharos.benchmark.profiles import SCORED_TASKS, SCORES
+from pharos.benchmark.results import FILE, WHAT
+from pharos.benchmark.suite import FOLDER
 from pharos.mdp import TabularMDP
+from pharos.system.sealed import write_sealed
 
 pytestmark = pytest.mark.long
 
@@ -363,6 +370,99 @@ def test_searches(attack, tmp_path):
 
     names = ("tuning.json", "hyperparameters.yaml")
     attack("searches", 30, tmp_path / "search", names, read, fewer=2)
+
+
+# Finished runs of a benchmark for a diagnosis ------------------------------------------------------------------------
+
+RECORD = {"form": "generator", "source": {"name": "mine.py:learn", "sha256": "ab"}, "notes": {"x": {"a": "b"}}}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder of results of three seeds, and what they say and have."""
+    whole = benchmark.AgentResults.read("v1/dqn")
+    names = [*SCORED_TASKS, "umbrella_chain-8", "umbrella_chain-16"]
+    facts = {name: {"one_action": 0.5, "deterministic": 0.0, "greedy_score": 0.5} for name in names}
+    record = {"agent": "mine", "suite": "v1", "suite_digest": whole.digest, "seeds": [0, 1, 2]}
+    record |= {"record": {**RECORD, "policies": facts, "failed": {"a": "why"}}}
+    curves = {name: whole.curves[name][:3] for name in names}
+    folder = tmp_path_factory.mktemp("finished")
+    write_sealed(folder / FILE, record, curves, WHAT)
+    return folder, record, curves
+
+
+def diagnosed(folder):
+    """What `diagnose --results` says; all of it can be written as JSON."""
+    said = command("diagnose", "--results", folder)
+    json.dumps(said, allow_nan=False)
+    assert "\n" not in said["verdict"] and len(said["verdict"]) < 1000
+    return {name: value for name, value in said.items() if name != "seconds"}
+
+
+def test_results_that_are_diagnosed(finished, attack):
+    folder, _, _ = finished
+    attack("results that are diagnosed", 12, folder, (FILE,), diagnosed)
+
+
+def test_results_that_are_diagnosed_and_are_others(finished, tmp_path, count):
+    """Each is refused in a line, or, if it says the same of scores and likeness, answered the same."""
+    folder, record, curves = finished
+    whole, tally = diagnosed(folder), Tally()
+    (tmp_path / "r").mkdir()
+
+    def read():
+        said = diagnosed(tmp_path / "r")
+        return [said[name] == whole[name] for name in ("scores", "likeness", "readings")]
+
+    def sealed(**changes):
+        write_sealed(
+            tmp_path / "r" / FILE, {**record, **changes.get("record", {})}, changes.get("curves", curves), WHAT
+        )
+
+    foreign = {
+        "a suite": (FOLDER / "v1.yaml").read_bytes(),
+        "a table": SCORES.read_bytes(),
+        "numbers alone": safetensors.numpy.save(dict(curves)),
+        "JSON": b"{}",
+        "half written": (folder / FILE).read_bytes()[: (folder / FILE).stat().st_size // 2],
+        "of a later version": (folder / FILE).read_bytes().replace(b'\\"format\\": 1', b'\\"format\\": 9'),
+    }
+    for name, data in foreign.items():
+        (tmp_path / "r" / FILE).write_bytes(data)
+        tally.note(name, *outcome(read, ("refused alone",)))
+    for name, suite in itertools.product(("suite", "suite_digest"), ("v2", "large", "../v1", "", "x" * 64)):
+        sealed(record={name: suite})
+        tally.note(f"{name} {suite}", *outcome(read, ("refused alone",)))
+    one = SCORED_TASKS[0]
+    for what, values in {
+        "huge": {**curves, one: curves[one] + 1e300},
+        "less than none": {**curves, one: curves[one] - 1e300},
+        "below optimal": {**curves, one: curves[one] - 5.0},
+        "one cell": {**curves, one: np.where(np.arange(15) == 3, 1e9, curves[one])},
+        "NaN": {**curves, one: curves[one] * np.nan},
+        "of three evaluations": {name: curve[:, :3] for name, curve in curves.items()},
+        "of no evaluation": {name: curve[:, :0] for name, curve in curves.items()},
+        "of another task": {**curves, "nobody": curves[one]},
+        "of nothing": {},
+    }.items():
+        sealed(curves=values)
+        tally.note(f"curves {what}", *outcome(read, ("refused alone",)))
+    assert tally.counts["refused"] == tally.total, tally.failures
+    values = [value for value in (*NUMBERS, *OTHERS) if value == value and value not in (np.inf, "\ud800")]
+    same = repr([True, True, True])
+    for name, value in itertools.product(record["record"], values[::2]):
+        with suppress(ValueError):  # no file has such a number
+            sealed(record={"record": {**record["record"], name: value}})
+            tally.note(f"{name} {str(value)[:20]}", *outcome(read, (same,)))
+    for name, value in itertools.product(("one_action", "deterministic", "greedy_score"), (-1, 1e300, "x", None, 2)):
+        facts = {each: {**own, name: value} for each, own in record["record"]["policies"].items()}
+        sealed(record={"record": {**record["record"], "policies": facts}})
+        tally.note(
+            f"{name} {value}", *outcome(lambda: diagnosed(tmp_path / "r")["findings"], (repr(whole["findings"]),))
+        )
+    count(f"{tally.total} other results that are diagnosed: {tally}")
+    tally.check()
+    assert tally.total >= 60
 
 
 # Submissions of single runs -------------------------------------------------------------------------------------------

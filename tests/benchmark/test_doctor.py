@@ -154,6 +154,30 @@ def test_values_of_what_was_played_obey_the_equation_of_a_learner_on_policy_alon
     assert residuals(greedy)[RIGHT_EQUATION][place] < 1e-6 < 0.05 < residuals(on_policy(greedy))[RIGHT_EQUATION].min()
 
 
+def test_old_values_hide_no_learner_on_policy_without_a_memory():
+    """Values are right by what was played of late, where it was of late; elsewhere they are anything."""
+    here, none = world(1), np.zeros((STATES, ACTIONS))
+    is_late = np.arange(STATES) < 6
+    here.transitions[:6, :, 6:8] = 0
+    here.transitions[:6] += (1 - here.transitions[:6].sum(axis=2, keepdims=True)) * np.eye(STATES)[8]
+    late = examination(here, q=none, seed=3).visits * is_late[:, None]
+    frequency = late / np.maximum(late.sum(axis=1, keepdims=True), 1)
+    q = solve(here, RIGHT_EQUATION, GAMMA, none, policy=frequency, at_terminal=0.0)
+    q[6:8] = [[40.0, -30.0, 20.0], [-50.0, 10.0, 35.0]]
+    each = examination(here, q=q, late=late, last=late)
+    numbers, of_late = readings([each]), readings([each], of_late=True)
+    assert min(numbers["consistency"], numbers["on_policy"]) > of_late["consistency"] + 1
+    assert of_late["consistency"] == pytest.approx(np.log10(0.02), abs=1e-3)
+    assert of_late["gamma"] == pytest.approx(-np.log10(1 - GAMMA)) and of_late["truth"] > 0.999
+    assert of_late["coverage"] == numbers["coverage"]  # of all of the run
+    largest = np.log10(residuals(each, late)[RIGHT_EQUATION].min() + 0.02)
+    assert (
+        numbers["on_policy_gap"] == pytest.approx(np.log10(0.02) - largest, abs=1e-3) and numbers["on_policy_gap"] < 0
+    )
+    greedy = readings([examination(here, q=optimal(here, GAMMA), late=late, last=late)])
+    assert greedy["on_policy_gap"] > 0
+
+
 def test_values_of_states_that_the_agent_has_left_are_no_sign_of_an_end_at_the_time_limit():
     here = replace(world(1), rewards=np.abs(world(1).rewards))
     policy = np.eye(ACTIONS)[np.zeros(STATES, int)]

@@ -1,6 +1,8 @@
 """Likeness to known faults, symptoms, and the page of `pharos diagnose`."""
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +16,14 @@ from pharos.benchmark.examination import NAMES, solved, value_functions
 from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY, batch_of
 from pharos.benchmark.profiles import (
     HEALTHY_ONES,
+    SCORED_TASKS,
+    SCORES,
     SYMPTOMS,
     Profile,
     accuracy,
     failed,
     families,
+    has_no_memory,
     is_on_policy,
     judged,
     kind_of,
@@ -28,7 +33,7 @@ from pharos.benchmark.profiles import (
 )
 from pharos.benchmark.results import AgentResults
 from pharos.benchmark.suite import load_suite
-from pharos.errors import TimeLimit
+from pharos.errors import ParameterError, TimeLimit
 from pharos.training import PolicyRecorder
 from refusals import failing
 
@@ -103,6 +108,15 @@ def test_a_learner_is_on_policy_if_the_largest_next_value_explains_less_than_wha
     for largest, played, is_so in ((0.01, -0.01, True), (-0.01, -0.3, False), (0.3, 0.01, False)):
         assert is_on_policy({"consistency": limit + largest, "on_policy": limit + played}, known) == is_so
     assert not is_on_policy({"consistency": 0.0}, known) and not is_on_policy({}, known)
+
+
+def test_a_learner_without_a_memory_is_far_from_both_backups_and_of_late_nearer_to_what_it_played():
+    known = [each for each in shipped() if each.kind == "dqn"]
+    limit = max(max(each.readings["consistency"] for each in known if each.fault == HEALTHY) + 0.1, -0.4)
+    for largest, played, gap, is_so in ((0.1, 0.1, -0.04, True), (0.1, 0.1, -0.02, False), (-0.1, 0.1, -0.04, False)):
+        numbers = {"consistency": limit + largest, "on_policy": limit + played, "on_policy_gap": gap}
+        assert has_no_memory(numbers, known) == is_so
+    assert not has_no_memory({"consistency": 0.0}, known) and not has_no_memory({}, known)
 
 
 def _symptoms(findings):
@@ -275,8 +289,69 @@ def test_a_run_of_a_shipped_agent_shows_no_symptom():
         results = AgentResults(f"my {name}", "v1", whole.digest, whole.seeds[:5], half)
         assert readings_of(results) == []
         said = diagnosis_of_results(contents_of(results))
-        assert said.kind == name and not said.readings and set(said.scores) == set(half)
+        assert said.kind == name and said.from_results and set(said.scores) == set(half)
         assert said.is_healthy and said.verdict == "Nothing is wrong that these results and checks can see."
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "diagnose.md").read_text(encoding="utf-8")
+
+
+def as_known(profile, agent):
+    """A run of the shipped DQN with the scores of a known agent on the tasks of the table."""
+    whole = AgentResults.read("dqn")
+    curves = {name: np.full(curve.shape, 0.5) for name, curve in whole.curves.items()}
+    curves |= {name: np.full_like(curves[name], 1 - profile.readings[f"score_{name}"]) for name in SCORED_TASKS}
+    return AgentResults(agent, "v1", whole.digest, whole.seeds, curves, {"source": {"name": "mine.py:learn"}})
+
+
+def test_a_finished_run_is_like_the_known_agents_with_its_scores():
+    table = shipped(SCORES)
+    for each in table[::7]:
+        said = diagnosis_of_results(contents_of(as_known(each, f"my {each.kind}")))
+        assert said.readings == pytest.approx(each.readings) and sum(said.likeness.values()) == pytest.approx(1)
+        # by hand: probabilities of the same table
+        of_kind = [other for other in table if other.kind == each.kind]
+        assert said.likeness == pytest.approx(likeness(each.readings, of_kind))
+        assert said.accuracy == accuracy(each.kind, SCORES) and said.how_often.startswith("By scores on ")
+        assert [*said.likeness].index(each.fault) < 3
+    for kind, words in FAULTS.items():
+        assert {each.fault for each in table if each.kind == kind} == {HEALTHY, *words} - {"seeds_ignored"}
+        right = accuracy(kind, SCORES)
+        assert right.three > 3 / len(words)  # better than a guess
+        shares = right.first, right.three, right.healthy, right.unknown
+        row = f"| {kind.upper()}, {len(words) - (kind == 'dqn')} faults | {right.agents} | "
+        assert row + " | ".join(f"{100 * share:.0f} %" for share in shares) + " |" in PAGE
+
+
+def test_a_likeness_of_scores_says_a_fault_only_beside_a_sign_of_it():
+    each = next(each for each in shipped(SCORES) if each.fault == "rewards_clipped")
+    whole = as_known(each, "my dqn")
+    assert next(iter(diagnosis_of_results(contents_of(whole)).likeness)) == "rewards_clipped"
+    for said in map(diagnosis_of_results, map(contents_of, (whole, as_known(each, "my ppo")))):
+        assert said.fault in (None, *(fault for finding in said.findings for fault in finding.faults))
+
+
+def test_a_run_without_the_tasks_of_the_table_names_the_command_that_has_the_likeness():
+    whole = as_known(shipped(SCORES)[0], "my dqn")
+    curves = {name: curve for name, curve in whole.curves.items() if name != SCORED_TASKS[0]}
+    said = diagnosis_of_results(contents_of(replace(whole, curves=curves)))
+    assert said.likeness == {} and said.fault is None and said.lacks in str(said)
+    assert said.lacks == (
+        f"Known faults are not compared: the run lacks {SCORED_TASKS[0]} of the suite v1; `pharos diagnose "
+        f"mine.py:learn` compares them, in some minutes."
+    )
+    assert said.lacks in said.to_html().replace("&#x27;", "'")
+
+
+def test_a_run_of_another_protocol_or_with_impossible_regret_is_refused():
+    whole = as_known(shipped(SCORES)[0], "my dqn")
+    short = {name: curve[:, :3] for name, curve in whole.curves.items()}
+    with pytest.raises(ParameterError, match="has 3 evaluations; expected the 15 of suite v1"):
+        diagnosis_of_results(contents_of(replace(whole, curves=short)))
+    for wrong in (-1e300, -1.0, 1e300):
+        with pytest.raises(ParameterError, match=r"has normalised regret of .*; expected 0, optimal, to 1e\+06"):
+            curves = {**whole.curves, SCORED_TASKS[0]: whole.curves[SCORED_TASKS[0]] * 0 + wrong}
+            diagnosis_of_results(contents_of(replace(whole, curves=curves)))
 
 
 def test_groups_of_tasks_that_lose_alone_are_named():
@@ -291,10 +366,11 @@ def test_groups_of_tasks_that_lose_alone_are_named():
 
 def test_what_policies_are_like_is_a_symptom():
     core = [task.name for task in load_suite("v1").core]
-    score = 1 - AgentResults.read("dqn").curves[core[0]].mean()
+    scores = {name: 1 - AgentResults.read("dqn").curves[name].mean() for name in core}
+    noisy_one = next(name for name, score in scores.items() if score < 0.6)
     fixed = {name: {"one_action": 0.95, "deterministic": 1.0} for name in core}
     assert readings_of(worse((), policies=fixed)) == ["one_action"]
-    noisy = {core[0]: {"one_action": 0.5, "deterministic": 0.0, "greedy_score": score + 0.3}}
+    noisy = {noisy_one: {"one_action": 0.5, "deterministic": 0.0, "greedy_score": scores[noisy_one] + 0.3}}
     assert readings_of(worse((), policies=noisy)) == ["noise"]
 
 

@@ -2,17 +2,18 @@
 
 An agent by name is trained on twelve small worlds, where its values are held against exact ones (`examination.py`). A
 finished run is held against the baseline that it is nearest to, on groups of tasks that one mistake hits, if the others
-are spared. Nothing is trained for it, and no likeness of known faults is told: their table has values.
+are spared, and its scores against those of known faults. Nothing is trained for it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pharos.benchmark.comparison import LEAST_DIFFERENCE, WORSE, compare_groups
-from pharos.benchmark.contents import Contents, Source, contents_of, listed, run_warnings
+from pharos.benchmark.contents import MOST_RECORD_LETTERS, Contents, Source, contents_of, listed, run_warnings
 from pharos.benchmark.diagnosis import ONE_ACTION, groups_of, nearest, policies_of, seeds_sentence
 from pharos.benchmark.doctor import on_policy, readings
 from pharos.benchmark.examination import EXAMINATION_PROTOCOL, NAMES, Examination, examine
@@ -20,19 +21,26 @@ from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY
 from pharos.benchmark.profiles import (
     BROKEN,
     CREDIBLE,
+    PROFILES_FILE,
+    SCORED_TASKS,
+    SCORES,
     Accuracy,
     Finding,
     Judgement,
     Profile,
     accuracy,
     families,
+    has_no_memory,
     is_on_policy,
     judged,
     kind_of,
+    likeness,
     shipped,
+    suspect,
 )
+from pharos.benchmark.results import AgentResults
 from pharos.benchmark.scores import run_scores
-from pharos.benchmark.suite import Suite
+from pharos.benchmark.suite import Suite, load_suite
 from pharos.errors import ParameterError
 from pharos.system.wording import pluralize
 
@@ -64,6 +72,7 @@ LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "credit": ("look at gamma, lambda and returns of several steps", ("gamma_half",)),
 }
 """Groups of tasks and axes that one mistake hits: what to try, and the faults that they are a sign of."""
+LEAST_REGRET, MOST_REGRET = -0.5, 1e6  # that a curve may have; what is evaluated by episodes may be below 0
 
 
 @dataclass(frozen=True)
@@ -74,14 +83,17 @@ class Diagnosis:
         agent: its label. kind: "dqn", "ppo", or empty if it offers no values.
         verdict: one sentence.
         findings: symptoms that are there, signs of the likeliest fault first, then the strongest.
-        likeness: probability of each known fault, "none" among them, the largest first. Empty for a finished run.
+        likeness: probability of each known fault, "none" among them, the largest first. Empty if a finished run lacks
+            tasks that it needs, see `lacks`.
         fault: the known fault that is said, or None for none of the known ones.
         strange: whether it is farther from all known faults, and from health, than known ones are.
         accuracy: how often the likeness was right for agents that the library did not have.
         scores: by world, or by task of a finished run: 1 optimal and 0 as uniform play, mean of the seeds.
-        readings: all numbers, see `doctor.readings`. Empty for a finished run.
+        readings: all numbers, see `doctor.readings`. Of a finished run see `score_readings`.
         on_policy: whether its values are those of the policy that explores, as of SARSA. If so, `readings` are by what
             was played, not by the largest next value. It is no fault of a learner on-policy.
+        from_results: whether it is the diagnosis of a finished run.
+        lacks: a sentence on what a finished run lacks for a likeness, and the command that gives it. Else empty.
     """
 
     agent: str
@@ -95,11 +107,13 @@ class Diagnosis:
     scores: Mapping[str, float]
     readings: Mapping[str, float] = field(default_factory=dict)
     on_policy: bool = False
+    from_results: bool = False
+    lacks: str = ""
 
     @property
     def is_healthy(self) -> bool:
         """Whether no check has found anything, and no fault is said."""
-        return not self.findings and self.fault is None and not (self.readings and self.score < BROKEN)
+        return not self.findings and self.fault is None and not (not self.from_results and self.score < BROKEN)
 
     @property
     def score(self) -> float:
@@ -110,6 +124,13 @@ class Diagnosis:
     def how_often(self) -> str:
         """A sentence on how far the likeness can be trusted."""
         right = self.accuracy
+        if right.agents and self.from_results:
+            return (
+                f"By scores on {pluralize(len(SCORED_TASKS), 'task')} alone. Of {right.agents} agents of one author, "
+                f"each left out of the table in turn, the fault was the likeliest for {right.first:.0%}, among three "
+                f"for {right.three:.0%}; health was the likeliest for {right.healthy:.0%} of the healthy ones. "
+                "It is right less often for other code. Values say more: `pharos diagnose AGENT`."
+            )
         if not right.agents:
             return "The table has one agent with each fault, so nothing is known of how often the likeness is right."
         return (
@@ -122,7 +143,7 @@ class Diagnosis:
     @property
     def library(self) -> list[Profile]:
         """Known agents that it was held against."""
-        return library_of(self.kind)
+        return library_of(self.kind, SCORES if self.from_results else PROFILES_FILE)
 
     def nearest(self) -> list[tuple[str, float, str]]:
         """The three likeliest faults: (name, or "healthy" for none, likeness, in words)."""
@@ -157,7 +178,8 @@ class Diagnosis:
             lines += ["## Nearest known agents", "", "| likeness | fault | |", "|---:|---|---|"]
             lines += [f"| {share:.2f} | {name} | {text} |" for name, share, text in self.nearest()]
             lines += ["", self.how_often, ""]
-        lines += ["## Scores", "", f"| {'world' if self.readings else 'task'} | score |", "|---|---:|"]
+        lines += [self.lacks, ""] if self.lacks else []
+        lines += ["## Scores", "", f"| {'task' if self.from_results else 'world'} | score |", "|---|---:|"]
         lines += [f"| {name} | {score:.2f} |" for name, score in self.scores.items()]
         return "\n".join(lines) + "\n"
 
@@ -167,9 +189,9 @@ def meanings(kind: str) -> dict[str, str]:
     return {name: text for agent, table in FAULTS.items() if kind in ("", agent) for name, text in table.items()}
 
 
-def library_of(kind: str) -> list[Profile]:
-    """Known agents of a kind, of all kinds if it is empty."""
-    return [each for each in shipped() if kind in ("", each.kind)]
+def library_of(kind: str, file: Path = PROFILES_FILE) -> list[Profile]:
+    """Known agents of a kind, of all kinds if it is empty; of PROFILES_FILE, or SCORES."""
+    return [each for each in shipped(file) if kind in ("", each.kind)]
 
 
 def diagnose(
@@ -213,8 +235,9 @@ def diagnosis_of(examinations: Sequence[Examination], label: str) -> Diagnosis:
     numbers = readings(examinations)
     kind = kind_of(numbers)
     answer, is_explorer = judged(numbers, library_of(kind)), False
-    if is_on_policy(numbers, library_of(kind)):
-        played = readings([on_policy(each) for each in examinations])
+    is_late = has_no_memory(numbers, library_of(kind))
+    if is_late or is_on_policy(numbers, library_of(kind)):
+        played = readings(examinations if is_late else [on_policy(each) for each in examinations], is_late)
         other = judged(played, library_of(kind))
         is_explorer = {each.reading for each in other.findings} < {each.reading for each in answer.findings}
         numbers, answer = (played, other) if is_explorer else (numbers, answer)
@@ -247,10 +270,11 @@ def _diagnosis(
     scores: Mapping[str, float],
     numbers: Mapping[str, float],
     is_explorer: bool = False,
+    **more: Any,
 ) -> Diagnosis:
     findings = (*mistakes, *answer.findings)
     entries = findings, answer.shares, answer.fault, answer.is_strange, trusted, scores, numbers, is_explorer
-    diagnosis = Diagnosis(label, kind, "", *entries)
+    diagnosis = Diagnosis(label, kind, "", *entries, **more)
     return replace(diagnosis, verdict=_verdict(diagnosis) + f" {EXPLORER}" * is_explorer)
 
 
@@ -260,13 +284,13 @@ def _verdict(diagnosis: Diagnosis) -> str:
     if diagnosis.findings:
         family, share = next(iter(families(shares).items()))
         near = f", and nearest to faults of {FAMILIES[family][0]}" if share > CREDIBLE else ""
-        like = like or f"it is like none of the known faults{near}" * bool(shares)
+        like = like or f"it is like none of the known faults{near}" * bool(shares and not diagnosis.from_results)
         return f"Something is wrong: {diagnosis.findings[0].wrong}{'; ' * bool(like)}{like}."
     if fault:
         return f"No single number is unlike those of healthy agents, but {like}."
-    if diagnosis.readings and diagnosis.score < BROKEN:
+    if not diagnosis.from_results and diagnosis.score < BROKEN:
         return f"It learns little (mean score {diagnosis.score:.2f}), and is like none of the known faults."
-    return f"Nothing is wrong that these {'worlds' if diagnosis.readings else 'results'} and checks can see."
+    return f"Nothing is wrong that these {'results' if diagnosis.from_results else 'worlds'} and checks can see."
 
 
 # Finished runs --------------------------------------------------------------------------------------------------------
@@ -275,15 +299,74 @@ def _verdict(diagnosis: Diagnosis) -> str:
 def diagnosis_of_results(contents: Contents) -> Diagnosis:
     """The diagnosis that follows from a finished run, beside the baseline that it is nearest to."""
     results, kind = contents.agent.results, contents.predictor if contents.predictor in FAULTS else ""
+    _check_curves(contents)
     scores = {name: float(runs.mean()) for name, runs in run_scores(results).items()}
     findings = sorted(findings_of(contents), key=lambda each: -each.strength)
+    numbers, lacks = score_readings(results), missing_tasks(contents)
     answer = Judgement(tuple(findings), {}, None, False)
+    if not lacks:
+        shares = likeness(numbers, library_of(kind, SCORES))
+        signs = {fault for each in findings for fault in each.faults}
+        fault = next((each for each in [suspect(shares)] if each in signs), None)
+        findings.sort(key=lambda each: fault not in each.faults)
+        answer = Judgement(tuple(findings), shares, fault, False)
     mistakes = [
-        Finding("warning", 1.0, 0.0, text.rstrip("."), "mend this first; see the page of `benchmark report`")
+        Finding(
+            "warning",
+            1.0,
+            0.0,
+            text.rstrip(".")[:MOST_RECORD_LETTERS],
+            "mend this first; see the page of `benchmark report`",
+        )
         for text in (*seeds_sentence([contents.agent]), *run_warnings(results))
         if "first policy came after" not in text
     ]
-    return _diagnosis(contents.agent.name, kind, mistakes, answer, accuracy(kind or "dqn"), scores, {})
+    trusted = accuracy(kind or "dqn", SCORES)
+    return _diagnosis(
+        contents.agent.name, kind, mistakes, answer, trusted, scores, numbers, from_results=True, lacks=lacks
+    )
+
+
+def _check_curves(contents: Contents) -> None:
+    """Raise ParameterError for a curve of another protocol, or of regret that no policy has."""
+    expected = contents.suite.protocol.evaluations
+    for name, curve in contents.agent.results.curves.items():
+        if curve.shape[1] != expected:
+            raise ParameterError(
+                f"results of {contents.agent.name}: {name} has {pluralize(curve.shape[1], 'evaluation')}; expected the "
+                f"{expected} of suite {contents.suite.name}"
+            )
+        if not (curve.min() > LEAST_REGRET and curve.max() < MOST_REGRET):
+            raise ParameterError(
+                f"results of {contents.agent.name}: {name} has normalised regret of {curve.min():.3g} to "
+                f"{curve.max():.3g}; expected 0, optimal, to {MOST_REGRET:g}; take the file as it was written"
+            )
+
+
+def score_readings(results: AgentResults) -> dict[str, float]:
+    """Numbers of a finished run that are held against those of known faults: scores on SCORED_TASKS that it has.
+
+    `score_` and the name of the task, the mean of its seeds.
+    """
+    scores = run_scores(results)
+    return {f"score_{name}": float(scores[name].mean()) for name in SCORED_TASKS if name in scores}
+
+
+def missing_tasks(contents: Contents) -> str:
+    """A sentence on the tasks that a finished run lacks for a likeness, and the command that gives it. Else empty."""
+    suite, results, v1 = contents.suite, contents.agent.results, load_suite("v1")
+    own = {task.name: task.digest for task in suite.tasks if task.name in results.curves}
+    is_same = (suite.protocol.steps, suite.protocol.evaluations) == (v1.protocol.steps, v1.protocol.evaluations)
+    missing = [name for name in SCORED_TASKS if not is_same or own.get(name) != v1.task(name).digest]
+    if not missing:
+        return ""
+    more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+    source = results.record.get("source")
+    agent = source["name"] if isinstance(source, Mapping) and isinstance(source.get("name"), str) else results.agent
+    return (
+        f"Known faults are not compared: the run lacks {missing[0]}{more} of the suite v1; `pharos diagnose {agent}` "
+        f"compares them, in some minutes."
+    )
 
 
 def findings_of(contents: Contents) -> list[Finding]:

@@ -43,6 +43,8 @@ def _findings(diagnosis: Diagnosis) -> Element | None:
 
 
 def _likeness(diagnosis: Diagnosis) -> Element | None:
+    if diagnosis.lacks:
+        return section("Nearest known agents", diagnosis.lacks)
     if not diagnosis.likeness:
         return None
     rows = [[f"{share:.2f}", name, text] for name, share, text in diagnosis.nearest()]
@@ -99,7 +101,7 @@ def _dots(names: list[str], rows: list[tuple[float, ...]], agents: list[str]) ->
 
 
 def _scores(diagnosis: Diagnosis) -> Element:
-    if not diagnosis.readings:
+    if diagnosis.from_results:
         cells = [[name, f"{score:.2f}"] for name, score in diagnosis.scores.items()]
         table = element("details", element("summary", "Task by task"), html_table(["task", "score"], cells, [1]))
         mean = f"{diagnosis.score:.2f} on the average task; 1 is optimal, 0 is uniform play."

@@ -143,6 +143,14 @@ def on_policy(examination: Examination) -> Examination:
     )
 
 
+def lately(examination: Examination) -> Examination:
+    """The same if the last fifth were all of the run, for a learner on-policy without a memory, whose values elsewhere
+    are old.
+    """
+    cuts = examination.cuts / np.maximum(examination.visits, 1) * examination.late  # by their share in all of the run
+    return on_policy(replace(examination, visits=examination.late, cuts=cuts))
+
+
 def residuals(examination: Examination, visits: np.ndarray | None = None) -> dict[str, np.ndarray]:
     """Distances from each of the equations that the world tells apart, (len(GAMMAS),) by name.
 
@@ -240,7 +248,7 @@ def optimal(world: WorldArrays, gamma: float, policy: np.ndarray | None = None, 
 # Readings -------------------------------------------------------------------------------------------------------------
 
 
-def readings(examinations: Sequence[Examination]) -> dict[str, float]:
+def readings(examinations: Sequence[Examination], of_late: bool = False) -> dict[str, float]:
     """Numbers that describe an agent, by name. Numbers that do not apply to it are left out.
 
     Of an agent with values:
@@ -253,6 +261,7 @@ def readings(examinations: Sequence[Examination]) -> dict[str, float]:
     - `cut_partial_late` and `itself_late`: the same in states that it visited in the last fifth alone, as values
       elsewhere lag behind, as if the time limit were an end, or what comes after the state itself
     - `on_policy`: `consistency` if the next actions count as they were played, see `on_policy`
+    - `on_policy_gap`: the same of the last fifth less `consistency` there
     - `slope`: log10 of the factor with which rewards enter
     - `size`: log10 of the deviation of the values relative to exact ones
     - `truth`: their correlation with exact ones, and `truth_unvisited` elsewhere
@@ -273,11 +282,14 @@ def readings(examinations: Sequence[Examination]) -> dict[str, float]:
     - `behind`: late regret of behaviour less the policy's
     - `equal_seeds`: share of worlds in which two seeds did the same
     - `regret` of each world
+
+    Args:
+        of_late: whether values are read as those of a learner on-policy without a memory, see `lately`.
     """
     numbers: dict[str, float] = {}
     with_values = [each for each in examinations if each.q is not None or each.v is not None]
     if with_values:
-        numbers |= _of_values(with_values)
+        numbers |= _of_values([lately(each) for each in with_values] if of_late else with_values)
     numbers |= _of_behaviour(examinations)
     return {name: float(value) for name, value in numbers.items() if np.isfinite(value)}
 
@@ -292,6 +304,12 @@ def _of_values(examinations: Sequence[Examination]) -> dict[str, float]:
     if all(each.q is not None for each in examinations):
         played = [np.log10(residuals(on_policy(each))[RIGHT_EQUATION] + RESIDUAL_FLOOR) for each in examinations]
         numbers["on_policy"] = float(np.mean(played, axis=0).min())
+        both = [
+            [np.log10(residuals(own, each.late)[RIGHT_EQUATION] + RESIDUAL_FLOOR) for own in (lately(each), each)]
+            for each in examinations
+        ]
+        lowest = np.mean(both, axis=0).min(axis=1)
+        numbers["on_policy_gap"] = float(lowest[0] - lowest[1])
     for name in EQUATIONS:
         applicable = [table for table in logs if name in table]
         if name != RIGHT_EQUATION and applicable:

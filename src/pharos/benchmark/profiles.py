@@ -6,6 +6,8 @@ extreme healthy agents in it, with a margin, so that no healthy agent of the tab
 The likeness of a fault is its probability by linear discriminant analysis among all faults of the agent's kind. An
 agent that is far from all of them is like none of the known ones.
 
+`data/fault_scores.csv` has the scores of the same agents on `SCORED_TASKS` of the suite v1, for finished runs.
+
 Source: Friedman (1989), Regularized discriminant analysis.
 """
 
@@ -21,6 +23,14 @@ from pharos.benchmark.doctor import EQUATIONS
 from pharos.benchmark.faults import FAMILIES, HEALTHY
 
 PROFILES_FILE = Path(__file__).parent / "data" / "fault_profiles.csv"
+SCORES = PROFILES_FILE.with_name("fault_scores.csv")
+SCORED_TASKS = (
+    "frozen_lake-5-0-vector-random-0.1",
+    "mini_grid_empty-8x8-one_hot-random-0.1",
+    "deep_sea-8-one_hot",
+    "umbrella_chain-22-hash",
+)
+"""Tasks of the suite v1 whose scores tell faults apart."""
 DECIMALS = 3
 LARGEST = 4.0  # deviations within a fault that a reading counts as being away
 DIAGONAL_WEIGHT = 0.5  # weight of the deviations alone in the covariance within a fault
@@ -29,7 +39,8 @@ LEAST_MARGIN = 0.3  # of a symptom's margin, that is added to the deviation of h
 CREDIBLE = 0.6  # likeness from which a fault is said
 HEALTHY_ONES = 3.0  # times as many agents that are healthy as agents with any one fault, before anything is seen
 FARTHEST = 1.45  # mean squared deviation from the nearest fault up to which an agent is like a known one
-ASIDE = ("on_policy", "cut_partial_late", "itself_late")  # readings that are no part of the likeness
+ASIDE = ("on_policy", "on_policy_gap", "cut_partial_late", "itself_late")  # readings that are no part of the likeness
+ON_POLICY_GAP = -0.03  # of residuals; agents of the table, which take the largest next value, have -0.014 to 0.42
 BROKEN = 0.5  # mean regret of an agent of which no check and no fault says what is wrong
 
 
@@ -340,9 +351,9 @@ class Profile:
 
 
 @cache
-def shipped() -> tuple[Profile, ...]:
-    """Profiles of the library."""
-    with open(PROFILES_FILE, encoding="utf-8", newline="") as lines:
+def shipped(file: Path = PROFILES_FILE) -> tuple[Profile, ...]:
+    """Profiles of the library: PROFILES_FILE, or SCORES, those of finished runs."""
+    with open(file, encoding="utf-8", newline="") as lines:
         return tuple(
             Profile(row.pop("agent"), row.pop("fault"), {name: float(text) for name, text in row.items() if text})
             for row in csv.DictReader(lines)
@@ -362,6 +373,15 @@ def is_on_policy(numbers: Mapping[str, float], library: Sequence[Profile]) -> bo
     """
     limit = next(each for each in SYMPTOMS if each.reading == "consistency").limit(_healthy(library))
     return numbers.get("on_policy", np.inf) <= limit < numbers.get("consistency", -np.inf)
+
+
+def has_no_memory(numbers: Mapping[str, float], library: Sequence[Profile]) -> bool:
+    """Whether values are those of a learner on-policy without a memory, such as SARSA with a network: far from both
+    backups, but nearer to that of what was played, by ON_POLICY_GAP, in states that it visited of late.
+    """
+    limit = next(each for each in SYMPTOMS if each.reading == "consistency").limit(_healthy(library))
+    is_far = min(numbers.get(name, -np.inf) for name in ("on_policy", "consistency")) > limit
+    return is_far and numbers.get("on_policy_gap", np.inf) <= ON_POLICY_GAP
 
 
 def _healthy(library: Sequence[Profile]) -> list[Mapping[str, float]]:
@@ -433,6 +453,9 @@ def families(shares: Mapping[str, float]) -> dict[str, float]:
 class Accuracy:
     """Shares of agents for which the likeness was right, of those that were left out of the library.
 
+    Of scores alone, `healthy` is the share for which health was likeliest, and `unknown` the share for which the
+    likeliest other fault was of the same family.
+
     Attributes:
         agents: how many. first: share of those with a fault whose fault was the likeliest; three: among three.
         healthy: share of healthy ones without a symptom and without a fault that is likely.
@@ -454,9 +477,9 @@ def suspect(shares: Mapping[str, float]) -> str | None:
 
 
 @cache
-def accuracy(kind: str) -> Accuracy:
+def accuracy(kind: str, file: Path = PROFILES_FILE) -> Accuracy:
     """Accuracy of a shipped library for a kind of agent: each of its agents is left out in turn, then its fault."""
-    library = [each for each in shipped() if each.kind == kind]
+    library = [each for each in shipped(file) if each.kind == kind]
     ranks, healthy, unknown = [], [], []
     for index, each in enumerate(library):
         rest = library[:index] + library[index + 1 :]
@@ -464,12 +487,14 @@ def accuracy(kind: str) -> Accuracy:
             continue
         answer = judged(each.readings, rest)
         if each.fault == HEALTHY:
-            healthy.append(not answer.findings and answer.fault is None)
+            is_healthy = not answer.findings and answer.fault is None
+            healthy.append(is_healthy if file == PROFILES_FILE else next(iter(answer.shares)) == HEALTHY)
             continue
         ranks.append([*answer.shares].index(each.fault))
         answer = judged(each.readings, [other for other in rest if other.fault != each.fault])
         own = {fault for _, faults in FAMILIES.values() if each.fault in faults for fault in faults}
-        unknown.append(answer.fault in own if answer.fault else bool(answer.findings) or answer.is_strange)
+        is_right = answer.fault in own if answer.fault else bool(answer.findings) or answer.is_strange
+        unknown.append(is_right if file == PROFILES_FILE else next(iter(answer.shares)) in own)
     rank = np.array(ranks)
     if not ranks or not healthy:
         return Accuracy(0, *[float("nan")] * 4)

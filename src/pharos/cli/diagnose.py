@@ -70,14 +70,17 @@ def _print(diagnosis: "Diagnosis") -> None:
         print_table(title, columns, ((str(number), each.wrong, each.advice) for number, each in rows))
     else:
         print(title)
-    if not diagnosis.likeness:
+    scores = f"{', '.join(f'{name} {score:.2f}' for name, score in diagnosis.scores.items())}"
+    scores = f"Scores, 1 optimal and 0 as uniform play: {scores}"
+    if diagnosis.from_results:
         tasks = pluralize(len(diagnosis.scores), "task")
-        print(f"Mean score on {tasks}, 1 optimal and 0 as uniform play: {diagnosis.score:.2f}")
+        scores = f"Mean score on {tasks}, 1 optimal and 0 as uniform play: {diagnosis.score:.2f}"
+    if not diagnosis.likeness:
+        print("\n".join([diagnosis.lacks, scores]) if diagnosis.lacks else scores)
         return
-    scores = ", ".join(f"{name} {score:.2f}" for name, score in diagnosis.scores.items())
     print_table(
         "Nearest known agents",
         ("", ">likeness", ""),
         ((name, f"{share:.2f}", words) for name, share, words in diagnosis.nearest()),
-        notes=[diagnosis.how_often, f"Scores, 1 optimal and 0 as uniform play: {scores}"],
+        notes=[diagnosis.how_often, scores],
     )
