@@ -1,22 +1,27 @@
-"""Breadth-first enumeration of anything that can be saved, restored and stepped: `explore`, and the MDP that results.
+"""Breadth-first enumeration of what can be saved, restored and stepped: `BreadthFirst`, and the MDP that results.
 
-A source hands over saved states and takes them back: bytes of a console, pickles of an environment. States have keys;
-equal keys are one state. A saved state is dropped as soon as it has been expanded, so that memory holds only the
+A source hands over saved states and takes them back: pickles of an environment, rows of arrays of JAX. States have
+keys. Equal keys are one state. A saved state is dropped as soon as it has been expanded, so that memory holds only the
 frontier.
 """
 
 import time
 from array import array
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from pharos.errors import RuleError, StateSpaceTooLarge
 from pharos.importers.folder import ImportedOutcomes
 from pharos.mdp import Residual, Rewards, TabularMDP, lacking, normalized_rows, rounding_of_mean
+
+if TYPE_CHECKING:
+    from pharos.importers.side_effects import SideEffects
+    from pharos.importers.step_spaces import SpaceRecorder
 
 END = -1
 REPORT_SECONDS = 0.1
@@ -37,7 +42,7 @@ class Arrival(NamedTuple):
     probability: Fraction | float
     reward: float
     key: bytes | None
-    saved: Any = None
+    saved: bytes | None = None
     observation: np.ndarray | None = None
     script: tuple[int, ...] = ()
 
@@ -50,15 +55,40 @@ class Steppable(Protocol):
     @property
     def num_actions(self) -> int:
         """Number of actions."""
-        ...
 
     def starts(self) -> list[Arrival]:
         """The states in which episodes start, with their probabilities."""
-        ...
 
-    def expand(self, saved: Any) -> list[list[Arrival]]:
-        """The outcomes of each action in a saved state."""
-        ...
+
+class SteppedSource(Steppable, Protocol):
+    """A source that `stepping` imports: an environment of Gymnasium, or functions of JAX.
+
+    Attributes:
+        action_names, time_limit: of the environment. observer: what it shows. effects: what it did to the process.
+    """
+
+    action_names: tuple[str, ...] | None
+    time_limit: int | None
+    observer: "SpaceRecorder"
+    effects: "SideEffects"
+
+    def expansions(self, workers: int) -> "Expansions":
+        """States to be expanded, here or by other processes."""
+
+    def arrive(self, saved: bytes | None, action: int, script: Sequence[int]) -> Arrival:
+        """Repeat an earlier step with these draws, from a saved state or from the reset (None)."""
+
+    def skip(self, keys: Sequence[bytes]) -> None:
+        """Hand over no saved states of these keys, which others have."""
+
+    def integers(self, saved: bytes) -> dict[str, int]:
+        """Whole numbers that a state holds, by the names of their fields."""
+
+    def compare(self, states: "SteppedStates", horizon: int | None) -> None:
+        """RuleError if a new environment, with its own chance, does what the states say to be impossible."""
+
+    def check_rest(self) -> None:
+        """Checks when all states were expanded."""
 
 
 class Expansions(Protocol):
@@ -70,35 +100,38 @@ class Expansions(Protocol):
 
     room: int
 
-    def submit(self, saved: Any) -> None:
+    def submit(self, saved: bytes) -> None:
         """Add a state."""
-        ...
 
     def fetch(self) -> list[list[Arrival]]:
         """The outcomes of the first state that was submitted and not fetched so far."""
-        ...
 
     def close(self) -> None:
         """End what works for it."""
-        ...
 
 
 class ExpansionsHere:
-    """States that are expanded in this process, one after the other."""
+    """States that are expanded in this process, as many together as there are, up to `room`.
 
-    room = 1
+    Args:
+        expanded: (saved states) -> the outcomes of each action in each of them.
+    """
 
-    def __init__(self, source: Steppable):
-        self._source = source
-        self._saved: Any = None
+    def __init__(self, expanded: Callable[[list[bytes]], list[list[list[Arrival]]]], room: int = 1):
+        self._expanded, self.room = expanded, room
+        self._states: list[bytes] = []
+        self._results: deque[list[list[Arrival]]] = deque()
 
-    def submit(self, saved: Any) -> None:
-        """Keep a state for `fetch`."""
-        self._saved = saved
+    def submit(self, saved: bytes) -> None:
+        """Add a state."""
+        self._states.append(saved)
 
     def fetch(self) -> list[list[Arrival]]:
-        """The outcomes of the state."""
-        return self._source.expand(self._saved)
+        """The outcomes of the first state that was not fetched."""
+        if not self._results:
+            self._results.extend(self._expanded(self._states))
+            self._states = []
+        return self._results.popleft()
 
     def close(self) -> None:
         """Nothing works elsewhere."""

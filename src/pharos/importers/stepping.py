@@ -14,7 +14,7 @@ import numpy as np
 from pharos.importers import side_effects
 from pharos.importers.chance import MOST_DRAW_OUTCOMES
 from pharos.importers.folder import ImportedOutcomes
-from pharos.importers.search import BreadthFirst, SteppedStates, mdp_of
+from pharos.importers.search import BreadthFirst, SteppedSource, SteppedStates, mdp_of
 from pharos.importers.step_checkpoint import StepCheckpoint
 from pharos.importers.stepped_environment import (
     ClockSearch,
@@ -136,7 +136,7 @@ class SteppingRun:
     check: bool = True
     checkpoint: StepCheckpoint | None = None
     workers: int = 1
-    source_of: Callable[[Any, SteppingOptions], Any] = SteppedEnvironment
+    source_of: Callable[[Any, SteppingOptions], SteppedSource] = SteppedEnvironment
 
     def __post_init__(self) -> None:
         if self.horizon is not None:
@@ -167,7 +167,7 @@ class SteppingRun:
         return mdp, StepRecording(observations, observed, outcomes, source.action_names, limit, depths, notes)
 
     def _states(
-        self, source: Any, progress: Callable[[SteppedStates, float, bool], None] | None
+        self, source: SteppedSource, progress: Callable[[SteppedStates, float, bool], None] | None
     ) -> tuple[SteppedStates, ClockSearch]:
         clocks = ClockSearch(source)
         search = BreadthFirst(
